@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
@@ -18,6 +19,9 @@ from typing import Any
 
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.solvers.table import SOLVERS
+
+NO_NAMES = ("",)
+"""A list of names without any: ROS cannot tell the type of an empty one."""
 
 
 def setting(
@@ -66,7 +70,7 @@ def check(config: Any, prefix: str = "") -> None:
         elif isinstance(default, float):
             valid = isinstance(value, Real) and not isinstance(value, bool)
         elif isinstance(default, tuple):
-            valid = _are_numbers(value, len(default))
+            valid = _are_texts(value) if default == NO_NAMES else _are_numbers(value, len(default))
         else:
             valid = isinstance(value, str)
         if not valid:
@@ -81,9 +85,19 @@ def check(config: Any, prefix: str = "") -> None:
 
 def type_of(default: Any) -> str:
     """In words, what a setting with this default is."""
+    if default == NO_NAMES:
+        return "names, as [front, rear]"
     if isinstance(default, tuple):
         return f"{len(default)} numbers, as {list(default)}"
     return f"of type {type(default).__name__}"
+
+
+def _are_texts(value: Any) -> bool:
+    return (
+        isinstance(value, Sequence)
+        and not isinstance(value, str)
+        and all(isinstance(item, str) for item in value)
+    )
 
 
 def _are_numbers(value: Any, count: int) -> bool:
@@ -400,6 +414,34 @@ class Imu:
         check(self, "imu.")
 
 
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """How the images of several cameras become frames."""
+
+    window: float = setting(
+        0.02,
+        "Images of several cameras are one frame if the middles of their exposures lie within this "
+        "time, in s; cameras that run freely need half their period",
+        minimum=0.0,
+        maximum=1.0,
+    )
+
+    def __post_init__(self) -> None:
+        check(self, "rig.")
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSettings:
+    """What each camera of a rig has of its own: ``NAME.readout_time`` and so on."""
+
+    readout_time: float
+    scan_direction: str
+    stamp_offset: float
+
+
+# A name stands in topics and before parameters.
+_NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
+
 LONGEST_READOUT_TIME = 0.2
 """What a camera may take from the first row to the last, in s."""
 
@@ -512,13 +554,23 @@ class NodeConfig(LocalizerConfig):
     )
     matching: Matching = field(default_factory=Matching)
     imu: Imu = field(default_factory=Imu)
+    cameras: tuple[str, ...] = setting(
+        NO_NAMES,
+        "Cameras of a rig: each has its topics and its readout_time, scan_direction and "
+        "stamp_offset below its name; without names there is one camera",
+        read_only=True,
+    )
+    rig: Rig = field(default_factory=Rig)
     gravity_in_map: tuple[float, ...] = setting(
         (0.0, 0.0, -1.0), "Direction in which things fall in the map, of any length: imu.gravity"
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
+    # Of each of the cameras, by its name.
+    of_cameras: Mapping[str, CameraSettings] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         LocalizerConfig.__post_init__(self)
+        self._check_cameras()
         if not any(self.gravity_in_map):
             raise ValueError("gravity_in_map must have a direction, got zeros")
         for name in ("base_frame", "odom_frame", "map_frame"):
@@ -540,6 +592,37 @@ class NodeConfig(LocalizerConfig):
             raise ValueError("px4_odometry needs orientation_covariance fixed_axes")
         if self.base_frame == self.odom_frame:
             raise ValueError(f"base_frame and odom_frame are both {self.odom_frame!r}")
+
+    @property
+    def is_rig(self) -> bool:
+        """Whether there are several cameras, by name."""
+        return self.cameras != NO_NAMES
+
+    def _check_cameras(self) -> None:
+        if not self.is_rig:
+            return
+        wrong = [name for name in self.cameras if not _NAME.fullmatch(name)]
+        if wrong or not self.cameras or len(set(self.cameras)) < len(self.cameras):
+            raise ValueError(
+                "cameras must have different names of letters, digits and underscores, got "
+                f"{', '.join(map(repr, self.cameras)) or 'none'}"
+            )
+        if set(self.of_cameras) != set(self.cameras):
+            raise ValueError("of_cameras must have the settings of each of the cameras")
+        for name, camera in self.of_cameras.items():
+            if not 0.0 < camera.readout_time <= LONGEST_READOUT_TIME:
+                raise ValueError(
+                    f"{name}.readout_time must be above 0 and at most {LONGEST_READOUT_TIME:g} s, "
+                    f"got {camera.readout_time!r}: a camera of a rig needs its own, or readout_time"
+                )
+            if camera.scan_direction not in tuple(ScanDirection):
+                raise ValueError(
+                    f"{name}.scan_direction must be one of {', '.join(ScanDirection)}; "
+                    f"got {camera.scan_direction!r}"
+                )
+        for name in ("estimate_readout_time", "marker_map", "image_rect_shutter"):
+            if getattr(self, name) not in (False, "", ShutterDepth.NONE):
+                raise ValueError(f"{name} is for one camera: leave it out with cameras")
 
 
 class ImageTransport(StrEnum):

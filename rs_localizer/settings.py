@@ -12,12 +12,18 @@ import difflib
 import json
 from array import array
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
-from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
+from rs_localizer.config import (
+    NO_NAMES,
+    CameraSettings,
+    DetectorConfig,
+    FeatureConfig,
+    NodeConfig,
+)
 from rs_localizer.io.yaml_text import YamlError, load_yaml
 
 NODE_NAME = "rs_localizer"
@@ -54,6 +60,30 @@ class Setting:
     fixed: bool  # once the node is configured
 
 
+# What each camera of a rig has of its own, below its name.
+_OF_CAMERA = tuple(item.name for item in fields(CameraSettings))
+
+
+def camera_settings(values: Mapping[str, Any]) -> dict[str, Setting]:
+    """The settings that the cameras of ``values`` have of their own, by ``NAME.setting``; the
+    default is the one of all.
+    """
+    shared = settings()
+    return {
+        f"{camera}.{name}": replace(shared[name], default=values.get(name, shared[name].default))
+        for camera in _cameras(values)
+        for name in _OF_CAMERA
+    }
+
+
+def _cameras(values: Mapping[str, Any]) -> list[str]:
+    """The names of cameras; none where they are no names, which is refused elsewhere."""
+    given = _as_tuple(values.get("cameras", NO_NAMES))
+    return (
+        [name for name in given if isinstance(name, str) and name] if type(given) is tuple else []
+    )
+
+
 def settings(kind: Kind = NodeConfig) -> dict[str, Setting]:
     """All settings of a node, by dotted name."""
     if kind not in _cached:
@@ -66,18 +96,25 @@ def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
         value = getattr(config, item.name)
         if is_dataclass(value):
             yield from _walk(value, f"{prefix}{item.name}.")
-        else:
+        elif item.metadata:
             yield prefix + item.name, Setting(default=value, **item.metadata)
 
 
 def unknown(name: str, kind: Kind = NodeConfig) -> str | None:
     """What to say of a name that is no setting; None for settings and what every node may have."""
     names = settings(kind)
-    if name in names or name.split(".")[0] in _FOREIGN:
+    if name in names or name.split(".")[0] in _FOREIGN or _of_camera(name, kind):
         return None
     close = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(names)}"
     return f"{name!r} is not a setting; {hint}"
+
+
+def _of_camera(name: str, kind: Kind) -> str:
+    """Which setting of a camera of a rig is meant by ``NAME.setting``; empty: none."""
+    group, _, last = name.rpartition(".")
+    own = kind is NodeConfig and last in _OF_CAMERA and group and "." not in group
+    return last if own and name not in settings(kind) else ""
 
 
 @overload
@@ -90,7 +127,23 @@ def build(values: Mapping[str, Any], kind: Any = NodeConfig) -> Any:
     Raises:
         ValueError: for a wrong value.
     """
+    if kind is NodeConfig:
+        values = {**values, "of_cameras": _of_cameras(values)}
     return _build(kind(), values, "")
+
+
+def _of_cameras(values: Mapping[str, Any]) -> dict[str, CameraSettings]:
+    """What the cameras have of their own; ValueError for a camera that there is not."""
+    own = camera_settings(values)
+    for name in values:
+        if _of_camera(name, NodeConfig) and name not in own:
+            named = ", ".join(_cameras(values)) or "none"
+            raise ValueError(f"{name}: no such camera; cameras names {named}")
+    chosen = {name: values.get(name, setting.default) for name, setting in own.items()}
+    return {
+        camera: CameraSettings(*(chosen[f"{camera}.{name}"] for name in _OF_CAMERA))
+        for camera in _cameras(values)
+    }
 
 
 def _build(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
@@ -178,9 +231,10 @@ def _flatten(parameters: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any
 
 
 def _checked(name: str, value: Any, where: str, kind: Kind) -> Any:
-    if name not in settings(kind):
+    known = _of_camera(name, kind) or name
+    if known not in settings(kind):
         raise SettingsError(f"{where}: {unknown(name, kind) or f'{name!r} is not a setting'}")
-    default = settings(kind)[name].default
+    default = settings(kind)[known].default
     if isinstance(default, tuple):
         return _as_tuple(value)
     if isinstance(value, str) and isinstance(default, float):

@@ -72,6 +72,7 @@ from rs_localizer.offline.table import (
 )
 from rs_localizer.offline.viewing.stream import check_screen, write_view
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.rigs import frame_localizer
 from rs_localizer.settings import NODE_NAME
 from rs_localizer.trajectory.warm_up import warm_up
 
@@ -176,7 +177,7 @@ def _replayed(args: argparse.Namespace) -> NodeConfig:
 def _settings(args: argparse.Namespace) -> NodeConfig:
     """The settings that the arguments give; refuses those that cannot be."""
     assignments = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
-    return given_settings(args, assignments, FrameLocalizer)  # refuses what it cannot do
+    return given_settings(args, assignments, frame_localizer)  # refuses what it cannot do
 
 
 def _name(recording: Location) -> str:
@@ -277,6 +278,7 @@ def _replay_matches(
     def notice(name: str, text: str) -> None:
         notices[name] = notices.get(name, (0, ""))[0] + 1, text
 
+    _refuse_for_rigs(args, config)
     with open_bag(path) as bag:
         topics, localizer = prepare(bag, config, given_topics(args), notice)
         unused = IMU not in topics.of and config.imu.use != ImuUse.NONE
@@ -305,6 +307,14 @@ def _replay_matches(
                 f"no frame of {recording} was localized; of the last one, {tally.last_refusal}"
             )
     return tally
+
+
+def _refuse_for_rigs(args: argparse.Namespace, config: NodeConfig) -> None:
+    """Name what there is of one camera only."""
+    options = ("smooth", "nerfstudio", "gsplat", "ncore", "rerun", "view", "parquet", "zarr")
+    given = [name for name in options if getattr(args, name)] + (["row"] if args.rows else [])
+    if config.is_rig and given:
+        raise UsageError(f"--{given[0]} is for one camera: leave it out with cameras")
 
 
 def _write_table(args: argparse.Namespace, tables: Iterable[Table]) -> None:
@@ -444,6 +454,10 @@ def _replay(
             if answer.stamp_ns not in smoothed:
                 tally.table.add(answer.stamp_ns, answer.result)
     tally.seconds = time.perf_counter() - start
+    if localizer.config.is_rig:
+        # Images of several cameras are one frame.
+        lost = sum(n for reason, n in tally.refused.items() if reason not in NO_FRAMES)
+        tally.total = tally.localized + lost
     tally.imu = localizer.imu.state
     if (measured := localizer.readout_watch.measured) is not None:
         tally.readout = measured.readout_time, measured.deviation
@@ -595,7 +609,7 @@ def _replay_batch(args: argparse.Namespace, config: NodeConfig) -> None:
 
 def _replay_warm(args: argparse.Namespace) -> None:
     """Compile what the settings need."""
-    FrameLocalizer(_settings(args)).warm_up()
+    frame_localizer(_settings(args)).warm_up()
     if args.smooth:
         warm_up()
 

@@ -21,6 +21,7 @@ from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import STORAGES, BagWriter
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
+from rs_localizer.io.rigs import RigParts, read_camchain
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.process.arguments import integer, number
@@ -30,6 +31,13 @@ from rs_localizer.simulation.image_sequence import FORMATS, Encoding, rendered_f
 from rs_localizer.simulation.imu import ImuBagWriter, ImuSettings, Lever, simulate_imu
 from rs_localizer.simulation.recording import write_rendered, write_simulated
 from rs_localizer.simulation.renderer import ImageSettings, Renderer
+from rs_localizer.simulation.rig import (
+    camera_stamps,
+    rig_parameters,
+    simulate_rig,
+    write_mounts,
+    write_rig_frame,
+)
 from rs_localizer.simulation.scene import described, keypoint_rows, room
 from rs_localizer.simulation.true_motion import (
     BODY_FROM_CAMERA,
@@ -158,6 +166,32 @@ def add_camera_arguments(group: argparse._ArgumentGroup) -> None:
     )
 
 
+def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
+    """Options of a recording of several cameras."""
+    group.add_argument(
+        "--rig",
+        type=Path,
+        metavar="FILE",
+        help="several cameras in place of one: Kalibr's camchain, with readout_time (s) and "
+        "scan_direction of each camera besides",
+    )
+    group.add_argument(
+        "--triggered",
+        action="store_true",
+        help="the cameras of --rig begin their images at once, instead of by clocks of their own",
+    )
+
+
+def rig_of(args: argparse.Namespace) -> RigParts:
+    """The rig of ``--rig``; UsageError for what it does not go with."""
+    if args.images or args.imu:
+        raise UsageError("--rig is for points: leave --images and --imu out")
+    parts = read_camchain(args.rig)
+    if unknown := [name for name, camera in parts.cameras.items() if camera.readout_time == 0.0]:
+        raise UsageError(f"--rig: {args.rig} has no readout_time of {', '.join(unknown)}")
+    return parts
+
+
 def camera_of(args: argparse.Namespace) -> Camera:
     """The camera; UsageError for a lens that cannot be."""
     K = np.array(
@@ -284,6 +318,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_overwrite(parser)
     add_motion_arguments(parser.add_argument_group("motion"))
     add_camera_arguments(parser.add_argument_group("camera"))
+    add_rig_arguments(parser.add_argument_group("rig"))
     add_imu_arguments(parser.add_argument_group("IMU"))
     frames = FrameSettings()
     points = parser.add_argument_group("what it sees: points")
@@ -340,10 +375,46 @@ def run(args: argparse.Namespace) -> None:
             if args.images
             else f"{option} is for images; give --images, too"
         )
-    if args.images:
+    if args.rig is not None:
+        _write_rig(args)
+    elif args.triggered:
+        raise UsageError("--triggered is for --rig")
+    elif args.images:
         _write_images(args)
     else:
         _write_points(args)
+
+
+def _write_rig(args: argparse.Namespace) -> None:
+    parts, motion = rig_of(args), motion_of(args)
+    seen = FrameSettings(args.points, args.noise, args.outliers, args.rate)
+    first = next(iter(parts.cameras.values()))
+    some = set(stamps_of(args, first, motion))
+    stamps = {
+        name: [stamp for stamp in all_ if min(some) <= stamp <= max(some)]
+        for name, all_ in camera_stamps(parts, motion, args.rate, args.seed, args.triggered).items()
+    }
+    rng = np.random.default_rng(args.seed)
+    landmarks = described(room(_positions(motion), rng), MAP_FRAME, rng)
+    total, counts = sum(map(len, stamps.values())), 0
+    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
+        with BagWriter(built, args.storage) as bag:
+            write_mounts(bag, parts, min(some))
+            images = simulate_rig(
+                parts, motion, landmarks.points, seen, stamps_ns=stamps, seed=args.seed
+            )
+            for image in tqdm(images, total=total, unit="image", desc="simulate", disable=None):
+                rows = keypoint_rows(image.frame, landmarks, rng) if args.keypoints else None
+                write_rig_frame(bag, parts, motion, image, rows)
+                counts += len(image.frame.points)
+        if not counts:
+            raise ValueError(f"no image sees any point; nothing is written to {args.out}")
+        write_parameters(built / PARAMETERS, rig_parameters(parts))
+        if args.keypoints:
+            write_map_file(built / MAP, landmarks)
+    names = ", ".join(parts.cameras)
+    print(f"{args.out}: {total} images of {names}, {counts / total:.0f} points each")
+    _tell_next(args)
 
 
 def _write_points(args: argparse.Namespace) -> None:
@@ -376,6 +447,10 @@ def _write_points(args: argparse.Namespace) -> None:
         f"{args.out}: {len(stamps)} frames in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s, "
         f"{np.mean(counts):.0f} points each{_fewer(counts, args.points)}"
     )
+    _tell_next(args)
+
+
+def _tell_next(args: argparse.Namespace) -> None:
     out = shlex.quote(str(args.out))
     poses = shlex.quote(f"{args.out}_poses")
     settings_words = f"--params {out}/{PARAMETERS}"

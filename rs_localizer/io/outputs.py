@@ -48,6 +48,16 @@ class Twist:
     covariance: Array  # (6,6) linear, then angular
 
 
+@dataclass(frozen=True, slots=True)
+class CameraShare:
+    """What one camera of a rig has contributed to a frame."""
+
+    name: str
+    points: int
+    inliers: int
+    residual: float  # px, root mean square of the inliers
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Localized:
     """A localized frame: all that gets published of it; true in a condition."""
@@ -61,6 +71,7 @@ class Localized:
     inliers: NDArray[Any]  # (k,) structured: the input rows that were kept, and their residual
     dropped: int  # input rows with NaN or infinity
     estimate: Estimate
+    cameras: tuple[CameraShare, ...] = ()  # those of a rig that had a part
 
     def __bool__(self) -> Literal[True]:
         return True

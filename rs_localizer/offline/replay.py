@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,11 +13,29 @@ from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.io.bags import BagError, BagReader, make_message
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.topics import CAMERA_INFO, DETECTIONS, IMU, MAP_POINTS, TF, TF_STATIC
+from rs_localizer.io.topics import (
+    CAMERA_INFO,
+    CORRESPONDENCES,
+    DETECTIONS,
+    IMU,
+    KEYPOINTS,
+    MAP_POINTS,
+    TF,
+    TF_STATIC,
+)
 from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.inputs import IMU_TYPE, INPUTS, Input, Role, with_role
+from rs_localizer.pipeline.inputs import (
+    IMU_TYPE,
+    INPUTS,
+    Input,
+    Results,
+    Role,
+    input_named,
+    with_role,
+)
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
+from rs_localizer.pipeline.rigs import frame_localizer, inputs_of, last_results
 
 Item = tuple[str, int, Any]
 """Topic, time of recording in ns, message."""
@@ -66,13 +84,19 @@ class Topics:
 
     @property
     def frames(self) -> str:
-        """The topic whose messages are localized."""
-        return next(topic for name, topic in self.of.items() if INPUTS[name].role == Role.FRAMES)
+        """The topic whose messages are localized; of a rig, that of the first camera."""
+        return self.all_frames[0]
+
+    @property
+    def all_frames(self) -> list[str]:
+        """The topics of all cameras whose messages are localized."""
+        return [topic for name, topic in self.of.items() if input_named(name).role == Role.FRAMES]
 
     @property
     def lacks_map(self) -> bool:
         """Whether the frames need a map that the recording does not have."""
-        frames = next(INPUTS[name] for name in self.of if INPUTS[name].role == Role.FRAMES)
+        names = (input_named(name) for name in self.of)
+        frames = next(item for item in names if item.role == Role.FRAMES)
         return frames.needs == MAP_POINTS and MAP_POINTS not in self.of
 
     @property
@@ -83,7 +107,7 @@ class Topics:
     @property
     def inputs(self) -> dict[str, Input]:
         """The inputs by their topics in the recording."""
-        return {topic: INPUTS[name] for name, topic in self.of.items()}
+        return {topic: input_named(name) for name, topic in self.of.items()}
 
     def without(self, name: str) -> Topics:
         """The topics but for that of an input."""
@@ -115,6 +139,52 @@ def find_topics(bag: BagReader, given: Mapping[str, str | None] | None = None) -
         if needed:
             found[name] = _find(bag, item, wanted.get(name))
     return Topics(found)
+
+
+def find_rig_topics(
+    bag: BagReader, cameras: Sequence[str], given: Mapping[str, str | None] | None = None
+) -> Topics:
+    """The topics of a rig's cameras: those that end in ``NAME/camera_info`` and so on.
+
+    Raises:
+        BagError: when a topic is given, is not there, or several could be meant.
+    """
+    if named := [name for name, topic in (given or {}).items() if topic and name != MAP_POINTS]:
+        raise BagError(
+            f"{INPUTS[named[0]].option} is for one camera; of the cameras {', '.join(cameras)} "
+            "topics are found by their names"
+        )
+    there = {
+        item.topic: _of_cameras(bag, item, cameras)
+        for item in (INPUTS[CORRESPONDENCES], INPUTS[KEYPOINTS])
+    }
+    kind = max(there, key=lambda name: len(there[name]))
+    found = _of_cameras(bag, INPUTS[CAMERA_INFO], cameras) | there[kind]
+    for name in cameras:
+        for own in (f"{name}/{CAMERA_INFO}", f"{name}/{kind}"):
+            if own not in found:
+                raise BagError(f"{bag.path} has no topic {own}; it has {_describe(bag.topics)}")
+    map_topic = (given or {}).get(MAP_POINTS)
+    if kind == KEYPOINTS and (map_topic or _named(bag, INPUTS[MAP_POINTS])):
+        found[MAP_POINTS] = _find(bag, INPUTS[MAP_POINTS], map_topic)
+    return Topics(found)
+
+
+def _of_cameras(bag: BagReader, item: Input, cameras: Sequence[str]) -> dict[str, str]:
+    """The topics of an input of each camera, by ``NAME/input``."""
+    found: dict[str, str] = {}
+    for name in cameras:
+        own = f"{name}/{item.topic}"
+        topics = sorted(
+            topic
+            for topic, kind in bag.topics.items()
+            if kind in item.types and f"/{topic}".endswith(f"/{own}")
+        )
+        if len(topics) > 1:
+            raise BagError(f"{bag.path}: several topics may be {own}: {_list(topics)}")
+        for topic in topics:
+            found[own] = topic
+    return found
 
 
 def _choose_frames(bag: BagReader, wanted: Mapping[str, str]) -> Input:
@@ -202,7 +272,11 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
     if config.publish_tf == PublishTf.MAP_TO_ODOM:
         wanted["odom_frame"] = config.odom_frame
     tree = TransformTree()
-    camera = _frame_of(bag, topics.of[CAMERA_INFO])
+    infos = [topic for name, topic in topics.of.items() if input_named(name).topic == CAMERA_INFO]
+    frames = [frame for topic in infos if (frame := _frame_of(bag, topic)) is not None]
+    camera, others = next(iter(frames), None), frames[1:]
+    for name, other in zip(config.cameras[1:], others, strict=False):
+        wanted[f"camera {name}"] = other
     imu = _frame_of(bag, topics.of[IMU]) if IMU in topics.of else None
     ends = [*wanted.values(), *([] if imu is None else [imu])]
     if not ends or camera is None:
@@ -255,14 +329,17 @@ def prepare(
     Raises:
         ValueError: for topics, transforms or a map that are missing or cannot be used.
     """
-    topics = find_topics(bag, given)
+    if config.is_rig:
+        topics = find_rig_topics(bag, config.cameras, given)
+    else:
+        topics = find_topics(bag, given)
     if config.imu.use == ImuUse.NONE:
         topics = topics.without(IMU)
     if topics.lacks_map and not config.map_file:
         raise BagError(f"{bag.path} has {topics.frames} and no map; give one with --map")
     if DETECTIONS in topics.of and not config.marker_map:
         raise BagError(f"{bag.path} has {topics.frames}; -p marker_map:=FILE says where tags are")
-    localizer = FrameLocalizer(config, notice, find_transforms(bag, topics, config))
+    localizer = frame_localizer(config, notice, find_transforms(bag, topics, config))
     localizer.load_map()
     return topics, localizer
 
@@ -281,17 +358,28 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
     A message that is no frame and cannot be used gives a Refusal of its own, for a reason of
     :data:`NO_FRAMES`.
     """
-    inputs = topics.inputs
+    rows = inputs_of(localizer.config)
+    inputs = {topic: rows[name] for name, topic in topics.of.items()}
 
     def awaits(item: tuple[str, int, Any]) -> bool:
         topic, _, message = item
         return topic == topics.frames and localizer.awaits_imu(stamp_ns(message), LOOK_AHEAD)
 
     messages = imu_first(bag.messages(topics.names), topics.of.get(IMU), awaits)
-    for topic, recorded_ns, message in messages:
-        result = inputs[topic].take(localizer, message)
-        if result is not None:
+    last: Item | None = None
+    for last in messages:
+        topic, recorded_ns, message = last
+        for result in _each(inputs[topic].take(localizer, message)):
             yield Answer(recorded_ns, stamp_ns(message), result)
+    for result in last_results(localizer):
+        assert last is not None  # which waits
+        yield Answer(last[1], stamp_ns(last[2]), result)
+
+
+def _each(results: Results) -> Sequence[Localized | Refusal]:
+    if results is None:
+        return []
+    return results if isinstance(results, Sequence) else [results]
 
 
 def _list(topics: list[str]) -> str:

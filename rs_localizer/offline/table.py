@@ -251,6 +251,8 @@ def localize_recording(
         ImportError: without pyarrow, or fsspec for a URL (``pip install 'rs_localizer[table]'``).
     """
     config = _config(map, settings)
+    if config.is_rig:
+        raise ValueError("a table is of one camera: leave the setting cameras out")
     rows = FrameTable(source)
     with open_bag(source) as bag:
         topics, localizer = prepare(bag, config)

@@ -212,10 +212,8 @@ def _behind(cloud: Correspondences, camera: Camera) -> str:
     if not camera.sees_behind:
         return ""
     behind = int(np.count_nonzero(camera.bearings(cloud.pixels)[:, 2] <= 0.0))
-    return "" if behind == 0 else (
-        f"{behind} of {len(cloud.pixels)} pixels look 90 degrees or more away from the axis and "
-        "are left out: poses use the half space before the camera"
-    )  # fmt: skip
+    text = f"{behind} of {len(cloud.pixels)} pixels look 90 degrees or more away from the axis"
+    return f"{text}: poses leave them out" if behind else ""
 
 
 def lens_is_off(lens: LensError) -> str:

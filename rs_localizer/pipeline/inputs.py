@@ -9,10 +9,10 @@ reader. Launch files read this list: it imports no kernels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Union
 
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io import topics
@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 IMU_TYPE = "sensor_msgs/msg/Imu"
+
+
+Results = Union["Localized", Refusal, Sequence[Union["Localized", Refusal]], None]
+"""None: the message was no frame. Of a rig an image may complete no frame, or several."""
 
 
 class Role(Enum):
@@ -59,7 +63,7 @@ class Input:
     type: str  # of its messages
     about: str  # what they hold
     role: Role
-    use: Callable[[FrameLocalizer, Any], Localized | Refusal | None]
+    use: Callable[[FrameLocalizer, Any], Results]
     refused: Reason
     read: Callable[[Any], Any] = _as_it_is
     said: str = ""  # what a user is told that is missing
@@ -82,8 +86,10 @@ class Input:
         """The option of commands that names its topic in a recording."""
         return f"--{self.topic.replace('_', '-')}"
 
-    def take(self, localizer: FrameLocalizer, message: Any) -> Localized | Refusal | None:
-        """Read and use a message at once; of a frame, its result."""
+    def take(self, localizer: FrameLocalizer, message: Any) -> Results:
+        """Read and use a message at once; of a frame, its result, or the results of all frames that
+        are complete with it.
+        """
         frames = self.role is Role.FRAMES
         try:
             return self.use(localizer, self.read(message))
@@ -163,6 +169,17 @@ _ROWS = (
 
 INPUTS = {row.topic: row for row in _ROWS}
 """All inputs by name."""
+
+
+def input_named(name: str) -> Input:
+    """An input by its name; of a camera of a rig that is ``NAME/correspondences`` and so on."""
+    return INPUTS[name.rpartition("/")[2]]
+
+
+def said(name: str) -> str:
+    """What a user is told that is missing."""
+    camera, _, own = name.rpartition("/")
+    return f"{INPUTS[own].said} of {camera}" if camera else INPUTS[own].said
 
 
 def with_role(role: Role) -> list[Input]:

@@ -18,7 +18,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from rs_localizer.config import DetectorConfig, NodeConfig
+from rs_localizer.config import NO_NAMES, DetectorConfig, NodeConfig
 from rs_localizer.settings import NODES, Kind, SettingsError, load_params_file, settings
 
 PACKAGE = "rs_localizer"
@@ -73,6 +73,8 @@ def chosen_parameters(configurations: Mapping[str, str], kind: Kind = NodeConfig
 def _typed(text: str, default: Any) -> Any:
     if isinstance(default, bool):
         return {"true": True, "false": False}.get(text.lower(), text)
+    if default == NO_NAMES:
+        return [word.strip() for word in text.strip("[] ").split(",")]
     if isinstance(default, (int, float)):
         try:
             return type(default)(text)

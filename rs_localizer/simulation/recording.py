@@ -60,8 +60,16 @@ def write_rendered(bag: BagWriter, camera: Camera, frame: RenderedFrame) -> None
         write_truth(bag, frame.middle_ns, frame.middle_row)
 
 
-def write_truth(bag: BagWriter, stamp_ns: int, state: TrueState) -> None:
-    """Pose of the camera in the map and its twist in camera axes, of a state of one instant."""
+def write_truth(
+    bag: BagWriter,
+    stamp_ns: int,
+    state: TrueState,
+    body: str = CAMERA_FRAME,
+    recorded_ns: int | None = None,
+) -> None:
+    """Pose of the camera, or of another body, in the map, and its twist in its axes, of a state of
+    one instant; recorded then, unless another time is given.
+    """
     x, y, z = state.positions[0].tolist()
     qx, qy, qz, qw = so3.quaternion(np.ascontiguousarray(state.rotations[0])).tolist()
     pose = make_message(
@@ -75,15 +83,16 @@ def write_truth(bag: BagWriter, stamp_ns: int, state: TrueState) -> None:
     )
     twist = make_message(
         "geometry_msgs/msg/TwistStamped",
-        header=make_header(make_message, stamp_ns, CAMERA_FRAME),
+        header=make_header(make_message, stamp_ns, body),
         twist=make_message(
             "geometry_msgs/msg/Twist",
             linear=_vector(state.linear[0]),
             angular=_vector(state.angular[0]),
         ),
     )
-    bag.write(TRUE_POSE_TOPIC, pose, stamp_ns)
-    bag.write(TRUE_TWIST_TOPIC, twist, stamp_ns)
+    recorded_ns = stamp_ns if recorded_ns is None else recorded_ns
+    bag.write(TRUE_POSE_TOPIC, pose, recorded_ns)
+    bag.write(TRUE_TWIST_TOPIC, twist, recorded_ns)
 
 
 def _vector(vector: Array) -> Any:

@@ -55,6 +55,8 @@ def read(cell: str, like: Any) -> Any:
     said = re.sub(r": none$", "", cell).strip("`")
     if isinstance(like, bool):
         return {"true": True, "false": False}[said]
+    if like == ("",):
+        return tuple(word.strip('" ') for word in said.strip("[]").split(","))
     if isinstance(like, tuple):
         return tuple(map(float, said.strip("[]").split(",")))
     return said.strip('"') if isinstance(like, str) else type(like)(said)
@@ -86,7 +88,7 @@ def test_the_topics_of_the_localizer():
     (table,) = [t for t in pages.all_tables("topic or service") if t.page == "docs/node.md"]
     said = {pages.names_in(row[1])[0]: (row[0], row[2]) for row in table.rows}
     unused: Any = None
-    inputs = Feed(unused, unused, unused, unused).topics()
+    inputs = Feed(unused, unused, unused, unused).topics(NodeConfig())
     taken = {name: topic.type for name, topic in inputs.items()}
     # Their packages are not installed everywhere; the node then does without.
     optional = {name: item for name, item in INPUTS.items() if item.also}
@@ -103,7 +105,7 @@ def test_the_topics_of_the_localizer():
 def test_the_diagram_of_the_node_has_every_topic():
     (diagram,) = pages.fenced("docs/node.md", "mermaid")
     unused: Any = None
-    for name in Feed(unused, unused, unused, unused).topics():
+    for name in Feed(unused, unused, unused, unused).topics(NodeConfig()):
         assert name in diagram
     for name in TYPES:
         assert f"~/{name}" in diagram

@@ -14,6 +14,7 @@ from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime, VelocityP
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.rig import Rig
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate, Failure
@@ -49,7 +50,7 @@ class MockLocalizer(Localizer):
     def __init__(self, camera: Camera, config: LocalizerConfig) -> None:
         if config.solver == "r9p":
             raise ValueError("nine are too many")
-        self.camera, self.config = camera, config
+        self.rig, self.config = Rig.of(camera), config
         self.priors: list[Prior | None] = []
         MockLocalizer.made.append(self)
 
@@ -70,6 +71,7 @@ class MockLocalizer(Localizer):
         prior: Prior | None = None,
         expected_share: float = 0.5,
         turn: object = None,
+        stamps: object = None,
     ) -> Estimate | Failure:
         self.priors.append(prior)
         if len(points) < 4:
@@ -84,6 +86,7 @@ class MockLocalizer(Localizer):
             joint_covariance=np.eye(18),
             global_shutter_inliers=4,
             iterations=10,
+            span=self.camera.readout_time,
         )
 
 

@@ -16,7 +16,7 @@ import rclpy
 import yaml
 from rclpy.context import Context
 
-from rs_localizer.config import DetectorConfig, FeatureConfig
+from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.markers.map_files import write_marker_map
@@ -142,7 +142,10 @@ def parameters(description: list[Piece], executable: str) -> dict[str, Any]:
 
 
 WALL = __file__  # any file that exists
-MAP = {"markers.launch.py": {"marker_map": WALL}}
+MAP = {
+    "markers.launch.py": {"marker_map": WALL},
+    "rig.launch.py": {"cameras": "front, rear"},
+}
 LOCALIZING = ["localizer.launch.py", "markers.launch.py", "features.launch.py"]
 DETECTORS = {"markers.launch.py": DetectorConfig, "features.launch.py": FeatureConfig}
 
@@ -164,7 +167,7 @@ def test_arguments_and_files_exist(describe, file):
 
 def test_every_input_can_be_remapped(describe):
     unused: Any = None
-    inputs = set(Feed(unused, unused, unused, unused).topics()) | set(INPUTS)
+    inputs = set(Feed(unused, unused, unused, unused).topics(NodeConfig())) | set(INPUTS)
     launched = node(describe("localizer.launch.py"), "localizer")
     assert {name for name, _ in launched.options["remappings"]} == inputs
     assert launched.options["name"] == NODE_NAME
@@ -263,6 +266,23 @@ def test_a_node_that_ends_ends_the_others_or_starts_again(describe, file):
             if piece.kind == "Node" and piece.options["package"] == "rs_localizer":
                 assert ("on_exit" in piece.options) == (respawn == "false")
                 assert piece.options.get("respawn", False) == (respawn == "true")
+
+
+def test_each_camera_of_a_rig_has_a_detector_in_its_namespace(describe):
+    given = {"cameras": "[front, rear]", "detector": "marker_detector", "marker_map": WALL}
+    found = describe("rig.launch.py", **given, namespace="/robot")
+    detectors = [
+        piece.options
+        for piece in found
+        if piece.kind == "Node" and piece.options["executable"] == "marker_detector"
+    ]
+    assert [options["namespace"] for options in detectors] == ["robot/front", "robot/rear"]
+    for options in detectors:
+        assert options["parameters"][1]["marker_map"].arguments == (WALL,)
+    launched = node(found, "localizer").options
+    assert launched["parameters"][1]["cameras"] == ["front", "rear"]
+    with pytest.raises(RuntimeError, match="cameras must name the cameras"):
+        describe("rig.launch.py")
 
 
 def test_two_cameras_pass_on_what_one_camera_takes(describe):

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rs_localizer.io.outputs import Localized
+from rs_localizer.io.outputs import CameraShare, Localized
 from rs_localizer.pipeline.imu import ImuState
-from rs_localizer.pipeline.inputs import INPUTS, Role
+from rs_localizer.pipeline.inputs import Role, input_named, said
 from rs_localizer.pipeline.reasons import IMU_REASONS
 from rs_localizer.ros.node.health import (
     SOME,
@@ -43,6 +43,7 @@ class Answer:
     iterations: int
     tracked: bool
     lens: float = 0.0  # px, how far the distortion that the calibration lacks moves image points
+    cameras: tuple[CameraShare, ...] = ()  # of a rig, those that had a part
 
 
 def tell(frame: Localized) -> tuple[int, Answer]:
@@ -58,6 +59,7 @@ def tell(frame: Localized) -> tuple[int, Answer]:
         iterations=estimate.iterations,
         tracked=estimate.tracked,
         lens=0.0 if estimate.lens is None else estimate.lens.pixels,
+        cameras=frame.cameras,
     )
     return frame.input_stamp_ns, answer
 
@@ -136,15 +138,15 @@ def of_interest(silence: Mapping[str, Silence], missing: Sequence[str]) -> dict[
     def counts(name: str, item: Silence) -> bool:
         if item.heard or item.mismatch:
             return True
-        if INPUTS[name].role == Role.FRAMES:
+        if input_named(name).role == Role.FRAMES:
             return not coming
-        return INPUTS[name].necessary or name in missing
+        return input_named(name).necessary or name in missing
 
     return {name: item for name, item in silence.items() if counts(name, item)}
 
 
 def _of_frames(silence: Mapping[str, Silence]) -> list[Silence]:
-    return [item for name, item in silence.items() if INPUTS[name].role == Role.FRAMES]
+    return [item for name, item in silence.items() if input_named(name).role == Role.FRAMES]
 
 
 def diagnose(condition: Condition, summary: Summary[Answer]) -> Health:
@@ -171,9 +173,9 @@ def _judge(condition: Condition, summary: Summary[Answer]) -> Judgement:
     silent = _silent_frames(condition)
     if condition.missing:
         level = Level.WARN if silent else Level.ERROR
-        what = " and ".join(INPUTS[name].said for name in condition.missing)
+        what = " and ".join(said(name) for name in condition.missing)
         causes = [f"{it.topic}: {it.cause}" for it in condition.silence.values() if it.cause]
-        for reason in (INPUTS[name].refused for name in condition.missing):
+        for reason in (input_named(name).refused for name in condition.missing):
             if count := summary.refusals.get(reason):
                 causes.append(f"{count} cannot be used: see {reason} in the log")
         if any(item.mismatch for item in condition.silence.values()):
@@ -245,6 +247,12 @@ def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
             "Lens error (px)": f"{summary.last.lens:.2f}",
             "Iterations": str(summary.last.iterations),
         }
+        for camera in summary.last.cameras:
+            share = camera.inliers / max(camera.points, 1)
+            values |= {
+                f"Inliers of {camera.name}": f"{camera.inliers} of {camera.points} ({share:.0%})",
+                f"Residual RMS of {camera.name} (px)": f"{camera.residual:.3f}",
+            }
     if condition.readout is not None:
         readout, deviation = 1e3 * condition.readout.readout_time, 1e3 * condition.readout.deviation
         values["Readout time seen (ms)"] = f"{readout:.2f} +- {deviation:.2f}"

@@ -22,8 +22,9 @@ from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
 from rs_localizer.pipeline.compiling import compile_in_child, is_compiled
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.inputs import INPUTS, Input, Role
+from rs_localizer.pipeline.inputs import Input, Results, Role
 from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.rigs import frame_localizer, inputs_of
 from rs_localizer.ros.localizer import px4, transforms
 from rs_localizer.ros.localizer.health import (
     Answer,
@@ -78,8 +79,8 @@ class Feed:
         self._repeated: dict[str, tuple[bytes, Any]] = {}
         self.changing = False  # whether the worker compiles kernels for new settings
 
-    def topics(self) -> dict[str, Topic]:
-        """The inputs; what changes the state comes before the frames."""
+    def topics(self, config: NodeConfig) -> dict[str, Topic]:
+        """The inputs of these settings; what changes the state comes before the frames."""
         make = {
             Role.FRAMES: self._frames_topic,
             Role.STATE: self._state_topic,
@@ -87,7 +88,7 @@ class Feed:
         }
         return {
             name: make[item.role](item)
-            for name, item in INPUTS.items()
+            for name, item in inputs_of(config).items()
             if not item.also or installed(*item.types)  # of packages that most do not have
         }
 
@@ -104,10 +105,8 @@ class Feed:
     def _frames_topic(self, item: Input) -> Topic:
         """A topic whose messages the worker localizes."""
 
-        def localize(frames: FrameLocalizer, message: Any) -> Localized | Refusal:
-            result = item.take(frames, message)
-            assert result is not None  # a frame has one
-            return result
+        def localize(frames: FrameLocalizer, message: Any) -> Results:
+            return item.take(frames, message)
 
         def take(message: Any) -> None:
             need = Need(_lacks_samples, self._frames.config.imu.wait)
@@ -241,7 +240,8 @@ class Outputs:
 
 # Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
 _ODD = (
-    "map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "lens", "bad_imu",
+    "map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "no_images",
+    "lens", "bad_imu",
 )  # fmt: skip
 
 
@@ -264,7 +264,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         self._imu_came = self.create_guard_condition(lambda: self._broadcaster.tf.listen("the IMU"))
 
     def kernels(self) -> Callable[[], None]:
-        frames = FrameLocalizer(self.config)
+        frames = frame_localizer(self.config)
         log = self.get_logger()
         self.compiles = not is_compiled(self.config.solver)
         log.info(
@@ -281,12 +281,12 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         return compiles
 
     def check(self, config: NodeConfig) -> None:
-        FrameLocalizer(config)
+        frame_localizer(config)
         transforms.check(config)
         px4.check(config)
 
     def open(self, config: NodeConfig) -> None:
-        frames = FrameLocalizer(config, self.refusals.notice, self._broadcaster.tf)
+        frames = frame_localizer(config, self.refusals.notice, self._broadcaster.tf)
         frames.load_map()
         if frames.map is not None:
             self.get_logger().info(described(frames.map))
@@ -329,8 +329,8 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def begin(self, config: NodeConfig) -> None:
         assert self._feed is not None
         images = {} if self._shutter is None else self._shutter.topics()
-        topics = self.listen(self._feed.topics() | images)
-        if config.readout_time == 0.0:
+        topics = self.listen(self._feed.topics(config) | images)
+        if config.readout_time == 0.0 and not config.is_rig:
             until = " until it is estimated" if config.estimate_readout_time else ""
             self.warn(
                 "readout_time is 0 (unknown): no twist is published and frames are not tracked"
@@ -353,7 +353,9 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         missing = () if frames is None else frames.missing
         watch = None if frames is None else frames.readout_watch
         imu = None if frames is None else frames.imu.state
-        inputs = {name: item for name, item in self.silence.items() if name in INPUTS}
+        inputs = {
+            name: item for name, item in self.silence.items() if name in inputs_of(self.config)
+        }
         condition = Condition(
             life_cycle=self.state,
             changing=self._feed is not None and self._feed.changing,

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -16,8 +16,8 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rs_localizer.config import type_of
-from rs_localizer.settings import Config, Kind, Setting, build, settings, unknown
+from rs_localizer.config import NodeConfig, type_of
+from rs_localizer.settings import Config, Kind, Setting, build, camera_settings, settings, unknown
 
 _UNCONFIGURED = "unconfigured"
 
@@ -32,7 +32,20 @@ def declare(node: Node, kind: type[Config]) -> Config:
     Raises:
         ValueError: for a value of a wrong type or out of range, saying what was found.
     """
-    for name, setting in settings(kind).items():
+    _declare(node, settings(kind))
+    _declare(node, _of_cameras(node, kind))
+    return read(node, kind)
+
+
+def _of_cameras(node: Node, kind: Kind) -> dict[str, Setting]:
+    """Of the cameras of a rig, which the parameters so far name."""
+    if kind is not NodeConfig:
+        return {}
+    return camera_settings({name: node.get_parameter(name).value for name in settings(kind)})
+
+
+def _declare(node: Node, names: Mapping[str, Setting]) -> None:
+    for name, setting in names.items():
         try:
             node.declare_parameter(name, setting.default, _descriptor(setting))
         except InvalidParameterTypeException as error:
@@ -45,7 +58,6 @@ def declare(node: Node, kind: type[Config]) -> Config:
             ) from error
         except InvalidParameterValueException as error:
             raise ValueError(str(error)) from error
-    return read(node, kind)
 
 
 def unknown_names(node: Node, kind: Kind) -> list[str]:
@@ -57,13 +69,17 @@ def unknown_names(node: Node, kind: Kind) -> list[str]:
     return [text for name in names if (text := unknown(name, kind))]
 
 
+def _names(node: Node, kind: Kind) -> list[str]:
+    return [*settings(kind), *_of_cameras(node, kind)]
+
+
 def read(node: Node, kind: type[Config], changes: Sequence[Parameter] = ()) -> Config:
     """The settings of the node's parameters, with these changes.
 
     Raises:
         ValueError: for values that the settings refuse.
     """
-    values = {name: node.get_parameter(name).value for name in settings(kind)}
+    values = {name: node.get_parameter(name).value for name in _names(node, kind)}
     for parameter in changes:
         if parameter.name in values:  # there are also use_sim_time and the QoS overrides
             values[parameter.name] = parameter.value
@@ -96,7 +112,8 @@ def on_change(
         return SetParametersResult(successful=True)
 
     def after_set(parameters: list[Parameter]) -> None:
-        if any(parameter.name in settings(kind) for parameter in parameters):
+        names = _names(node, kind)
+        if any(parameter.name in names for parameter in parameters):
             apply(read(node, kind))
 
     node.add_on_set_parameters_callback(on_set)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -113,8 +113,10 @@ class Mailbox(Generic[State, Item]):
 
 
 Result = TypeVar("Result")
-Process = Callable[[State, Any], Result | Refusal]
-"""What is done with a message, given what the worker alone touches."""
+Process = Callable[[State, Any], Result | Refusal | Sequence[Result | Refusal] | None]
+"""What is done with a message, given what the worker alone touches; a message may have no result,
+or several.
+"""
 
 _NAME = "rs_localizer worker"
 # How often frames and results are looked at that wait for something, in s, and how many may.
@@ -262,11 +264,13 @@ class Worker(Generic[State, Result]):
         self._statistics.started()
         result = self._attempt(lambda: arrival.process(self._state, arrival.message))
         self._statistics.ended()
-        if isinstance(result, Waiting) and len(self._late) < _MOST_LATE:
-            deadline = time.monotonic() + result.patience
-            self._late.append(_Late(work, arrival, result, deadline))
-        else:
-            self._finish(work, arrival, result)
+        results = [] if result is None else result if isinstance(result, list) else [result]
+        for each in results:
+            if isinstance(each, Waiting) and len(self._late) < _MOST_LATE:
+                deadline = time.monotonic() + each.patience
+                self._late.append(_Late(work, arrival, each, deadline))
+            else:
+                self._finish(work, arrival, each)
 
     def _finish_late(self) -> None:
         """Publish what has become known, in the order in which it came; give up what is overdue."""

@@ -39,7 +39,7 @@ class Bench:
         message = CameraInfo(width=width, height=480, distortion_model="plumb_bob", d=list(D))
         message.header.frame_id, message.header.stamp.sec = "camera", stamp
         message.k = [500.0, 0.0, 320.0, 0.0, 500.0, 240.0, 0.0, 0.0, 1.0]
-        self.feed.topics()["camera_info"].callback(serialize_message(message))
+        self.feed.topics(NodeConfig())["camera_info"].callback(serialize_message(message))
 
     @property
     def width(self) -> int:

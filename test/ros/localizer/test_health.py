@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rs_localizer.io.outputs import CameraShare
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.localizer.health import Condition, diagnose, of_interest, tell
 from rs_localizer.ros.node.health import Level
@@ -23,8 +24,8 @@ FRAMES = replace(COMES, topic="/correspondences")
 GOOD = Condition("active", False, (), {"camera_info": COMES, "correspondences": FRAMES})
 
 
-def frame(stamp: float = 0.0, tracked: bool = False) -> Any:
-    """Three inliers of four points, 3, 4 and 0 px off."""
+def frame(stamp: float = 0.0, tracked: bool = False, rig: bool = False) -> Any:
+    """Three inliers of four points, 3, 4 and 0 px off; of a rig, one is of another camera."""
     estimate = SimpleNamespace(
         inliers=np.array([True, True, False, True]),
         residuals=np.array([3.0, 4.0, 100.0, 0.0]),
@@ -34,7 +35,10 @@ def frame(stamp: float = 0.0, tracked: bool = False) -> Any:
         tracked=tracked,
         lens=None,
     )
-    return SimpleNamespace(input_stamp_ns=round(stamp * 1e9), estimate=estimate)
+    cameras = (CameraShare("front", 3, 2, 3.5), CameraShare("rear", 1, 1, 0.0))
+    return SimpleNamespace(
+        input_stamp_ns=round(stamp * 1e9), estimate=estimate, cameras=cameras if rig else ()
+    )
 
 
 class World:
@@ -108,6 +112,14 @@ def test_numbers_of_a_working_node(world):
     assert values["Poses out (Hz)"] == "0.0"
     assert "Latency p50 (ms)" not in values
     assert values["Poses published"] == "100"
+
+
+def test_each_camera_of_a_rig_has_its_numbers(world):
+    world.statistics.answered(frame(rig=True), world.now)
+    values = world.diagnose().values
+    assert values["Inliers of front"] == "2 of 3 (67%)"
+    assert values["Residual RMS of front (px)"] == "3.500"
+    assert values["Inliers of rear"] == "1 of 1 (100%)"
 
 
 def test_lost_after_some_frames_and_found_by_one(world):

@@ -1,0 +1,184 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of several cameras on one body, each with a clock of its own."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.io import topics
+from rs_localizer.io.bags import BagWriter, make_message
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.recording import make_camera_info, make_correspondences
+from rs_localizer.io.rigs import RigParts, shutters
+from rs_localizer.io.transforms import Transform, make_transform
+from rs_localizer.simulation.frames import (
+    FrameSettings,
+    SimulatedFrame,
+    frame_stamps,
+    simulate_frames,
+)
+from rs_localizer.simulation.recording import write_truth
+from rs_localizer.simulation.true_motion import TrueMotion, TrueState
+
+RIG_FRAME = "rig"
+# How far the rates of cameras' oscillators are off, as a part of themselves: common quartz.
+_RATE_ERROR = 5e-5
+# The random numbers of clocks are their own.
+_CLOCK_STREAM = 28
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MountedMotion:
+    """The motion of a camera that is mounted to a moving rig: ``X_camera = rotation X_rig +
+    translation``.
+    """
+
+    rig: TrueMotion
+    rotation: Array  # (3,3)
+    translation: Array  # (3,) m
+
+    @property
+    def intervals_ns(self) -> list[tuple[int, int]]:
+        return self.rig.intervals_ns
+
+    def state(self, stamp_ns: int, offsets: Array) -> TrueState:
+        rig = self.rig.state(stamp_ns, offsets)
+        centre = -self.rotation.T @ self.translation
+        return TrueState(
+            rig.rotations @ self.rotation.T,
+            rig.positions + rig.rotations @ centre,
+            rig.angular @ self.rotation.T,
+            (rig.linear + np.cross(rig.angular, centre)) @ self.rotation.T,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigFrame:
+    """An image of one of the cameras."""
+
+    name: str
+    stamp_ns: int  # by the camera's own clock
+    frame: SimulatedFrame
+
+
+def camera_stamps(
+    parts: RigParts, motion: TrueMotion, rate: float, seed: int, triggered: bool
+) -> dict[str, list[int]]:
+    """When the first rows of each camera are exposed, in ns of true time.
+
+    ``triggered``: all at once; otherwise each camera runs freely, at any phase, with a rate that is
+    off by some parts in a hundred thousand.
+    """
+    stamps = {}
+    for place, (name, camera) in enumerate(parts.cameras.items()):
+        rng = np.random.default_rng([seed, _CLOCK_STREAM, place])
+        phase, error = (
+            (0.0, 0.0)
+            if triggered
+            else (rng.uniform(0.0, 1.0 / rate), rng.normal(0.0, _RATE_ERROR))
+        )
+        steady = np.array(frame_stamps(motion, camera, rate * (1.0 + error)), np.int64)
+        shifted = steady + round(phase * 1e9)
+        lasts_ns = round(camera.readout_time * 1e9)
+        stamps[name] = [
+            int(stamp)
+            for stamp in shifted
+            if any(first <= stamp <= last - lasts_ns for first, last in motion.intervals_ns)
+        ]
+    return stamps
+
+
+def simulate_rig(
+    parts: RigParts,
+    motion: TrueMotion,
+    map_points: Array,
+    settings: FrameSettings,
+    *,
+    stamps_ns: dict[str, list[int]],
+    seed: int = 0,
+) -> Iterator[RigFrame]:
+    """The images of all cameras of a map (m,3), in the order in which they have been read.
+
+    Args:
+        parts: the rig; its stamps are those of true time without ``time_offset``.
+        motion: of the rig's axes.
+        stamps_ns: of :func:`camera_stamps`.
+        seed: of the noise.
+    """
+
+    def images(place: int, name: str, camera: Camera) -> Iterator[tuple[int, int, RigFrame]]:
+        mounted = MountedMotion(motion, *parts.camera_from_rig[name])
+        offset_ns = round(parts.time_offset.get(name, 0.0) * 1e9)
+        for frame in simulate_frames(
+            camera, mounted, map_points, settings, stamps_ns=stamps_ns[name],
+            seed=seed + 1000 * place,
+        ):  # fmt: skip
+            read_ns = frame.stamp_ns + round(camera.readout_time * 1e9)
+            yield read_ns, place, RigFrame(name, frame.stamp_ns - offset_ns, frame)
+
+    streams = [images(place, *item) for place, item in enumerate(parts.cameras.items())]
+    for _, _, image in heapq.merge(*streams, key=lambda item: item[:2]):
+        yield image
+
+
+def optical_frame(name: str) -> str:
+    """The frame of a camera of a simulated rig."""
+    return f"{name}_optical_frame"
+
+
+def rig_parameters(parts: RigParts) -> dict[str, Any]:
+    """The node's parameters for a recording of the rig."""
+    offsets = {
+        f"{name}.stamp_offset": parts.time_offset[name]
+        for name in parts.cameras
+        if parts.time_offset.get(name, 0.0) != 0.0
+    }
+    named = {"cameras": list(parts.cameras), "base_frame": RIG_FRAME}
+    return named | shutters(parts.cameras) | offsets
+
+
+def write_mounts(bag: BagWriter, parts: RigParts, stamp_ns: int) -> None:
+    """Where the cameras are on the rig, on /tf_static."""
+    transforms = [
+        make_transform(
+            make_message, 0, RIG_FRAME, optical_frame(name),
+            Transform(*parts.camera_from_rig[name]).inverse(),
+        )
+        for name in parts.cameras
+    ]  # fmt: skip
+    bag.write(
+        topics.TF_STATIC, make_message("tf2_msgs/msg/TFMessage", transforms=transforms), stamp_ns
+    )
+
+
+def write_rig_frame(
+    bag: BagWriter,
+    parts: RigParts,
+    motion: TrueMotion,
+    image: RigFrame,
+    keypoints: NDArray[Any] | None = None,
+) -> None:
+    """Camera info and correspondences (or keypoints) of a camera, and the truth of the rig when its
+    first and its middle row were exposed.
+    """
+    camera, frame, stamp_ns = parts.cameras[image.name], image.frame, image.stamp_ns
+    recorded_ns = frame.stamp_ns + round(camera.readout_time * 1e9)
+    for time_ns in sorted({frame.stamp_ns, frame.middle_ns}):
+        write_truth(bag, time_ns, motion.state(time_ns, np.zeros(1)), RIG_FRAME, recorded_ns)
+    info = make_camera_info(camera, stamp_ns, optical_frame(image.name))
+    bag.write(f"/{image.name}/{topics.CAMERA_INFO}", info, recorded_ns)
+    if keypoints is None:
+        cloud = make_correspondences(stamp_ns, frame.points, frame.pixels, frame.ids)
+        bag.write(f"/{image.name}/{topics.CORRESPONDENCES}", cloud, recorded_ns)
+    else:
+        cloud = make_cloud(make_message, stamp_ns, optical_frame(image.name), keypoints)
+        bag.write(f"/{image.name}/{topics.KEYPOINTS}", cloud, recorded_ns)

@@ -1,0 +1,124 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of a rig from a recording to poses, against the true motion."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from rs_localizer.config import NodeConfig
+from rs_localizer.core import so3
+from rs_localizer.io.bags import BagError, open_bag
+from rs_localizer.io.outputs import Localized
+from rs_localizer.offline.replay import prepare, replay
+from rs_localizer.settings import build, load_params_file
+
+from .opposed_pair import record
+
+
+def localize(path, **settings):
+    """Frames, refusals and notices of a recording."""
+    values = load_params_file(path / "parameters.yaml") | {"min_inliers": 20} | settings
+    notices: list[tuple[str, str]] = []
+    with open_bag(path) as bag:
+        topics, localizer = prepare(
+            bag, build(values), notice=lambda name, text: notices.append((name, text))
+        )
+        answers = [answer.result for answer in replay(bag, topics, localizer)]
+    frames = [answer for answer in answers if answer]
+    return frames, [answer for answer in answers if not answer], notices
+
+
+def errors(frame: Localized, motion) -> np.ndarray:
+    """Errors (12,) of position, orientation, linear and angular velocity, over their deviations."""
+    true = motion.state(frame.stamp_ns, np.zeros(1))
+    turn = so3.log(np.ascontiguousarray(frame.pose.rotation @ true.rotations[0].T))
+    assert frame.twist is not None
+    pose = np.r_[frame.pose.position - true.positions[0], turn]
+    twist = np.r_[frame.twist.linear - true.linear[0], frame.twist.angular - true.angular[0]]
+    deviations = [np.sqrt(np.diag(it.covariance)) for it in (frame.pose, frame.twist)]
+    return np.r_[pose, twist], np.concatenate(deviations)
+
+
+@pytest.fixture(scope="module")
+def opposed(tmp_path_factory):
+    path = tmp_path_factory.mktemp("opposed") / "bag"
+    return path, record(path)
+
+
+@pytest.mark.parametrize("pose_time", ["stamp", "mid_frame"])
+def test_an_opposed_pair_before_a_wall_knows_pose_and_velocity(opposed, pose_time):
+    path, motion = opposed
+    frames, refused, notices = localize(path, pose_time=pose_time)
+    assert refused == []
+    assert notices == []
+    assert len(frames) >= 28
+    found = np.array([errors(frame, motion) for frame in frames])
+    off, deviations = found[:, 0], found[:, 1]
+    size = np.linalg.norm(off.reshape(-1, 4, 3), axis=2)
+    medians = np.median(size, axis=0)
+    assert medians[0] < 0.01
+    assert np.degrees(medians[1]) < 0.2
+    assert medians[2] < 0.5
+    assert np.degrees(medians[3]) < 12.0
+    assert np.mean(np.abs(off) < 1.96 * deviations) > 0.85
+    assert {frame.body_frame for frame in frames} == {"rig"}
+
+
+def test_inliers_name_their_camera(opposed):
+    path, _ = opposed
+    frame = localize(path)[0][3]
+    places = dict(zip(*np.unique(frame.inliers["camera"], return_counts=True), strict=True))
+    assert places == {place: share.inliers for place, share in enumerate(frame.cameras)}
+    assert [share.name for share in frame.cameras] == ["left", "right"]
+    for place, share in enumerate(frame.cameras):
+        own = frame.inliers["residual"][frame.inliers["camera"] == place]
+        assert share.residual == pytest.approx(np.sqrt(np.mean(own**2)), rel=1e-5)
+
+
+def test_a_camera_that_stops_and_starts_again_is_named_and_poses_go_on(tmp_path):
+    def keep(image):
+        return image.name == "left" or not 1_300_000_000 < image.frame.stamp_ns < 1_650_000_000
+
+    motion = record(tmp_path / "bag", keep=keep)
+    frames, refused, notices = localize(tmp_path / "bag", max_orientation_deviation=1.0)
+    alone = [frame for frame in frames if len(frame.cameras) == 1]
+    # One camera alone does not know its velocity before a wall: it says so, or says how little.
+    assert len(frames) + len(refused) >= 28
+    assert len(alone) + len(refused) >= 9
+    assert {answer.reason for answer in refused} <= {"uncertain", "mirrored"}
+    assert {share.name for frame in alone for share in frame.cameras} == {"left"}
+    assert Counter(name for name, _ in notices).keys() == {"no_images"}
+    assert all("right is left out: no image in the last" in text for _, text in notices)
+    both = [frame for frame in frames if len(frame.cameras) == 2]
+    assert max(frame.stamp_ns for frame in both) > 1_900_000_000
+    off = np.array([errors(frame, motion)[0] for frame in frames])
+    assert np.median(np.linalg.norm(off[:, :3], axis=1)) < 0.02
+    found = np.array([errors(frame, motion) for frame in frames])
+    assert np.mean(np.abs(found[:, 0]) < 3.0 * found[:, 1]) > 0.95
+
+
+def prepare_named(path, cameras):
+    with open_bag(path) as bag:
+        prepare(bag, build({"cameras": cameras, "readout_time": 0.03}))
+
+
+def test_what_is_missing_is_said(tmp_path, opposed):
+    path, _ = opposed
+    with pytest.raises(BagError, match="has no topic rear/camera_info; it has /left/camera_info"):
+        prepare_named(path, ["left", "rear"])
+    record(tmp_path / "bag", seconds=0.2, names=("left",))
+    frames, refused, _ = localize(tmp_path / "bag", max_orientation_deviation=1.0)
+    assert {len(frame.cameras) for frame in frames} <= {1}
+    assert len(frames) + len(refused) >= 5
+
+
+def test_cameras_do_not_go_with_what_is_of_one():
+    with pytest.raises(ValueError, match=r"left.readout_time must be above 0"):
+        build({"cameras": ["left", "right"], "right.readout_time": 0.03})
+    with pytest.raises(ValueError, match="estimate_readout_time is for one camera"):
+        build({"cameras": ["left"], "readout_time": 0.03, "estimate_readout_time": True})
+    with pytest.raises(ValueError, match=r"rear\.readout_time: no such camera; cameras names left"):
+        build({"cameras": ["left"], "readout_time": 0.03, "rear.readout_time": 0.02})
+    assert not NodeConfig().is_rig

@@ -1,0 +1,88 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Two cameras at one node, in its own process: what it says is what replay says."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import robot as around
+from opposed_pair import PARTS, record
+from robot import ENVIRONMENT, replayed
+
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.outputs import TYPES
+from rs_localizer.io.transforms import Transform, make_transform
+from rs_localizer.ros.node.conversion import copy_message, message_class
+from rs_localizer.simulation.rig import RIG_FRAME, optical_frame
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    """A pair, of which the second camera loses five images."""
+    path = tmp_path_factory.mktemp("bags") / "pair"
+    record(
+        path, 0.7,
+        keep=lambda image: image.name == "left" or not 1.2e9 < image.frame.stamp_ns < 1.37e9,
+        max_orientation_deviation=1.0,
+    )  # fmt: skip
+    return path
+
+
+class Robot(around.Robot):
+    """Sends what two cameras see."""
+
+    def __init__(self, peer: Any, tf2_ros: Any) -> None:
+        super().__init__(peer)
+        self.publishers = {
+            f"/{name}/{topic}": peer.node.create_publisher(kind, f"/{name}/{topic}", 100)
+            for name in PARTS.cameras
+            for topic, kind in (
+                ("camera_info", around.CameraInfo), ("correspondences", around.PointCloud2),
+            )
+        }  # fmt: skip
+        self._static = []
+        for name, mount in PARTS.camera_from_rig.items():
+            self._static.append(tf2_ros.StaticTransformBroadcaster(peer.node))
+            rig_from_camera = Transform(*mount).inverse()
+            self._static[-1].sendTransform(
+                make_transform(
+                    lambda kind, **fields: message_class(kind)(**fields),
+                    0, RIG_FRAME, optical_frame(name), rig_from_camera,
+                )
+            )  # fmt: skip
+
+
+def test_node_and_replay_say_the_same_of_a_pair(recording, tmp_path, start_node, peer):
+    settings = recording / "parameters.yaml"
+    offline = replayed(recording, tmp_path / "out", "--params", str(settings))
+    node = start_node("--params-file", str(settings), **ENVIRONMENT)
+    node.wait_for_log("active with solver")
+    with around.tf2_ros() as tf2_ros:
+        robot = Robot(peer, tf2_ros)
+        robot.connect()
+        peer.spin_until(lambda: False, 1.0)  # /tf_static comes, too
+        with open_bag(recording) as bag:
+            sent = [
+                (topic, copy_message(message, message.__msgtype__))
+                for topic, _, message in bag.messages(tuple(robot.publishers))
+            ]
+        for name in PARTS.cameras:
+            info = next(message for topic, message in sent if topic == f"/{name}/camera_info")
+            robot.publishers[f"/{name}/camera_info"].publish(info)
+        peer.spin_until(lambda: False, 0.5)
+        for topic, message in sent:
+            if topic.endswith("/correspondences"):
+                robot.publishers[topic].publish(message)
+                peer.spin_until(lambda: False, 0.15)
+        # The last frame may wait for an image that never comes.
+        expected = len(offline["pose"]) - 1
+        assert expected >= 18
+        assert peer.spin_until(lambda: len(robot.answers["inliers"]) >= expected)
+        for name in TYPES:
+            answered = robot.answered(name)
+            assert len(answered) >= expected
+            assert answered.items() <= offline[name].items()
+        assert peer.spin_until(lambda: "Inliers of right" in robot.values)
+    assert "right is left out: no image in the last 3 frames" in node.log
+    assert node.stop() == 0

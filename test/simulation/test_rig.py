@@ -1,0 +1,114 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of several cameras: how they move, what they see and when, by other formulas."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.cli.main import main
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.rigs import RigParts, write_camchain
+from rs_localizer.io.transforms import TransformTree
+from rs_localizer.settings import build, load_params_file
+from rs_localizer.simulation.rig import MountedMotion
+from rs_localizer.simulation.true_motion import ConstantVelocity
+
+K = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 240.0], [0.0, 0.0, 1.0]])
+TURN = Rotation.from_euler("xyz", [0.1, -0.2, np.pi]).as_matrix()
+PLACE = np.array([0.1, -0.2, 0.05])
+
+
+def test_a_mounted_camera_is_carried_along_by_the_turn_of_the_rig():
+    rig = ConstantVelocity(np.array([0.5, -1.0, 0.7]), np.array([0.3, 0.1, -0.2]), 1.0)
+    mounted = MountedMotion(rig, TURN, PLACE)
+    step, point = 1e-6, np.array([1.0, 2.0, 3.0])
+    before, now, after = (mounted.state(0, np.array([0.4 + k * step])) for k in (-1, 0, 1))
+    velocity = (after.positions[0] - before.positions[0]) / (2.0 * step)
+    np.testing.assert_allclose(now.rotations[0] @ now.linear[0], velocity, atol=1e-8)
+    turned = Rotation.from_matrix(before.rotations[0].T @ after.rotations[0]).as_rotvec()
+    np.testing.assert_allclose(now.angular[0], turned / (2.0 * step), atol=1e-8)
+    state = rig.state(0, np.array([0.4]))
+    in_rig = state.rotations[0].T @ (point - state.positions[0])
+    in_camera = now.rotations[0].T @ (point - now.positions[0])
+    np.testing.assert_allclose(in_camera, TURN @ in_rig + PLACE, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rig")
+    cameras = {
+        "front": Camera(640, 480, K, readout_time=0.03),
+        "rear": Camera(640, 480, K, None, "plumb_bob", 0.02, "bottom_to_top"),
+    }
+    poses = {"front": (np.eye(3), np.zeros(3)), "rear": (TURN, PLACE)}
+    parts = RigParts(cameras, poses, {"front": 0.0, "rear": -0.25})
+    write_camchain(folder / "chain.yaml", parts)
+    out = folder / "seen"
+    words = f"simulate {out} --rig {folder / 'chain.yaml'} --duration 1 --noise 0 --outliers 0"
+    assert main([*words.split(), "--angular-velocity", "0.4", "0.8", "-0.5", "-q"]) == 0
+    return out, parts
+
+
+def test_pixels_are_those_of_the_row_by_the_cameras_own_clock(recording):
+    out, parts = recording
+    angular, stamps = np.array([0.4, 0.8, -0.5]), {}
+    start = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    with open_bag(out) as bag:
+        for name, readout in (("front", 0.03), ("rear", 0.02)):
+            clouds = [m for _, _, m in bag.messages((f"/{name}/correspondences",))]
+            stamps[name] = [read_correspondences(m).stamp_ns for m in clouds]
+            cloud = read_correspondences(clouds[-1])
+            rotation, translation = parts.camera_from_rig[name]
+            row = cloud.pixels[:, 1] / 479.0
+            row = row if name == "front" else 1.0 - row
+            # The rig starts to turn about its origin at 1 s of true time; stamps of rear are late.
+            times = 1e-9 * cloud.stamp_ns - 1.0 + parts.time_offset[name] + readout * row
+            for point, pixel, time in zip(cloud.points, cloud.pixels, times, strict=True):
+                map_from_rig = start @ Rotation.from_rotvec(angular * time).as_matrix()
+                x, y, z = rotation @ (map_from_rig.T @ point) + translation
+                np.testing.assert_allclose(pixel, [450 * x / z + 320, 450 * y / z + 240], atol=2e-3)
+    assert all(len(own) >= 28 for own in stamps.values())
+    # Clocks run freely: neither at once, nor at the same rate.
+    pairs = min(len(s) for s in stamps.values())
+    apart = np.array(stamps["rear"][:pairs]) - stamps["front"][:pairs] - 250_000_000
+    assert np.abs(apart).min() > 1e5
+    assert np.ptp(apart) > 1e3
+
+
+def test_the_recording_says_how_the_rig_is_mounted_and_set(recording):
+    out, _ = recording
+    tree = TransformTree()
+    with open_bag(out) as bag:
+        for _, _, message in bag.messages(("/tf_static",)):
+            tree.add(message, static=True)
+        (info, *_) = [m for _, _, m in bag.messages(("/rear/camera_info",))]
+    assert info.header.frame_id == "rear_optical_frame"
+    mounted = tree.lookup(info.header.frame_id, "rig", None)
+    np.testing.assert_allclose(mounted.rotation, TURN, atol=1e-12)
+    np.testing.assert_allclose(mounted.translation, PLACE, atol=1e-12)
+    config = build(load_params_file(out / "parameters.yaml"))
+    assert config.cameras == ("front", "rear")
+    assert config.base_frame == "rig"
+    rear = config.of_cameras["rear"]
+    assert (rear.readout_time, rear.scan_direction, rear.stamp_offset) == (
+        0.02, "bottom_to_top", -0.25,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--images", "--rig is for points"),
+        ("--imu", "--rig is for points"),
+        ("", "has no readout_time of cam0"),
+    ],
+)
+def test_what_a_rig_does_not_go_with_is_refused(tmp_path, capsys, words, said):
+    parts = RigParts({"cam0": Camera(640, 480, K)}, {"cam0": (np.eye(3), np.zeros(3))}, {})
+    write_camchain(tmp_path / "c.yaml", parts)
+    call = f"simulate {tmp_path / 'out'} --rig {tmp_path / 'c.yaml'} {words}".split()
+    assert main(call) == 2
+    assert said in capsys.readouterr().err
