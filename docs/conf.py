@@ -27,7 +27,7 @@ PAGES = {
 }
 OTHERS = (
     *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README"),
-    *("QUALITY_DECLARATION", "CHANGELOG"),
+    *("QUALITY_DECLARATION", "CHANGELOG", "docs/adr/0001-compiled-kernels"),
 )
 if not by_rosdoc2:
     root_doc = "README"
