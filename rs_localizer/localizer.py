@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import LocalizerConfig, localizer_config
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.lens import LensError, with_lens
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
@@ -75,7 +75,7 @@ class _Given(NamedTuple):
     scores: Array | None
     prior: Prior | None
     expected_share: float
-    turn: KnownTurn | None
+    turn: GyroRotation | None
 
 
 class Localizer:
@@ -120,9 +120,7 @@ class Localizer:
         return next(iter(self.rig.cameras.values()))
 
     def warm_up(self) -> None:
-        """Compile every kernel that :meth:`localize`, or tracking, may need, or load it from the
-        cache.
-        """
+        """Compile every kernel of :meth:`localize` and of tracking, or load it from the cache."""
         if not self._alone:
             Localizer(next(iter(self.rig.cameras.values())), self.config).warm_up()
             return
@@ -154,7 +152,8 @@ class Localizer:
         # And beside the turn that a gyroscope knows, of which the delay is in doubt.
         tau = np.linspace(-0.7, 0.7, 29)
         rates = 0.1 * np.column_stack([np.sin(20.0 * tau)] * 3)
-        self.localize(points, pixels, turn=KnownTurn.of(tau, rates, 1e-4 * np.eye(6), delay=0.01))
+        turn = GyroRotation.of(tau, rates, 1e-4 * np.eye(6), delay=0.01)
+        self.localize(points, pixels, turn=turn)
 
     def localize(
         self,
@@ -163,7 +162,7 @@ class Localizer:
         scores: ArrayLike | None = None,
         prior: Prior | None = None,
         expected_share: float = 0.5,
-        turn: KnownTurn | None = None,
+        turn: GyroRotation | None = None,
         stamps: Mapping[str, float] | None = None,
     ) -> Estimate | Failure:
         """Estimate pose and velocities from one image, or from those of a rig.
@@ -204,7 +203,7 @@ class Localizer:
         scores: ArrayLike | None = None,
         prior: Prior | None = None,
         expected_share: float = 0.5,
-        turn: KnownTurn | None = None,
+        turn: GyroRotation | None = None,
         stamps: Mapping[str, float] | None = None,
     ) -> Estimate | Failure:
         """As :meth:`localize`, however uncertain it is: the next frames may know better."""

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array, instance
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.shutter import motion_of, numbers_of
 from rs_localizer.core.state import PARAMETERS, step_between
 from rs_localizer.core.types import Estimate, Failure
@@ -37,7 +37,7 @@ from rs_localizer.estimation.motion_model import (
     with_mean_turn,
 )
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.inertial.aiding import Before, Found, GyroPrediction, GyroscopeAid, beside_turn
+from rs_localizer.inertial.aiding import Before, Found, GyroPrediction, GyroscopeAid, without_gyro
 from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
@@ -129,7 +129,7 @@ class Tracker:
         if inertial is not None:
             self._aid = GyroscopeAid(inertial, localizer.camera.readout_time)
             self._aid.warm_up()
-        self._beside_turn = Acceleration(_LEAST_ACCELERATION, localizer.config.acceleration.linear)
+        self._without_gyro = Acceleration(_LEAST_ACCELERATION, localizer.config.acceleration.linear)
 
     def reset(self) -> None:
         """Forget all frames so far."""
@@ -264,7 +264,7 @@ class Tracker:
                 self._track = None
         return self.localizer.accepted(result)
 
-    def _prior(self, time_ns: int, turn: KnownTurn | None, span: float | None) -> Prior | None:
+    def _prior(self, time_ns: int, turn: GyroRotation | None, span: float | None) -> Prior | None:
         """What is known of a frame of whose motion a gyroscope predicts no more than the turn."""
         if self._memory is Memory.NOTHING:
             return Prior(of_rest=self.of_rest) if turn is None else None
@@ -274,7 +274,7 @@ class Tracker:
         if prior is not None and not self.trusts_readout_time:
             rest = self.of_rest if turn is None else 0.0
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
-        return prior if turn is None else beside_turn(prior, turn)
+        return prior if turn is None else without_gyro(prior, turn)
 
     def _remember(self, time_ns: int, prior: Prior | None, result: Estimate) -> None:
         """Keep what the next frames are to know of this one."""
@@ -299,8 +299,8 @@ class Tracker:
         readout_time = self.localizer.camera.readout_time
         motion, covariance, added = unshaken(track.estimate)
         dt = 1e-9 * (time_ns - track.time_ns)
-        scaled = _scaled(self._beside_turn, track.process_noise_scale)
-        expected = replace(self._beside_turn, linear=scaled.linear)
+        scaled = _scaled(self._without_gyro, track.process_noise_scale)
+        expected = replace(self._without_gyro, linear=scaled.linear)
         added += acceleration_covariance(expected, dt, readout_time)
         return Before(
             track.time_ns,
@@ -346,7 +346,7 @@ def _innovation(prior: Prior, newest: Estimate) -> Array:
     assert prior.covariance is not None
     if np.isinf(prior.covariance.diagonal()).any():
         return np.ones(2)  # a first guess predicts nothing
-    motion, origin = newest.beside_turn(), np.zeros(3)
+    motion, origin = newest.without_gyro(), np.zeros(3)
     step = step_between(state_in(prior.motion, origin), state_in(motion, origin))
     joint = np.ascontiguousarray(newest.joint_covariance)
     innovation: Array = surprises_of(step, np.ascontiguousarray(prior.covariance), joint)

@@ -209,14 +209,14 @@ def _with(config: Any, name: str, value: Any) -> Any:
 
 
 def _turn(gyroscope: Gyroscope, readout: float) -> Any:
-    from rs_localizer.core.known_turn import KnownTurn
+    from rs_localizer.core.gyro_rotation import GyroRotation
 
     noise = readout * gyroscope.rate_deviation
     # Of a line through the samples of one readout.
     mean = noise**2 * float(np.mean(np.diff(gyroscope.tau)))
     constant = mean + (readout * gyroscope.bias_deviation) ** 2
     error = np.diag(np.repeat([constant, 12.0 * mean], 3))
-    return KnownTurn.of(gyroscope.tau, readout * gyroscope.rates, error, noise)
+    return GyroRotation.of(gyroscope.tau, readout * gyroscope.rates, error, noise)
 
 
 def _scored(result: Any, frame: Frame, condition: Condition) -> list[float]:

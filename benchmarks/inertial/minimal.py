@@ -30,7 +30,7 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera as Believed
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rig import Rig
 from rs_localizer.estimation.assumptions import (
     assumptions,
@@ -158,7 +158,7 @@ def _found(
     camera: Believed,
     solver: Solver,
     given: tuple[Array, Array],
-    turn: KnownTurn | None,
+    turn: GyroRotation | None,
     prior: Prior | None,
 ) -> tuple[Array, int]:
     """Rotation (3,3) camera_from_map by the robust loop and the refinement."""

@@ -18,7 +18,7 @@ from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import Moving
 from benchmarks.independent.scenes import Scene
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
@@ -157,7 +157,7 @@ def alone_and_aided(
     return localizer.localize(points, pixels), localizer.localize(points, pixels, turn=turn)
 
 
-def turn_of_frame(recorded: Recorded, frame: int, readout_time: float) -> KnownTurn:
+def turn_of_frame(recorded: Recorded, frame: int, readout_time: float) -> GyroRotation:
     """How the camera turned during a frame, by a gyroscope that is known by now."""
     samples, errors = recorded.around(frame), _known_errors(recorded)
     within = turn_within(samples, recorded.frames.middle_ns(frame), readout_time, errors)

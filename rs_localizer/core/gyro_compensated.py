@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.known_turn import KnownTurn, find_turn
+from rs_localizer.core.gyro_rotation import GyroRotation, find_turn
 from rs_localizer.core.simd.jit import kernel
 
 # Image points that nearly keep pace with the rows.
@@ -29,7 +29,7 @@ _LEAST_FRONT = 1e-3
 
 
 def gyro_compensated(
-    rays: Array, tau: Array, by_ray: Array, gradient: Array, turn: KnownTurn
+    rays: Array, tau: Array, by_ray: Array, gradient: Array, turn: GyroRotation
 ) -> tuple[Array, Array]:
     """Bearings (n,2) and derivatives (n,2,2) of the pixels by them, with a known turn taken out.
 

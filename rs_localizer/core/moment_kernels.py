@@ -10,7 +10,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import add_block
-from rs_localizer.core.known_turn import Turning, find_turn, late_at
+from rs_localizer.core.gyro_rotation import Turning, find_turn, late_at
 from rs_localizer.core.rate_spline import change_at
 from rs_localizer.core.shake import FUNCTIONS, shake_basis
 from rs_localizer.core.shutter import Numbers

@@ -146,7 +146,7 @@ def rotations_at_knots(times: Array, cubics: Array) -> Array:
 
 @kernel
 def turns_at(wanted: Array, times: Array, cubics: Array, rotations: Array) -> tuple[Array, Array]:
-    """Rotations (n,3,3) and rates (n,3) at times (n,) of a spline of rates; see `KnownTurn`."""
+    """Rotations (n,3,3) and rates (n,3) at times (n,) of a spline of rates; see `GyroRotation`."""
     turns, rates = np.empty((len(wanted), 3, 3)), np.empty((len(wanted), 3))
     for i in range(len(wanted)):
         place = place_of(wanted[i], times)

@@ -12,7 +12,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scales import Scales
@@ -53,7 +53,7 @@ class Estimate(Motion):
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
     tracked: bool = False  # found near a prior motion, without a search
     # How a gyroscope says that the camera turned; velocities and accelerations are those of both
-    turn: KnownTurn | None = None
+    turn: GyroRotation | None = None
     # By how many readouts the points would delay the known turn, and the variance of that
     delay: tuple[float, float] = (0.0, math.inf)
     # What the calibration lacks, if the motion was found with it: project with lens.mended(camera)
@@ -81,8 +81,8 @@ class Estimate(Motion):
         turn = shake_at(np.array([within_rows(tau)]), self.shake)[0]
         return turn[:3], turn[3:] if tau == within_rows(tau) else np.zeros(3)
 
-    def turned(self, turn: KnownTurn, delay: tuple[float, float]) -> Estimate:
-        """The same with a known turn, beside which its motion was estimated."""
+    def turned(self, turn: GyroRotation, delay: tuple[float, float]) -> Estimate:
+        """The same with the gyroscope's rotation, beside which its motion was estimated."""
         return replace(
             self,
             angular_velocity=self.angular_velocity + turn.rate,
@@ -91,8 +91,8 @@ class Estimate(Motion):
             delay=delay,
         )
 
-    def beside_turn(self) -> Motion:
-        """The motion but for the known turn."""
+    def without_gyro(self) -> Motion:
+        """The motion without the gyroscope's rotation."""
         if self.turn is None:
             return self
         return Motion(
@@ -112,13 +112,13 @@ class Estimate(Motion):
     def at(self, tau: float) -> tuple[Array, Array]:
         """Rotation (3,3) and translation (3,) camera_from_map at row time ``tau``."""
         # Not by the object itself: a dataclass with slots is made anew, and this is overridden.
-        rotation, translation = Motion.at(self.beside_turn(), tau)
+        rotation, translation = Motion.at(self.without_gyro(), tau)
         turned = self.turned_beside(tau)
         return turned @ rotation, turned @ translation
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
         """Rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
-        rotations, translations = Motion.at_rows(self.beside_turn(), tau)
+        rotations, translations = Motion.at_rows(self.without_gyro(), tau)
         turns = shake_at(np.clip(np.asarray(tau, float), -0.5, 0.5), self.shake)
         turned = so3.exp_many(-turns[:, :3])
         if self.turn is not None:
@@ -128,7 +128,7 @@ class Estimate(Motion):
     def angular_velocity_at(self, tau: float) -> Array:
         """Body rate (3,) at ``tau``, rad per readout, in the camera axes of that moment."""
         turn, rate = self.shake_at(tau)
-        body_rate = so3.exp(-turn) @ Motion.angular_velocity_at(self.beside_turn(), tau)
+        body_rate = so3.exp(-turn) @ Motion.angular_velocity_at(self.without_gyro(), tau)
         shaken: Array = body_rate + so3.right_jacobian(turn) @ rate
         if self.turn is None:
             return shaken
@@ -138,7 +138,7 @@ class Estimate(Motion):
 
     def linear_velocity_at(self, tau: float) -> Array:
         """Velocity (3,) of the camera centre in the camera axes at ``tau``, m per readout."""
-        velocity = Motion.linear_velocity_at(self.beside_turn(), tau)
+        velocity = Motion.linear_velocity_at(self.without_gyro(), tau)
         turned: Array = self.turned_beside(tau) @ velocity
         return turned
 

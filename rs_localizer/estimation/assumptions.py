@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.scales import SPEEDS, Scales
 from rs_localizer.core.state import ANGULAR
@@ -118,14 +118,14 @@ def with_experience(assumed: Assumed, prior: Prior | None, turn: TurnSeen | None
     return assumed
 
 
-def known_terms(terms: PriorTerms, prior: Prior | None, turn: KnownTurn | None) -> PriorTerms:
+def known_terms(terms: PriorTerms, prior: Prior | None, turn: GyroRotation | None) -> PriorTerms:
     """The terms of the configuration and what is known of this frame, but for its motion."""
     if turn is not None:
         terms = with_turn(terms, turn.error)
     return terms if prior is None else with_measurements(terms, prior)
 
 
-def turn_seen(terms: PriorTerms, turn: KnownTurn | None) -> TurnSeen | None:
+def turn_seen(terms: PriorTerms, turn: GyroRotation | None) -> TurnSeen | None:
     """What a known turn says of the speed, beside the prior of the configuration."""
     if turn is None:
         return None

@@ -16,7 +16,7 @@ from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import add_block
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.shake import MIDDLE_RATES, MIDDLE_VALUES
 from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
 from rs_localizer.core.simd.jit import kernel
@@ -136,7 +136,7 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
     somewhere else on it. What a gyroscope knows of the turn is not in the motion, either.
     """
     motion, covariance, swing = _unshaken(
-        numbers_of(estimate.beside_turn()),
+        numbers_of(estimate.without_gyro()),
         np.ascontiguousarray(estimate.shake),
         np.ascontiguousarray(estimate.joint_covariance),
     )
@@ -183,7 +183,7 @@ def _unshaken(motion: Numbers, shake: Array, joint: Array) -> tuple[Numbers, Arr
     return beside, covariance, swing
 
 
-def with_mean_turn(motion: Motion, covariance: Array, turn: KnownTurn) -> tuple[Motion, Array]:
+def with_mean_turn(motion: Motion, covariance: Array, turn: GyroRotation) -> tuple[Motion, Array]:
     """A motion beside a known turn with the mean rate of that, for a camera that goes on alone.
 
     How much the rate changed within the readout, a gyroscope knows it to change in the next.

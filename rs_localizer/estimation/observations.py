@@ -16,7 +16,7 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray, Random
 from rs_localizer.core.bearings import bearings
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.gyro_compensated import gyro_compensated
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Mounts, Rig
@@ -332,7 +332,7 @@ def relinearized(
     exposure: Exposure,
     observations: Observations,
     state: Array,
-    turn: KnownTurn | None,
+    turn: GyroRotation | None,
     fewest: int = _MANY,
 ) -> Observations:
     """The same observations with derivatives at a motion near the best; few points as they are.
@@ -398,7 +398,7 @@ class Sighted:
     points: Array  # (n,3)
     pixels: Array  # (n,2)
     usable: Usable
-    turn: KnownTurn | None  # what the rays are compensated by
+    turn: GyroRotation | None  # what the rays are compensated by
 
     @property
     def camera(self) -> Camera:
@@ -435,7 +435,11 @@ class Observed:
 
 
 def find_usable(
-    exposure: Exposure, points: Array, pixels: Array, counts: Sequence[int], turn: KnownTurn | None
+    exposure: Exposure,
+    points: Array,
+    pixels: Array,
+    counts: Sequence[int],
+    turn: GyroRotation | None,
 ) -> Usable:
     """Find the usable ones of points (n,3) and pixels (n,2), so many of each camera in turn.
 
@@ -458,7 +462,7 @@ def find_usable(
 
 
 def _rays(
-    exposure: Exposure, place: int, pixels: Array, tau: Array, turn: KnownTurn | None
+    exposure: Exposure, place: int, pixels: Array, tau: Array, turn: GyroRotation | None
 ) -> tuple[Array, Array]:
     """Bearings (n,2) and derivatives (n,2,2) of a camera's pixels by them, compensated."""
     rays, by_ray = bearings(exposure.cameras[place], pixels)

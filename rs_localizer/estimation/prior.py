@@ -285,7 +285,7 @@ def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
 
 
 def with_turn(terms: PriorTerms, error: Array) -> PriorTerms:
-    """The terms of a motion beside a known turn; error (6,6): see ``KnownTurn.error``."""
+    """The terms of a motion beside a known turn; error (6,6): see ``GyroRotation.error``."""
     return PriorTerms(_with_turn(terms.informations, error), terms.references, terms.gravity)
 
 

@@ -21,7 +21,7 @@ import math
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rate_spline import multiplied
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import log
@@ -51,7 +51,7 @@ _TINY = 1e-12
 
 
 def delay_of(
-    observations: Observations, posterior: Posterior, turn: KnownTurn
+    observations: Observations, posterior: Posterior, turn: GyroRotation
 ) -> tuple[float, float]:
     """By how many readouts the known turn has to be delayed, and the variance of that.
 
@@ -83,7 +83,7 @@ def delay_of(
 
 
 def _costs(
-    observations: Observations, posterior: Posterior, turn: KnownTurn, delays: Array
+    observations: Observations, posterior: Posterior, turn: GyroRotation, delays: Array
 ) -> Array:
     """What delays (k,) leave, in noise variances."""
     count = observations.count

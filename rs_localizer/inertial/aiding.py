@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.scales import Scales
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN, step_between
@@ -64,7 +64,7 @@ class GyroPrediction:
     predicted: Predicted | None  # the same with the gyroscope's parameters
 
     @property
-    def turn(self) -> KnownTurn:
+    def turn(self) -> GyroRotation:
         return self.within.known
 
 
@@ -283,7 +283,7 @@ def _step(foreseen: GyroPrediction, found: Estimate | Failure) -> Array | None:
     """
     if not found:
         return None
-    motion, origin = found.beside_turn(), np.zeros(3)
+    motion, origin = found.without_gyro(), np.zeros(3)
     if foreseen.predicted is None:
         step = np.zeros(PARAMETERS)
         step[ANGULAR] = motion.angular_velocity
@@ -300,7 +300,7 @@ def _contradicts(foreseen: GyroPrediction, step: Array) -> bool:
     return contradicts(step, foreseen.predicted.covariance, _SEEN)
 
 
-def beside_turn(prior: Prior | None, turn: KnownTurn) -> Prior | None:
+def without_gyro(prior: Prior | None, turn: GyroRotation) -> Prior | None:
     """What the camera alone predicts, for a motion beside a known turn."""
     if prior is None:
         return None

@@ -60,7 +60,7 @@ def row_offset_likelihood(
     exposure = Rig.of(camera).exposure()
     usable = find_usable(exposure, *given, [len(chosen)], found.turn)
     seen = packed(exposure, given[0], usable)
-    count, motion = len(seen), found.beside_turn()
+    count, motion = len(seen), found.without_gyro()
     errors, by_motion, by_turn, tau, _ = linearized(
         seen.packed, count, state_in(motion, usable.centre),
         np.zeros((count, 6)),

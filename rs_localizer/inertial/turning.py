@@ -26,7 +26,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.blocks import write
-from rs_localizer.core.known_turn import KnownTurn, turn_of
+from rs_localizer.core.gyro_rotation import GyroRotation, turn_of
 from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import coefficients, log
@@ -149,7 +149,7 @@ class TurnWithin:
     That is the rate and its change (6), per readout, along the axes of the middle row.
     """
 
-    known: KnownTurn
+    known: GyroRotation
     by_parameters: Array  # (6,4)
     variances: Array  # (6,) by noise and scale
 
@@ -180,7 +180,7 @@ def turn_within(
     rate_noise = errors.noise * readout_time / math.sqrt(period)
     delay = math.sqrt(errors.covariance[OFFSET, OFFSET] + JITTER**2) / readout_time
     rate_error = readout_time**2 * errors.covariance[BIAS, BIAS]
-    known = KnownTurn(*turn, error, rate_noise, delay, rate_error)
+    known = GyroRotation(*turn, error, rate_noise, delay, rate_error)
     return TurnWithin(known, by_parameters, variances)
 
 
@@ -222,7 +222,7 @@ def _within(
     times_ns: IntArray, rates: Array, here_ns: int, bias: Array, readout_time: float, noise: float,
     of_parameters: Array,
 ) -> tuple[_Turn, Array, Array, Array, float]:  # fmt: skip
-    """The turn of a :class:`KnownTurn`, its error, and the other fields of :class:`TurnWithin`;
+    """The turn of a :class:`GyroRotation`, its error, and the other fields of :class:`TurnWithin`;
     and the period of the samples, s.
     """
     times, steady = _relative(times_ns, rates, here_ns, bias)

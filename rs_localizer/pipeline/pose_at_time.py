@@ -38,7 +38,7 @@ from rs_localizer.config import Acceleration, NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.known_turn import NO_TURN, Turning
+from rs_localizer.core.gyro_rotation import NO_TURN, Turning
 from rs_localizer.core.moment_kernels import pose_of, twist_of
 from rs_localizer.core.shake import shake_at, within_rows
 from rs_localizer.core.shutter import Numbers, numbers_of

@@ -41,7 +41,7 @@ _CERTAIN, _DOUBT, _LEAST = 12.0, 3.0, -4.0
 # every so many, as long as nothing speaks for the other axis.
 _TRIED_FIRST, _SUSPECTED, _EVERY = 5, 40, 10
 # Frames in which motion along the other axis has to agree; it takes 22 in a row for a measurement,
-# and a few for odds of 100 that it agrees (see :mod:`rs_localizer.trajectory.shutter_hypotheses`).
+# and a few for odds of 100 that it agrees (see :class:`.ShutterHypotheses`).
 _CHANCES, _AGREES, _CONTRADICTS = 40, 4.6, 2.0
 # Frames from one measurement of the readout time to the next: it takes as long as some frames.
 _MEASURED_EVERY = 5

@@ -149,8 +149,8 @@ class Score(NamedTuple):
 
 @kernel
 def score(of: Equations, value: float) -> Score:
-    """``sum of x*^T W (y - T x)``, where ``x*`` is the best guess of the way: what the noise of
-    ``y - T x`` tells of that of ``x`` is taken out of it, so that both are independent, and it is
+    """``sum of x*^T W (y - T x)``, where ``x*`` is the best estimate of the displacement: what
+    its noise shares with that of ``y - T x`` is removed, so that both are independent, and it is
     shrunk towards rest where it is only noise.
 
     NaN where a covariance is none.
@@ -171,47 +171,66 @@ def score(of: Equations, value: float) -> Score:
                 squared[n] += error[n, i] * weights[n, i, j] * error[n, j]
     scale = max(1.0, np.median(squared) / _MEDIAN)
     slope, noise, squares = 0.0, 0.0, 0.0
-    mixed, taken = np.empty((SIDE, SIDE)), np.empty((SIDE, SIDE))  # of the noise of x and the error
-    left, way = np.empty((SIDE, SIDE)), np.empty(SIDE)
+    covariance, displacement = np.empty((SIDE, SIDE)), np.empty(SIDE)
     for n in range(count):
         robust = min(1.0, np.sqrt(_HUBER * scale / max(squared[n], 1e-12))) / scale
-        for i in range(SIDE):
-            for j in range(SIDE):
-                mixed[i, j] = of.yx[n, j, i] - value * of.xx[n, i, j]
-        for i in range(SIDE):
-            way[i] = of.x[n, i]
-            for j in range(SIDE):
-                taken[i, j] = 0.0
-                for k in range(SIDE):
-                    taken[i, j] += mixed[i, k] * weights[n, k, j]
-                way[i] -= taken[i, j] * error[n, j]
-        for i in range(SIDE):
-            for j in range(SIDE):
-                left[i, j] = of.xx[n, i, j]
-                for k in range(SIDE):
-                    left[i, j] -= taken[i, k] * mixed[j, k]
-                spread[i, j] = left[i, j]
-            spread[i, i] += _MOTION[i]
-        shrink = inverted(spread)
-        for i in range(SIDE):
-            for j in range(SIDE):
-                shrink[i, j] *= _MOTION[i]
+        shrink = _decorrelate(of, n, value, weights[n], error[n], displacement, covariance)
         own = 0.0
         for i in range(SIDE):
             likely = 0.0
             for j in range(SIDE):
-                likely += shrink[i, j] * way[j]
+                likely += shrink[i, j] * displacement[j]
             for j in range(SIDE):
                 pulled = robust * weights[n, j, i] * likely
                 terms[n] += pulled * error[n, j]
                 own += pulled * of.x[n, j]
                 through = 0.0
                 for k in range(SIDE):
-                    through += shrink[i, k] * left[k, j]
+                    through += shrink[i, k] * covariance[k, j]
                 noise += robust * weights[n, j, i] * through
         slope += own
         squares += own * own
     return Score(terms, slope - noise, noise, slope * slope / max(squares, 1e-300))
+
+
+@kernel
+def _decorrelate(
+    of: Equations,
+    n: int,
+    value: float,
+    weight: Array,
+    error: Array,
+    displacement: Array,
+    covariance: Array,
+) -> Array:
+    """Write displacement (6,) and covariance (6,6) of ``x`` without what its noise shares with that
+    of the error (6,), whose inverse covariance is weight (6,6); return the matrix (6,6) that
+    shrinks the displacement towards rest.
+    """
+    shared, gain = np.empty((SIDE, SIDE)), np.empty((SIDE, SIDE))
+    for i in range(SIDE):
+        for j in range(SIDE):
+            shared[i, j] = of.yx[n, j, i] - value * of.xx[n, i, j]
+    for i in range(SIDE):
+        displacement[i] = of.x[n, i]
+        for j in range(SIDE):
+            gain[i, j] = 0.0
+            for k in range(SIDE):
+                gain[i, j] += shared[i, k] * weight[k, j]
+            displacement[i] -= gain[i, j] * error[j]
+    spread = np.empty((SIDE, SIDE))
+    for i in range(SIDE):
+        for j in range(SIDE):
+            covariance[i, j] = of.xx[n, i, j]
+            for k in range(SIDE):
+                covariance[i, j] -= gain[i, k] * shared[j, k]
+            spread[i, j] = covariance[i, j]
+        spread[i, i] += _MOTION[i]
+    shrink = inverted(spread)
+    for i in range(SIDE):
+        for j in range(SIDE):
+            shrink[i, j] *= _MOTION[i]
+    return shrink
 
 
 @kernel

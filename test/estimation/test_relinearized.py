@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Motion
@@ -26,7 +26,7 @@ FISHEYE = Camera(
 EXPOSURE = Rig.of(FISHEYE).exposure()
 STILL = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
 TAU = np.linspace(-0.7, 0.7, 29)
-TURN = KnownTurn.of(TAU, np.tile([0.1, -0.2, 0.15], (29, 1)), 1e-8 * np.eye(6))
+TURN = GyroRotation.of(TAU, np.tile([0.1, -0.2, 0.15], (29, 1)), 1e-8 * np.eye(6))
 
 
 def seen(count, turn=None, seed=0):

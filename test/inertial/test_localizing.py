@@ -58,7 +58,7 @@ def test_velocities_are_the_derivatives_of_the_poses(camera):
     centres = -np.einsum("nji,nj->ni", rotations, translations)
     moved = rotations[1] @ (centres[2] - centres[0]) / (2.0 * step)
     np.testing.assert_allclose(found.linear_velocity_at(0.2), moved, atol=1e-6)
-    assert np.all(found.beside_turn().angular_velocity == found.angular_velocity - turn.rate)
+    assert np.all(found.without_gyro().angular_velocity == found.angular_velocity - turn.rate)
 
 
 def test_a_bias_is_what_the_points_are_left_with(camera):
@@ -69,7 +69,7 @@ def test_a_bias_is_what_the_points_are_left_with(camera):
     loose = GyroscopeErrors(known.bias, 0.0, np.diag([1.0, 1.0, 1.0, 1e-10]), 1e-5)
     within = turn_within(shaken.samples(bias=bias), MIDDLE_NS, READOUT_TIME, loose)
     found = Localizer(camera).localize(points, pixels, turn=within.known)
-    left = found.beside_turn().angular_velocity / READOUT_TIME
+    left = found.without_gyro().angular_velocity / READOUT_TIME
     np.testing.assert_allclose(left, -bias, atol=np.radians(0.05))
 
 

@@ -10,8 +10,7 @@ import pytest
 from rs_localizer.config import Matching
 from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.matching import Matcher
-from rs_localizer.matching.descriptors import Visible, make_index
+from rs_localizer.matching import Matcher, Visible, make_index
 
 
 def make_map(count: int, **fields: Any) -> Map:

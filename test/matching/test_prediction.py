@@ -14,8 +14,7 @@ from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.matching import Matcher, find_view, predict
-from rs_localizer.matching.descriptors import Visible
+from rs_localizer.matching import Matcher, Visible, find_view, predict
 from rs_localizer.simulation.scene import room
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])

@@ -6,7 +6,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.known_turn import late_at
+from rs_localizer.core.gyro_rotation import late_at
 from rs_localizer.core.rate_spline import change_at
 from rs_localizer.core.shake import within_rows
 from rs_localizer.core.state import (
@@ -27,7 +27,7 @@ def plain_pose(estimate: Estimate, tau: float) -> tuple[Array, Array, Array]:
     """Position, rotation map_from_camera and covariance at a row time within the rows."""
     rotation, translation = estimate.at(tau)
     map_from_middle, map_from_then = estimate.rotation.T, rotation.T
-    motion = estimate.beside_turn()
+    motion = estimate.without_gyro()
     by_angle = map_from_middle @ so3.right_jacobian(-motion.angle_at(tau))
     values, _ = shaking(estimate, tau)
     jacobian = np.zeros((6, len(estimate.joint_covariance)))
@@ -52,7 +52,7 @@ def plain_twist(estimate: Estimate, tau: float) -> tuple[Array, Array, Array]:
     """Linear and angular velocity per readout, and their covariance, within the rows."""
     linear = estimate.linear_velocity_at(tau)
     shaken = estimate.turned_beside(tau)
-    angle = estimate.beside_turn().angle_at(tau)
+    angle = estimate.without_gyro().angle_at(tau)
     angular = estimate.angular_velocity_at(tau)
     by_angle = so3.hat(linear) @ shaken @ so3.right_jacobian(angle)
     values, rates = shaking(estimate, tau)

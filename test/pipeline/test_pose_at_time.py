@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.types import Estimate
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at, with_timing
 
@@ -209,7 +209,7 @@ def test_nothing_runs_away_beyond_the_rows(tau):
     samples = np.linspace(-0.6, 0.6, 25)
     rates = 0.02 * np.sin(np.outer(samples, [20.0, 25.0, 30.0]))
     motion = replace(estimate(0.1), shake=shaking, joint_covariance=1e-10 * np.eye(18 + 84))
-    for seen in (motion, motion.turned(KnownTurn.of(samples, rates), (0.0, np.inf))):
+    for seen in (motion, motion.turned(GyroRotation.of(samples, rates), (0.0, np.inf))):
         edge = 0.5 if tau > 0.0 else -0.5
         before, after = pose_at(seen, edge), pose_at(seen, tau)
         turn = Rotation.from_matrix(before.rotation.T @ after.rotation).magnitude()
@@ -229,7 +229,7 @@ def test_nothing_runs_away_beyond_the_rows(tau):
 def test_the_kernels_are_plain_arithmetic_beside_a_gyroscope(rate_error, tau):
     samples = np.linspace(-0.6, 0.6, 25)
     rates = 0.1 * np.sin(np.outer(samples, [20.0, 25.0, 30.0]) + 1.0)
-    known = KnownTurn.of(samples, rates, rate_noise=0.003, delay=0.02)
+    known = GyroRotation.of(samples, rates, rate_noise=0.003, delay=0.02)
     known = replace(known, rate_error=rate_error)
     for turn in (None, known):
         motion = estimate(0.2, acceleration=0.05, shake=0.002)

@@ -254,61 +254,62 @@ def test_the_unit_of_length_and_the_origin_do_not_matter():
             assert np.nanmedian(np.abs(other[3] / factor - t)) < 1e-11
 
 
-def spoil(p, kind, rng):
-    """Make every sample degenerate in one way."""
-    h = len(p.points)
-    points, rays, tau = p.points.copy(), p.rays.copy(), p.tau.copy()
-    some = np.arange(h)
-    match kind:
-        case "coplanar":
-            normal = directions(rng, np.ones(h))
-            points -= (points @ normal[..., None]) * normal[:, None]
-        case "frontal":
-            points[..., 2] = 0.0
-        case "collinear":
-            points = points[:, :1] + rng.uniform(-1, 1, (h, 6, 1)) * points[:, 1:2]
-        case "one point":
-            points[:] = points[:, :1]
-        case "one bearing":
-            rays[:] = rays[:, :1]
-        case "repeated":
-            i, j = rng.integers(0, 6, (2, h))
-            points[some, i], rays[some, i], tau[some, i] = (
-                points[some, j], rays[some, j], tau[some, j],
-            )  # fmt: skip
-        case "one row":
-            tau[:] = tau[:, :1]
-        case "two rows":
-            tau = np.where(np.arange(6) % 2, tau[:, :1], tau[:, 1:2])
-        case "behind":
-            points[..., 2] -= 10.0
-        case "zero":
-            points[:] = 0.0
-            rays[:] = 0.0
-            tau[:] = 0.0
-        case "huge":
-            points *= 1e200
-        case "tiny":
-            points *= 1e-200
-        case "no number":
-            points[some, rng.integers(0, 6, h)] = np.nan
-        case "infinite":
-            rays[some, rng.integers(0, 6, h)] = np.inf
-        case "integers":
-            points, rays, tau = points.round(), rays.round(1), tau.round(1)
-    return points, rays, tau
+def one_number(values, value):
+    """The same with one sixth of a sample replaced."""
+
+    def change(p, rng):
+        changed = getattr(p, values).copy()
+        changed[np.arange(len(changed)), rng.integers(0, 6, len(changed))] = value
+        return {values: changed}
+
+    return change
 
 
-KINDS = (
-    "coplanar", "frontal", "collinear", "one point", "one bearing", "repeated", "one row",
-    "two rows", "behind", "zero", "huge", "tiny", "no number", "infinite", "integers",
-)  # fmt: skip
+def coplanar(p, rng):
+    normal = directions(rng, np.ones(len(p.points)))
+    return {"points": p.points - (p.points @ normal[..., None]) * normal[:, None]}
 
 
-@pytest.mark.parametrize("kind", KINDS)
+def collinear(p, rng):
+    along = rng.uniform(-1, 1, (len(p.points), 6, 1)) * p.points[:, 1:2]
+    return {"points": p.points[:, :1] + along}
+
+
+def repeated(p, rng):
+    i, j = rng.integers(0, 6, (2, len(p.points)))
+    order = np.tile(np.arange(6), (len(i), 1))
+    order[np.arange(len(i)), i] = j
+    rows = np.arange(len(i))[:, None]
+    return {name: getattr(p, name)[rows, order] for name in ("points", "rays", "tau")}
+
+
+# What changes of samples that are degenerate in one way.
+DEGENERATE = {
+    "coplanar": coplanar,
+    "frontal": lambda p, _: {"points": p.points * [1.0, 1.0, 0.0]},
+    "collinear": collinear,
+    "one point": lambda p, _: {"points": np.repeat(p.points[:, :1], 6, axis=1)},
+    "one bearing": lambda p, _: {"rays": np.repeat(p.rays[:, :1], 6, axis=1)},
+    "repeated": repeated,
+    "one row": lambda p, _: {"tau": np.repeat(p.tau[:, :1], 6, axis=1)},
+    "two rows": lambda p, _: {"tau": np.where(np.arange(6) % 2, p.tau[:, :1], p.tau[:, 1:2])},
+    "behind": lambda p, _: {"points": p.points - [0.0, 0.0, 10.0]},
+    "zero": lambda p, _: {name: 0.0 * getattr(p, name) for name in ("points", "rays", "tau")},
+    "huge": lambda p, _: {"points": 1e200 * p.points},
+    "tiny": lambda p, _: {"points": 1e-200 * p.points},
+    "no number": one_number("points", np.nan),
+    "infinite": one_number("rays", np.inf),
+    "integers": lambda p, _: {
+        "points": p.points.round(), "rays": p.rays.round(1), "tau": p.tau.round(1),
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", DEGENERATE)
 def test_degenerate_samples_end_without_noise_and_leave_others_alone(kind):
     p = problems(600, 14, physical=True)
-    bad = spoil(p, kind, np.random.default_rng(15))
+    spoilt = DEGENERATE[kind](p, np.random.default_rng(15))
+    bad = [spoilt.get(name, getattr(p, name)) for name in ("points", "rays", "tau")]
     good = batch(p.points, p.rays, p.tau, np.eye(3)[None])
     odd = np.arange(len(p.points)) % 2 == 1
     mixed = [np.where(odd.reshape(-1, *[1] * (x.ndim - 1)), y, x) for x, y in

@@ -10,8 +10,8 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.trajectory.online_readout import single_image_likelihood
 from rs_localizer.trajectory.readout_equations import SIDE, Equations, View, equation, score
-from rs_localizer.trajectory.single_image_likelihood import single_image_likelihood
 
 
 def covariance(rng: np.random.Generator, size: int) -> Array:

@@ -5,8 +5,8 @@
 import numpy as np
 import pytest
 
+from rs_localizer.trajectory.online_readout import ShutterHypotheses
 from rs_localizer.trajectory.readout_equations import SIDE, Equations
-from rs_localizer.trajectory.shutter_hypotheses import ShutterHypotheses
 
 SET = 0.02
 NOISE = 1e-3

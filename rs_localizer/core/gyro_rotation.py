@@ -31,8 +31,8 @@ _UNKNOWN = np.diag(np.full(3, np.inf))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class KnownTurn:
-    """The camera's turn beside the motion that its points are to tell.
+class GyroRotation:
+    """The camera's rotation as its gyroscope measured it; points estimate the motion beside it.
 
     Times are row times, rates are body rates in rad per readout, along the camera axes of then.
     """
@@ -62,7 +62,7 @@ class KnownTurn:
         error: Array | None = None,
         rate_noise: float = 0.0,
         delay: float = 0.0,
-    ) -> KnownTurn:
+    ) -> GyroRotation:
         """The turn of body rates (k,3), rad per readout, at row times (k,).
 
         Raises:
@@ -102,7 +102,7 @@ class KnownTurn:
 
 
 class Turning(NamedTuple):
-    """What kernels need of a :class:`KnownTurn`; the fields are the same."""
+    """What kernels need of a :class:`GyroRotation`; the fields are the same."""
 
     tau: Array
     rates: Array
@@ -127,7 +127,7 @@ def find_turn(
     wanted: float, times: Array, cubics: Array, rotations: Array, parabola: Array,
     rotation: Array, rate: Array,
 ) -> None:  # fmt: skip
-    """Fill in rotation and rate of a :class:`KnownTurn` at a row time."""
+    """Fill in rotation and rate of a :class:`GyroRotation` at a row time."""
     inside = min(max(wanted, times[0]), times[-1])
     place = place_of(inside, times)
     since = inside - times[place]
@@ -168,7 +168,7 @@ def late_at(tau: float, times: Array, cubics: Array, parabola: Array) -> tuple[A
 
 @kernel
 def turn_of(tau: Array, rates: Array) -> tuple[Array, Array, Array, Array, Array, float]:
-    """What a :class:`KnownTurn` holds of rates (k,3) at row times (k,)."""
+    """What a :class:`GyroRotation` holds of rates (k,3) at row times (k,)."""
     cubics = spline(tau, rates)
     rotations = rotations_at_knots(tau, cubics)
     moments, squares = np.zeros((3, 3)), np.zeros(3)

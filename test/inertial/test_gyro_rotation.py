@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 from rs_localizer.core.gyro_compensated import gyro_compensated
-from rs_localizer.core.known_turn import KnownTurn, late_at
+from rs_localizer.core.gyro_rotation import GyroRotation, late_at
 from rs_localizer.core.so3 import hat
 from rs_localizer.inertial.turning import densified
 
@@ -31,14 +31,14 @@ def integrated(rate, tau):
 
 
 def test_rates_are_a_natural_spline():
-    turn = KnownTurn.of(TAU, shaking(TAU))
+    turn = GyroRotation.of(TAU, shaking(TAU))
     expected = CubicSpline(TAU, shaking(TAU), bc_type="natural")
     np.testing.assert_allclose(turn.at_rows(ROWS)[1], expected(ROWS), atol=1e-14)
     np.testing.assert_allclose(turn.change, expected(0.0, 1), atol=1e-12)
 
 
 def test_rotations_are_the_integral_of_the_rates():
-    turn = KnownTurn.of(TAU, shaking(TAU))
+    turn = GyroRotation.of(TAU, shaking(TAU))
     spline = CubicSpline(TAU, shaking(TAU), bc_type="natural")
     for tau, rotation in zip(ROWS, turn.at_rows(ROWS)[0], strict=True):
         np.testing.assert_allclose(rotation, integrated(spline, tau), atol=1e-7)
@@ -47,11 +47,11 @@ def test_rotations_are_the_integral_of_the_rates():
 def test_a_parabola_leaves_nothing():
     rates = np.column_stack([1.0 + TAU, TAU**2, 0.0 * TAU])
     # A natural spline is none at its ends; a cubic through many samples is one in the middle.
-    turn = KnownTurn.of(np.linspace(-3.0, 3.0, 121), np.zeros((121, 3)))
+    turn = GyroRotation.of(np.linspace(-3.0, 3.0, 121), np.zeros((121, 3)))
     assert turn.roughness == 0.0
     dense = np.linspace(-3.0, 3.0, 121)
     rates = np.column_stack([1.0 + dense, dense**2, 0.0 * dense])
-    turn = KnownTurn.of(dense, rates)
+    turn = GyroRotation.of(dense, rates)
     np.testing.assert_allclose(turn.parabola, [[1, 0, 0], [1, 0, 0], [0, 1, 0]], atol=1e-6)
     assert turn.roughness < 1e-6
     late = late_at(0.3, turn.tau, turn.rates, turn.parabola)
@@ -61,13 +61,13 @@ def test_a_parabola_leaves_nothing():
 @pytest.mark.parametrize("tau", [np.zeros(1), np.array([0.0, 0.0]), np.array([1.0, 0.0])])
 def test_times_must_increase(tau):
     with pytest.raises(ValueError, match="increasing"):
-        KnownTurn.of(tau, np.zeros((len(tau), 3)))
+        GyroRotation.of(tau, np.zeros((len(tau), 3)))
 
 
 def test_compensated_bearings_are_those_of_the_middle_row():
     rng = np.random.default_rng(1)
     rays, tau = rng.uniform(-0.6, 0.6, (20, 2)), rng.uniform(-0.5, 0.5, 20)
-    turn = KnownTurn.of(TAU, shaking(TAU))
+    turn = GyroRotation.of(TAU, shaking(TAU))
     by_ray = np.broadcast_to(400.0 * np.eye(2), (20, 2, 2)).copy()
     found, _ = gyro_compensated(rays, tau, by_ray, np.zeros(2), turn)
     bearings = np.column_stack([rays, np.ones(20)])
@@ -77,7 +77,7 @@ def test_compensated_bearings_are_those_of_the_middle_row():
 
 def test_derivatives_of_compensated_bearings_by_differences():
     """Noise of the pixel moves the bearing and, with the row time, the turn."""
-    turn, gradient, step = KnownTurn.of(TAU, shaking(TAU)), np.array([3e-4, 2e-3]), 1e-4
+    turn, gradient, step = GyroRotation.of(TAU, shaking(TAU)), np.array([3e-4, 2e-3]), 1e-4
     ray, tau, focal = np.array([0.2, -0.3]), 0.21, 400.0
 
     def steady(pixel):  # where a pixel's own row time puts its bearing
@@ -97,7 +97,7 @@ def test_derivatives_of_compensated_bearings_by_differences():
 
 
 def test_bearings_that_turn_behind_the_camera_are_left_out():
-    turn = KnownTurn.of(TAU, np.broadcast_to([0.0, 3.0, 0.0], (len(TAU), 3)).copy())
+    turn = GyroRotation.of(TAU, np.broadcast_to([0.0, 3.0, 0.0], (len(TAU), 3)).copy())
     rays = np.array([[0.0, 0.0], [-30.0, 0.0], [30.0, 0.0]])
     found, _ = gyro_compensated(rays, np.full(3, 0.5), np.ones((3, 2, 2)), np.zeros(2), turn)
     assert np.isfinite(found[0, 0])
