@@ -158,7 +158,8 @@ def run(args: argparse.Namespace) -> Figures | None:
         return None
     recording: Location = args.recordings[0]
     if args.ros:
-        _refuse_images(recording)
+        if is_url(recording) or not is_bag(Path(recording)):  # of a bag, images are played
+            _refuse_images(recording)
         with open_bag(recording) as bag:
             only_images = not has_frames(bag) and not (args.correspondences or args.keypoints)
             topics = None if only_images else find_topics(bag, given_topics(args))

@@ -16,9 +16,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rs_localizer.pipeline.frames
-from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
+from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
@@ -170,9 +169,6 @@ class Panning(Chain):
 
 class KnowsTheMotion(Localizer):
     """Stands in for the localizer."""
-
-    def __init__(self, camera: Camera, config: LocalizerConfig) -> None:
-        self.camera, self.config = camera, config
 
     def localize(self, *given: Any, **more: Any) -> Estimate:
         return estimate()

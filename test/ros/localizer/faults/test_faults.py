@@ -19,10 +19,21 @@ from live_world import PATIENCE, World, record
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory) -> Iterator[World]:
-    world = World(record(tmp_path_factory.mktemp("bags") / "flight"))
-    yield world
-    world.close()
+def worlds(tmp_path_factory) -> Iterator[list[World]]:
+    """The faults share one; after one that failed, it is a new one."""
+    recording = record(tmp_path_factory.mktemp("bags") / "flight")
+    worlds = [World(recording)]
+    yield worlds
+    worlds[-1].close()
+
+
+@pytest.fixture
+def world(worlds, request) -> Iterator[World]:
+    failed = request.session.testsfailed
+    yield worlds[-1]
+    if request.session.testsfailed > failed:
+        worlds[-1].close()
+        worlds.append(World(worlds[-1].recording))
 
 
 @pytest.fixture(scope="module")
