@@ -21,9 +21,9 @@ by_rosdoc2 = "confpy_succeeded" in globals()  # which runs this file inside its 
 # The pages, in the order of the site's contents; rosdoc2 makes a front page of its own.
 PAGES = {
     "Start": "concepts install camera cameras/index",
-    "Use": "node reasons detector features imu recordings calibration mapping map_build maps "
+    "Use": "node reasons detector features imu rigs recordings calibration mapping map_build maps "
     "simulation viewing integrations library security",
-    "Understand": "solvers estimator honesty benchmarks architecture api",
+    "Understand": "solvers estimator honesty benchmarks architecture api stability",
 }
 OTHERS = (
     *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README"),
