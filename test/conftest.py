@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages for the tests, written from the definitions of ROS and not by the package's code."""
 
+import signal
 import struct
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
@@ -16,6 +17,10 @@ settings.register_profile(
     "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("any machine")
+
+# The shell of a background job and nohup pass on ignored signals, which our processes respect.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # sensor_msgs/PointField: number of a type -> code of struct.
 STRUCT_CODES = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
