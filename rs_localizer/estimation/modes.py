@@ -32,7 +32,7 @@ from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import MOVE, PARAMETERS, STATE_SIZE, TURN, step_between
 from rs_localizer.estimation.frame_fit import fit_frame, log_determinant_of_inverse
-from rs_localizer.estimation.mirror import leaning_less
+from rs_localizer.estimation.mirror import leaning_less, plane_of
 from rs_localizer.estimation.observations import weighted
 from rs_localizer.estimation.posterior import WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, terms_at
@@ -59,6 +59,14 @@ _MOST_BETTER = 0.01
 _LEAST_LIKELY = -10.0
 _FITS, _FINE = 4, 1e-6
 _NO_SCALE, _ITERATIONS = 1e6, 50
+# Deviation (rad, 2 deg) of the parts of a lean; what is known better is a Gaussian as it is.
+_PART = 0.035
+# Parts lie two deviations apart: their sum is constant to 1.5 % (Poisson's sum, 2 exp(-pi^2 / 2)).
+_PART_STEP = 2.0 * _PART
+# Logarithm of the odds of the best part against those that are left out.
+_LEAST_PART = 6.0
+_REACH, _MOST_PARTS = 7, 80
+_WITHIN = 1.0
 # Probabilities that have no part in the covariance.
 _NO_PART = 1e-5
 
@@ -314,7 +322,6 @@ def _modes(
     for speed in range(slowest, len(SPEEDS)):
         prior = terms_at(terms, SPEEDS[speed], turn_known)
         mode = _mode(data, inliers, near, prior, odds[speed], smooth)
-        count = _keep(modes, count, speed, mode)
         near, here = mode.state, mode.evidence
         other = has_twin
         if leans and not has_twin:
@@ -323,8 +330,13 @@ def _modes(
             second = _mode(data, inliers, twin, prior, odds[speed], smooth)
             leans = has_twin = _apart(mode, second)
             if has_twin:
-                count = _keep(modes, count, speed, second)
                 twin, here = second.state, max(here, second.evidence)
+                if planar:
+                    second = _over_leans(data, inliers, second, prior, odds[speed], smooth)
+                count = _keep(modes, count, speed, second)
+        if planar:
+            mode = _over_leans(data, inliers, mode, prior, odds[speed], smooth)
+        count = _keep(modes, count, speed, mode)
         best = max(best, here)
         if here < best - FAR_LESS_PROBABLE / TEMPER:
             break
@@ -396,6 +408,88 @@ def _mode(
         return Mode(start, np.zeros((PARAMETERS, PARAMETERS)), -np.inf, np.inf, 0.0)
     covariance = along_arcs(inliers.inflation * covariance, state[9:12])
     return Mode(state, covariance, evidence + odds, cost, scale)
+
+
+@kernel
+def _over_leans(
+    data: Array, inliers: Inliers, mode: Mode, terms: PriorTerms, odds: float, smooth: SmoothError
+) -> Mode:  # fmt: skip
+    """The mode of a plane, integrated over the lean where that is hardly known (nested Laplace).
+
+    The posterior times Gaussians of the lean that add up to one: each part is narrow, a Gaussian
+    about an optimum of its own.
+    """
+    _, centre, normal = plane_of(inliers.points, inliers.chosen)
+    rotation = mode.state[:9].copy().reshape(3, 3)
+    _, sizes, axes = np.linalg.svd(
+        (np.eye(3) - np.outer(rotation @ normal, rotation @ normal))
+        @ mode.covariance[:3, :3].copy()
+        @ (np.eye(3) - np.outer(rotation @ normal, rotation @ normal))
+    )
+    if not (mode.evidence > -np.inf and sizes[0] > _PART**2):
+        return mode
+    width = 2 * _REACH + 1
+    reach = np.array([_REACH, _REACH if sizes[1] > _PART**2 else 0])
+    states, evidences = np.empty((_MOST_PARTS, STATE_SIZE)), np.empty(_MOST_PARTS)
+    covariances = np.empty((_MOST_PARTS, PARAMETERS, PARAMETERS))
+    queued, places = np.zeros((width, width), np.bool_), np.zeros((width * width, 2), np.int64)
+    parents, kept = np.zeros(width * width, np.int64), np.zeros(width * width, np.int64)
+    queued[_REACH, _REACH] = True
+    first, last, count, best = 0, 1, 0, -np.inf
+    while first < last and count < _MOST_PARTS:
+        place = places[first]
+        turn = _PART_STEP * (place[0] * axes[0] + place[1] * axes[1])
+        reference = mode.state.copy()
+        reference[:9] = (exp(-turn) @ rotation).ravel()
+        across = reference[:9].copy().reshape(3, 3) @ normal
+        start = states[kept[parents[first]]] if count > 0 else mode.state
+        # Turned about the middle of the plane.
+        back = start[:9].copy().reshape(3, 3)
+        towards = _PART_STEP * (
+            (place[0] - places[parents[first], 0]) * axes[0]
+            + (place[1] - places[parents[first], 1]) * axes[1]
+        )
+        turned = exp(-towards) @ back
+        moved = start.copy()
+        moved[:9] = turned.ravel()
+        moved[9:12] = start[9:12] + back @ centre - turned @ centre
+        informations = np.zeros((len(terms.informations) + 1, PARAMETERS, PARAMETERS))
+        references = np.empty((len(terms.informations) + 1, STATE_SIZE))
+        informations[:-1], references[:-1] = terms.informations, terms.references
+        references[-1] = reference
+        block = np.eye(3) - np.outer(across, across)
+        if reach[1] == 0:
+            block = np.outer(axes[0], axes[0])
+        informations[-1, :3, :3] = block / _PART**2
+        part = _mode(
+            data, inliers, moved, PriorTerms(informations, references, terms.gravity), odds, smooth
+        )
+        if part.evidence > best - _LEAST_PART:
+            best = max(best, part.evidence)
+            states[count], covariances[count] = part.state, part.covariance
+            evidences[count] = part.evidence
+            for k in range(4):
+                i = place[0] + (k == 0) - (k == 1)
+                j = place[1] + (k == 2) - (k == 3)
+                if abs(i) <= reach[0] and abs(j) <= reach[1] and not queued[i + _REACH, j + _REACH]:
+                    queued[i + _REACH, j + _REACH] = True
+                    places[last, 0], places[last, 1], parents[last] = i, j, first
+                    last += 1
+            # Parents are told by their place among the parts that are kept.
+            kept[first] = count
+            count += 1
+        first += 1
+    if count == 0:
+        return mode
+    probable = np.exp(evidences[:count] - best)
+    total = np.sum(probable)
+    within = probable**_WITHIN
+    state, covariance, _ = averaged(
+        states[:count], covariances[:count], 0, probable / total, within / np.sum(within)
+    )
+    covered = 2.0 if reach[1] > 0 else 1.0
+    evidence = best + math.log(total) + 0.5 * covered * math.log(2.0 / math.pi)
+    return Mode(state, covariance, evidence, mode.cost, mode.smooth)
 
 
 @kernel
