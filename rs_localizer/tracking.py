@@ -41,7 +41,7 @@ from rs_localizer.inertial.aiding import Before, Found, GyroPrediction, Gyroscop
 from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
-from rs_localizer.inertial.status import InertialStatus
+from rs_localizer.inertial.watch import InertialStatus
 from rs_localizer.localizer import Localizer
 from rs_localizer.solvers.table import find_solver
 

@@ -56,8 +56,7 @@ from rs_localizer.offline.image_sources import (
     Carried,
     Shot,
 )
-from rs_localizer.offline.imu_recording import optical_frame, read_imu_recording
-from rs_localizer.offline.recordings import read_recording
+from rs_localizer.offline.recordings import optical_frame, read_imu_recording, read_recording
 from rs_localizer.offline.replay import find_topics, has_frames
 from rs_localizer.pipeline.images import FrameDetector
 from rs_localizer.process.arguments import number

@@ -22,9 +22,8 @@ from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
-from rs_localizer.io.phone_logs import read_log
 from rs_localizer.io.recording import PARAMETERS
-from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_telemetry
+from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_log, read_telemetry
 from rs_localizer.io.video import has_times
 from rs_localizer.offline.image_sources import (
     IMAGE_TYPES,

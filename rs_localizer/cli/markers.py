@@ -15,9 +15,8 @@ from rs_localizer.markers.consistency import problems
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.map_files import read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.pages import page_files, write_pages
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.printing import PAGES, plan
+from rs_localizer.markers.printing import PAGES, page_files, plan, write_pages
 from rs_localizer.markers.prints import Board, Charuco, Chessboard
 from rs_localizer.process.arguments import integer, number
 

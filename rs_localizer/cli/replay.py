@@ -47,7 +47,7 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
 from rs_localizer.io.remote import Location, is_url, location, url_name
 from rs_localizer.io.topics import IMU
-from rs_localizer.markers.formats.files import is_marker_file
+from rs_localizer.markers.formats import is_marker_file
 from rs_localizer.offline.fleet.task import Figures, Kind
 from rs_localizer.offline.image_sources import INFO_TYPE, holds_images, image_topics
 from rs_localizer.offline.replay import (
@@ -70,7 +70,7 @@ from rs_localizer.offline.table import (
     write_parquet,
     write_zarr,
 )
-from rs_localizer.offline.viewing.stream import check_screen, write_view
+from rs_localizer.offline.viewing import check_screen, write_view
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.rigs import frame_localizer
 from rs_localizer.settings import NODE_NAME

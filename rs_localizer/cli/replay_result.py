@@ -27,11 +27,16 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import BagReader, BagWriter
-from rs_localizer.io.gsplat import exposed_rows, write_gsplat
 from rs_localizer.io.image_clock import readout_fault
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.ncore import sequence
-from rs_localizer.io.nerfstudio import View, middle_of_image, transforms
+from rs_localizer.io.neural_reconstruction import (
+    View,
+    exposed_rows,
+    middle_of_image,
+    sequence,
+    transforms,
+    write_gsplat,
+)
 from rs_localizer.io.outputs import Localized, Pose, messages
 from rs_localizer.io.remote import location
 from rs_localizer.io.topics import TF

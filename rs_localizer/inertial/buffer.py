@@ -16,7 +16,7 @@ from enum import StrEnum
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.inertial.gaps import span_of
+from rs_localizer.inertial.samples import span_of
 
 Vector = tuple[float, float, float]
 

@@ -1,14 +1,17 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a map of markers can be true, against what an image shows of them."""
+"""Whether a map of markers can be true, against what images show of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
 from rs_localizer.markers.detection import Detections, IntArray
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Marker
@@ -204,3 +207,159 @@ def _projection(points: Array, pixels: Array) -> tuple[float, bool]:
 def _mean_side(pixels: Array) -> float:
     quads = pixels.reshape(-1, 4, 2)
     return float(np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).mean())
+
+
+def still_pose(points: Array, rays: Array) -> tuple[Array, Array] | None:
+    """Rotation (3,3) and translation (3,) camera_from_map that fit best; None: there are none.
+
+    Args:
+        points: (n,3) m, map frame.
+        rays: (n,2) undistorted bearings.
+    """
+    try:
+        solved, rotation, translation = cv2.solvePnP(
+            points, np.ascontiguousarray(rays), np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:
+        return None
+    if not solved:
+        return None
+    turn = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
+    return turn, np.asarray(translation, np.float64).ravel()
+
+
+def still_errors(camera: Camera, pose: tuple[Array, Array], points: Array, pixels: Array) -> Array:
+    """From where the pixels (n,2) are to where a pose puts the points (n,3): px."""
+    return camera.project(points @ pose[0].T + pose[1]) - pixels
+
+
+def rms(errors: Array) -> float:
+    """Root mean square of the lengths of errors (n,2)."""
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+# With fewer in an image it cannot be said which one is off.
+_LEAST_MARKERS = 3
+# Images with the marker; fewer may be bad luck.
+_LEAST_IMAGES = 5
+# All images count until there are so many, then one in ten: a pose for each marker takes time.
+_ALL_UNTIL, _ONE_IN = 60, 10
+# px rms: what a still camera leaves at most.
+_STILL = 0.5
+# Without the marker the others fit to this share of what they fit to with it, and it is off by this
+# multiple of how well they fit.
+_BETTER, _CLEARLY = 0.6, 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """A marker against the others in one image."""
+
+    fit: float  # px rms of the others
+    fit_with: float  # px rms of all
+    off: float  # px, mean over its corners
+    axes: Array  # (2,3) directions across the line of sight, in the map
+    shift: Array  # (2,) m along them
+
+
+Predict = Callable[[Array], Array]
+"""Pixels (n,2) of points (n,3) of the map."""
+Fit = Callable[[Camera, Array, Array], Predict | None]
+"""What predicts, fitted to a camera's points (n,3) and pixels (n,2); None: nothing fits."""
+
+
+def still_fit(camera: Camera, points: Array, pixels: Array) -> Predict | None:
+    """The fit of a camera that does not move, or of a global shutter."""
+    pose = still_pose(points, camera.rays(pixels))
+    if pose is None:
+        return None
+    return lambda some: camera.project(some @ pose[0].T + pose[1])
+
+
+class LeaveOneOut:
+    """Which marker of a map is not where the map has it: each is held against the others.
+
+    In every image the pose of the camera is estimated from all markers but one, and that one is
+    looked for where this pose puts it. A marker that was mounted a centimetre off is off in every
+    image by as much, and the others fit each other well once it is left out; what a rolling shutter
+    does changes from image to image and spares no marker. Where it does much, it has to be part of
+    the fit.
+
+    Args:
+        marker_map: the map.
+        fit: for images that a still camera does not explain.
+    """
+
+    def __init__(self, marker_map: MarkerMap, fit: Fit = still_fit) -> None:
+        self._names = [marker.name for marker in marker_map.markers]
+        self._fit = fit
+        self._views: dict[int, list[_View]] = {}
+        self._images = 0
+
+    def add(self, camera: Camera, seen: Detections) -> None:
+        """Take in what an image shows."""
+        whole = whole_markers(seen, 4 * len(self._names))
+        if len(whole) < _LEAST_MARKERS:
+            return
+        self._images += 1
+        if self._images > _ALL_UNTIL and self._images % _ONE_IN:
+            return
+        rows = np.concatenate(list(whole.values()))
+        points, pixels = seen.points, seen.pixels
+        pose = still_pose(points[rows], camera.rays(pixels[rows]))
+        still = still_fit(camera, points[rows], pixels[rows])
+        if pose is None or still is None:
+            return
+        fit = still_fit if rms(still(points[rows]) - pixels[rows]) < _STILL else self._fit
+        together = fit(camera, points[rows], pixels[rows])
+        if together is None:
+            return
+        fit_with = rms(together(points[rows]) - pixels[rows])
+        depths = points @ pose[0][2] + pose[1][2]
+        for marker, own in whole.items():
+            others = rows[~np.isin(rows, own)]
+            alone = fit(camera, points[others], pixels[others])
+            if alone is None:
+                continue
+            predicted = alone(points[own])
+            turned = camera.rays(pixels[own]) - camera.rays(predicted)
+            view = _View(
+                fit=rms(alone(points[others]) - pixels[others]),
+                fit_with=fit_with,
+                off=float(np.linalg.norm((predicted - pixels[own]).mean(axis=0))),
+                axes=pose[0][:2],
+                shift=turned.mean(axis=0) * depths[own].mean(),
+            )
+            if np.isfinite([view.fit, view.fit_with, view.off, *view.shift]).all():
+                self._views.setdefault(marker, []).append(view)
+
+    def fault(self) -> str | None:
+        """Which marker is off and by how much; None when none stands out."""
+        candidates = {m: v for m, v in self._views.items() if len(v) >= _LEAST_IMAGES}
+        if len(candidates) < _LEAST_MARKERS:
+            return None
+        gains = {m: _median(v, "fit") / _median(v, "fit_with") for m, v in candidates.items()}
+        worst = min(gains, key=lambda m: gains[m])
+        views = candidates[worst]
+        fit, off = _median(views, "fit"), _median(views, "off")
+        if not gains[worst] < _BETTER or not off > _CLEARLY * fit:
+            return None
+        away = _shift(views)
+        x, y, z = (f"{value:+.4f}" for value in away)
+        return (
+            f"{self._names[worst]} is not where the map has it: against the others, which fit to "
+            f"{fit:.2f} px without it, it is off by {off:.1f} px, about "
+            f"{100.0 * np.linalg.norm(away):.1f} cm ({x}, {y}, {z} m in the map)"
+        )
+
+
+def _median(views: list[_View], name: str) -> float:
+    return float(np.median([getattr(view, name) for view in views]))
+
+
+def _shift(views: list[_View]) -> Array:
+    """Displacement (3,) m in the map; along the common line of sight of all views it is zero."""
+    system = np.concatenate([view.axes for view in views])
+    shifts = np.concatenate([view.shift for view in views])
+    # Where all views look the same way, the depth is not seen: it is not made up either.
+    return np.asarray(np.linalg.lstsq(system, shifts, rcond=0.3)[0])

@@ -26,9 +26,9 @@ from rs_localizer.io.recording import (
     KEYPOINTS_TOPIC,
 )
 from rs_localizer.localizer import Localizer
-from rs_localizer.markers.displaced import LeaveOneOut, Predict, rms, still_errors, still_pose
+from rs_localizer.markers.detection import recognized
+from rs_localizer.markers.map_check import LeaveOneOut, Predict, rms, still_errors, still_pose
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.recognition import recognized
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
 from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
@@ -208,7 +208,7 @@ class _Tally:
 
 
 class _RollingFit:
-    """Fits the motion of a rolling shutter (see :data:`rs_localizer.markers.displaced.Fit`)."""
+    """Fits the motion of a rolling shutter (see :data:`rs_localizer.markers.map_check.Fit`)."""
 
     def __init__(self) -> None:
         self._last: tuple[Camera, Localizer] | None = None

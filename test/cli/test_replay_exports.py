@@ -15,7 +15,7 @@ from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.io.nerfstudio import NerfstudioError, transforms
+from rs_localizer.io.neural_reconstruction import NerfstudioError, transforms
 from rs_localizer.io.trajectories import read_tum
 
 READOUT = 0.03

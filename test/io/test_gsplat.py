@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.io.gsplat import exposed_rows, write_gsplat
+from rs_localizer.io.neural_reconstruction import exposed_rows, write_gsplat
 
 K = np.array([[500.0, 0.0, 321.5], [0.0, 510.0, 238.5], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 640, 480

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rs_localizer.io.phone_logs import read_log
-from rs_localizer.io.telemetry import TelemetryError
+from rs_localizer.io.telemetry import TelemetryError, read_log
 
 BOOT = 81_234.5  # s on the phone's clock when the first image began
 EXPOSURE, READOUT = 0.01, 0.0187

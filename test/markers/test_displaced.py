@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.markers.detection import Detections
-from rs_localizer.markers.displaced import Fit, LeaveOneOut, still_fit
+from rs_localizer.markers.map_check import Fit, LeaveOneOut, still_fit
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.offline.detect import _RollingFit
 

@@ -10,8 +10,7 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.markers.families import FAMILIES
-from rs_localizer.markers.formats.common import Unsaid
-from rs_localizer.markers.formats.files import FORMATS, OWN, read_any, write_any
+from rs_localizer.markers.formats import FORMATS, OWN, Unsaid, read_any, write_any
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker

@@ -11,9 +11,8 @@ import pytest
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.pages import write_pages
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.printing import PAGES, plan
+from rs_localizer.markers.printing import PAGES, plan, write_pages
 from rs_localizer.markers.prints import Charuco, Chessboard
 
 PIXEL = 0.0254 / 300  # m, of the PNG files

@@ -5,11 +5,11 @@
 import numpy as np
 import pytest
 
+from rs_localizer.markers.detection import chessboard_size, recognized
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.families import family
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
-from rs_localizer.markers.recognition import chessboard_size, recognized
 
 
 @pytest.mark.parametrize("name", ["5x5_250", "apriltag_36h11"])

@@ -48,8 +48,7 @@ from rs_localizer.mapping.report import advice, rows, written
 from rs_localizer.mapping.views import Looker, View
 from rs_localizer.offline.detect import Cameras
 from rs_localizer.offline.image_sources import Carried
-from rs_localizer.offline.imu_recording import optical_frame, read_imu_recording
-from rs_localizer.offline.recordings import RecordingError
+from rs_localizer.offline.recordings import RecordingError, optical_frame, read_imu_recording
 from rs_localizer.offline.replay import imu_topics
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.process.arguments import integer, number

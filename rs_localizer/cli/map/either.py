@@ -15,11 +15,12 @@ from rs_localizer.io.maps.files import WRITERS, read_map_file
 from rs_localizer.io.maps.landmarks import Map, make_map
 from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.markers.families import family
-from rs_localizer.markers.formats.common import USUAL_FAMILY, Unsaid
-from rs_localizer.markers.formats.files import (
+from rs_localizer.markers.formats import (
     FORMATS,
     OWN,
     SUFFIXES,
+    USUAL_FAMILY,
+    Unsaid,
     is_marker_file,
     read_any,
     write_any,

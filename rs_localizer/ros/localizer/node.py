@@ -20,12 +20,14 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
+from rs_localizer.io.topics import VEHICLE_ODOMETRY
 from rs_localizer.pipeline.compiling import compile_in_child, is_compiled
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import Input, Results, Role
+from rs_localizer.pipeline.px4 import TYPE, Jumps, vehicle_odometry
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.pipeline.rigs import frame_localizer, inputs_of
-from rs_localizer.ros.localizer import px4, transforms
+from rs_localizer.ros.localizer import transforms
 from rs_localizer.ros.localizer.health import (
     Answer,
     Condition,
@@ -245,6 +247,45 @@ _ODD = (
 )  # fmt: skip
 
 
+def check_px4(config: NodeConfig) -> None:
+    """Raise ``ValueError`` if PX4's output is asked for and px4_msgs is not installed."""
+    if config.px4_odometry == Px4Odometry.NONE:
+        return
+    try:
+        message_class(TYPE)
+    except ImportError as error:
+        raise ValueError(
+            f"px4_odometry {config.px4_odometry} needs the package px4_msgs, which cannot be "
+            f"imported ({error}): build it in your workspace, of PX4's release"
+        ) from error
+
+
+class Px4Output:
+    """Publishes frames as PX4's messages on ``~/vehicle_odometry``; needs px4_msgs.
+
+    Args:
+        node: creates the publisher, and has the clock of the stamps.
+        frames: has the settings that hold now.
+    """
+
+    def __init__(self, node: LifecycleNode, frames: FrameLocalizer) -> None:
+        self._node = node
+        self._world = frames.config.px4_odometry
+        self._jumps = Jumps(lambda: frames.config)
+        self._publisher = create_output(node, message_class(TYPE), f"~/{VEHICLE_ODOMETRY}")
+
+    def publish(self, frame: Localized) -> None:
+        """Publish a frame; jumps are counted whether anybody listens or not."""
+        resets = self._jumps.add(frame)
+        if self._publisher.get_subscription_count():
+            now_ns = self._node.get_clock().now().nanoseconds
+            fields = vehicle_odometry(frame, self._world, resets, now_ns)
+            self._publisher.publish(make_message(TYPE, **fields))
+
+    def close(self) -> None:
+        self._node.destroy_lifecycle_publisher(self._publisher)
+
+
 class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     """Localizes; see :class:`rs_localizer.ros.node.managed.ManagedNode`."""
 
@@ -255,7 +296,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         self._localizer: FrameLocalizer | None = None  # the worker's: here only to be read
         self._feed: Feed | None = None
         self._outputs: Outputs | None = None
-        self._px4: px4.Px4Output | None = None
+        self._px4: Px4Output | None = None
         self._shutter: ShutterOutput | None = None
         self._reset_service: Service | None = None
         super().__init__(NODE_NAME, NodeConfig, tell, **options)
@@ -283,7 +324,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def check(self, config: NodeConfig) -> None:
         frame_localizer(config)
         transforms.check(config)
-        px4.check(config)
+        check_px4(config)
 
     def open(self, config: NodeConfig) -> None:
         frames = frame_localizer(config, self.refusals.notice, self._broadcaster.tf)
@@ -293,7 +334,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         frames.warm_up()  # what has been set since they were compiled
         self._broadcaster.configure(config)
         if config.px4_odometry != Px4Odometry.NONE:
-            self._px4 = px4.Px4Output(self, frames)
+            self._px4 = Px4Output(self, frames)
         if config.image_rect_shutter != ShutterDepth.NONE:
             self._shutter = ShutterOutput(self, frames)
         self._outputs = Outputs(self, afterwards=lambda frame: self._send_on(frame, frames.config))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from rs_localizer.core.reasons import ImuReason
-from rs_localizer.inertial.status import Alone, InertialStatus
+from rs_localizer.inertial.watch import Alone, InertialStatus
 from rs_localizer.pipeline.imu import ImuState, Unused
 from rs_localizer.ros.localizer.health import imu_oddity, imu_values
 

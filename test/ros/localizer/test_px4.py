@@ -13,7 +13,8 @@ import pytest
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Localized, Pose
-from rs_localizer.ros.localizer.px4 import Px4Output, check
+from rs_localizer.ros.localizer.node import Px4Output
+from rs_localizer.ros.localizer.node import check_px4 as check
 from rs_localizer.ros.node.conversion import message_class
 
 STAND_IN = Path(__file__).parents[1] / "stand_in"

@@ -12,9 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.shutter import project_rolling
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagReader
 from rs_localizer.io.clouds import read_correspondences
@@ -26,17 +29,145 @@ from rs_localizer.io.remote import is_url, url_name
 from rs_localizer.io.topics import COMPRESSED_IMAGE, CORRESPONDENCES
 from rs_localizer.offline.image_sources import image_topics
 from rs_localizer.offline.replay import Topics
-from rs_localizer.offline.viewing import paths
-from rs_localizer.offline.viewing.shapes import (
-    Eye,
-    ellipsoid,
-    enlargement,
-    eye,
-    others,
-    readout_path,
-    reproject,
-)
 from rs_localizer.pipeline.frames import FrameLocalizer
+
+TIMELINE = "stamp"
+"""Of the images, as ``header.stamp`` says it."""
+
+MAP = "map"
+LANDMARKS = "map/landmarks"
+INLIERS = "map/inliers"
+PATH = "map/path"
+BODY = "map/body"
+COVARIANCE = "map/covariance"
+READOUT = "map/readout"
+CAMERA = "map/camera"
+IMAGE = "map/camera/image"
+MATCHES = "map/camera/image/inliers"
+RESIDUALS = "map/camera/image/residuals_x{}"
+OTHERS = "map/camera/image/others"
+REFUSED = "refused"
+
+ANGULAR, LINEAR = "plots/angular_velocity", "plots/linear_velocity"
+RESIDUAL, COUNTS, DEVIATION = "plots/residual", "plots/counts", "plots/deviation"
+PLOTS = {
+    ANGULAR: "angular velocity (rad/s)",
+    LINEAR: "linear velocity (m/s)",
+    RESIDUAL: "residual rms, model error (px)",
+    COUNTS: "points, inliers with rolling and global shutter",
+    DEVIATION: "standard deviation: position (mm), orientation (mrad)",
+}
+"""What is drawn over time, and its title."""
+
+
+Colours = NDArray[np.uint8]
+
+# 95 % of the chi-square distribution with three degrees of freedom.
+_WITHIN = np.sqrt(7.8147)
+# The first row is blue, the last one yellow: both are seen on gray images, by everybody.
+_FIRST, _LAST = np.array([0.0, 114.0, 255.0]), np.array([255.0, 220.0, 0.0])
+# px that a typical residual is to be drawn at most, and by which factors.
+_SEEN, _STEPS = 15.0, (1, 2, 5, 10, 20, 50, 100, 200, 500)
+_INSTANTS = np.linspace(-0.5, 0.5, 9)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ellipsoid:
+    """Where a position lies with a probability of 95 %."""
+
+    half_sizes: Array  # (3,) m, ascending
+    quaternion: Array  # (4,) x y z w, of its axes in the map
+
+
+def ellipsoid(covariance: Array) -> Ellipsoid:
+    """Of the covariance (3,3) of a position, m^2."""
+    values, axes = np.linalg.eigh(covariance)
+    if np.linalg.det(axes) < 0.0:
+        axes[:, 0] *= -1.0
+    half_sizes = _WITHIN * np.sqrt(np.maximum(values, 0.0))
+    return Ellipsoid(half_sizes, so3.quaternion(np.ascontiguousarray(axes)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reprojection:
+    """The inliers of a frame, and where its motion sees them, each at the time of its row."""
+
+    points: Array  # (k,3) m, map
+    pixels: Array  # (k,2) raw, as they were matched
+    predicted: Array  # (k,2) raw
+    colours: Colours  # (k,3) by the row: from blue, the first one, to yellow
+
+
+def reproject(frame: Localized, camera: Camera) -> Reprojection:
+    """Project the inliers through the shutter that the frame was localized with."""
+    points, pixels = columns(frame, "xyz"), columns(frame, "uv")
+    predicted, tau = project_rolling(camera, frame.estimate.at_rows, points)
+    seen = np.isfinite(tau)
+    return Reprojection(points[seen], pixels[seen], predicted[seen], row_colours(tau[seen]))
+
+
+def enlargement(frames: Sequence[Localized]) -> int:
+    """How much longer residuals are drawn so that one can see them: 1, 2, 5, 10, ..."""
+    rms = [f.estimate.residual_rms for f in frames if f.estimate.inliers.any()]
+    wanted = _SEEN / max(float(np.median(rms)), 1e-3) if rms else 1.0
+    return max(step for step in _STEPS if step <= max(wanted, 1.0))
+
+
+def row_colours(tau: Array) -> Colours:
+    """Colours (k,3) of row times (k,), from -0.5 to 0.5."""
+    share = np.clip(np.asarray(tau) + 0.5, 0.0, 1.0)[:, None]
+    colours: Colours = np.round((1.0 - share) * _FIRST + share * _LAST).astype(np.uint8)
+    return colours
+
+
+def readout_path(frame: Localized) -> Array:
+    """Camera centres (9,3) in the map, from the first row to the last."""
+    rotations, translations = frame.estimate.at_rows(_INSTANTS)
+    centres: Array = -np.einsum("nji,nj->ni", rotations, translations)
+    return centres
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Eye:
+    """From where a viewer looks at the scene."""
+
+    position: Array  # (3,) m, map
+    target: Array  # (3,) m
+    up: Array  # (3,)
+    depth: float  # m from the camera to its points, by which things are drawn large or small
+
+
+def eye(frames: Sequence[Localized]) -> Eye:
+    """Behind the camera of the middle frame and above it, looking at what it sees.
+
+    Args:
+        frames: one or more.
+    """
+    frame = next((it for it in frames[len(frames) // 2 :] if len(it.inliers)), frames[0])
+    rotation, translation = frame.estimate.at(0.0)
+    centre = -rotation.T @ translation
+    right, down, ahead = rotation
+    points = columns(frame, "xyz") if len(frame.inliers) else centre + ahead[None]
+    target = np.median(points, axis=0)
+    depth = float(np.linalg.norm(target - centre))
+    position = centre + depth * (0.6 * right - 0.5 * down - 0.7 * ahead)
+    return Eye(position, 0.5 * (target + centre), -down, depth)
+
+
+def columns(frame: Localized, names: str) -> Array:
+    """Fields (k, len(names)) of the inliers."""
+    return np.stack([frame.inliers[name].astype(np.float64) for name in names], axis=1)
+
+
+def others(pixels: Array, frame: Localized | None) -> Array:
+    """The pixels (m,2) of an image that are no inliers of its frame."""
+    if frame is None or len(frame.inliers) == 0:
+        return pixels
+    kept = {tuple(pixel) for pixel in columns(frame, "uv").tolist()}
+    out = [tuple(pixel) not in kept for pixel in pixels.tolist()]
+    rest: Array = pixels[np.array(out, np.bool_)]
+    return rest
+
 
 _MEDIA = {b"\xff\xd8": "image/jpeg", b"\x89P": "image/png"}
 
@@ -109,17 +240,17 @@ def series(frames: Sequence[Localized]) -> Series:
     spread = [np.sqrt(np.diag(frame.pose.covariance)) for frame in frames]
     twists = [frame.twist for frame in frames]
     return {
-        paths.ANGULAR: (_COMPONENTS, _rows([t.angular if t else _UNKNOWN for t in twists])),
-        paths.LINEAR: (_COMPONENTS, _rows([t.linear if t else _UNKNOWN for t in twists])),
-        paths.RESIDUAL: (
+        ANGULAR: (_COMPONENTS, _rows([t.angular if t else _UNKNOWN for t in twists])),
+        LINEAR: (_COMPONENTS, _rows([t.linear if t else _UNKNOWN for t in twists])),
+        RESIDUAL: (
             ["residual of the inliers", "model error"],
             _rows([[_rms(frame), frame.estimate.model_error] for frame in frames]),
         ),
-        paths.COUNTS: (
+        COUNTS: (
             ["points", "inliers, rolling shutter", "inliers, global shutter"],
             _rows([[len(e.inliers), e.inliers.sum(), e.global_shutter_inliers] for e in found]),
         ),
-        paths.DEVIATION: (
+        DEVIATION: (
             ["position", "orientation"],
             1e3 * _rows([[np.linalg.norm(s[:3]), np.linalg.norm(s[3:])] for s in spread]),
         ),
@@ -145,21 +276,21 @@ def blueprint(with_images: bool, eye: Eye) -> Any:
     import rerun.blueprint as rrb
 
     scene = rrb.Spatial3DView(
-        origin=paths.MAP,
+        origin=MAP,
         name="map: path, covariance (95 %), landmarks, inliers",
         eye_controls=rrb.EyeControls3D(
             position=eye.position, look_target=eye.target, eye_up=eye.up
         ),
     )
     image = rrb.Spatial2DView(
-        origin=paths.IMAGE,
+        origin=IMAGE,
         name=f"{'image' if with_images else 'pixels'}: inliers by row (blue first), residuals "
         "enlarged, the others red",
     )
-    plots = [rrb.TimeSeriesView(origin=path, name=name) for path, name in paths.PLOTS.items()]
+    plots = [rrb.TimeSeriesView(origin=path, name=name) for path, name in PLOTS.items()]
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(scene, image), rrb.Vertical(*plots), column_shares=[3, 2]),
-        rrb.TimePanel(timeline=paths.TIMELINE, state="collapsed"),
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
@@ -261,19 +392,19 @@ class _Scene:
         self._stream = stream
         self._camera = camera
         self._sizes = sizes
-        self._residuals = paths.RESIDUALS.format(sizes.longer)
+        self._residuals = RESIDUALS.format(sizes.longer)
         self._frames = {stamp: frames[stamp] for stamp in sorted(frames)}
 
     def log(self, items: Sequence[Picture | Cloud], landmarks: Array) -> None:
         self._log_still(items, landmarks)
         for item in items:
-            self._stream.set_time(paths.TIMELINE, timestamp=_time(item.stamp_ns))
+            self._stream.set_time(TIMELINE, timestamp=_time(item.stamp_ns))
             if isinstance(item, Picture):
                 self._log_picture(item)
             else:
                 self._log_pixels(item)
         for stamp, frame in self._frames.items():  # those of a smoothed motion, too
-            self._stream.set_time(paths.TIMELINE, timestamp=_time(stamp))
+            self._stream.set_time(TIMELINE, timestamp=_time(stamp))
             self._log_pose(frame)
         self._log_series()
 
@@ -284,13 +415,11 @@ class _Scene:
         points = np.unique(np.concatenate([landmarks, *clouds]), axis=0)
         points = points[:: 1 + len(points) // _MOST_LANDMARKS]
         way = [frame.pose.position for frame in self._frames.values()]
-        self._stream.log(
-            paths.LANDMARKS, rr.Points3D(points, colors=_GRAY, radii=-1.5), static=True
-        )
-        self._stream.log(paths.PATH, rr.LineStrips3D([way], colors=_BLUE, radii=-1.0), static=True)
+        self._stream.log(LANDMARKS, rr.Points3D(points, colors=_GRAY, radii=-1.5), static=True)
+        self._stream.log(PATH, rr.LineStrips3D([way], colors=_BLUE, radii=-1.0), static=True)
         camera = self._camera
         self._stream.log(
-            paths.IMAGE,
+            IMAGE,
             rr.Pinhole(
                 image_from_camera=camera.K,
                 resolution=camera.size,
@@ -307,7 +436,7 @@ class _Scene:
             image: Any = rr.EncodedImage(contents=picture.data, media_type=picture.media_type)
         else:
             image = rr.Image(picture.data, color_model="L")
-        self._stream.log(paths.IMAGE, image)
+        self._stream.log(IMAGE, image)
 
     def _log_pixels(self, cloud: Cloud) -> None:
         """The matches of an image by what became of them."""
@@ -315,37 +444,37 @@ class _Scene:
 
         frame = self._frames.get(cloud.stamp_ns)
         rest = others(cloud.pixels, frame)
-        self._stream.log(paths.OTHERS, rr.Points2D(_centred(rest), colors=_RED, radii=-2.0))
+        self._stream.log(OTHERS, rr.Points2D(_centred(rest), colors=_RED, radii=-2.0))
         if frame is None:
-            for path in (paths.MATCHES, self._residuals, paths.INLIERS):
+            for path in (MATCHES, self._residuals, INLIERS):
                 self._stream.log(path, rr.Clear(recursive=False))
-            self._stream.log(paths.REFUSED, rr.TextLog("no pose", level=rr.TextLogLevel.WARN))
+            self._stream.log(REFUSED, rr.TextLog("no pose", level=rr.TextLogLevel.WARN))
             return
         found = reproject(frame, self._camera)
         ends = found.pixels + self._sizes.longer * (found.predicted - found.pixels)
         strips = np.stack([_centred(found.pixels), _centred(ends)], axis=1)
         self._stream.log(
-            paths.MATCHES, rr.Points2D(_centred(found.predicted), colors=found.colours, radii=-3.0)
+            MATCHES, rr.Points2D(_centred(found.predicted), colors=found.colours, radii=-3.0)
         )
         self._stream.log(self._residuals, rr.LineStrips2D(list(strips), colors=_ORANGE))
-        self._stream.log(paths.INLIERS, rr.Points3D(found.points, colors=found.colours, radii=-3.0))
+        self._stream.log(INLIERS, rr.Points3D(found.points, colors=found.colours, radii=-3.0))
 
     def _log_pose(self, frame: Localized) -> None:
         import rerun as rr
 
         rotation, translation = frame.estimate.at(0.0)
         self._stream.log(
-            paths.CAMERA,
+            CAMERA,
             rr.Transform3D(translation=-rotation.T @ translation, mat3x3=rotation.T),
         )
         self._stream.log(
-            paths.BODY,
+            BODY,
             rr.Transform3D(translation=frame.pose.position, mat3x3=frame.pose.rotation),
             rr.TransformAxes3D(_AXES * self._sizes.depth),
         )
         shape = ellipsoid(frame.pose.covariance[:3, :3])
         self._stream.log(
-            paths.COVARIANCE,
+            COVARIANCE,
             rr.Ellipsoids3D(
                 centers=[frame.pose.position],
                 half_sizes=[shape.half_sizes],
@@ -353,7 +482,7 @@ class _Scene:
                 colors=_ORANGE,
             ),
         )
-        self._stream.log(paths.READOUT, rr.LineStrips3D([readout_path(frame)], colors=_ORANGE))
+        self._stream.log(READOUT, rr.LineStrips3D([readout_path(frame)], colors=_ORANGE))
 
     def _log_series(self) -> None:
         import rerun as rr
@@ -363,7 +492,7 @@ class _Scene:
             self._stream.log(path, rr.SeriesLines(names=names), static=True)
             rr.send_columns(
                 path,
-                indexes=[rr.TimeColumn(paths.TIMELINE, timestamp=stamps)],
+                indexes=[rr.TimeColumn(TIMELINE, timestamp=stamps)],
                 columns=rr.Scalars.columns(scalars=values),
                 recording=self._stream,
             )

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 import rs_localizer as rsl
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.outputs import Localized, Pose
-from rs_localizer.offline.viewing.shapes import ellipsoid, readout_path, reproject
+from rs_localizer.offline.viewing import ellipsoid, readout_path, reproject
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = rsl.Camera(width=640, height=480, K=K, readout_time=0.03)
