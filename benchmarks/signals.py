@@ -113,10 +113,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.signals", description=__doc__)
     parser.add_argument("--count", type=int, default=1000, metavar="N")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--command", choices=COMMANDS, metavar="NAME", help="this one only")
     options = parser.parse_args()
     codes: Counter[tuple[str, int]] = Counter()
     faults = 0
-    for ended in campaign(options.count, options.seed):
+    chosen = tuple(COMMANDS) if options.command is None else (options.command,)
+    for ended in campaign(options.count, options.seed, chosen):
         codes[ended.command, ended.code] += 1
         if ended.fault:
             faults += 1

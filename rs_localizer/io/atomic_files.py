@@ -5,9 +5,9 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 import shutil
 import signal
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -106,9 +106,10 @@ def write_errors(path: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def _workplace(parent: Path) -> Iterator[Path]:
     """Within ``with``, a directory beside the results."""
-    path = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=parent))
-    _unfinished.add(path)
+    path = parent / f"{_UNFINISHED}{secrets.token_hex(8)}"
+    _unfinished.add(path)  # before it is there: a signal may come while it is made
     try:
+        path.mkdir(mode=0o700)
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)

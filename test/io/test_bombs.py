@@ -94,6 +94,13 @@ def test_counts_of_a_model_that_lie(tmp_path, features):
         read_images(tmp_path)
 
 
+@pytest.mark.parametrize("point", ["1e999", "-nan", "9" * 40, "0.5"])
+def test_a_feature_of_a_point_that_is_no_number_of_one(tmp_path, point):
+    (tmp_path / "images.txt").write_text(f"1 1 0 0 0 0 0 1 1 a.jpg\n3 4 -1 5 6 {point}\n")
+    with pytest.raises(MapError, match="expected ID QW"):
+        read_images(tmp_path)
+
+
 def test_a_query_that_is_no_camera(tmp_path):
     (tmp_path / "queries.txt").write_text("image.jpg what is this\n")
     with pytest.raises(HlocError, match="line 1: expected NAME MODEL"):

@@ -215,6 +215,9 @@ def _read_text_images(path: Path) -> dict[str, ModelImage]:
             if len(words) != 10:
                 raise ValueError
             triples = np.array(features.split(), np.float64).reshape(-1, 3)
+            # Above 2**53 neighbouring numbers are the same float; NaN is below nothing.
+            if not np.all(np.abs(triples[:, 2]) <= 2.0**53) or np.any(triples[:, 2] % 1.0):
+                raise ValueError
             table = np.empty(len(triples), _FEATURE)
             table["x"], table["y"], table["point"] = triples.T
             pose = [float(word) for word in words[1:8]]
