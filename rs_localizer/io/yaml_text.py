@@ -25,15 +25,25 @@ class YamlError(ValueError):
 class _Loader(yaml.SafeLoader):
     """PyYAML's, with limits on what takes much more time or memory than its text does."""
 
-    merged = 0
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self.sizes: dict[int, int] = {}  # of mappings, by identity
 
     def flatten_mapping(self, node: Any) -> None:
-        """Put what ``<<`` names into a mapping: copies, of copies where these merge, too."""
+        """Put what ``<<`` names into a mapping: copies, of copies where these merge, too.
+
+        PyYAML since 6.0.4 leaves out what is named twice. Other readers of the same file do not, so
+        every copy counts.
+        """
+        merges = [value for key, value in node.value if key.tag == "tag:yaml.org,2002:merge"]
+        size = len(node.value) - len(merges)
         super().flatten_mapping(node)
-        if node.tag == "tag:yaml.org,2002:map":
-            self.merged += len(node.value)
-            if self.merged > _MOST_VALUES:
-                raise YamlError(f"it holds more than {_MOST_VALUES} values")
+        for value in merges:
+            named = value.value if isinstance(value, yaml.SequenceNode) else [value]
+            size += sum(self.sizes[id(mapping)] for mapping in named)
+        self.sizes[id(node)] = max(size, self.sizes.get(id(node), 0))
+        if size > _MOST_VALUES:
+            raise YamlError(f"it holds more than {_MOST_VALUES} values")
 
     def construct_scalar(self, node: Any) -> Any:
         is_number = node.tag.rpartition(":")[2] in ("int", "float", "timestamp")
