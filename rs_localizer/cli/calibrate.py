@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, refuse_existing
 from rs_localizer.cli.batch import (
     Plan,
     add_batch_arguments,
@@ -195,6 +195,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.yaml",
         help="parameters for node and replay --params; of many recordings, a directory",
     )
+    add_overwrite(parser)
     parser.add_argument(
         "--plots",
         type=Path,
@@ -240,6 +241,8 @@ def run(args: argparse.Namespace) -> Figures | None:
 
 def calibrate_one(args: argparse.Namespace) -> Calibration:
     """Calibrate with one recording, and say what was found."""
+    if args.out is not None:
+        refuse_existing(args)
     config = _config(args)
     source = _read(args, config)
     intrinsics, camera = args.intrinsics or source.camera is None, source.camera
@@ -486,7 +489,10 @@ def _calibrate_batch(args: argparse.Namespace) -> None:
     given = [name for name in options if getattr(args, name) not in (None, False)]
     files = inputs(args.map, args.calibration, args.params)
     kind = Kind("calibrate", _calibrate_of_many, " ".join(["calibrate", *given]), _calibrate_warm)
-    run_batch(argparse.Namespace(**vars(args) | {"plots": plots}), Plan(kind, lambda _: files))
+    run_batch(
+        argparse.Namespace(**vars(args) | {"plots": plots}),
+        Plan(kind, lambda _: files, args.overwrite),
+    )
 
 
 def _calibrate_warm(_: argparse.Namespace) -> None:
