@@ -13,11 +13,9 @@ from setuptools import Distribution, find_packages, setup
 package_name = "rs_localizer"
 
 requirements = [
-    "matplotlib",
     "numba",
     "numpy>=1.26",
     "opencv-python-headless>=4.6",
-    "Pillow>=9.1",
     "PyYAML",
     "rosbags",
     "scipy",
@@ -78,7 +76,8 @@ setup(
         "evo": ["evo"],
         "fleet": ["dask", "distributed"],
         "hloc": ["h5py"],
-        "mapping": ["pycolmap"],
+        "mapping": ["pycolmap", "matplotlib"],
+        "plots": ["matplotlib", "Pillow>=9.1"],
         "table": ["fsspec", "pyarrow"],
         # There is no wheel for 3.13, and a build needs Rust.
         "video": ["telemetry-parser; python_version < '3.13'"],

@@ -29,7 +29,6 @@ from rs_localizer.cli.marker_map import read_checked_map
 from rs_localizer.config import FeatureConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.evaluation.map_pictures import save_pictures
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import is_bag, open_bag
 from rs_localizer.io.calibration import write_calibration
@@ -321,6 +320,8 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
     if looked.camera is None:
         write_calibration(out / CAMERA, replace(built.camera, readout_time=0.0))
+    from rs_localizer.evaluation.map_pictures import save_pictures
+
     save_pictures(built, out)
     (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")
 
