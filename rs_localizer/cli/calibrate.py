@@ -252,6 +252,7 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
     tell_telemetry(
         argparse.Namespace(images=args.recording, no_telemetry=args.no_telemetry),
         verdict.readout_time(found),
+        lens=False,
     )
     if intrinsics:
         _tell_lens(found)

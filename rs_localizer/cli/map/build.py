@@ -276,7 +276,7 @@ def run(args: argparse.Namespace) -> None:
     if not args.images.exists():
         raise ValueError(f"{args.images} does not exist")
     markers = None if args.markers is None else read_checked_map(args.markers)
-    tell_telemetry(args)
+    tell_telemetry(args, lens=False)
     shutter, imu = shutter_of(args), imu_of(args)
     with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
