@@ -74,7 +74,7 @@ setup(
         "completion": ["argcomplete"],
         "docs": ["sphinx", "myst-parser", "sphinxcontrib-mermaid"],
         "evo": ["evo"],
-        "fleet": ["dask", "distributed"],
+        "fleet": ["dask", "distributed", "matplotlib"],
         "hloc": ["h5py"],
         "mapping": ["pycolmap", "matplotlib"],
         "plots": ["matplotlib", "Pillow>=9.1"],
