@@ -44,7 +44,6 @@ if WORKING:
     from rs_localizer.config import DetectorConfig, NodeConfig
     from rs_localizer.core.arrays import Array
     from rs_localizer.core.camera import Camera
-    from rs_localizer.evaluation.calibration_plots import save_plots
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
     from rs_localizer.io.calibration import read_calibration, write_calibration
@@ -258,12 +257,15 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
     tell_telemetry(
         argparse.Namespace(images=args.recording, no_telemetry=args.no_telemetry),
         verdict.readout_time(found),
+        lens=False,
     )
     if intrinsics:
         _tell_lens(found)
     for line in imu_lines(found, source.imu, config):
         print(line)
     if args.plots is not None:
+        from rs_localizer.evaluation.calibration_plots import save_plots
+
         save_plots(camera, found, args.plots)
     refusal = verdict.refusal(found)
     if args.out is not None and (args.force or not refusal):

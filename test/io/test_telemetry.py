@@ -9,6 +9,7 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -20,6 +21,7 @@ pytest.importorskip("telemetry_parser", reason="needs telemetry-parser (rs_local
 from rs_localizer.cli import image_input
 from rs_localizer.cli.main import main
 from rs_localizer.cli.map import build
+from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.telemetry import (
@@ -69,6 +71,45 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         read_telemetry(path)
     path.write_bytes(bytes(2**20))
     assert not has_telemetry(path)
+
+
+PROFILE = {  # as telemetry-parser makes them of DJI's files; there they name no model
+    "calibrated_by": "DJI",
+    "calib_dimension": {"w": 160, "h": 120},
+    "fisheye_params": {
+        "camera_matrix": [[70.0, 0.0, 80.0], [0.0, 70.0, 60.0], [0.0, 0.0, 1.0]],
+        "distortion_coeffs": [0.1, -0.02, 0.01, 0.001],
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("model", "known"), [({}, True), ({"distortion_model": "insta360"}, False)]
+)
+def test_lens_profiles(log: Path, monkeypatch: Any, model: dict[str, str], known: bool) -> None:
+    import telemetry_parser
+
+    real = telemetry_parser.Parser
+    tags = [{"Lens": {"Data": PROFILE | model}}]
+    parser = SimpleNamespace(
+        camera="DJI", model="Action 4", normalized_imu=real(str(log)).normalized_imu
+    )
+    parser.telemetry = lambda readable: tags
+    monkeypatch.setattr(telemetry_parser, "Parser", lambda path: parser)
+    read_telemetry.cache_clear()
+    found = read_telemetry(log)
+    read_telemetry.cache_clear()
+    assert found is not None
+    name = model.get("distortion_model", "opencv_fisheye")
+    assert found.lens == f"lens profile by DJI ({name}, 70 px)"
+    assert (found.profile is not None) == known
+    if found.profile is not None:
+        points = np.array([[[0.5, -0.3, 1.0], [-2.0, 1.0, 1.5]]])
+        K, D = (
+            np.array(PROFILE["fisheye_params"][k]) for k in ("camera_matrix", "distortion_coeffs")
+        )
+        pixels, _ = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, D)
+        np.testing.assert_allclose(found.profile.project(points[0]), pixels[0], atol=1e-9)
 
 
 @pytest.fixture
@@ -149,6 +190,24 @@ def test_what_is_given_goes_before(
     detect(video, "--rate", "50")  # slowed down: nobody knows when the readings were
     with open_bag(out) as bag:
         assert "/imu" not in bag.topics
+
+
+def test_a_lens_profile_takes_the_place_of_a_calibration(
+    video: Path, telemetry: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lens = Camera(160, 120, [[140.0, 0, 80], [0, 140, 60], [0, 0, 1]], np.zeros(4), "equidistant")
+    telemetry(lens="lens profile by DJI (opencv_fisheye, 140 px)", profile=lens)
+    out = video.parent / "seen"
+    words = ["detect", str(video), "--features", "orb", "--out", str(out)]
+    assert main(words) == 0
+    assert "lens profile by DJI (opencv_fisheye, 140 px), used;" in capsys.readouterr().out
+    with open_bag(out) as bag:
+        info = next(message for _, _, message in bag.messages(["/camera_info"]))
+    assert (info.distortion_model, info.k[0]) == ("equidistant", 140.0)
+    detect(video)
+    assert "140 px), not used;" in capsys.readouterr().out
+    with open_bag(out) as bag:
+        assert next(m for _, _, m in bag.messages(["/camera_info"])).k[0] == 150.0
 
 
 def test_a_stabilized_video_is_named(
