@@ -60,7 +60,7 @@ def test_the_frame_is_in_metres_and_upright(felt, refined, imu):
     place = place_by_imu(NOTHING, refined, GivenImu(imu, asked=True))
     assert place.placement.scaled
     assert place.placement.levelled
-    assert "the IMU, to 0." in place.placement.told
+    assert "the IMU, to 0." in place.placement.basis
     similarity = place.placement.similarity
     assert similarity.scale == pytest.approx(felt.scale, rel=5e-3)
     assert angle(similarity.rotation @ felt.down, np.array([0.0, 0.0, -1.0])) < 0.1

@@ -209,9 +209,7 @@ class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Kept]):
         config = parameters.declare(self, kind)
         self._bond_period: float = config.bond_heartbeat_period
         if self._bond_period and installed(_BOND) is None:
-            raise ValueError(
-                "bond_heartbeat_period needs the package bond: ros-$ROS_DISTRO-bond"
-            )
+            raise ValueError("bond_heartbeat_period needs the package bond: ros-$ROS_DISTRO-bond")
         if self.checked_at_start:
             self.check(config)
         for text in parameters.unknown_names(self, kind):
