@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,7 +31,6 @@ from rs_localizer.io.telemetry import (
 )
 from rs_localizer.settings import load_params_file
 
-SAMPLES = os.environ.get("RS_LOCALIZER_SAMPLES", "")
 RATE = 200.0
 
 
@@ -234,51 +232,3 @@ def test_maps_take_the_gyroscope_of_a_video(video: Path, telemetry: Any) -> None
     assert imu.recording.stamps_ns[0] == 10**9
     assert build.shutter_of(given).readout_time == pytest.approx(0.0205)
     assert build.imu_of(parser.parse_args([str(video), "--out", "map", "--no-telemetry"])) is None
-
-
-@pytest.mark.skipif(not SAMPLES, reason="RS_LOCALIZER_SAMPLES: karma.mp4 and max-heromode.mp4 of "
-                    "gopro/gpmf-parser, which are not ours to give away")  # fmt: skip
-def test_real_videos() -> None:
-    found = read_telemetry(Path(SAMPLES) / "karma.mp4")
-    assert found is not None
-    assert (found.camera, found.stabilizer) == ("GoPro HERO5 Black", "")
-    assert found.rate == pytest.approx(397.5, abs=0.5)
-    np.testing.assert_allclose(np.median(found.forces, axis=0), [0, -9.8, 0], atol=0.25)
-    times, turns = image_turns(Path(SAMPLES) / "karma.mp4")
-    smooth = [np.convolve(column, np.ones(13) / 13, "same") for column in found.rates.T]
-    felt = np.stack([np.interp(times, found.times, column) for column in smooth], axis=1)
-    # Its gimbal leaves a turn about the vertical.
-    assert np.corrcoef(turns[:, 1], felt[:, 1])[0, 1] > 0.95
-    other = read_telemetry(Path(SAMPLES) / "max-heromode.mp4")
-    assert other is not None
-    assert other.readout_time == pytest.approx(0.0206, abs=1e-4)
-    assert other.stabilizer == "HS HLevel"
-
-
-def image_turns(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) between images, and how a camera that only turns would do it there (n,3)."""
-    film, last, times, turns = cv2.VideoCapture(str(path)), None, [], []
-    while True:
-        more, image = film.read()
-        if not more:
-            return np.array(times), np.array(turns)
-        now = 1e-3 * film.get(cv2.CAP_PROP_POS_MSEC)
-        gray = cv2.cvtColor(cv2.resize(image, (480, 270)), cv2.COLOR_BGR2GRAY)
-        if last is not None:
-            points = cv2.goodFeaturesToTrack(last[1], 150, 0.01, 12)
-            moved, kept, _ = cv2.calcOpticalFlowPyrLK(last[1], gray, points, None)
-            before, after = points[kept == 1], moved[kept == 1]
-            focal = 0.65 * 480  # about that of a HERO5
-            x, y = ((before - (240.0, 135.0)) / focal).T
-            rows = np.empty((2 * len(x), 3))
-            rows[0::2] = np.c_[x * y, -(1 + x * x), y]
-            rows[1::2] = np.c_[1 + y * y, -x * y, -x]
-            flow = ((after - before) / focal).ravel()
-            fit = np.ones(len(flow), bool)
-            for _ in range(4):
-                turn = np.linalg.lstsq(rows[fit], flow[fit], rcond=None)[0]
-                errors = np.abs(rows @ turn - flow)
-                fit = errors < 3 * np.median(errors) + 1e-6
-            times.append(0.5 * (now + last[0]))
-            turns.append(turn / (now - last[0]))
-        last = now, gray
