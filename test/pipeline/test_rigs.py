@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of a rig from a recording to poses, against the true motion."""
 
+import re
 from collections import Counter
 
 import numpy as np
@@ -14,11 +15,11 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import prepare, replay
 from rs_localizer.settings import build, load_params_file
 
-from .opposed_pair import record
+from .opposed_pair import PARTS, hand, record, rich
 
 
-def localize(path, **settings):
-    """Frames, refusals and notices of a recording."""
+def localize(path, seen=None, **settings):
+    """Frames, refusals and notices of a recording; ``seen``: takes what is known of the cameras."""
     values = load_params_file(path / "parameters.yaml") | {"min_inliers": 20} | settings
     notices: list[tuple[str, str]] = []
     with open_bag(path) as bag:
@@ -26,6 +27,8 @@ def localize(path, **settings):
             bag, build(values), notice=lambda name, text: notices.append((name, text))
         )
         answers = [answer.result for answer in replay(bag, topics, localizer)]
+    if seen is not None:
+        seen.update(localizer.watch.values)
     frames = [answer for answer in answers if answer]
     return frames, [answer for answer in answers if not answer], notices
 
@@ -97,6 +100,63 @@ def test_a_camera_that_stops_and_starts_again_is_named_and_poses_go_on(tmp_path)
     assert np.median(np.linalg.norm(off[:, :3], axis=1)) < 0.02
     found = np.array([errors(frame, motion) for frame in frames])
     assert np.mean(np.abs(found[:, 0]) < 3.0 * found[:, 1]) > 0.95
+
+
+SIDEWAYS = np.array([0.3, 0.8, -0.5]) / np.linalg.norm([0.3, 0.8, -0.5])
+
+
+@pytest.mark.parametrize(("degrees", "centimetres"), [(1.0, 0.0), (0.0, 1.0)])
+def test_a_wrong_extrinsic_is_named(tmp_path, degrees, centimetres):
+    motion, (rotation, translation) = hand(5.0, 3.0), PARTS.camera_from_rig["right"]
+    mounted = (
+        so3.exp(np.radians(degrees) * SIDEWAYS) @ rotation,
+        translation + 0.01 * centimetres * SIDEWAYS,
+    )
+    true = PARTS._replace(camera_from_rig=PARTS.camera_from_rig | {"right": mounted})
+    record(tmp_path / "bag", motion=motion, points=rich(motion), true=true)
+    notices = localize(tmp_path / "bag")[2]
+    texts = [text for name, text in notices if name == "extrinsics"]
+    assert len(texts) == 1
+    assert texts[0].startswith("extrinsics of right relative to left differ by ")
+    turn, turn_deviation, moved, moved_deviation = numbers(texts[0])
+    assert turn == pytest.approx(degrees, abs=3.0 * turn_deviation)
+    assert moved == pytest.approx(10.0 * centimetres, abs=3.0 * moved_deviation)
+
+
+def numbers(text):
+    return [float(number) for number in re.findall(r"-?\d+\.\d+", text)]
+
+
+@pytest.mark.parametrize("jump", [0.0, 0.02, -5.0])
+def test_clocks_are_estimated_and_followed(tmp_path, jump):
+    """4 ms that nobody has told, and a clock that jumps half-way: poses go on."""
+    motion = hand(5.0, 4.0)
+    half_ns = motion.intervals_ns[0][0] + 2_000_000_000
+
+    def stamp(image):
+        jumped = round(1e9 * jump) if image.frame.stamp_ns > half_ns else 0
+        return image.stamp_ns + (4_000_000 + jumped if image.name == "right" else 0)
+
+    record(tmp_path / "bag", motion=motion, points=rich(motion), stamp=stamp)
+    known: dict[str, str] = {}
+    frames, refused, notices = localize(
+        tmp_path / "bag", known, **{"rig.estimate_time_offsets": True}
+    )
+    assert len(refused) <= 6
+    assert len(frames) >= 112
+    offset, deviation = numbers(known["Clock offset of right (ms)"])
+    assert deviation < 0.3
+    assert offset == pytest.approx(-4.0 - 1e3 * jump, abs=3.0 * deviation)
+    said = [text for name, text in notices if name == "clock"]
+    assert len(said) == (jump != 0.0)
+    assert all("right" in text for text in said)
+    last = [frame for frame in frames if len(frame.cameras) == 2][-30:]
+    assert last[0].stamp_ns > half_ns
+    off = np.array([errors(frame, motion)[0][:3] for frame in last])
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.003
+    if jump == 0.0:  # what is not asked for is said, and changes nothing
+        notices = localize(tmp_path / "bag")[2]
+        assert Counter(name for name, _ in notices)["clock"] == 1
 
 
 def prepare_named(path, cameras):
