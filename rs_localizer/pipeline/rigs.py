@@ -317,7 +317,7 @@ class RigLocalizer(FrameLocalizer):
             images[0].camera
         )  # what is published has stamps of that clock
         stamp_ns = time_ns - own_ns if config.pose_time == PoseTime.MID_FRAME else cloud.stamp_ns
-        tau = 1e-9 * (stamp_ns + own_ns - time_ns) / result.span
+        tau = (stamp_ns + own_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
         moving = find_solver(config.solver).rolling_shutter
         table = _table(config.cameras, images)
         return Localized(

@@ -4,6 +4,7 @@
 
 import re
 from collections import Counter
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ import pytest
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.io.bags import BagError, open_bag
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import prepare, replay
+from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import build, load_params_file
 
 from .opposed_pair import PARTS, hand, record, rich
@@ -157,6 +160,37 @@ def test_clocks_are_estimated_and_followed(tmp_path, jump):
     if jump == 0.0:  # what is not asked for is said, and changes nothing
         notices = localize(tmp_path / "bag")[2]
         assert Counter(name for name, _ in notices)["clock"] == 1
+
+
+def test_one_camera_gives_the_same_bytes_by_name(tmp_path):
+    """As a rig of one, and without ``cameras``: poses, twists, covariances and inliers."""
+    path = tmp_path / "bag"
+    record(path, 0.5, names=("left",), max_orientation_deviation=1.0)
+    named, refused, _ = localize(path)
+    values = {"readout_time": 0.03, "min_inliers": 20, "max_orientation_deviation": 1.0}
+    alone = FrameLocalizer(build(values | {"base_frame": "rig"}))
+    plain = []
+    with open_bag(path) as bag:
+        settings = build(load_params_file(path / "parameters.yaml"))
+        alone.transforms = prepare(bag, settings)[1].transforms
+        for topic, _, message in bag.messages(("/left/camera_info", "/left/correspondences")):
+            if topic == "/left/camera_info":
+                alone.calibrate(read_camera_info(message))
+            else:
+                plain.append(alone.localize(message))
+    assert len(plain) == len(named) + len(refused) >= 14
+    plain = [frame for frame in plain if frame]
+    assert len(plain) == len(named) > 0
+    for one, other in zip(plain, named, strict=True):
+        assert one.stamp_ns == other.stamp_ns
+        for value in (
+            "pose.position", "pose.rotation", "pose.covariance", "twist.linear", "twist.angular",
+            "twist.covariance",
+        ):  # fmt: skip
+            a, b = (attrgetter(value)(it) for it in (one, other))
+            assert a.tobytes() == b.tobytes(), value
+        for field in one.inliers.dtype.names:
+            np.testing.assert_array_equal(one.inliers[field], other.inliers[field])
 
 
 def prepare_named(path, cameras):
