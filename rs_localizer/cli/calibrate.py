@@ -13,11 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import WORKING, UsageError
 from rs_localizer.cli.batch import (
     Plan,
     add_batch_arguments,
@@ -38,50 +34,56 @@ from rs_localizer.cli.image_input import (
 )
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
-from rs_localizer.config import DetectorConfig, NodeConfig
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, DistortionModel
-from rs_localizer.evaluation.calibration_plots import save_plots
-from rs_localizer.io.atomic_files import atomic_files
-from rs_localizer.io.bags import BagReader, is_bag, open_bag
-from rs_localizer.io.calibration import kalibr_fields, read_calibration, write_calibration
-from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.images import Image
-from rs_localizer.io.maps.files import read_map_file
-from rs_localizer.io.rigs import (
-    RigParts,
-    node_parameters,
-    write_camchain,
-    write_static_transforms,
-)
 from rs_localizer.io.topics import IMU
-from rs_localizer.markers.boards import BoardSizes
-from rs_localizer.markers.map_files import write_marker_map
-from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.offline.fleet.task import Figures, Kind
-from rs_localizer.offline.image_sources import (
-    Carried,
-    Shot,
-)
-from rs_localizer.offline.recordings import (
-    camera_topics,
-    optical_frame,
-    read_imu_recording,
-    read_recording,
-    transform_between,
-)
-from rs_localizer.offline.replay import find_topics, has_frames
-from rs_localizer.pipeline.images import FrameDetector
 from rs_localizer.process.arguments import number
-from rs_localizer.readout import shared_row
-from rs_localizer.settings import write_parameters
-from rs_localizer.trajectory import verdict
-from rs_localizer.trajectory.calibration import Calibration, calibrate
-from rs_localizer.trajectory.first_lens import first_lens
-from rs_localizer.trajectory.imu import ImuRecording, MountFound
-from rs_localizer.trajectory.lens import LensErrors
-from rs_localizer.trajectory.observe import Observed, in_order
-from rs_localizer.trajectory.rig import Mounted, Recording, calibrate_rig
+
+if WORKING:
+    import numpy as np
+    from scipy.spatial.transform import Rotation
+    from tqdm import tqdm
+
+    from rs_localizer.config import DetectorConfig, NodeConfig
+    from rs_localizer.core.arrays import Array
+    from rs_localizer.core.camera import Camera, DistortionModel
+    from rs_localizer.evaluation.calibration_plots import save_plots
+    from rs_localizer.io.atomic_files import atomic_files
+    from rs_localizer.io.bags import BagReader, is_bag, open_bag
+    from rs_localizer.io.calibration import kalibr_fields, read_calibration, write_calibration
+    from rs_localizer.io.camera_info import read_camera_info
+    from rs_localizer.io.images import Image
+    from rs_localizer.io.maps.files import read_map_file
+    from rs_localizer.io.rigs import (
+        RigParts,
+        node_parameters,
+        write_camchain,
+        write_static_transforms,
+    )
+    from rs_localizer.markers.boards import BoardSizes
+    from rs_localizer.markers.map_files import write_marker_map
+    from rs_localizer.markers.maps import MarkerMap
+    from rs_localizer.offline.fleet.task import Figures, Kind
+    from rs_localizer.offline.image_sources import (
+        Carried,
+        Shot,
+    )
+    from rs_localizer.offline.recordings import (
+        camera_topics,
+        optical_frame,
+        read_imu_recording,
+        read_recording,
+        transform_between,
+    )
+    from rs_localizer.offline.replay import find_topics, has_frames
+    from rs_localizer.pipeline.images import FrameDetector
+    from rs_localizer.readout import shared_row
+    from rs_localizer.settings import write_parameters
+    from rs_localizer.trajectory import verdict
+    from rs_localizer.trajectory.calibration import Calibration, calibrate
+    from rs_localizer.trajectory.first_lens import first_lens
+    from rs_localizer.trajectory.imu import ImuRecording, MountFound
+    from rs_localizer.trajectory.lens import LensErrors
+    from rs_localizer.trajectory.observe import Observed, in_order
+    from rs_localizer.trajectory.rig import Mounted, Recording, calibrate_rig
 
 # A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
 _MOST_TURN, _SIGMAS = 1.0, 4.0

@@ -13,34 +13,36 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import WORKING, UsageError
 from rs_localizer.cli.settings_args import add_settings, given_values
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
-from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_log, read_telemetry
-from rs_localizer.io.video import has_times
-from rs_localizer.offline.image_sources import (
-    IMAGE_TYPES,
-    INFO_TYPE,
-    Carried,
-    Shot,
-    find_topic,
-    from_bag,
-    from_files,
-    from_video,
-    have_times,
-    image_files,
-    with_telemetry,
-)
 from rs_localizer.process.arguments import number
 from rs_localizer.settings import build, settings, write_parameters
-from rs_localizer.trajectory.imu import ImuRecording
+
+if WORKING:
+    import numpy as np
+
+    from rs_localizer.core.camera import Camera
+    from rs_localizer.io.bags import BagReader, is_bag, open_bag
+    from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_log, read_telemetry
+    from rs_localizer.io.video import has_times
+    from rs_localizer.offline.image_sources import (
+        IMAGE_TYPES,
+        INFO_TYPE,
+        Carried,
+        Shot,
+        find_topic,
+        from_bag,
+        from_files,
+        from_video,
+        have_times,
+        image_files,
+        with_telemetry,
+    )
+    from rs_localizer.trajectory.imu import ImuRecording
 
 # Readout times that differ by less are called the same: what a file says counts rows its own way.
 _SAME_READOUT = 0.05

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import rs_localizer
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import LateParser, UsageError
 from rs_localizer.io.atomic_files import remove_unfinished
 from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import INTERRUPTED, StopRequest
@@ -263,11 +263,11 @@ def complete() -> None:
     import argcomplete
 
     parser = argparse.ArgumentParser(prog="rs_localizer", allow_abbrev=False)
-    commands = parser.add_subparsers()
+    commands = parser.add_subparsers(parser_class=LateParser)
     for name, command in COMMANDS.items():
-        own = _with_common(commands.add_parser(name, help=command.summary))
-        if name in os.environ["COMP_LINE"].split()[1:2]:
-            importlib.import_module(command.module).add_arguments(own)
+        own = commands.add_parser(name, help=command.summary)
+        own.come_from(command.module)
+        _with_common(own)
     argcomplete.autocomplete(parser)
 
 

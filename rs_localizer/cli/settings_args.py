@@ -9,10 +9,12 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import UsageError
-from rs_localizer.config import NodeConfig
+from rs_localizer.cli import WORKING, UsageError
 from rs_localizer.pipeline.inputs import INPUTS
-from rs_localizer.settings import build, load_params_file, parse_assignment
+
+if WORKING:
+    from rs_localizer.config import NodeConfig
+    from rs_localizer.settings import build, load_params_file, parse_assignment
 
 # Rows by name, as row times.
 _ROWS = {"first": -0.5, "middle": 0.0, "last": 0.5}

@@ -23,14 +23,11 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.transforms import Transform
 from rs_localizer.markers.detection import MarkerDetector
-from rs_localizer.markers.families import Family
+from rs_localizer.markers.families import LEAST_SIDE, Family
 from rs_localizer.markers.map_check import whole_markers
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
-
-# Smaller ones (px) may be anything, and their corners say little.
-LEAST_SIDE = 12.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -57,13 +57,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.yaml_text import YamlError, load_yaml
 from rs_localizer.markers.entries import Entry, EntryError
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.poses import Pose, finite
+from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation
 from rs_localizer.markers.poses import rotation_of_quaternion as _rotation
 from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid, Marker
 
@@ -251,7 +250,7 @@ def _board_entry(board: Board) -> dict[str, Any]:
 
 
 def _pose_entry(pose: Pose) -> dict[str, Any]:
-    quaternion = so3.quaternion(np.ascontiguousarray(pose.rotation))
+    quaternion = quaternion_of_rotation(pose.rotation)
     return {"position": _numbers(pose.position), "quaternion": _numbers(quaternion)}
 
 

@@ -20,13 +20,9 @@ from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.recording import make_camera_info, make_correspondences
 from rs_localizer.io.rigs import RigParts, node_parameters, optical_frame
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.simulation.frames import (
-    FrameSettings,
-    SimulatedFrame,
-    frame_stamps,
-    simulate_frames,
-)
+from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
 from rs_localizer.simulation.recording import write_truth
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import TrueMotion, TrueState
 
 RIG_FRAME = "rig"

@@ -21,7 +21,7 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.mapping.gauge import through
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.offline.table import read_parquet
-from rs_localizer.simulation.renderer import ImageSettings
+from rs_localizer.simulation.settings import ImageSettings
 
 pytest.importorskip("pycolmap")
 pytest.importorskip("zarr", reason="needs Zarr (rs_localizer[zarr])")

@@ -17,7 +17,8 @@ from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import write_frame
 from rs_localizer.io.transforms import TransformTree
 from rs_localizer.offline.replay import find_topics
-from rs_localizer.simulation.imu import ImuSettings, make_imu
+from rs_localizer.simulation.imu import make_imu
+from rs_localizer.simulation.settings import ImuSettings
 
 CAMERA = Camera(640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]))
 TURN = ("--angular-velocity", "0.5", "-1", "2", "--linear-velocity", "0.2", "0", "0")

@@ -56,6 +56,16 @@ def test_every_command_has_help_and_takes_its_example(name, capsys):
     parser.parse_args(COMMANDS[name].example.split()[2:])
 
 
+@pytest.mark.parametrize("words", [*([name] for name in COMMANDS), ["map", "build"]])
+def test_help_waits_for_nothing_that_only_work_needs(words):
+    command = [sys.executable, "-X", "importtime", "-m", "rs_localizer", *words, "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert f"usage: rs_localizer {' '.join(words)} " in done.stdout
+    imported = {line.split("|")[-1].strip() for line in done.stderr.splitlines()}
+    assert "rs_localizer.cli" in imported
+    assert imported.isdisjoint({"numba", "scipy", "matplotlib", "pyarrow"})
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [
@@ -183,6 +193,7 @@ def test_quiet_and_verbose(monkeypatch, capsys):
         ("rs_localizer rep", {"replay"}),
         ("rs_localizer evaluate --pl", {"--plot"}),
         ("rs_localizer simulate out --scan-direction l", {"left_to_right"}),
+        ("rs_localizer map build --mar", {"--markers"}),
     ],
 )
 def test_shells_complete(tmp_path, line, expected):

@@ -13,9 +13,9 @@ from rs_localizer.cli.main import main
 from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.trajectories import read_tum, read_twists
-from rs_localizer.simulation.frames import FrameSettings
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 
 FRAMES = 6
 # Nanoseconds since 1970 that a float of seconds cannot hold.

@@ -16,9 +16,9 @@ from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.frames import FrameSettings
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
+from rs_localizer.simulation.settings import FrameSettings
 
 FRAMES = 8
 POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=6000)

@@ -24,8 +24,9 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.offline.replay import find_topics, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.frames import simulate_frames
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 
 READOUT = 0.02

@@ -12,7 +12,8 @@ from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.simulation.planes import TexturedPlane
-from rs_localizer.simulation.renderer import ImageSettings, Renderer
+from rs_localizer.simulation.renderer import Renderer
+from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 K = np.array([[80.0, 0.0, 47.0], [0.0, 82.0, 36.5], [0.0, 0.0, 1.0]])

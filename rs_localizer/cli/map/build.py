@@ -11,10 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError, add_overwrite, replaced, stage
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced, stage
 from rs_localizer.cli.image_input import (
     add_source_arguments,
     opened,
@@ -25,35 +22,40 @@ from rs_localizer.cli.image_input import (
     time_faults,
     video_imu,
 )
-from rs_localizer.cli.marker_map import read_checked_map
 from rs_localizer.config import FeatureConfig
-from rs_localizer.core.camera import Camera
-from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.evaluation.map_pictures import save_pictures
-from rs_localizer.io.atomic_files import atomic_directory
-from rs_localizer.io.bags import is_bag, open_bag
-from rs_localizer.io.calibration import write_calibration
-from rs_localizer.io.image_clock import DEFAULT_START_NS
-from rs_localizer.io.images import Image
-from rs_localizer.io.imu import read_imu_csv
-from rs_localizer.io.maps.npz import write_npz
-from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
-from rs_localizer.io.topics import IMU
-from rs_localizer.io.trajectories import Trajectory, write_tum
-from rs_localizer.mapping.anchors import Anchors, Distance, PointSight
-from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_features
-from rs_localizer.mapping.colmap import Effort, require
-from rs_localizer.mapping.inertial_metres import GivenImu
-from rs_localizer.mapping.report import advice, rows, written
-from rs_localizer.mapping.views import Looker, View
-from rs_localizer.offline.detect import Cameras
-from rs_localizer.offline.image_sources import Carried
-from rs_localizer.offline.recordings import RecordingError, optical_frame, read_imu_recording
-from rs_localizer.offline.replay import imu_topics
-from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.process.arguments import integer, number
-from rs_localizer.settings import build, write_parameters
-from rs_localizer.trajectory.imu import ImuRecording
+
+if WORKING:
+    import numpy as np
+    from tqdm import tqdm
+
+    from rs_localizer.cli.marker_map import read_checked_map
+    from rs_localizer.core.camera import Camera
+    from rs_localizer.core.scanning import ScanDirection
+    from rs_localizer.evaluation.map_pictures import save_pictures
+    from rs_localizer.io.atomic_files import atomic_directory
+    from rs_localizer.io.bags import is_bag, open_bag
+    from rs_localizer.io.calibration import write_calibration
+    from rs_localizer.io.image_clock import DEFAULT_START_NS
+    from rs_localizer.io.images import Image
+    from rs_localizer.io.imu import read_imu_csv
+    from rs_localizer.io.maps.npz import write_npz
+    from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
+    from rs_localizer.io.topics import IMU
+    from rs_localizer.io.trajectories import Trajectory, write_tum
+    from rs_localizer.mapping.anchors import Anchors, Distance, PointSight
+    from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_features
+    from rs_localizer.mapping.colmap import Effort, require
+    from rs_localizer.mapping.inertial_metres import GivenImu
+    from rs_localizer.mapping.report import advice, rows, written
+    from rs_localizer.mapping.views import Looker, View
+    from rs_localizer.offline.detect import Cameras
+    from rs_localizer.offline.image_sources import Carried
+    from rs_localizer.offline.recordings import RecordingError, optical_frame, read_imu_recording
+    from rs_localizer.offline.replay import imu_topics
+    from rs_localizer.pipeline.refusal import Refusal
+    from rs_localizer.settings import build, write_parameters
+    from rs_localizer.trajectory.imu import ImuRecording
 
 # After so many, images without features are refused: two seconds of a usual video.
 _EARLY_VIEWS = 30

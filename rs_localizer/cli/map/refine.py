@@ -8,25 +8,27 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError, refuse_existing
+from rs_localizer.cli import WORKING, UsageError, refuse_existing
 from rs_localizer.cli.map import colmap, contradiction
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
-from rs_localizer.io.atomic_files import atomic_files
-from rs_localizer.io.bags import open_bag
-from rs_localizer.io.calibration import read_calibration, write_calibration
 from rs_localizer.io.maps.files import WRITERS, read_map_file
-from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.topics import IMU
-from rs_localizer.mapping.observations import RecordedMap, from_recording
-from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
-from rs_localizer.offline.recordings import Recorded, read_recording
-from rs_localizer.offline.replay import find_topics
 from rs_localizer.process.arguments import number
+
+if WORKING:
+    import numpy as np
+    from tqdm import tqdm
+
+    from rs_localizer.core.arrays import Array
+    from rs_localizer.core.camera import Camera
+    from rs_localizer.io.atomic_files import atomic_files
+    from rs_localizer.io.bags import open_bag
+    from rs_localizer.io.calibration import read_calibration, write_calibration
+    from rs_localizer.io.maps.landmarks import Map
+    from rs_localizer.mapping.observations import RecordedMap, from_recording
+    from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
+    from rs_localizer.offline.recordings import Recorded, read_recording
+    from rs_localizer.offline.replay import find_topics
 
 _GIVEN, _ESTIMATED, _GLOBAL = "given", "estimated", "global"
 _HOLD = 0.001

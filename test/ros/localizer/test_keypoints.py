@@ -22,9 +22,10 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.ros.node.conversion import copy_message, make_message
-from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
