@@ -1,0 +1,96 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``rs_localizer calibrate --rig``: a simulated pair that never sees the same, and faults."""
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.cli.main import main
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.rigs import RigParts, read_camchain, write_camchain
+from rs_localizer.settings import build, load_params_file
+
+K = np.array([[420.0, 0.0, 320.0], [0.0, 422.0, 240.0], [0.0, 0.0, 1.0]])
+LENS = [-0.12, 0.04, 0.001, -0.0015]
+# The second camera looks back, 10 cm to the right; its stamps are 30 ms late.
+AXES = Rotation.from_euler("yx", [175.0, 10.0], degrees=True).as_matrix()
+CENTRE, OFFSET = np.array([0.1, -0.02, -0.05]), 0.03
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    return RigParts(
+        {
+            "front": Camera(640, 480, K, LENS, readout_time=0.02),
+            "rear": Camera(640, 480, K, LENS, "plumb_bob", 0.03, "bottom_to_top"),
+        },
+        {"front": (np.eye(3), np.zeros(3)), "rear": (AXES, -AXES @ CENTRE)},
+        {"front": 0.0, "rear": OFFSET},
+    )
+
+
+def record(folder, rig, *words):
+    write_camchain(folder / "chain.yaml", rig)
+    out = folder / "pair"
+    simulate = ["simulate", str(out), "--rig", str(folder / "chain.yaml"), "--noise", "0.3", *words]
+    assert main(simulate) == 0
+    return str(out)
+
+
+def test_a_pair(rig, tmp_path, capsys):
+    pair = record(tmp_path, rig, *"--trajectory tum_vi_room5 --duration 3 --points 60".split())
+    assert main(["calibrate", "--rig", pair, "--out", str(tmp_path / "rig.yaml")]) == 0
+    said = capsys.readouterr().out
+    assert "rear <- front " in said
+    assert "TF has it 0.0" in said
+    values = load_params_file(tmp_path / "rig.yaml")
+    config = build(values)
+    assert config.cameras == ("front", "rear")
+    own = config.of_cameras["rear"]
+    assert own.scan_direction == "bottom_to_top"
+    assert own.readout_time == pytest.approx(0.03, abs=1e-3)
+    assert own.stamp_offset == pytest.approx(OFFSET, abs=1e-3)
+    parts = read_camchain(tmp_path / "rig_camchain.yaml")
+    assert parts.time_offset == {"front": 0.0, "rear": own.stamp_offset}
+    assert parts.cameras["rear"].readout_time == own.readout_time
+    rotation, translation = parts.camera_from_rig["rear"]
+    turned = Rotation.from_matrix(rotation @ AXES.T).magnitude()
+    assert np.degrees(turned) < 0.1
+    np.testing.assert_allclose(-rotation.T @ translation, CENTRE, atol=5e-3)
+    # What the launch file publishes is the same mounting.
+    (node,) = ElementTree.parse(tmp_path / "rig_transforms.launch.xml").getroot()
+    words = node.get("args").split()
+    given = dict(zip(words[::2], words[1::2], strict=True))
+    assert given["--frame-id"] == "front_optical_frame"
+    assert given["--child-frame-id"] == "rear_optical_frame"
+    place = np.array([float(given[f"--{axis}"]) for axis in "xyz"])
+    turn = Rotation.from_quat([float(given[f"--q{axis}"]) for axis in "xyzw"])
+    np.testing.assert_allclose(place, -rotation.T @ translation, atol=1e-12)
+    np.testing.assert_allclose(turn.as_matrix(), rotation.T, atol=1e-12)
+
+
+def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
+    words = "--duration 2 --points 40 --angular-velocity 0 0 0 --linear-velocity 0 0 0".split()
+    pair = record(tmp_path, rig, *words)
+    assert main(["calibrate", "--rig", pair, "--out", str(tmp_path / "rig.yaml")]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
+    assert "front: not observable" in line
+    assert "rear: not observable" in line
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["video.mp4"], "--rig needs the recordings of several cameras, or one bag"),
+        (["a/cam.mp4", "b/cam.mp4"], "cameras need different names"),
+        (["1.mp4", "b.mp4"], "names that begin with a letter: 1, b"),
+        (["a.mp4", "b.mp4", "--imu"], "--imu is for one camera"),
+    ],
+)
+def test_what_is_no_rig(words, expected, capsys):
+    assert main(["calibrate", "--rig", *words]) == 2
+    assert expected in capsys.readouterr().err
