@@ -1,7 +1,11 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``rs_localizer calibrate --rig``: a simulated pair that never sees the same, and faults."""
+"""``rs_localizer calibrate --rig`` and ``replay --smooth`` of a simulated pair that never sees the
+same, and faults.
+"""
 
+import json
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -40,8 +44,13 @@ def record(folder, rig, *words):
     return str(out)
 
 
-def test_a_pair(rig, tmp_path, capsys):
-    pair = record(tmp_path, rig, *"--trajectory tum_vi_room5 --duration 3 --points 60".split())
+@pytest.fixture(scope="module")
+def pair(rig, tmp_path_factory):
+    words = "--trajectory tum_vi_room5 --duration 3 --points 60".split()
+    return record(tmp_path_factory.mktemp("pair"), rig, *words)
+
+
+def test_a_pair(pair, tmp_path, capsys):
     assert main(["calibrate", "--rig", pair, "--out", str(tmp_path / "rig.yaml")]) == 0
     said = capsys.readouterr().out
     assert "rear <- front " in said
@@ -82,6 +91,15 @@ def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
     assert not (tmp_path / "rig.yaml").exists()
 
 
+def test_maps_are_made_with_one_camera(pair, tmp_path, capsys):
+    parameters, out = f"{pair}/parameters.yaml", str(tmp_path / "map")
+    refine = ["map", "refine", pair, "--params", parameters, "--out", f"{out}.npz"]
+    survey = ["map", "survey", pair, "--params", parameters, "--out", f"{out}.yaml"]
+    for words in (refine, [*survey, "--family", "apriltag_36h11", "--size", "0.1"]):
+        assert main(words) == 2
+        assert "maps are made with one camera of a rig" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -94,3 +112,22 @@ def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
 def test_what_is_no_rig(words, expected, capsys):
     assert main(["calibrate", "--rig", *words]) == 2
     assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("pose_time", ["stamp", "mid_frame"])
+def test_smoothed_frames_are_nearer_to_the_truth(pair, pose_time, tmp_path, capsys):
+    settings = ["--params", str(Path(pair) / "parameters.yaml"), "-p", f"pose_time:={pose_time}"]
+    errors, counts = [], []
+    for name, words in (("plain", []), ("smooth", ["--smooth"])):
+        out = str(tmp_path / name)
+        assert main(["replay", pair, *settings, *words, "--out", out]) == 0
+        capsys.readouterr()
+        assert main(["evaluate", out, pair, "--json"]) == 0
+        errors.append(json.loads(capsys.readouterr().out)["result"])
+        counts.append(len((tmp_path / name / "poses.txt").read_text().splitlines()))
+    assert counts[0] == counts[1]
+    limits = {"position (m)": 0.9, "orientation (deg)": 0.9, "linear velocity (m/s)": 0.6,
+              "angular velocity (deg/s)": 0.6}  # fmt: skip
+    for quantity, limit in limits.items():
+        plain, smooth = (each[f"{quantity} median"] for each in errors)
+        assert smooth < limit * plain
