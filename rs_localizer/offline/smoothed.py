@@ -90,7 +90,7 @@ def smooth_frames(
         others = np.array([s for s in known if begin_ns <= s < end_ns], np.int64)
         inputs = np.union1d(window.stamps_ns, others)
         if rate is not None:
-            inputs = _moments(inputs, first_ns, last_ns if not pending else None, rate)
+            inputs = _moments(window.stamps_ns, first_ns, last_ns if not pending else None, rate)
         if not stretches((np.array(known, np.int64) - first_ns).astype(np.float64) * 1e-9):
             return SmoothedFrames([], inputs[:0], len(inputs), 0)
         smoothed += 1

@@ -91,6 +91,19 @@ def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
     assert not (tmp_path / "rig.yaml").exists()
 
 
+def test_samples_of_the_motion(pair, tmp_path, capsys):
+    parameters = ["--params", f"{pair}/parameters.yaml", "--smooth", "--rate", "100"]
+    assert main(["replay", pair, *parameters, "--out", str(tmp_path / "fast")]) == 0
+    said = capsys.readouterr().out
+    # 3 s, of which the first and the last readout may be left out.
+    samples, lost = (
+        int(next(line for line in said.splitlines() if name in line).split()[-1])
+        for name in ("samples of the smoothed motion", "left out, not determined")
+    )
+    assert 285 <= samples <= 301
+    assert lost < 10
+
+
 def test_maps_are_made_with_one_camera(pair, tmp_path, capsys):
     parameters, out = f"{pair}/parameters.yaml", str(tmp_path / "map")
     refine = ["map", "refine", pair, "--params", parameters, "--out", f"{out}.npz"]
