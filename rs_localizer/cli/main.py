@@ -79,7 +79,7 @@ COMMANDS = {
     ),
     "calibrate": Command(
         "rs_localizer.cli.calibrate",
-        "readout time, scan direction and lens of a camera, from a recording in which it moves",
+        "readout time, scan direction and lens of a camera that moves in a recording; or of a rig",
         "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --out shutter.yaml",
     ),
     "readout": Command(

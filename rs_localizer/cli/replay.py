@@ -287,7 +287,7 @@ def _replay_matches(
         unused = IMU not in topics.of and config.imu.use != ImuUse.NONE
         if unused and (several := imu_topics(bag)):
             print(f"no IMU is used: choose {' or '.join(several)} with --imu")
-        if args.smooth and config.readout_time == 0.0:
+        if args.smooth and config.readout_time == 0.0 and not config.is_rig:
             raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
         localizer.warm_up()
         wanted = args.parquet is not None or args.zarr is not None
@@ -314,7 +314,7 @@ def _replay_matches(
 
 def _refuse_for_rigs(args: argparse.Namespace, config: NodeConfig) -> None:
     """Name what there is of one camera only."""
-    options = ("smooth", "nerfstudio", "gsplat", "ncore", "rerun", "view", "parquet", "zarr")
+    options = ("nerfstudio", "gsplat", "ncore", "rerun", "view", "parquet", "zarr")
     given = [name for name in options if getattr(args, name)] + (["row"] if args.rows else [])
     if config.is_rig and given:
         raise UsageError(f"--{given[0]} is for one camera: leave it out with cameras")

@@ -9,6 +9,7 @@ limit closes from the first guess to the noise.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from rs_localizer.trajectory.lens import with_lens
 from rs_localizer.trajectory.model import Freedom, Observations, State
 from rs_localizer.trajectory.problem import LIMIT, Problem, RigProblem
 from rs_localizer.trajectory.spline_kernels import CONTROL
+
+AnyProblem = TypeVar("AnyProblem", Problem, RigProblem)
+"""Of one camera, or of several."""
 
 _FEW_STEPS = 6
 # Richer models must lower the cost by this much per new parameter (Akaike).
@@ -80,7 +84,7 @@ def fit(
     return solve(Problem(camera, observations, start, freedom), start, deviation)
 
 
-def solve(problem: Problem | RigProblem, start: State, deviation: float | None = None) -> Fit:
+def solve(problem: AnyProblem, start: State, deviation: float | None = None) -> Fit:
     """:func:`fit` of one camera or of a rig, whose noise is that of its first camera's keypoints.
 
     Raises:
@@ -123,7 +127,7 @@ def image_speeds(camera: Camera, observations: Observations, state: State) -> Ar
     return np.concatenate(speeds)
 
 
-def _finish(problem: Problem | RigProblem, state: State, deviation: float) -> Fit:
+def _finish(problem: AnyProblem, state: State, deviation: float) -> Fit:
     """The estimate with its covariances."""
     squared = problem.errors(state)
     cost, normal = problem.normal(state, deviation)

@@ -152,7 +152,7 @@ class Problem:
         return max(noise_of(self.errors(state), deviation), self.freedom.least_noise)
 
     def normal(self, state: State, deviation: float, motion: bool = True) -> tuple[float, Normal]:
-        """Cost and normal equations; without what is expected of the motion, where others add it."""
+        """Cost and normal equations; without ``motion`` others add what is expected of it."""
         curve, parts = self.look(state)
         terms = self.terms(state, deviation)
         normals = self._empty(len(state.spline.positions), parts, len(state.delays))
@@ -315,7 +315,7 @@ class RigProblem:
 
     def normal(self, state: State, deviation: float) -> tuple[float, RigNormal]:
         """Cost and normal equations."""
-        cost, own = 0.0, []
+        cost, own = 0.0, list[Normal]()
         for camera, one, ratio in zip(self.cameras, self.states(state), self.ratios, strict=True):
             added, normal = camera.normal(one, deviation * float(ratio), motion=not own)
             own.append(normal)

@@ -184,6 +184,29 @@ def make_row(sights: Sights, terms: Terms) -> Row:
 
 
 @kernel
+def _to_body(
+    sights: Sights, terms: Terms, n: int, row: Row, r: int, gradient: Array, point: Array
+) -> None:
+    """Fill the derivative (3,) of coordinate r and the landmark (3,) along the body's axes; and the
+    derivatives by the mount, where it is free.
+    """
+    axes, g, p = sights.axes, row.by_point[r], sights.local[n]
+    for i in range(3):
+        gradient[i] = 0.0
+        point[i] = sights.centre[i]
+        for j in range(3):
+            gradient[i] += axes[j, i] * g[j]
+            point[i] += axes[j, i] * p[j]
+    if terms.mount_free:
+        first = row.by_shared.shape[1] - EXTRINSICS
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            row.by_shared[r, first + i] = p[a] * g[b] - p[b] * g[a]
+            row.by_shared[r, first + 3 + i] = -gradient[i]
+        row.by_shared[r, first + 6] = row.by_time[r]
+
+
+@kernel
 def differentiate(
     curve: Curve, sights: Sights, terms: Terms, n: int, row: Row
 ) -> tuple[float, float]:
@@ -198,28 +221,13 @@ def differentiate(
     if not rest > 0.0:
         return 0.0, full
     rotation, turn, basis = row.rotation, row.position, row.work[7, 2]
-    axes, centre = sights.axes, sights.centre
     shared = row.by_shared.shape[1] - (EXTRINSICS if terms.mount_free else 0)
     pose(curve.rotations, curve.positions, curve.vectors, sights.first[n], sights.u[n], row.work,
          rotation, row.position)  # fmt: skip
     for r in range(2):
         row.by_time[r] = flow[2 + r, 0] * flow[0, 0] + flow[2 + r, 1] * flow[0, 1]
-        g, p = by_point[r], sights.local[n]
-        if terms.mount_free:
-            for i in range(3):
-                a, b = (i + 1) % 3, (i + 2) % 3
-                row.by_shared[r, shared + i] = p[a] * g[b] - p[b] * g[a]
-        g, p = row.work[7, 0], row.work[7, 1]  # the same along the body's axes
-        for i in range(3):
-            g[i] = 0.0
-            p[i] = centre[i]
-            for j in range(3):
-                g[i] += axes[j, i] * by_point[r, j]
-                p[i] += axes[j, i] * sights.local[n, j]
-        if terms.mount_free:
-            for i in range(3):
-                row.by_shared[r, shared + 3 + i] = -g[i]
-            row.by_shared[r, shared + 6] = row.by_time[r]
+        g, p = row.work[7, 0], row.work[7, 1]
+        _to_body(sights, terms, n, row, r, g, p)
         turn[0] = g[1] * p[2] - g[2] * p[1]  # the position is not needed any more
         turn[1] = g[2] * p[0] - g[0] * p[2]
         turn[2] = g[0] * p[1] - g[1] * p[0]

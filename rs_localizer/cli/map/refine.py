@@ -10,7 +10,13 @@ from pathlib import Path
 
 from rs_localizer.cli import WORKING, UsageError, refuse_existing
 from rs_localizer.cli.map import colmap, contradiction
-from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
+from rs_localizer.cli.settings_args import (
+    add_settings,
+    add_topics,
+    given_settings,
+    given_topics,
+    one_camera,
+)
 from rs_localizer.io.maps.files import WRITERS, read_map_file
 from rs_localizer.io.topics import IMU
 from rs_localizer.process.arguments import number
@@ -92,7 +98,7 @@ def run(args: argparse.Namespace) -> None:
         raise UsageError("give RECORDING and --out OUT, or --colmap IN OUT")
     if args.out.suffix not in WRITERS:
         raise UsageError(f"--out must end in {' or '.join(WRITERS)}, got {args.out}")
-    config = given_settings(args)
+    config = given_settings(args, check=one_camera)
     refuse_existing(args)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     with open_bag(args.recording) as bag:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rs_localizer.cli import WORKING, UsageError, refuse_existing
 from rs_localizer.cli.map import contradiction
-from rs_localizer.cli.settings_args import add_settings, given_settings
+from rs_localizer.cli.settings_args import add_settings, given_settings, one_camera
 from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family, family
 from rs_localizer.process.arguments import number
 
@@ -91,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     if args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
-    config, markers = given_settings(args), _markers(args)
+    config, markers = given_settings(args, check=one_camera), _markers(args)
     origin = _origin(args, markers)
     refuse_existing(args)
     if not args.recording.exists():
