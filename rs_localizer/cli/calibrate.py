@@ -536,6 +536,8 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
     for name in ("imu", "share", "workers", "scheduler"):
         if getattr(args, name) is not None:
             raise UsageError(f"--{name} is for one camera: leave it out with --rig")
+    if args.out is not None:
+        refuse_existing(args)
     config, recordings, maps = _config(args), dict[str, Recording](), list[MarkerMap]()
     cameras = _cameras_of(args, config)
     intrinsics = args.intrinsics
