@@ -437,6 +437,11 @@ class Rig:
         minimum=0.0,
         maximum=1.0,
     )
+    estimate_time_offsets: bool = setting(
+        False,
+        "Estimate what is to be added to the stamps of each camera but the first, from the motion, "
+        "and follow clocks that drift or jump",
+    )
 
     def __post_init__(self) -> None:
         check(self, "rig.")

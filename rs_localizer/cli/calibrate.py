@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, refuse_existing
 from rs_localizer.cli.batch import (
     Plan,
     add_batch_arguments,
@@ -45,7 +45,6 @@ if WORKING:
     from rs_localizer.config import DetectorConfig, NodeConfig
     from rs_localizer.core.arrays import Array
     from rs_localizer.core.camera import Camera, DistortionModel
-    from rs_localizer.evaluation.calibration_plots import save_plots
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
     from rs_localizer.io.calibration import kalibr_fields, read_calibration, write_calibration
@@ -219,6 +218,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.yaml",
         help="parameters for node and replay --params; of many recordings, a directory",
     )
+    add_overwrite(parser)
     parser.add_argument(
         "--plots",
         type=Path,
@@ -266,6 +266,8 @@ def run(args: argparse.Namespace) -> Figures | None:
 
 def calibrate_one(args: argparse.Namespace) -> Calibration:
     """Calibrate with one recording, and say what was found."""
+    if args.out is not None:
+        refuse_existing(args)
     config = _config(args)
     source = _read(args, config)
     intrinsics = args.intrinsics or source.camera is None
@@ -301,12 +303,15 @@ def _calibrated(
     tell_telemetry(
         argparse.Namespace(images=args.recording, no_telemetry=args.no_telemetry),
         verdict.readout_time(found),
+        lens=False,
     )
     if intrinsics:
         _tell_lens(found)
     for line in imu_lines(found, source.imu, config):
         print(line)
     if args.plots is not None:
+        from rs_localizer.evaluation.calibration_plots import save_plots
+
         save_plots(camera, found, args.plots)
     return found
 
@@ -531,6 +536,8 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
     for name in ("imu", "share", "workers", "scheduler"):
         if getattr(args, name) is not None:
             raise UsageError(f"--{name} is for one camera: leave it out with --rig")
+    if args.out is not None:
+        refuse_existing(args)
     config, recordings, maps = _config(args), dict[str, Recording](), list[MarkerMap]()
     cameras = _cameras_of(args, config)
     intrinsics = args.intrinsics
@@ -706,7 +713,10 @@ def _calibrate_batch(args: argparse.Namespace) -> None:
     given = [name for name in options if getattr(args, name) not in (None, False)]
     files = inputs(args.map, args.calibration, args.params)
     kind = Kind("calibrate", _calibrate_of_many, " ".join(["calibrate", *given]), _calibrate_warm)
-    run_batch(argparse.Namespace(**vars(args) | {"plots": plots}), Plan(kind, lambda _: files))
+    run_batch(
+        argparse.Namespace(**vars(args) | {"plots": plots}),
+        Plan(kind, lambda _: files, args.overwrite),
+    )
 
 
 def _calibrate_warm(_: argparse.Namespace) -> None:

@@ -146,12 +146,13 @@ def add_telemetry(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def tell_telemetry(args: argparse.Namespace, used: float | None = None) -> None:
+def tell_telemetry(args: argparse.Namespace, used: float | None = None, lens: bool = True) -> None:
     """Say what a video knows of its camera, and what is not used of it.
 
     Args:
         args: with ``images`` and ``no_telemetry``.
         used: the readout time that was measured, s; None: that of the settings is used.
+        lens: whether a lens profile takes the place of a calibration.
     """
     path = args.images
     if args.no_telemetry:
@@ -179,7 +180,8 @@ def tell_telemetry(args: argparse.Namespace, used: float | None = None) -> None:
     if found.exposure is not None:
         said.append(f"exposure {1e3 * found.exposure:.2f} ms (median)")
     if found.lens:
-        said.append(found.lens)
+        how = "used" if lens and args.calibration is None else "not used"
+        said.append(found.lens + (f", {how}" if found.profile is not None else ""))
     print(f"{found.camera}: {', '.join(said)}; --no-telemetry ignores them")
 
 
@@ -252,11 +254,13 @@ def opened(
         for name in ("image", "camera_info"):
             if getattr(args, name) is not None:
                 raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
-        if args.calibration is None and calibrated:
-            raise UsageError("a video or folder has no camera_info: give --calibration")
-        camera = None if args.calibration is None else read_calibration(args.calibration)
-        source = of_files(path, camera, clock_of(path, args.rate, start))
         telemetry = telemetry_of(path, args)
+        camera = None if args.calibration is None else read_calibration(args.calibration)
+        if camera is None and calibrated:
+            camera = None if telemetry is None else telemetry.profile
+            if camera is None:
+                raise UsageError("a video or folder has no camera_info: give --calibration")
+        source = of_files(path, camera, clock_of(path, args.rate, start))
         if telemetry is not None and source.clock is not None:
             moving = with_telemetry(source.shots, telemetry, source.clock)
             source = replace(source, shots=moving)

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import rs_localizer
-from rs_localizer.cli import LateParser, UsageError
+from rs_localizer.cli import COMMON, LateParser, UsageError, add_common
 from rs_localizer.io.atomic_files import remove_unfinished
 from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import INTERRUPTED, StopRequest
@@ -35,14 +35,6 @@ _SIGPIPE = 141
 _STEERING = {
     code: f"\\x{code:02x}" for code in (*range(32), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"
 }
-
-
-# Of every command, wherever they stand behind its name.
-_COMMON = (
-    ("--json", "print the result as JSON"),
-    ("--quiet", "print nothing but faults"),
-    ("--verbose", "print the traceback of a fault"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +189,7 @@ def _said(name: str, error: Exception) -> int | None:
 
 def _common_options(words: Sequence[str]) -> tuple[set[str], list[str]]:
     """Options of all commands that are among the words, and the other words."""
-    names = {"-q": "--quiet", "-v": "--verbose"} | {name: name for name, _ in _COMMON}
+    names = {"-q": "--quiet", "-v": "--verbose"} | {name: name for name, _ in COMMON}
     end = words.index("--") if "--" in words else len(words)
     first, rest = list(words[1:end]), list(words[end:])
     common = {names[word] for word in first if word in names}
@@ -206,22 +198,14 @@ def _common_options(words: Sequence[str]) -> tuple[set[str], list[str]]:
 
 def _command_parser(name: str) -> argparse.ArgumentParser:
     command = COMMANDS[name]
-    return _with_common(
-        argparse.ArgumentParser(
-            prog=f"rs_localizer {name}",
-            description=_sentence(command.summary),
-            epilog=f"example:\n  {command.example}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
-        )
+    parser = argparse.ArgumentParser(
+        prog=f"rs_localizer {name}",
+        description=_sentence(command.summary),
+        epilog=f"example:\n  {command.example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
-
-
-def _with_common(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
-    group = parser.add_argument_group("of all commands")
-    for name, text in _COMMON:
-        short = (name[1:3],) if name != "--json" else ()
-        group.add_argument(*short, name, action="store_true", help=text, dest=f"common{name}")
+    add_common(parser)
     return parser
 
 
@@ -267,7 +251,7 @@ def complete() -> None:
     for name, command in COMMANDS.items():
         own = commands.add_parser(name, help=command.summary)
         own.come_from(command.module)
-        _with_common(own)
+        add_common(own)
     argcomplete.autocomplete(parser)
 
 

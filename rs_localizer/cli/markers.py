@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import WORKING, UsageError, read_counts
+from rs_localizer.cli import WORKING, UsageError, add_common, read_counts
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.printing import PAGES, page_files, plan, write_pages
 from rs_localizer.process.arguments import integer, number
@@ -84,6 +84,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         description="Read a map and look for overlaps, mirrored markers and sizes in other units.",
     )
     check.add_argument("map", type=Path, metavar="MAP")
+    for action in (make, check):
+        add_common(action)
 
 
 def run(args: argparse.Namespace) -> None:

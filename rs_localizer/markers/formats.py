@@ -160,14 +160,14 @@ def _write_tagslam(marker_map: MarkerMap, family: str) -> str:
 
     tags = []
     for marker in marker_map.markers:
-        known = marker.deviations
-        if known is None:
-            known = np.repeat([_POSITION_NOISE, _ROTATION_NOISE], 3)
+        deviations = marker.deviations
+        if deviations is None:
+            deviations = np.repeat([_POSITION_NOISE, _ROTATION_NOISE], 3)
         pose = {
             "position": _xyz(marker.pose.position),
             "rotation": _xyz(Rotation.from_matrix(marker.pose.rotation).as_rotvec()),
-            "position_noise": _xyz(known[:3]),
-            "rotation_noise": _xyz(known[3:]),
+            "position_noise": _xyz(deviations[:3]),
+            "rotation_noise": _xyz(deviations[3:]),
         }
         tags.append({"id": marker.id, "size": _rounded([marker.size])[0], "pose": pose})
     # Each of its own: YAML would refer from one to the other.

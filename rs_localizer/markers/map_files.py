@@ -120,12 +120,12 @@ def _marker(entry: Entry) -> Marker:
         with entry.named():
             return replace(Marker.at(name, number, size, pose), deviations=deviations)
     corners = entry.take("corners", list)
-    told = entry.number("size") if "size" in entry else None
+    stated = entry.number("size") if "size" in entry else None
     entry.finish()
     with entry.named():
         marker = Marker(family(name), number, corners, deviations)
-        if told is not None and abs(marker.size - told) > _SIZE_TOLERANCE * abs(told):
-            raise ValueError(f"its corners are {marker.size:.4g} m apart, but size is {told:g}")
+        if stated is not None and abs(marker.size - stated) > _SIZE_TOLERANCE * abs(stated):
+            raise ValueError(f"its corners are {marker.size:.4g} m apart, but size is {stated:g}")
         return marker
 
 
@@ -211,14 +211,14 @@ def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:
 
 def _marker_entry(marker: Marker) -> dict[str, Any]:
     entry: dict[str, Any] = {"family": marker.family.name, "id": marker.id}
-    known: dict[str, Any] = {}
+    deviations: dict[str, Any] = {}
     if marker.deviations is not None:
-        known["position_deviation"] = _significant(marker.deviations[:3])
-        known["rotation_deviation"] = _significant(marker.deviations[3:])
+        deviations["position_deviation"] = _significant(marker.deviations[:3])
+        deviations["rotation_deviation"] = _significant(marker.deviations[3:])
     square = Marker.at(marker.family.name, marker.id, marker.size, marker.pose)
     if np.abs(square.corners - marker.corners).max() > _SAME * marker.size:
-        return entry | {"corners": _numbers(marker.corners)} | known
-    return entry | {"size": _rounded(marker.size)} | _pose_entry(marker.pose) | known
+        return entry | {"corners": _numbers(marker.corners)} | deviations
+    return entry | {"size": _rounded(marker.size)} | _pose_entry(marker.pose) | deviations
 
 
 def _board_entry(board: Board) -> dict[str, Any]:

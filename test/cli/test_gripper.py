@@ -30,7 +30,7 @@ READOUT, RATE = 0.03, 12.0
 K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(320, 240, K, readout_time=READOUT)
 WALK = Piece(37.4, 2.2, RATE)
-DEMOS = Piece(37.56, 0.8, RATE), Piece(38.3, 0.8, RATE)
+DEMOS = Piece(37.56, 0.5, RATE), Piece(38.3, 0.5, RATE)
 
 
 def film(room: Room, piece: Piece, path: Path) -> np.ndarray:

@@ -132,17 +132,3 @@ def test_no_frame_localized_is_a_failure(recording, tmp_path, capsys):
     captured = capsys.readouterr()
     assert f"no frame of {bag} was localized" in captured.err
     assert "refused: empty_cloud" in captured.out
-
-
-def test_an_earlier_result_is_not_overwritten_unasked(recording, tmp_path, capsys):
-    out = tmp_path / "out"
-    arguments = ["replay", str(recording), "--out", str(out), *SHUTTER]
-    assert main(arguments) == 0
-    (out / "notes.txt").write_text("mine")
-    before = (out / "poses.txt").read_bytes()
-    assert main([*arguments, "-p", "pose_time:=mid_frame"]) == 1
-    assert f"{out} exists" in capsys.readouterr().err
-    assert (out / "poses.txt").read_bytes() == before
-    assert main([*arguments, "-p", "pose_time:=mid_frame", "--overwrite"]) == 0
-    assert (out / "poses.txt").read_bytes() != before
-    assert (out / "notes.txt").read_text() == "mine"

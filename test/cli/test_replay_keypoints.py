@@ -71,16 +71,6 @@ def errors(out: Path, truth: Path) -> Any:
     return np.linalg.norm(found.positions - true, axis=1)
 
 
-def test_a_map_in_the_recording(flight, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert main(["replay", str(flight / "with_map"), "--out", str(out), *SHUTTER]) == 0
-    said = capsys.readouterr().out
-    assert [line.split()[-1] for line in said.splitlines() if ": no_map" in line] == ["2"]
-    found = errors(out, flight / "with_map")
-    assert len(found) == FRAMES - 2
-    assert found.max() < 0.02
-
-
 @pytest.mark.parametrize("how", ["--map", "-p"])
 def test_a_map_file(flight, tmp_path, how):
     file = str(flight / "map.npz")

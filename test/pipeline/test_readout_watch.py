@@ -208,7 +208,7 @@ def sideways(count: int, **settings: Any) -> tuple[FrameLocalizer, list[str], li
     return frames, notices, [bool(result) for result in results]
 
 
-@pytest.mark.parametrize("tracking", [True, False])
+@pytest.mark.parametrize("tracking", [True, pytest.param(False, marks=pytest.mark.bench)])
 def test_the_wrong_axis_is_named_and_no_pose_comes_of_it(tracking):
     # Before: more than half of the frames had poses 0.5 to 2.5 degrees off, all beyond 5 sigma,
     # and the advice was to calibrate again, or that the shutter is a global one.

@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 import importlib
 
-from rs_localizer.cli import LateParser
+from rs_localizer.cli import LateParser, add_common
 
 # Each module offers ``add_arguments(parser)`` and ``run(arguments)``.
 ACTIONS = {
@@ -26,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     for name, summary in ACTIONS.items():
         action = actions.add_parser(name, help=summary, allow_abbrev=False)
+        add_common(action)
         action.come_from(f"{__name__}.{name}")
 
 

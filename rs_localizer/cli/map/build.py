@@ -32,7 +32,6 @@ if WORKING:
     from rs_localizer.cli.marker_map import read_checked_map
     from rs_localizer.core.camera import Camera
     from rs_localizer.core.scanning import ScanDirection
-    from rs_localizer.evaluation.map_pictures import save_pictures
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.bags import is_bag, open_bag
     from rs_localizer.io.calibration import write_calibration
@@ -279,7 +278,7 @@ def run(args: argparse.Namespace) -> None:
     if not args.images.exists():
         raise ValueError(f"{args.images} does not exist")
     markers = None if args.markers is None else read_checked_map(args.markers)
-    tell_telemetry(args)
+    tell_telemetry(args, lens=False)
     shutter, imu = shutter_of(args), imu_of(args)
     with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
@@ -323,6 +322,8 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
     if looked.camera is None:
         write_calibration(out / CAMERA, replace(built.camera, readout_time=0.0))
+    from rs_localizer.evaluation.map_pictures import save_pictures
+
     save_pictures(built, out)
     (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")
 
