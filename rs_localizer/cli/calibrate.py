@@ -596,6 +596,8 @@ def _cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, _OfRi
         raise UsageError(
             f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
         )
+    if len(set(frames)) < len(frames):  # as of single recordings put together
+        frames = [""] * len(frames)
     lens = args.calibration
     return {
         name: _OfRig(

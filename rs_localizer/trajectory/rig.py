@@ -24,7 +24,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Undetermined
-from rs_localizer.trajectory.calibration import Calibration, cut, disagreement
+from rs_localizer.trajectory.calibration import Calibration, cut, disagreement, discrepancy
 from rs_localizer.trajectory.fit import Fit, solve
 from rs_localizer.trajectory.imu import middle_row
 from rs_localizer.trajectory.lens import with_lens
@@ -248,11 +248,13 @@ def _mounted(place: int, whole: _Joint, parts: list[_Joint]) -> Mounted:
     state = whole.states[place]
     extrinsics = state.extrinsics
     values, deviations = whole.numbers(place, extrinsics)
-    inflations = np.ones(EXTRINSICS)
+    inflations, beside = np.ones(EXTRINSICS), np.zeros(EXTRINSICS)
     if place > 0 and len(parts) > 1:
         each = np.array([part.numbers(place, extrinsics) for part in parts])
-        inflations = np.array([disagreement(*each[:, :, k].T) for k in range(EXTRINSICS)])
-    deviations = deviations * inflations
+        for k, (own, noise) in enumerate(each.transpose(2, 1, 0)):
+            inflations[k] = disagreement(own, noise)
+            beside[k] = discrepancy(float(values[k]), own, inflations[k] * noise)
+    deviations = np.hypot(inflations * deviations, beside)
     return Mounted(
         camera=with_lens(whole.problem.cameras[place].camera, state.lens),
         readout_time=state.readout_time,
