@@ -71,6 +71,8 @@ _RIDGE = 1.0 + 1e-13
 _CLOSING = 0.6
 # A last step this short, in squared standard deviations: the next one is its square.
 _SHORT = 1e-3
+# A step that raises the cost is halved, up to a thirtieth.
+_HALVINGS = 6
 # Fewer inliers determine nothing.
 _FEWEST = 6
 _TINY = 1e-300
@@ -608,32 +610,42 @@ def fit_frame(
     tau = _row_times(data, count)
     turns = np.zeros((FUNCTIONS if with_turns else 0, 3))
     inliers = squared_errors(data, count, state) < gate * gate
-    prior_cost, finite, done = 0.0, True, False
+    finite, done, groups = True, False, _groups(q)
     lines = linearized(data, count, state, shake_at(tau, turns))
     errors, squared = _beside(data, state, lines, inliers, coefficients[first:], bend)
+    information, slope, prior_cost = full_prior(prior, state, turns, size)
     for turn in range(most):
         kept = int(np.count_nonzero(inliers))
         if kept < _FEWEST:
             finite = False
             break
         normal = products_of(lines, inliers, errors, with_turns, with_smooth, bend)
-        information, slope, prior_cost = full_prior(prior, state, turns, size)
         solved = with_scales(
             normal, information, slope, coefficients, scales, hyper_mean, hyper_precision, noise,
             2 * kept, (_SCALE_ROUNDS if turn < 3 else _LATER_SCALE_ROUNDS) if q > 0 else 1,
         )  # fmt: skip
-        values, scales = solved.values, solved.log_scales
-        moved = _largest_move(values, coefficients, solved.covariance)
+        step, scales = solved.values.copy(), solved.log_scales
+        step[PARAMETERS:] -= coefficients
+        moved = _largest_move(step, solved.covariance)
         if not np.isfinite(moved):
             finite = False
             break
-        state = apply_step(state, values[:PARAMETERS])
-        coefficients = values[PARAMETERS:].copy()
-        for k in range(len(turns)):
-            for axis in range(3):
-                turns[k, axis] = coefficients[3 * k + axis]
-        lines = linearized(data, count, state, shake_at(tau, turns))
-        errors, squared = _beside(data, state, lines, inliers, coefficients[first:], bend)
+        precisions, origin, before = np.exp(-2.0 * scales[groups]), state, coefficients
+        most_cost = prior_cost + np.sum(before**2 * precisions)
+        most_cost += np.sum(squared[inliers]) / noise**2 + _SHORT
+        # What hardly determines a velocity is a valley that bends: a full step may leave it.
+        for _ in range(_HALVINGS):
+            state, coefficients = apply_step(origin, step[:PARAMETERS]), before + step[PARAMETERS:]
+            for k in range(len(turns)):
+                for axis in range(3):
+                    turns[k, axis] = coefficients[3 * k + axis]
+            lines = linearized(data, count, state, shake_at(tau, turns))
+            errors, squared = _beside(data, state, lines, inliers, coefficients[first:], bend)
+            information, slope, prior_cost = full_prior(prior, state, turns, size)
+            cost = prior_cost + np.sum(coefficients**2 * precisions)
+            if cost + np.sum(squared[inliers]) / noise**2 <= most_cost:
+                break
+            step *= 0.5
         noise = noise_deviation(squared, gate, max(2.0 * kept - solved.freedom, 0.0))
         closed = gate <= WIDEST_GATE * threshold
         gate = max(_CLOSING * gate, min(max(threshold, GATE * noise), WIDEST_GATE * threshold))
@@ -643,9 +655,10 @@ def fit_frame(
                 break
             done = True
     variance, chosen = noise * noise, PARAMETERS + first
-    cost = solved.left / variance + prior_cost + solved.prior_cost
+    left = np.sum(squared[inliers]) / variance
+    prior_cost += np.sum(coefficients**2 * np.exp(-2.0 * scales[groups]))
     kept = int(np.count_nonzero(inliers))
-    evidence = 0.5 * (solved.log_determinant - cost) - kept * math.log(variance)
+    evidence = 0.5 * (solved.log_determinant - left - prior_cost) - kept * math.log(variance)
     smooth = math.exp(scales[SCALES - 1]) if with_smooth else 0.0
     agreement = neighbours_agree(errors, tau, lines.image, inliers)
     finite = finite and bool(np.all(np.isfinite(solved.covariance)))
@@ -654,7 +667,7 @@ def fit_frame(
     return FrameFit(
         state, turns, own, noise, solved.freedom, inliers, squared, scales,
         solved.decided, smooth, agreement, evidence,
-        solved.left / variance, prior_cost + solved.prior_cost, solved.log_determinant, finite,
+        left, prior_cost, solved.log_determinant, finite,
     )  # fmt: skip
 
 
@@ -679,12 +692,11 @@ def _beside(
 
 
 @inlined
-def _largest_move(values: Array, coefficients: Array, covariance: Array) -> float:
+def _largest_move(step: Array, covariance: Array) -> float:
     """Square of the longest part of a step, in deviations; NaN where one is not finite."""
     longest = 0.0
-    for i in range(len(values)):
-        change = values[i] - (coefficients[i - PARAMETERS] if i >= PARAMETERS else 0.0)
-        part = change * change / max(covariance[i, i], _TINY)
+    for i in range(len(step)):
+        part = step[i] * step[i] / max(covariance[i, i], _TINY)
         if not part <= longest:
             longest = part
     return longest
