@@ -74,6 +74,8 @@ class Notice(StrEnum):
     TOO_MANY_POINTS = "too_many_points"
     READOUT_TIME = "readout_time"
     LENS = "lens"
+    EXTRINSICS = "extrinsics"
+    CLOCK = "clock"
     # Of maps and keypoints.
     MAP_REPLACED = "map_replaced"
     MAP_INCOMPLETE = "map_incomplete"

@@ -42,6 +42,7 @@ from rs_localizer.pipeline.inputs import INPUTS, Input
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 from rs_localizer.pipeline.rig_frames import FrameAssembler, Image
+from rs_localizer.pipeline.rig_watch import RigWatch
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Memory, Tracker
 
@@ -118,6 +119,7 @@ class RigLocalizer(FrameLocalizer):
         self.calibrations: dict[str, Calibration] = {}
         self._assembler = FrameAssembler(config.cameras, config.rig.window, notice)
         self._mounts: dict[str, Transform] = {}
+        self.watch = RigWatch(config, notice)
         super().__init__(config, notice, transforms)
 
     def _use(self, calibration: Calibration, config: NodeConfig) -> None:
@@ -128,6 +130,7 @@ class RigLocalizer(FrameLocalizer):
         self._tracker = Tracker(Localizer(rig, config), None, memory)
         if not hasattr(self, "_config") or config.rig != self._config.rig:
             self._assembler = FrameAssembler(config.cameras, config.rig.window, self._notice)
+        self.watch = RigWatch(config, self._notice)
         self._config = config
 
     def _rig(
@@ -146,6 +149,11 @@ class RigLocalizer(FrameLocalizer):
             for name in mounts
         }
         return Rig(cameras, {name: (it.rotation, it.translation) for name, it in mounts.items()})
+
+    @property
+    def rig(self) -> Rig:
+        """As far as its cameras are known."""
+        return self._rig(self._config, self.calibrations, self._mounts)
 
     @property
     def camera_frame(self) -> str:
@@ -167,6 +175,7 @@ class RigLocalizer(FrameLocalizer):
 
     def reset(self) -> None:
         self._assembler.reset()
+        self.watch.reset()
         super().reset()
 
     def warm_up(self) -> None:
@@ -214,13 +223,22 @@ class RigLocalizer(FrameLocalizer):
         cloud = self._read(name, kind, message, camera)
         if isinstance(cloud, Refusal):
             return [cloud]
-        start_ns = cloud.stamp_ns + round(own.stamp_offset * 1e9)
-        middle_ns = start_ns - round(camera.first_row_time * own.readout_time * 1e9)
         for notice, text in oddities(cloud, camera, self.calibrations[name].frame).items():
             self._notice(notice, f"{name}: {text}")
         cloud = thinned(cloud, self._config.max_points // len(self._config.cameras), camera.size)
-        frames = self._assembler.add(Image(name, start_ns, middle_ns, cloud))
-        return [self._localize_frame(frame) for frame in frames]
+        start_ns = self.watch.start_ns(name, cloud.stamp_ns + round(own.stamp_offset * 1e9))
+        middle_ns = start_ns - round(camera.first_row_time * own.readout_time * 1e9)
+        image = Image(name, start_ns, middle_ns, cloud)
+        frames = self._assembler.add(image) if self.watch.is_usable(name) else []
+        answers = [self._localize_frame(frame) for frame in frames]
+        frame = self.camera_frame
+        fixed = {
+            each: mount
+            for each, mount in self._mounts.items()
+            if not self.transforms.moves(self.calibrations[each].frame, frame)
+        }
+        self.watch.add(image, camera, fixed)
+        return answers
 
     def flush(self) -> list[Localized | Refusal]:
         """The results of what still waits for other images: none will come."""
@@ -252,7 +270,7 @@ class RigLocalizer(FrameLocalizer):
                 f"the points of {images[0].camera} are in frame {reference.frame!r}, others in "
                 f"{', '.join(map(repr, sorted(others)))}: cameras of a rig see one map",
             )
-        self._follow(reference.stamp_ns, reference.frame)
+        self._follow(images[0].start_ns, reference.frame)
         refusal = self._mount(images)
         images = [image for image in images if image.camera in self._mounts]
         if not images:
@@ -263,6 +281,7 @@ class RigLocalizer(FrameLocalizer):
         starts = {image.camera: 1e-9 * (image.start_ns - origin_ns) for image in images}
         matches = {image.camera: _matches(image.cloud, images) for image in images}
         result = self._tracker.localize(origin_ns, matches, stamps=starts)
+        self.watch.judge(bool(result))
         if not result:
             return Refusal(result.reason, result.detail)
         assert isinstance(result, RigEstimate)
@@ -299,8 +318,11 @@ class RigLocalizer(FrameLocalizer):
         """Pose and twist of the rig's axes at the published moment."""
         config, cloud = self._config, images[0].cloud
         time_ns = origin_ns + round(1e9 * result.time)
-        stamp_ns = time_ns if config.pose_time == PoseTime.MID_FRAME else cloud.stamp_ns
-        tau = 1e-9 * (stamp_ns - time_ns) / result.span
+        own_ns = self.watch.offset_ns(
+            images[0].camera
+        )  # what is published has stamps of that clock
+        stamp_ns = time_ns - own_ns if config.pose_time == PoseTime.MID_FRAME else cloud.stamp_ns
+        tau = (stamp_ns + own_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
         moving = find_solver(config.solver).rolling_shutter
         table = _table(config.cameras, images)
         return Localized(
@@ -313,7 +335,7 @@ class RigLocalizer(FrameLocalizer):
             inliers=select_inliers(table, np.asarray(result.inliers), np.asarray(result.residuals)),
             dropped=sum(image.cloud.dropped for image in images),
             estimate=result,
-            cameras=tuple(_share(image.camera, result) for image in images),
+            cameras=tuple(_share(image, result) for image in images),
         )
 
 
@@ -343,10 +365,11 @@ def _table(names: Sequence[str], images: Sequence[Image]) -> NDArray[Any]:
     return rows
 
 
-def _share(name: str, result: RigEstimate) -> CameraShare:
+def _share(image: Image, result: RigEstimate) -> CameraShare:
+    name = image.camera
     assert isinstance(result.inliers, ByCamera)  # as all of a rig
     assert isinstance(result.residuals, ByCamera)
     inliers = result.inliers[name]
     kept = np.asarray(result.residuals[name][inliers])
     rms = float(np.sqrt(kept @ kept / max(len(kept), 1)))
-    return CameraShare(name, len(inliers), len(kept), rms)
+    return CameraShare(name, len(inliers), len(kept), rms, image.start_ns)

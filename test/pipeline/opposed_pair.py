@@ -3,16 +3,18 @@
 """A recording of two cameras with opposed scans before a wall."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.rigs import RigParts
+from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import write_parameters
-from rs_localizer.simulation.frames import FrameSettings
 from rs_localizer.simulation.rig import (
     RigFrame,
     camera_stamps,
@@ -21,7 +23,9 @@ from rs_localizer.simulation.rig import (
     write_mounts,
     write_rig_frame,
 )
-from rs_localizer.simulation.true_motion import ConstantVelocity
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
+from rs_localizer.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
 
 K = np.array([[450.0, 0.0, 319.5], [0.0, 450.0, 239.5], [0.0, 0.0, 1.0]])
 # The second camera hangs upside down, 10 cm to the right of the first.
@@ -43,23 +47,58 @@ def wall(count: int = 6000) -> np.ndarray:
     return np.column_stack([2.5 + 0.2 * y - 0.15 * z, y, z])
 
 
+def hand(begin: float, seconds: float) -> TrueMotion:
+    """Some seconds of the bundled motion of a hand-held rig."""
+    motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
+    start_ns = motion.intervals_ns[0][0] + round(begin * 1e9)
+    return Part(motion, [(start_ns, start_ns + round(seconds * 1e9))])
+
+
+@dataclass(frozen=True)
+class Part:
+    """Of a motion, what lies in some intervals."""
+
+    motion: TrueMotion
+    intervals_ns: list[tuple[int, int]]
+
+    def state(self, stamp_ns: int, offsets: Any) -> Any:
+        """Of the whole."""
+        return self.motion.state(stamp_ns, offsets)
+
+
+def rich(motion: TrueMotion) -> np.ndarray:
+    """Points (n,3) of a room all around a motion."""
+    start_ns, end_ns = motion.intervals_ns[0]
+    places = motion.state(start_ns, np.linspace(0.0, 1e-9 * (end_ns - start_ns), 50)).positions
+    return room(places, np.random.default_rng(3))
+
+
 def record(
     path: Path,
     seconds: float = 1.0,
     noise: float = 0.5,
     keep: Callable[[RigFrame], bool] = lambda image: True,
     names: tuple[str, ...] = ("left", "right"),
+    motion: TrueMotion | None = None,
+    points: np.ndarray | None = None,
+    true: RigParts = PARTS,
+    stamp: Callable[[RigFrame], int] = lambda image: image.stamp_ns,
     **parameters: Any,
-) -> ConstantVelocity:
-    """Write a recording with its parameters; the true motion of the rig."""
-    motion = ConstantVelocity(ANGULAR, LINEAR, seconds, start_ns=1_000_000_000)
+) -> TrueMotion:
+    """Write a recording with its parameters; the true motion of the rig.
+
+    ``true``: the rig as it is, where it differs from what the recording says.
+    """
+    motion = motion or ConstantVelocity(ANGULAR, LINEAR, seconds, start_ns=1_000_000_000)
     settings = FrameSettings(points=80, noise=noise, outliers=0.2)
     parts = PARTS._replace(cameras={name: PARTS.cameras[name] for name in names})
+    true = true._replace(cameras=parts.cameras)
     stamps = camera_stamps(parts, motion, settings.rate, seed=4, triggered=False)
+    points = wall() if points is None else points
     with BagWriter(path) as bag:
-        write_mounts(bag, parts, 900_000_000)
-        for image in simulate_rig(parts, motion, wall(), settings, stamps_ns=stamps, seed=1):
+        write_mounts(bag, parts, motion.intervals_ns[0][0] - 100_000_000)
+        for image in simulate_rig(true, motion, points, settings, stamps_ns=stamps, seed=1):
             if keep(image):
-                write_rig_frame(bag, parts, motion, image)
+                write_rig_frame(bag, parts, motion, replace(image, stamp_ns=stamp(image)))
     write_parameters(path / "parameters.yaml", rig_parameters(parts) | parameters)
     return motion

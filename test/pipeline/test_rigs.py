@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of a rig from a recording to poses, against the true motion."""
 
+import re
 from collections import Counter
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -10,15 +12,17 @@ import pytest
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.io.bags import BagError, open_bag
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import prepare, replay
+from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import build, load_params_file
 
-from .opposed_pair import record
+from .opposed_pair import PARTS, hand, record, rich
 
 
-def localize(path, **settings):
-    """Frames, refusals and notices of a recording."""
+def localize(path, seen=None, **settings):
+    """Frames, refusals and notices of a recording; ``seen``: takes what is known of the cameras."""
     values = load_params_file(path / "parameters.yaml") | {"min_inliers": 20} | settings
     notices: list[tuple[str, str]] = []
     with open_bag(path) as bag:
@@ -26,6 +30,8 @@ def localize(path, **settings):
             bag, build(values), notice=lambda name, text: notices.append((name, text))
         )
         answers = [answer.result for answer in replay(bag, topics, localizer)]
+    if seen is not None:
+        seen.update(localizer.watch.values)
     frames = [answer for answer in answers if answer]
     return frames, [answer for answer in answers if not answer], notices
 
@@ -97,6 +103,94 @@ def test_a_camera_that_stops_and_starts_again_is_named_and_poses_go_on(tmp_path)
     assert np.median(np.linalg.norm(off[:, :3], axis=1)) < 0.02
     found = np.array([errors(frame, motion) for frame in frames])
     assert np.mean(np.abs(found[:, 0]) < 3.0 * found[:, 1]) > 0.95
+
+
+SIDEWAYS = np.array([0.3, 0.8, -0.5]) / np.linalg.norm([0.3, 0.8, -0.5])
+
+
+@pytest.mark.parametrize(("degrees", "centimetres"), [(1.0, 0.0), (0.0, 1.0)])
+def test_a_wrong_extrinsic_is_named(tmp_path, degrees, centimetres):
+    motion, (rotation, translation) = hand(5.0, 3.0), PARTS.camera_from_rig["right"]
+    mounted = (
+        so3.exp(np.radians(degrees) * SIDEWAYS) @ rotation,
+        translation + 0.01 * centimetres * SIDEWAYS,
+    )
+    true = PARTS._replace(camera_from_rig=PARTS.camera_from_rig | {"right": mounted})
+    record(tmp_path / "bag", motion=motion, points=rich(motion), true=true)
+    notices = localize(tmp_path / "bag")[2]
+    texts = [text for name, text in notices if name == "extrinsics"]
+    assert len(texts) == 1
+    assert texts[0].startswith("extrinsics of right relative to left differ by ")
+    turn, turn_deviation, moved, moved_deviation = numbers(texts[0])
+    assert turn == pytest.approx(degrees, abs=3.0 * turn_deviation)
+    assert moved == pytest.approx(10.0 * centimetres, abs=3.0 * moved_deviation)
+
+
+def numbers(text):
+    return [float(number) for number in re.findall(r"-?\d+\.\d+", text)]
+
+
+@pytest.mark.parametrize("jump", [0.0, 0.02, -5.0])
+def test_clocks_are_estimated_and_followed(tmp_path, jump):
+    """4 ms that nobody has told, and a clock that jumps half-way: poses go on."""
+    motion = hand(5.0, 4.0)
+    half_ns = motion.intervals_ns[0][0] + 2_000_000_000
+
+    def stamp(image):
+        jumped = round(1e9 * jump) if image.frame.stamp_ns > half_ns else 0
+        return image.stamp_ns + (4_000_000 + jumped if image.name == "right" else 0)
+
+    record(tmp_path / "bag", motion=motion, points=rich(motion), stamp=stamp)
+    known: dict[str, str] = {}
+    frames, refused, notices = localize(
+        tmp_path / "bag", known, **{"rig.estimate_time_offsets": True}
+    )
+    assert len(refused) <= 6
+    assert len(frames) >= 112
+    offset, deviation = numbers(known["Clock offset of right (ms)"])
+    assert deviation < 0.3
+    assert offset == pytest.approx(-4.0 - 1e3 * jump, abs=3.0 * deviation)
+    said = [text for name, text in notices if name == "clock"]
+    assert len(said) == (jump != 0.0)
+    assert all("right" in text for text in said)
+    last = [frame for frame in frames if len(frame.cameras) == 2][-30:]
+    assert last[0].stamp_ns > half_ns
+    off = np.array([errors(frame, motion)[0][:3] for frame in last])
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.003
+    if jump == 0.0:  # what is not asked for is said, and changes nothing
+        notices = localize(tmp_path / "bag")[2]
+        assert Counter(name for name, _ in notices)["clock"] == 1
+
+
+def test_one_camera_gives_the_same_bytes_by_name(tmp_path):
+    """As a rig of one, and without ``cameras``: poses, twists, covariances and inliers."""
+    path = tmp_path / "bag"
+    record(path, 0.5, names=("left",), max_orientation_deviation=1.0)
+    named, refused, _ = localize(path)
+    values = {"readout_time": 0.03, "min_inliers": 20, "max_orientation_deviation": 1.0}
+    alone = FrameLocalizer(build(values | {"base_frame": "rig"}))
+    plain = []
+    with open_bag(path) as bag:
+        settings = build(load_params_file(path / "parameters.yaml"))
+        alone.transforms = prepare(bag, settings)[1].transforms
+        for topic, _, message in bag.messages(("/left/camera_info", "/left/correspondences")):
+            if topic == "/left/camera_info":
+                alone.calibrate(read_camera_info(message))
+            else:
+                plain.append(alone.localize(message))
+    assert len(plain) == len(named) + len(refused) >= 14
+    plain = [frame for frame in plain if frame]
+    assert len(plain) == len(named) > 0
+    for one, other in zip(plain, named, strict=True):
+        assert one.stamp_ns == other.stamp_ns
+        for value in (
+            "pose.position", "pose.rotation", "pose.covariance", "twist.linear", "twist.angular",
+            "twist.covariance",
+        ):  # fmt: skip
+            a, b = (attrgetter(value)(it) for it in (one, other))
+            assert a.tobytes() == b.tobytes(), value
+        for field in one.inliers.dtype.names:
+            np.testing.assert_array_equal(one.inliers[field], other.inliers[field])
 
 
 def prepare_named(path, cameras):

@@ -126,6 +126,7 @@ class Condition:
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
     readout: MeasuredReadout | None = None  # as the camera's motion shows it
     imu: ImuState | None = None  # None: there is none
+    of_rig: Mapping[str, str] = field(default_factory=dict)  # of its cameras, by readable names
 
 
 def of_interest(silence: Mapping[str, Silence], missing: Sequence[str]) -> dict[str, Silence]:
@@ -256,6 +257,7 @@ def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
     if condition.readout is not None:
         readout, deviation = 1e3 * condition.readout.readout_time, 1e3 * condition.readout.deviation
         values["Readout time seen (ms)"] = f"{readout:.2f} +- {deviation:.2f}"
+    values |= condition.of_rig
     if condition.imu is not None:
         values |= imu_values(condition.imu)
     values |= {

@@ -26,7 +26,7 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import Input, Results, Role
 from rs_localizer.pipeline.px4 import TYPE, Jumps, vehicle_odometry
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.pipeline.rigs import frame_localizer, inputs_of
+from rs_localizer.pipeline.rigs import RigLocalizer, frame_localizer, inputs_of
 from rs_localizer.ros.localizer import transforms
 from rs_localizer.ros.localizer.health import (
     Answer,
@@ -243,7 +243,7 @@ class Outputs:
 # Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
 _ODD = (
     "map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "no_images",
-    "lens", "bad_imu",
+    "lens", "clock", "bad_imu",
 )  # fmt: skip
 
 
@@ -394,6 +394,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         missing = () if frames is None else frames.missing
         watch = None if frames is None else frames.readout_watch
         imu = None if frames is None else frames.imu.state
+        rig = frames.watch if isinstance(frames, RigLocalizer) else None
         inputs = {
             name: item for name, item in self.silence.items() if name in inputs_of(self.config)
         }
@@ -405,9 +406,11 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
             oddities=self.refusals.recent(_ODD, WINDOW)
             | self._broadcaster.fault()
             | imu_oddity(imu)
-            | ({"readout_time": watch.fault} if watch and watch.fault else {}),
+            | ({"readout_time": watch.fault} if watch and watch.fault else {})
+            | (rig.faults if rig else {}),
             readout=watch.measured if watch else None,
             imu=imu,
+            of_rig=rig.values if rig else {},
         )
         health = diagnose(condition, self.statistics.summary())
         return health, "" if frames is None else frames.camera_frame
