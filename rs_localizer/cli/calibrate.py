@@ -538,15 +538,19 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
             raise UsageError(f"--{name} is for one camera: leave it out with --rig")
     if args.out is not None:
         refuse_existing(args)
+    # Cameras by name need a readout time; what it is does not matter where it is estimated.
+    args.assignments = ["readout_time:=0.03", *args.assignments]
     config, recordings, maps = _config(args), dict[str, Recording](), list[MarkerMap]()
     cameras = _cameras_of(args, config)
     intrinsics = args.intrinsics
     for name, own in cameras.items():
         print(f"{name}:")
-        source = _read(own.args, config)
+        axis = config.of_cameras.get(name, config).scan_direction
+        of_camera = replace(config, scan_direction=axis)
+        source = _read(own.args, of_camera)
         intrinsics |= source.camera is None
         maps += [] if source.map is None else [source.map]
-        camera = _without_k3(_first_camera(source, config))
+        camera = _without_k3(_first_camera(source, of_camera))
         recordings[name] = Recording(camera, _calibrated(own.args, source, camera, config))
     refusals = {name: verdict.refusal(each.calibration) for name, each in recordings.items()}
     refusals = {name: text for name, text in refusals.items() if text}
@@ -654,7 +658,8 @@ def _parts(
             scan_direction=verdict.scan_direction(own),
         )
     poses = {name: (one.rotation, one.translation) for name, one in rig.items()}
-    offsets = {name: config.stamp_offset + one.time_offset for name, one in rig.items()}
+    base = config.of_cameras.get(next(iter(rig)), config).stamp_offset
+    offsets = {name: base + one.time_offset for name, one in rig.items()}
     return RigParts(cameras, poses, offsets)
 
 
