@@ -105,8 +105,8 @@ class FrameFit(NamedTuple):
     agreement: float  # of neighbouring rows (see residual_tests)
     evidence: float  # logarithm, but for a constant of the inliers
     left: float  # squared errors beside all, in variances of the noise
-    prior_cost: float  # of motion and coefficients
-    log_determinant: float  # of the covariance over that of the prior of the coefficients
+    prior_cost: float  # of motion, coefficients and scales
+    log_determinant: float  # of the covariance over that of the prior of coefficients and scales
     finite: bool
 
 
@@ -657,8 +657,13 @@ def fit_frame(
     variance, chosen = noise * noise, PARAMETERS + first
     left = np.sum(squared[inliers]) / variance
     prior_cost += np.sum(coefficients**2 * np.exp(-2.0 * scales[groups]))
+    cost, volume = _of_scales(
+        scales - hyper_mean, scales, hyper_precision, solved.decided,
+        0 if with_turns else SCALES - 1, SCALES if with_smooth else SCALES - 1,
+    )  # fmt: skip
+    prior_cost, log_determinant = prior_cost + cost, solved.log_determinant + volume
     kept = int(np.count_nonzero(inliers))
-    evidence = 0.5 * (solved.log_determinant - left - prior_cost) - kept * math.log(variance)
+    evidence = 0.5 * (log_determinant - left - prior_cost) - kept * math.log(variance)
     smooth = math.exp(scales[SCALES - 1]) if with_smooth else 0.0
     agreement = neighbours_agree(errors, tau, lines.image, inliers)
     finite = finite and bool(np.all(np.isfinite(solved.covariance)))
@@ -667,8 +672,33 @@ def fit_frame(
     return FrameFit(
         state, turns, own, noise, solved.freedom, inliers, squared, scales,
         solved.decided, smooth, agreement, evidence,
-        left, prior_cost, solved.log_determinant, finite,
+        left, prior_cost, log_determinant, finite,
     )  # fmt: skip
+
+
+@inlined
+def _of_scales(
+    away: Array, scales: Array, precision: Array, decided: Array, first: int, last: int
+) -> tuple[float, float]:
+    """Cost of the log-scales from ``first`` to before ``last``, ``away`` from what is known of
+    them, and the logarithm of the determinant of their covariance over that of their hyperprior
+    (Laplace): modes and frames with an in-frame turn are not equally probable in them.
+    """
+    count, cost = last - first, 0.0
+    before = np.zeros((count, count))
+    for i in range(count):
+        g = first + i
+        cost += precision[g] * away[g] ** 2
+        before[i, i] += precision[g]
+        if i > 0 and g < SCALES - 1:
+            cost += _SMOOTH_SPECTRUM * (scales[g] - scales[g - 1]) ** 2
+            for j in (i - 1, i):
+                before[j, j] += _SMOOTH_SPECTRUM
+                before[j, 2 * i - 1 - j] -= _SMOOTH_SPECTRUM
+    after = before.copy()
+    for i in range(count):
+        after[i, i] += 2.0 * decided[first + i]
+    return cost, log_determinant_of_inverse(before) - log_determinant_of_inverse(after)
 
 
 @kernel

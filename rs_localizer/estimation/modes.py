@@ -57,6 +57,9 @@ _SAME = 1e-2
 _MOST_BETTER = 0.01
 # No frame says more than this against a typical speed.
 _LEAST_LIKELY = -10.0
+# Gate from which a smooth error is fitted, in thresholds: what it will explain stands outside of
+# the widest one, and would stay there.
+_FIRST_GATE = 2.0 * WIDEST_GATE
 _FITS, _FINE = 4, 1e-6
 _NO_SCALE, _ITERATIONS = 1e6, 50
 # Deviation of a lean (rad, 2 deg) up to which one Gaussian will do.
@@ -392,7 +395,7 @@ def _mode(
     if smooth.fitted and np.isfinite(evidence):
         fit = fit_frame(
             inliers.data, len(inliers.chosen), state, terms, inliers.threshold,
-            WIDEST_GATE * inliers.threshold, noise, smooth.first, smooth.mean, smooth.precision,
+            _FIRST_GATE * inliers.threshold, noise, smooth.first, smooth.mean, smooth.precision,
             False, True, smooth.bend, STEPS,
         )  # fmt: skip
         if fit.finite:
