@@ -88,14 +88,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add_common(action)
 
 
-def run(args: argparse.Namespace) -> None:
-    if args.action == "make":
-        _make(args)
-    else:
-        _check(args.map)
+def run(args: argparse.Namespace) -> dict[str, object]:
+    return _make(args) if args.action == "make" else _check(args.map)
 
 
-def _make(args: argparse.Namespace) -> None:
+def _make(args: argparse.Namespace) -> dict[str, object]:
     try:
         marker_map = _map(args)
     except UsageError:
@@ -123,6 +120,7 @@ def _make(args: argparse.Namespace) -> None:
     print(f"{map_file}: {len(marker_map.points)} corners in {marker_map.map_frame}")
     if marker_map.markers and len(pages) > 1:
         print("the markers do not fit on a page together: mount each where the map has it")
+    return {"pages": files, "map": map_file, "corners": len(marker_map.points)}
 
 
 def _map(args: argparse.Namespace) -> MarkerMap:
@@ -159,7 +157,7 @@ def _refuse(args: argparse.Namespace, what: str, *names: str) -> None:
             raise UsageError(f"--{name.replace('_', '-')} is for {what}")
 
 
-def _check(path: Path) -> None:
+def _check(path: Path) -> dict[str, object]:
     marker_map = read_marker_map(path)
     faults = problems(marker_map)
     for text in faults:
@@ -173,3 +171,7 @@ def _check(path: Path) -> None:
         f"{path}: {len(marker_map.markers)} markers and {len(marker_map.boards)} boards{of} in "
         f"{marker_map.map_frame}; no problem found"
     )
+    return {
+        "markers": len(marker_map.markers), "boards": len(marker_map.boards),
+        "families": kinds, "map_frame": marker_map.map_frame,
+    }  # fmt: skip

@@ -374,7 +374,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     })  # fmt: skip
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> dict[str, object]:
     foreign = _OF_POINTS if args.images else _OF_IMAGES
     foreign_options = [name for name in foreign if getattr(args, name) != args.defaults[name]]
     if foreign_options:
@@ -384,17 +384,17 @@ def run(args: argparse.Namespace) -> None:
             if args.images
             else f"{option} is for images; give --images, too"
         )
-    if args.rig is not None:
-        _write_rig(args)
-    elif args.triggered:
+    if args.rig is None and args.triggered:
         raise UsageError("--triggered is for --rig")
+    write = _write_points
+    if args.rig is not None:
+        write = _write_rig
     elif args.images:
-        _write_images(args)
-    else:
-        _write_points(args)
+        write = _write_images
+    return {"recording": str(args.out), **write(args)}
 
 
-def _write_rig(args: argparse.Namespace) -> None:
+def _write_rig(args: argparse.Namespace) -> dict[str, object]:
     parts, motion = rig_of(args), motion_of(args)
     seen = FrameSettings(args.points, args.noise, args.outliers, args.rate)
     first = next(iter(parts.cameras.values()))
@@ -424,9 +424,10 @@ def _write_rig(args: argparse.Namespace) -> None:
     names = ", ".join(parts.cameras)
     print(f"{args.out}: {total} images of {names}, {counts / total:.0f} points each")
     _tell_next(args)
+    return {"images": total, "cameras": list(parts.cameras), "points_per_image": counts / total}
 
 
-def _write_points(args: argparse.Namespace) -> None:
+def _write_points(args: argparse.Namespace) -> dict[str, object]:
     camera, motion = camera_of(args), motion_of(args)
     frame_settings = FrameSettings(args.points, args.noise, args.outliers, args.rate)
     stamps = stamps_of(args, camera, motion)
@@ -457,6 +458,7 @@ def _write_points(args: argparse.Namespace) -> None:
         f"{np.mean(counts):.0f} points each{_fewer(counts, args.points)}"
     )
     _tell_next(args)
+    return {"images": len(stamps), "points_per_image": float(np.mean(counts))}
 
 
 def _tell_next(args: argparse.Namespace) -> None:
@@ -468,7 +470,7 @@ def _tell_next(args: argparse.Namespace) -> None:
     print(f"next: rs_localizer replay {out} {settings_words} --out {poses}")
 
 
-def _write_images(args: argparse.Namespace) -> None:
+def _write_images(args: argparse.Namespace) -> dict[str, object]:
     camera, motion = camera_of(args), motion_of(args)
     stamps = stamps_of(args, camera, motion)
     scene = SCENES[args.walls](sampled_states(motion))
@@ -486,11 +488,12 @@ def _write_images(args: argparse.Namespace) -> None:
     said = f"{args.out}: {len(stamps)} images in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"
     if scene.marker_map is None:
         print(said)
-        return
+        return {"images": len(stamps)}
     print(f"{said}, {len(scene.marker_map.markers)} markers on the walls")
     out = shlex.quote(str(args.out))
     markers = shlex.quote(f"{args.out}_markers")
     print(f"next: rs_localizer detect {out} --map {out}/{MARKER_MAP} --out {markers}")
+    return {"images": len(stamps), "markers": len(scene.marker_map.markers)}
 
 
 def _shutter(args: argparse.Namespace) -> dict[str, object]:

@@ -37,13 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Compile, and say where the machine code is.
+def run(arguments: argparse.Namespace) -> dict[str, object]:
+    """Compile, and say where the machine code is, and the seconds of each step.
 
     Raises:
         OSError: when it could not be kept there.
     """
     steps: dict[str, Callable[[], None]] = {"markers": detection.warm_up}
+    seconds = dict[str, float]()
     for name in arguments.solver or SOLVERS:
         config = NodeConfig(solver=name, readout_time=_READOUT_TIME)
         steps[f"solver {name}"] = FrameLocalizer(config).warm_up
@@ -59,8 +60,10 @@ def run(arguments: argparse.Namespace) -> None:
                 raise OSError(str(warning)) from warning
             if name.startswith("solver "):
                 note_compiled(name.removeprefix("solver "))
-            print(f"{name:20} {time.monotonic() - started:6.1f} s", flush=True)
+            seconds[name] = time.monotonic() - started
+            print(f"{name:20} {seconds[name]:6.1f} s", flush=True)
     places = f"{cache_directory()}"
     if shipped.FOLDER.is_dir():
         places = f"{shipped.FOLDER}, and what it has not for this CPU in {places}"
     print(f"kernels are in {places}")
+    return {"seconds": seconds, "kernels": places}

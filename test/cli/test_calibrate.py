@@ -111,6 +111,11 @@ def test_faults(flight, tmp_path, capsys):
     nothing.touch()
     assert main(["calibrate", str(nothing), "--board", "5x4", "--square", "0.1"]) == 1
     assert "Traceback" not in capsys.readouterr().err
+    earlier = tmp_path / "earlier.yaml"
+    earlier.write_text("mine")
+    assert main(["calibrate", str(flight), "--out", str(earlier)]) == 1
+    assert f"{earlier} exists; choose another OUT, or --overwrite" in capsys.readouterr().err
+    assert earlier.read_text() == "mine"
 
 
 def test_smooth(flight, tmp_path, capsys):

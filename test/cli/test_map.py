@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``rs_localizer map``: what it says and writes."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -43,4 +44,7 @@ def test_a_model_of_colmap_becomes_a_file(tmp_path, capsys, form):
     assert read_map_file(out, "map").equals(read_map_file(COLMAP / "binary", "map"))
     assert main(words) == 1
     assert "exists; choose another OUT, or --overwrite" in capsys.readouterr().err
-    assert main([*words, "--overwrite"]) == 0
+    assert main([*words, "--overwrite", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)["result"]
+    assert result["landmarks"] == str(len(read_map_file(out, "map")))
+    assert result["written to"] == str(out)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prints with their maps, and what is said of maps that cannot be right."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -28,7 +29,9 @@ def test_make_and_check(tmp_path, capsys):
     # Nothing is overwritten.
     assert make(out, "--size", "0.05") == 1
     assert "exists already" in capsys.readouterr().err
-    assert make(out, "--size", "0.05", "--overwrite") == 0
+    assert make(out, "--size", "0.05", "--overwrite", "--json") == 0
+    pages = {"pages": [f"{out}.pdf"], "map": f"{out}.yaml", "corners": 24}
+    assert json.loads(capsys.readouterr().out)["result"] == pages
     assert read_marker_map(f"{out}.yaml").markers[0].size == pytest.approx(0.05)
 
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """rs_localizer warm: kernels are there, or the exit code says that they are not."""
 
+import json
 import os
 import subprocess
 import sys
@@ -16,6 +17,10 @@ def test_it_says_where_the_kernels_are(capsys):
     assert [line[:10].strip() for line in lines[:2]] == ["markers", "solver p3p"]
     assert lines[2:] == [f"kernels are in {cache_directory()}"]
     assert list(cache_directory().rglob("*.nbc"))
+    assert main(["warm", "--solver", "p3p", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)["result"]
+    assert list(result["seconds"]) == ["markers", "solver p3p"]
+    assert result["kernels"] == str(cache_directory())
 
 
 def test_kernels_that_cannot_be_kept_are_a_failure(tmp_path):

@@ -14,8 +14,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     either.add_output(parser)
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> dict[str, str]:
     either.check_output(args)
     any_map, kind = either.read(args)
-    info.describe(args.file, any_map, kind)
+    table = info.describe(args.file, any_map, kind)
     either.write(args, any_map)
+    return {**table, "written to": str(args.out)}
