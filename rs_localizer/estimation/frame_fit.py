@@ -657,11 +657,11 @@ def fit_frame(
     variance, chosen = noise * noise, PARAMETERS + first
     left = np.sum(squared[inliers]) / variance
     prior_cost += np.sum(coefficients**2 * np.exp(-2.0 * scales[groups]))
-    cost, volume = _of_scales(
+    scale_cost, volume = _of_scales(
         scales - hyper_mean, scales, hyper_precision, solved.decided,
         0 if with_turns else SCALES - 1, SCALES if with_smooth else SCALES - 1,
     )  # fmt: skip
-    prior_cost, log_determinant = prior_cost + cost, solved.log_determinant + volume
+    prior_cost, log_determinant = prior_cost + scale_cost, solved.log_determinant + volume
     kept = int(np.count_nonzero(inliers))
     evidence = 0.5 * (log_determinant - left - prior_cost) - kept * math.log(variance)
     smooth = math.exp(scales[SCALES - 1]) if with_smooth else 0.0
