@@ -13,11 +13,9 @@ from setuptools import Distribution, find_packages, setup
 package_name = "rs_localizer"
 
 requirements = [
-    "matplotlib",
     "numba",
     "numpy>=1.26",
     "opencv-python-headless>=4.6",
-    "Pillow>=9.1",
     "PyYAML",
     "rosbags",
     "scipy",
@@ -76,9 +74,10 @@ setup(
         "completion": ["argcomplete"],
         "docs": ["sphinx", "myst-parser", "sphinxcontrib-mermaid"],
         "evo": ["evo"],
-        "fleet": ["dask", "distributed"],
+        "fleet": ["dask", "distributed", "matplotlib"],
         "hloc": ["h5py"],
-        "mapping": ["pycolmap"],
+        "mapping": ["pycolmap", "matplotlib"],
+        "plots": ["matplotlib", "Pillow>=9.1"],
         "table": ["fsspec", "pyarrow"],
         # There is no wheel for 3.13, and a build needs Rust.
         "video": ["telemetry-parser; python_version < '3.13'"],

@@ -87,7 +87,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   load, load.signals               a live node under load, and stopped at random moments
   image_flight, marker_flight      rendered flights through live nodes and through commands
   signals                          commands that are stopped at random moments
-  rigs                             poses of several cameras against their bounds
+  rig_calibration                  calibrate --rig against its bounds
   start                            memory and time of a start of the node
   fusion                           estimates in the filter of robot_localization
 """

@@ -15,6 +15,11 @@ from rs_localizer.process.stopping import StopSignals
 _PROGRAM = "rs_localizer"
 
 
+def _asks_for_help(words: list[str]) -> bool:
+    end = words.index("--") if "--" in words else len(words)
+    return not {"-h", "--help"}.isdisjoint(words[:end])
+
+
 def run() -> int:
     """Run the command of the process's arguments; Ctrl-C and SIGTERM end it with one line.
 
@@ -31,6 +36,9 @@ def run() -> int:
         code = 0
         try:
             with importing(_PROGRAM):
+                from rs_localizer import cli
+
+                cli.WORKING = not ("_ARGCOMPLETE" in os.environ or _asks_for_help(sys.argv))
                 from rs_localizer.cli.main import complete, main
 
                 complete()

@@ -57,6 +57,18 @@ def setting(
     )
 
 
+def bond_setting() -> Any:
+    """Of every node."""
+    return setting(
+        0.0,
+        "Time between heartbeats for nav2's lifecycle manager, in s; 0: none; needs the package "
+        "bond",
+        minimum=0.0,
+        maximum=2.0,
+        read_only=True,
+    )
+
+
 def check(config: Any, prefix: str = "") -> None:
     """Raise ``ValueError`` for the first setting whose type, range or choice is wrong."""
     for item in fields(config):
@@ -570,6 +582,7 @@ class NodeConfig(LocalizerConfig):
         (0.0, 0.0, -1.0), "Direction in which things fall in the map, of any length: imu.gravity"
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
+    bond_heartbeat_period: float = bond_setting()
     # Of each of the cameras, by its name.
     of_cameras: Mapping[str, CameraSettings] = field(default_factory=dict)
 
@@ -676,6 +689,7 @@ class DetectorConfig:
         maximum=10.0,
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
+    bond_heartbeat_period: float = bond_setting()
 
     def __post_init__(self) -> None:
         check(self)
@@ -711,6 +725,7 @@ class FeatureConfig:
         read_only=True,
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
+    bond_heartbeat_period: float = bond_setting()
 
     def __post_init__(self) -> None:
         check(self)

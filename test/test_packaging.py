@@ -18,9 +18,7 @@ ROOT = Path(__file__).parents[1]
 DOCKERFILE = ROOT / "packaging" / "docker" / "Dockerfile"
 # conda's names, where they differ from pip's.
 CONDA = {
-    "matplotlib": "matplotlib-base",
     "opencv-python-headless": "py-opencv",
-    "Pillow": "pillow",
     "PyYAML": "pyyaml",
 }
 

@@ -26,7 +26,7 @@ from rs_localizer.settings import build
 from rs_localizer.settings import settings as all_settings
 from rs_localizer.simulation.scene import map_rows
 
-quick = settings(max_examples=60, deadline=None)
+quick = settings(max_examples=40, deadline=None)
 # Of a PointField: 32 bits, unsigned or signed.
 IDS = [
     st.integers(0, 2**32 - 1) | st.integers(0, 5) | st.just(2**32 - 1),

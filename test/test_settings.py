@@ -97,12 +97,9 @@ other_node:
     ("text", "fault"),
     [
         ("/**:\n  ros__parameters:\n    sead: 5\n", "'sead' is not a setting; did you mean 'seed'"),
-        ("/**:\n  ros__parameters:\n    colour: 5\n", "is not a setting; there are solver, "),
         ("/**:\n  ros__parameters:\n    velocity_prior: 5\n", "'velocity_prior' is not a setting"),
         ("/**:\n  ros__parameters: 5\n", "ros__parameters of /.* must be a mapping"),
         ("other:\n  ros__parameters:\n    seed: 5\n", "has no ros__parameters for /rs_localizer"),
-        ("seed: 5\n", "has no ros__parameters"),
-        ("", "has no ros__parameters"),
         ("a: [", "is not a YAML file"),
     ],
 )
@@ -132,12 +129,8 @@ def test_assignments(text, name, value):
         ({"solver": "epnp"}, "solver must be one of .*; got 'epnp'"),
         ({"seed": 1.5}, "seed must be of type int, got 1.5"),
         ({"velocity_prior.linear": -1.0}, "velocity_prior.linear must lie between"),
-        ({"readout_time": "long"}, "readout_time must be of type float, got 'long'"),
         ({"imu.use": "yes"}, "imu.use must be one of auto, none; got 'yes'"),
-        ({"imu.wait": -0.1}, "imu.wait must lie between"),
         ({"gravity_in_map": [0.0, 1.0]}, r"must be 3 numbers, as \[0.0, 0.0, -1.0\]"),
-        ({"gravity_in_map": [0.0, 0.0, 0.0]}, "gravity_in_map must have a direction, got zeros"),
-        ({"gravity_in_map": "down"}, "gravity_in_map must be 3 numbers, .* got 'down'"),
     ],
 )
 def test_wrong_values(values, fault):

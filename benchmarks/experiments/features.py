@@ -28,7 +28,8 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.simulation.frames import frame_stamps
 from rs_localizer.simulation.planes import TexturedPlane
-from rs_localizer.simulation.renderer import ImageSettings, Renderer
+from rs_localizer.simulation.renderer import Renderer
+from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import RecordedMotion, TrueMotion, sampled_states
 from rs_localizer.simulation.walls import room
 

@@ -23,13 +23,9 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.simulation.frames import (
-    FrameSettings,
-    SimulatedFrame,
-    frame_stamps,
-    simulate_frames,
-)
+from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
 from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import RecordedMotion
 
 _LANDMARKS = 100_000

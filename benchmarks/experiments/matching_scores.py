@@ -17,8 +17,9 @@ from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher
-from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.scene import random_descriptors, seen_descriptors
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import TrueMotion
 
 _FRAMES = 12

@@ -12,7 +12,8 @@ import numpy as np
 from benchmarks.experiments.results import Claim, Statement, Table
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.simulation.frames import FrameSettings, frame_stamps, simulate_frames
+from rs_localizer.simulation.frames import frame_stamps, simulate_frames
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import RecordedMotion
 from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import calibrate

@@ -17,8 +17,9 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.frames import FrameSettings, frame_stamps, simulate_frames
+from rs_localizer.simulation.frames import frame_stamps, simulate_frames
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import RecordedMotion
 from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import Calibration, calibrate

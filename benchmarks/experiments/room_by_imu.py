@@ -35,8 +35,9 @@ from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.inertial_metres import inertial_metres
 from rs_localizer.mapping.refine import RefinedMap
 from rs_localizer.process.arguments import integer, number
-from rs_localizer.simulation.imu import ImuSettings, Lever, simulate_imu
+from rs_localizer.simulation.imu import Lever, simulate_imu
 from rs_localizer.simulation.marker_frames import CAMERA, SENSOR
+from rs_localizer.simulation.settings import ImuSettings
 from rs_localizer.simulation.true_motion import TrueMotion
 from rs_localizer.trajectory.imu import ImuRecording
 

@@ -21,8 +21,9 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.frames import FrameSettings, frame_stamps, simulate_frames
+from rs_localizer.simulation.frames import frame_stamps, simulate_frames
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import RecordedMotion
 
 _POINTS = 150

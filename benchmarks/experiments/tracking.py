@@ -21,13 +21,9 @@ from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.evaluation.plots import BLUE, ORANGE
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.localizer import Localizer
-from rs_localizer.simulation.frames import (
-    FrameSettings,
-    SimulatedFrame,
-    frame_stamps,
-    simulate_frames,
-)
+from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import RecordedMotion
 from rs_localizer.tracking import Tracker
 

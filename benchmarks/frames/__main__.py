@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The commands: ``python -m benchmarks.frames run``, ``compare`` and ``times``.
+"""The commands: ``python -m benchmarks.frames run``, ``compare``, ``times`` and ``gate``.
 
 Another version of the package is judged by the same benches from any other folder:
 
@@ -27,7 +27,7 @@ import yaml
 from benchmarks.frames.compared import compare, read, totals, totals_line, write
 from benchmarks.frames.conditions import BENCHES, Condition, conditions
 from benchmarks.frames.judged import Judged, judge
-from benchmarks.frames.timed import times
+from benchmarks.frames.timed import gate, times
 
 _SHOWN = {
     "frames": "frames", "localized": "loc", "pose@stamp": "pose@s", "pose@mid": "pose@m",
@@ -70,6 +70,8 @@ def _parser() -> argparse.ArgumentParser:
     timed.add_argument("--frames", type=int, default=20, metavar="N", help="of a condition (20)")
     timed.add_argument("--rounds", type=int, default=7, metavar="N", help="of each frame (7)")
     timed.set_defaults(command=times)
+    gated = commands.add_parser("gate", help="of CI: cost and coverage against what they were")
+    gated.set_defaults(command=gate)
     return parser
 
 

@@ -27,8 +27,9 @@ from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.maps.ply import write_ply
-from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 _COUNT = 5

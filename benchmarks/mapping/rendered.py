@@ -14,7 +14,8 @@ from rs_localizer.mapping.unknown_markers import Spotted, Spotter, every_marker
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.families import Family, family
 from rs_localizer.simulation.planes import TexturedPlane
-from rs_localizer.simulation.renderer import ImageSettings, Renderer
+from rs_localizer.simulation.renderer import Renderer
+from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import TrueState
 
 _CELL_TEXELS = 24

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,9 +15,51 @@ from typing import Any
 
 from tqdm import tqdm
 
+WORKING = True
+"""Whether commands work: where one only shows or completes its arguments, its module imports no
+more than these need."""
+
 
 class UsageError(ValueError):
     """Wrong arguments that argparse cannot see by itself."""
+
+
+# Of every command, wherever they stand behind its name.
+COMMON = (
+    ("--json", "print the result as JSON"),
+    ("--quiet", "print nothing but faults"),
+    ("--verbose", "print the traceback of a fault"),
+)
+
+
+def add_common(parser: argparse.ArgumentParser) -> None:
+    """Show them in the help; whoever reads the command line takes them out before."""
+    group = parser.add_argument_group("of all commands")
+    for name, text in COMMON:
+        short = (name[1:3],) if name != "--json" else ()
+        group.add_argument(*short, name, action="store_true", help=text, dest=f"common{name}")
+
+
+class LateParser(argparse.ArgumentParser):
+    """Of a sub-command, whose module is imported when its turn comes, for ``add_arguments``."""
+
+    _module = ""
+
+    def come_from(self, module: str) -> None:
+        """Name the module."""
+        self._module = module
+        # argcomplete asks for no parsing before it looks at the arguments.
+        if self.prog.split()[-1] in os.environ.get("COMP_LINE", "").split():
+            self._add_arguments()
+
+    def _add_arguments(self) -> None:
+        name, self._module = self._module, ""
+        if name:
+            importlib.import_module(name).add_arguments(self)
+
+    def parse_known_args(self, *args: Any, **kwargs: Any) -> Any:
+        self._add_arguments()
+        return super().parse_known_args(*args, **kwargs)
 
 
 def add_overwrite(parser: argparse._ActionsContainer) -> None:

@@ -17,26 +17,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError
-from rs_localizer.io.atomic_files import write_errors
-from rs_localizer.io.remote import Location, is_url
-from rs_localizer.offline.fleet.cluster import Where, perform_all
-from rs_localizer.offline.fleet.identity import folder_names, identity, program, read_marker
-from rs_localizer.offline.fleet.summary import (
-    CSV,
-    DONE,
-    FAILED,
-    MARKDOWN,
-    OPEN,
-    PICTURE,
-    Row,
-    counted,
-    write_summary,
-)
-from rs_localizer.offline.fleet.task import PARTIAL, Kind, Outcome, Task, finished, readable
+from rs_localizer.cli import WORKING, UsageError
 from rs_localizer.process.arguments import integer
+
+if WORKING:
+    from tqdm import tqdm
+
+    from rs_localizer.io.atomic_files import write_errors
+    from rs_localizer.io.remote import Location, is_url
+    from rs_localizer.offline.fleet.cluster import Where, perform_all
+    from rs_localizer.offline.fleet.identity import folder_names, identity, program, read_marker
+    from rs_localizer.offline.fleet.summary import (
+        CSV,
+        DONE,
+        FAILED,
+        MARKDOWN,
+        OPEN,
+        PICTURE,
+        Row,
+        counted,
+        write_summary,
+    )
+    from rs_localizer.offline.fleet.task import PARTIAL, Kind, Outcome, Task, finished, readable
 
 # Arguments that say what to do with which recordings, and nothing of a result.
 _OF_THE_FLEET = ("recordings", "out", "workers", "scheduler", "overwrite")

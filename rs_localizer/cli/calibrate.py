@@ -5,18 +5,15 @@
 from __future__ import annotations
 
 import argparse
+import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, refuse_existing
 from rs_localizer.cli.batch import (
     Plan,
     add_batch_arguments,
@@ -37,35 +34,55 @@ from rs_localizer.cli.image_input import (
 )
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
-from rs_localizer.config import DetectorConfig, NodeConfig
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
-from rs_localizer.evaluation.calibration_plots import save_plots
-from rs_localizer.io.atomic_files import atomic_files
-from rs_localizer.io.bags import BagReader, is_bag, open_bag
-from rs_localizer.io.calibration import read_calibration, write_calibration
-from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.images import Image
-from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.topics import IMU
-from rs_localizer.markers.boards import BoardSizes
-from rs_localizer.markers.map_files import write_marker_map
-from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.offline.fleet.task import Figures, Kind
-from rs_localizer.offline.image_sources import (
-    Carried,
-    Shot,
-)
-from rs_localizer.offline.recordings import optical_frame, read_imu_recording, read_recording
-from rs_localizer.offline.replay import find_topics, has_frames
-from rs_localizer.pipeline.images import FrameDetector
 from rs_localizer.process.arguments import number
-from rs_localizer.readout import shared_row
-from rs_localizer.trajectory import verdict
-from rs_localizer.trajectory.calibration import Calibration, calibrate
-from rs_localizer.trajectory.first_lens import first_lens
-from rs_localizer.trajectory.imu import ImuRecording, MountFound
-from rs_localizer.trajectory.observe import Observed, in_order
+
+if WORKING:
+    import numpy as np
+    from scipy.spatial.transform import Rotation
+    from tqdm import tqdm
+
+    from rs_localizer.config import DetectorConfig, NodeConfig
+    from rs_localizer.core.arrays import Array
+    from rs_localizer.core.camera import Camera, DistortionModel
+    from rs_localizer.io.atomic_files import atomic_files
+    from rs_localizer.io.bags import BagReader, is_bag, open_bag
+    from rs_localizer.io.calibration import kalibr_fields, read_calibration, write_calibration
+    from rs_localizer.io.camera_info import read_camera_info
+    from rs_localizer.io.images import Image
+    from rs_localizer.io.maps.files import read_map_file
+    from rs_localizer.io.rigs import (
+        RigParts,
+        node_parameters,
+        write_camchain,
+        write_static_transforms,
+    )
+    from rs_localizer.markers.boards import BoardSizes
+    from rs_localizer.markers.map_files import write_marker_map
+    from rs_localizer.markers.maps import MarkerMap
+    from rs_localizer.offline.fleet.task import Figures, Kind
+    from rs_localizer.offline.image_sources import (
+        Carried,
+        Shot,
+    )
+    from rs_localizer.offline.recordings import (
+        camera_topics,
+        optical_frame,
+        read_imu_recording,
+        read_recording,
+        transform_between,
+    )
+    from rs_localizer.offline.replay import find_topics, has_frames
+    from rs_localizer.pipeline.images import FrameDetector
+    from rs_localizer.readout import shared_row
+    from rs_localizer.settings import write_parameters
+    from rs_localizer.trajectory import verdict
+    from rs_localizer.trajectory.calibration import Calibration, calibrate
+    from rs_localizer.trajectory.first_lens import first_lens
+    from rs_localizer.trajectory.imu import ImuRecording, MountFound
+    from rs_localizer.trajectory.lens import LensErrors
+    from rs_localizer.trajectory.observe import Observed, in_order
+    from rs_localizer.trajectory.rig import Mounted, Recording, calibrate_rig
 
 # A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
 _MOST_TURN, _SIGMAS = 1.0, 4.0
@@ -162,6 +179,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     above = number(0.0, above=True)
     parser.add_argument(
+        "--rig",
+        action="store_true",
+        help="the recordings are those of cameras on one body, one each, or one bag has topics of "
+        "several: find where the cameras are, and their clocks, too; the first one's axes and "
+        "clock are the rig's. Cameras are named as their files, or as their topics begin; "
+        "--calibration is a camchain, or FILE of all as FILE#NAME",
+    )
+    parser.add_argument(
         "--map", type=Path, metavar="FILE", help="map of the keypoints, or marker map of the images"
     )
     add_board_arguments(parser)
@@ -193,6 +218,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.yaml",
         help="parameters for node and replay --params; of many recordings, a directory",
     )
+    add_overwrite(parser)
     parser.add_argument(
         "--plots",
         type=Path,
@@ -227,7 +253,9 @@ class _Source:
 
 
 def run(args: argparse.Namespace) -> Figures | None:
-    if is_batch(args):
+    if args.rig:
+        _calibrate_rig(args)
+    elif is_batch(args):
         given_settings(args)  # refuses wrong ones before there are workers
         _calibrate_batch(args)
     else:
@@ -238,12 +266,34 @@ def run(args: argparse.Namespace) -> Figures | None:
 
 def calibrate_one(args: argparse.Namespace) -> Calibration:
     """Calibrate with one recording, and say what was found."""
+    if args.out is not None:
+        refuse_existing(args)
     config = _config(args)
     source = _read(args, config)
-    intrinsics, camera = args.intrinsics or source.camera is None, source.camera
+    intrinsics = args.intrinsics or source.camera is None
+    found = _calibrated(args, source, _first_camera(source, config), config)
+    refusal = verdict.refusal(found)
+    if args.out is not None and (args.force or not refusal):
+        _write(args, found, source.map, intrinsics, config)
+    if refusal:
+        raise ValueError(refusal)
+    if args.share:
+        _share(args, found)
+    return found
+
+
+def _first_camera(source: _Source, config: NodeConfig) -> Camera:
+    camera = source.camera
     if camera is None:
         camera = first_lens(source.size, in_order(source.images))
-    camera = replace(camera, scan_direction=config.scan_direction)
+    return replace(camera, scan_direction=config.scan_direction)
+
+
+def _calibrated(
+    args: argparse.Namespace, source: _Source, camera: Camera, config: NodeConfig
+) -> Calibration:
+    """What the images of a camera say, printed."""
+    intrinsics = args.intrinsics or source.camera is None
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
         found = calibrate(
             camera, source.images, intrinsics=intrinsics, imu=source.imu,
@@ -253,20 +303,16 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
     tell_telemetry(
         argparse.Namespace(images=args.recording, no_telemetry=args.no_telemetry),
         verdict.readout_time(found),
+        lens=False,
     )
     if intrinsics:
         _tell_lens(found)
     for line in imu_lines(found, source.imu, config):
         print(line)
     if args.plots is not None:
+        from rs_localizer.evaluation.calibration_plots import save_plots
+
         save_plots(camera, found, args.plots)
-    refusal = verdict.refusal(found)
-    if args.out is not None and (args.force or not refusal):
-        _write(args, found, source.map, intrinsics, config)
-    if refusal:
-        raise ValueError(refusal)
-    if args.share:
-        _share(args, found)
     return found
 
 
@@ -477,6 +523,194 @@ def _next(args: argparse.Namespace, out: Path, lens: Path | None, shape: Path | 
     return f"{shlex.join(detect)} && {shlex.join(['rs_localizer', *replay])}"
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _OfRig:
+    """What goes into a rig's calibration of one camera."""
+
+    args: argparse.Namespace  # as of a recording of this camera alone
+    frame: str  # of its optical axes
+
+
+def _calibrate_rig(args: argparse.Namespace) -> None:
+    """Calibrate each camera alone, then all together, and say what was found."""
+    for name in ("imu", "share", "workers", "scheduler"):
+        if getattr(args, name) is not None:
+            raise UsageError(f"--{name} is for one camera: leave it out with --rig")
+    if args.out is not None:
+        refuse_existing(args)
+    # Cameras by name need a readout time; what it is does not matter where it is estimated.
+    args.assignments = ["readout_time:=0.03", *args.assignments]
+    config, recordings, maps = _config(args), dict[str, Recording](), list[MarkerMap]()
+    cameras = _cameras_of(args, config)
+    intrinsics = args.intrinsics
+    for name, own in cameras.items():
+        print(f"{name}:")
+        axis = config.of_cameras.get(name, config).scan_direction
+        of_camera = replace(config, scan_direction=axis)
+        source = _read(own.args, of_camera)
+        intrinsics |= source.camera is None
+        maps += [] if source.map is None else [source.map]
+        camera = _without_k3(_first_camera(source, of_camera))
+        recordings[name] = Recording(camera, _calibrated(own.args, source, camera, config))
+    refusals = {name: verdict.refusal(each.calibration) for name, each in recordings.items()}
+    refusals = {name: text for name, text in refusals.items() if text}
+    if refusals and not args.force:
+        raise ValueError("; ".join(f"{name}: {text}" for name, text in refusals.items()))
+    rig = calibrate_rig(recordings)
+    first, comments = next(iter(rig)), list[str]()
+    for name, mounted in list(rig.items())[1:]:
+        comments += _mounted_lines(name, first, mounted)
+        print("\n".join(comments[-3:]))
+        if np.any(mounted.inflations > 1.0):
+            print(
+                "parts of the recording differ by more than their noise: the deviations of "
+                f"rotation, place and offset are {_numbers(mounted.inflations, 1)} times that"
+            )
+        if len(args.recordings) == 1:
+            _tell_tf(args.recordings[0], mounted, cameras[name].frame, cameras[first].frame)
+    refusals |= {name: text for name, one in rig.items() if (text := one.undetermined)}
+    if args.out is not None and (args.force or not refusals):
+        frames = {name: own.frame for name, own in cameras.items()}
+        values = _of_maps(config, maps) | (_of_lenses(recordings) if intrinsics else {})
+        _write_rig(args.out, _parts(rig, recordings, config), frames, values, comments, intrinsics)
+    if refusals:
+        raise ValueError(
+            "not observable: " + "; ".join(f"{name}: {text}" for name, text in refusals.items())
+        )
+
+
+def _cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, _OfRig]:
+    """The cameras of the recordings, by name."""
+    plots = args.plots
+    if len(args.recordings) > 1:
+        names = [re.sub(r"\W", "_", path.stem, flags=re.ASCII) for path in args.recordings]
+        topics = [{"recording": path} for path in args.recordings]
+        frames = [f"{name}_optical_frame" for name in names]
+    else:
+        (path,) = args.recordings
+        if not is_bag(path):
+            raise UsageError(f"--rig needs the recordings of several cameras, or one bag; {path}")
+        given = config.cameras if config.is_rig else None
+        with open_bag(path) as bag:
+            by_name = camera_topics(bag, given)
+            frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
+        names = list(by_name)
+        topics = [{"recording": path, **own} for own in by_name.values()]
+    if len(set(names)) < max(len(names), 2) or not all(name[:1].isalpha() for name in names):
+        raise UsageError(
+            f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
+        )
+    if len(set(frames)) < len(frames):  # as of single recordings put together
+        frames = [""] * len(frames)
+    lens = args.calibration
+    return {
+        name: _OfRig(
+            argparse.Namespace(**vars(args) | own | {
+                "calibration": None if lens is None else lens.with_name(f"{lens.name}#{name}"),
+                "plots": None if plots is None else plots / name,
+            }),
+            frame or f"{name}_optical_frame",
+        )
+        for name, own, frame in zip(names, topics, frames, strict=True)
+    }  # fmt: skip
+
+
+def _without_k3(camera: Camera) -> Camera:
+    """With the four coefficients that Kalibr knows, if the lens does not need a fifth."""
+    if camera.distortion_model != DistortionModel.PLUMB_BOB or np.any(camera.D[4:]):
+        return camera
+    return replace(camera, D=np.r_[camera.D, np.zeros(4)][:4])
+
+
+def _mounted_lines(name: str, first: str, found: Mounted) -> list[str]:
+    """Where a camera is beside the first one, and its clock."""
+    turn = Rotation.from_matrix(found.rotation).as_quat(canonical=True)
+    turned, moved = np.degrees(found.rotation_deviations), 1e3 * found.centre_deviations
+    centre = -1e3 * found.rotation.T @ found.translation
+    offset, deviation = 1e3 * found.time_offset, 1e3 * found.time_offset_deviation
+    return [
+        f"{f'{name} <- {first}':26} {_numbers(turn, 5)} (x y z w) +- {_numbers(turned, 3)} deg",
+        f"{f'place in {first}':26} {_numbers(centre, 2)} +- {_numbers(moved, 2)} mm",
+        f"{'offset of its stamps':26} {offset:+.3f} +- {deviation:.3f} ms",
+    ]
+
+
+def _tell_tf(path: Path, found: Mounted, own: str, first: str) -> None:
+    """What TF of a bag says of a camera's frame in that of the first one."""
+    with open_bag(path) as bag:
+        given = transform_between(bag, own, first)
+    if given is not None:
+        off = np.degrees(Rotation.from_matrix(given.rotation.T @ found.rotation).magnitude())
+        away = given.rotation.T @ given.translation - found.rotation.T @ found.translation
+        print(f"TF has it {off:.2f} deg and {1e3 * np.linalg.norm(away):.1f} mm off")
+
+
+def _parts(
+    rig: Mapping[str, Mounted], recordings: Mapping[str, Recording], config: NodeConfig
+) -> RigParts:
+    """The rig that was found, in the axes of its first camera and by its clock."""
+    cameras = {}
+    for name, one in rig.items():
+        own = recordings[name].calibration
+        cameras[name] = replace(
+            one.camera,
+            readout_time=0.0 if own.global_shutter else abs(one.readout_time),
+            scan_direction=verdict.scan_direction(own),
+        )
+    poses = {name: (one.rotation, one.translation) for name, one in rig.items()}
+    base = config.of_cameras.get(next(iter(rig)), config).stamp_offset
+    offsets = {name: base + one.time_offset for name, one in rig.items()}
+    return RigParts(cameras, poses, offsets)
+
+
+def _of_lenses(recordings: Mapping[str, Recording]) -> dict[str, float]:
+    """Parameters that all cameras share: the errors of the worst."""
+    errors = np.max([each.calibration.lens for each in recordings.values()], axis=0)
+    pairs = zip(LensErrors._fields, errors.tolist(), strict=True)
+    return {f"calibration.{name}": value for name, value in pairs}
+
+
+def _of_maps(config: NodeConfig, maps: Sequence[MarkerMap]) -> dict[str, float]:
+    declared = [config.map_deviation, *(each.settings.get("map_deviation", 0.0) for each in maps)]
+    return {"map_deviation": max(declared)} if max(declared) else {}
+
+
+def _write_rig(
+    path: Path, parts: RigParts, frames: Mapping[str, str], values: dict[str, float],
+    comments: Sequence[str], intrinsics: bool,
+) -> None:  # fmt: skip
+    """FILE.yaml, and beside it the transforms, the camchain, and lenses that were found."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    transforms, chain = (
+        path.with_name(f"{path.stem}_{what}") for what in ("transforms.launch.xml", "camchain.yaml")
+    )
+    writers: dict[Path, Callable[[Path], object]] = {
+        transforms: partial(write_static_transforms, parts=parts, frames=frames),
+        chain: partial(write_camchain, parts=parts),
+    }
+    try:
+        [kalibr_fields(camera) for camera in parts.cameras.values()]
+    except ValueError as error:
+        del writers[chain]
+        print(f"no camchain: {error}")
+    for name, camera in parts.cameras.items() if intrinsics else ():
+        lens = path.with_name(f"{path.stem}_{name}_camera_info.yaml")
+        writers[lens] = partial(write_calibration, camera=camera)
+
+    def write_values(part: Path) -> None:
+        write_parameters(part, node_parameters(parts) | values)
+        text = part.read_text("utf-8")
+        part.write_text("".join(f"# {line}\n" for line in comments) + text, "utf-8")
+
+    writers[path] = write_values
+    with atomic_files(*writers) as files:
+        for file, write in zip(files, writers.values(), strict=True):
+            write(file)
+    for file in writers:
+        print(f"written: {file}")
+    print(f"next: ros2 launch {shlex.quote(str(transforms))}")
+
+
 def _calibrate_batch(args: argparse.Namespace) -> None:
     """``calibrate`` with each of many recordings."""
     plots = folder_name("--plots", args.plots)
@@ -484,7 +718,10 @@ def _calibrate_batch(args: argparse.Namespace) -> None:
     given = [name for name in options if getattr(args, name) not in (None, False)]
     files = inputs(args.map, args.calibration, args.params)
     kind = Kind("calibrate", _calibrate_of_many, " ".join(["calibrate", *given]), _calibrate_warm)
-    run_batch(argparse.Namespace(**vars(args) | {"plots": plots}), Plan(kind, lambda _: files))
+    run_batch(
+        argparse.Namespace(**vars(args) | {"plots": plots}),
+        Plan(kind, lambda _: files, args.overwrite),
+    )
 
 
 def _calibrate_warm(_: argparse.Namespace) -> None:

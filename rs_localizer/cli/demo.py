@@ -13,54 +13,55 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
-from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
-from rs_localizer import data
-from rs_localizer.cli import import_ros, stage
+from rs_localizer.cli import WORKING, import_ros, stage
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.evaluation import plots
-from rs_localizer.evaluation.comparison import Recording, Result, compare, load_recording, table
-from rs_localizer.evaluation.cube_clip import (
-    CLIP_SENSOR,
-    OURS,
-    P3P,
-    RUN_UP,
-    clip_stamps,
-    draw_clip,
-)
-from rs_localizer.evaluation.map_pictures import localized_picture
-from rs_localizer.evaluation.plots import (
-    error_picture,
-    inlier_picture,
-    residual_picture,
-    trajectory_picture,
-)
-from rs_localizer.evaluation.room_mapping import Piece, Room, without_refinement
-from rs_localizer.io.bags import BagWriter
-from rs_localizer.io.estimates import Motions
-from rs_localizer.io.maps.npz import write_npz
-from rs_localizer.io.recording import make_camera_info, write_frame
-from rs_localizer.io.topics import KEYPOINTS
-from rs_localizer.io.trajectories import Trajectory, Twists, read_tum
-from rs_localizer.io.video import Image
-from rs_localizer.mapping.colmap import Effort, require
-from rs_localizer.process.missing import explain
-from rs_localizer.settings import build, load_params_file
-from rs_localizer.simulation.frames import (
-    FrameSettings,
-    frame_stamps,
-    middle_stamp,
-    simulate_frames,
-)
-from rs_localizer.simulation.marker_frames import CAMERA, MarkerWalls
-from rs_localizer.simulation.recording import write_simulated, write_truth
-from rs_localizer.simulation.renderer import ImageSettings
-from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.true_motion import RecordedMotion
+from rs_localizer.simulation.settings import FrameSettings, ImageSettings
 from rs_localizer.solvers.table import SOLVERS
+
+if WORKING:
+    from matplotlib.figure import Figure
+    from scipy.spatial.transform import Rotation
+    from tqdm import tqdm
+
+    from rs_localizer import data
+    from rs_localizer.evaluation import plots
+    from rs_localizer.evaluation.comparison import Recording, Result, compare, load_recording, table
+    from rs_localizer.evaluation.cube_clip import (
+        CLIP_SENSOR,
+        OURS,
+        P3P,
+        RUN_UP,
+        clip_stamps,
+        draw_clip,
+    )
+    from rs_localizer.evaluation.map_pictures import localized_picture
+    from rs_localizer.evaluation.plots import (
+        error_picture,
+        inlier_picture,
+        residual_picture,
+        trajectory_picture,
+    )
+    from rs_localizer.evaluation.room_mapping import Piece, Room, without_refinement
+    from rs_localizer.io.bags import BagWriter
+    from rs_localizer.io.estimates import Motions
+    from rs_localizer.io.maps.npz import write_npz
+    from rs_localizer.io.recording import make_camera_info, write_frame
+    from rs_localizer.io.topics import KEYPOINTS
+    from rs_localizer.io.trajectories import Trajectory, Twists, read_tum
+    from rs_localizer.io.video import Image
+    from rs_localizer.mapping.colmap import Effort, require
+    from rs_localizer.process.missing import explain
+    from rs_localizer.settings import build, load_params_file
+    from rs_localizer.simulation.frames import frame_stamps, middle_stamp, simulate_frames
+    from rs_localizer.simulation.marker_frames import CAMERA, MarkerWalls
+    from rs_localizer.simulation.recording import write_simulated, write_truth
+    from rs_localizer.simulation.scene import room
+    from rs_localizer.simulation.true_motion import RecordedMotion
+
+    _WALK, _FLIGHT = Piece(28.0, 11.8, 15.0), Piece(40.0, 8.0, 10.0)  # of the room
+    _EFFORT = Effort(adjusted=60)
 
 ROOM = "room.png"
 # A quarter of VGA: all of it within half a minute.
@@ -70,8 +71,6 @@ _CAMERA = Camera(
 )  # fmt: skip
 _SENSOR = ImageSettings(noise=2.0)
 _KEYPOINTS = 300
-_WALK, _FLIGHT = Piece(28.0, 11.8, 15.0), Piece(40.0, 8.0, 10.0)
-_EFFORT = Effort(adjusted=60)
 
 
 def _missing() -> str:
@@ -189,8 +188,6 @@ class CubeScene:
         self._images: dict[int, Image] = {}
         self._middles: dict[int, int] = {}
 
-    readout_time = CAMERA.readout_time
-
     def record(self, path: Path, most: int | None) -> Path:
         """Render the clip, find the markers, and write them into a bag."""
         stamps = clip_stamps(self._walls, most)
@@ -214,7 +211,7 @@ class CubeScene:
         stamps = recording.stamps_ns[RUN_UP:]
         motions = [
             {
-                name: answer.motion(self.readout_time) if answer is not None else None
+                name: answer.motion(CAMERA.readout_time) if answer is not None else None
                 for name, answer in (
                     (P3P, results[p3p].answers.get(stamp)),
                     (OURS, results[ours].answers.get(stamp)),
@@ -286,7 +283,7 @@ def run(args: argparse.Namespace) -> None:
         for title, recording, readout_time in (
             ("Webcam over a board", webcam, _webcam_readout_time()),
             ("Simulated hand-held flight", flight, _FLIGHT_CAMERA.readout_time),
-            ("Rendered walls of markers", cube, scene.readout_time),
+            ("Rendered walls of markers", cube, CAMERA.readout_time),
         ):
             total = len(recording.clouds)
             with tqdm(total=total, unit="frame", desc=title, disable=None) as bar:

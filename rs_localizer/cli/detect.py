@@ -9,10 +9,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-import numpy as np
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError, add_overwrite, replaced
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced
 from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
 from rs_localizer.cli.image_input import (
     Source,
@@ -27,14 +24,19 @@ from rs_localizer.cli.image_input import (
 )
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
-from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import STORAGES
-from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
-from rs_localizer.offline.fleet.task import Figures, Kind
-from rs_localizer.pipeline.images import FrameDetector
-from rs_localizer.pipeline.keypoints import FrameExtractor
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import build, settings
+
+if WORKING:
+    import numpy as np
+    from tqdm import tqdm
+
+    from rs_localizer.io.atomic_files import atomic_directory
+    from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
+    from rs_localizer.offline.fleet.task import Figures, Kind
+    from rs_localizer.pipeline.images import FrameDetector
+    from rs_localizer.pipeline.keypoints import FrameExtractor
 
 # Options of markers and boards.
 _OF_MARKERS = ("map", "board", "pattern", "square", "min_side")

@@ -7,33 +7,35 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import WORKING, UsageError
 from rs_localizer.cli.batch import Plan, add_batch_arguments, folder_name, run_batch
-from rs_localizer.core.arrays import Array
-from rs_localizer.evaluation.metrics import (
-    Errors,
-    Summary,
-    TimeOffset,
-    aligned,
-    associate,
-    estimate_offset,
-    interpolated,
-    interpolated_twists,
-    pose_errors,
-    shifted,
-    summarize,
-    twist_errors,
-)
-from rs_localizer.io.atomic_files import atomic_files
-from rs_localizer.io.bags import BagError, open_bag
-from rs_localizer.io.estimates import Motions, read_motions
-from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
-from rs_localizer.io.trajectories import Trajectory, Twists, read_twists
-from rs_localizer.offline.fleet.task import Figures, Kind
 from rs_localizer.process.arguments import number
+
+if WORKING:
+    import numpy as np
+    from scipy.spatial.transform import Rotation
+
+    from rs_localizer.core.arrays import Array
+    from rs_localizer.evaluation.metrics import (
+        Errors,
+        Summary,
+        TimeOffset,
+        aligned,
+        associate,
+        estimate_offset,
+        interpolated,
+        interpolated_twists,
+        pose_errors,
+        shifted,
+        summarize,
+        twist_errors,
+    )
+    from rs_localizer.io.atomic_files import atomic_files
+    from rs_localizer.io.bags import BagError, open_bag
+    from rs_localizer.io.estimates import Motions, read_motions
+    from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
+    from rs_localizer.io.trajectories import Trajectory, Twists, read_twists
+    from rs_localizer.offline.fleet.task import Figures, Kind
 
 _AUTO = "auto"
 # Deg: less is an error, not another frame. And what is left once a rotation explains the rest.

@@ -13,34 +13,36 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import WORKING, UsageError
 from rs_localizer.cli.settings_args import add_settings, given_values
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
-from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_log, read_telemetry
-from rs_localizer.io.video import has_times
-from rs_localizer.offline.image_sources import (
-    IMAGE_TYPES,
-    INFO_TYPE,
-    Carried,
-    Shot,
-    find_topic,
-    from_bag,
-    from_files,
-    from_video,
-    have_times,
-    image_files,
-    with_telemetry,
-)
 from rs_localizer.process.arguments import number
 from rs_localizer.settings import build, settings, write_parameters
-from rs_localizer.trajectory.imu import ImuRecording
+
+if WORKING:
+    import numpy as np
+
+    from rs_localizer.core.camera import Camera
+    from rs_localizer.io.bags import BagReader, is_bag, open_bag
+    from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_log, read_telemetry
+    from rs_localizer.io.video import has_times
+    from rs_localizer.offline.image_sources import (
+        IMAGE_TYPES,
+        INFO_TYPE,
+        Carried,
+        Shot,
+        find_topic,
+        from_bag,
+        from_files,
+        from_video,
+        have_times,
+        image_files,
+        with_telemetry,
+    )
+    from rs_localizer.trajectory.imu import ImuRecording
 
 # Readout times that differ by less are called the same: what a file says counts rows its own way.
 _SAME_READOUT = 0.05
@@ -144,12 +146,13 @@ def add_telemetry(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def tell_telemetry(args: argparse.Namespace, used: float | None = None) -> None:
+def tell_telemetry(args: argparse.Namespace, used: float | None = None, lens: bool = True) -> None:
     """Say what a video knows of its camera, and what is not used of it.
 
     Args:
         args: with ``images`` and ``no_telemetry``.
         used: the readout time that was measured, s; None: that of the settings is used.
+        lens: whether a lens profile takes the place of a calibration.
     """
     path = args.images
     if args.no_telemetry:
@@ -177,7 +180,8 @@ def tell_telemetry(args: argparse.Namespace, used: float | None = None) -> None:
     if found.exposure is not None:
         said.append(f"exposure {1e3 * found.exposure:.2f} ms (median)")
     if found.lens:
-        said.append(found.lens)
+        how = "used" if lens and args.calibration is None else "not used"
+        said.append(found.lens + (f", {how}" if found.profile is not None else ""))
     print(f"{found.camera}: {', '.join(said)}; --no-telemetry ignores them")
 
 
@@ -250,11 +254,13 @@ def opened(
         for name in ("image", "camera_info"):
             if getattr(args, name) is not None:
                 raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
-        if args.calibration is None and calibrated:
-            raise UsageError("a video or folder has no camera_info: give --calibration")
-        camera = None if args.calibration is None else read_calibration(args.calibration)
-        source = of_files(path, camera, clock_of(path, args.rate, start))
         telemetry = telemetry_of(path, args)
+        camera = None if args.calibration is None else read_calibration(args.calibration)
+        if camera is None and calibrated:
+            camera = None if telemetry is None else telemetry.profile
+            if camera is None:
+                raise UsageError("a video or folder has no camera_info: give --calibration")
+        source = of_files(path, camera, clock_of(path, args.rate, start))
         if telemetry is not None and source.clock is not None:
             moving = with_telemetry(source.shots, telemetry, source.clock)
             source = replace(source, shots=moving)

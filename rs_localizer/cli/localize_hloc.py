@@ -10,25 +10,27 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
-from rs_localizer.cli import add_overwrite
+from rs_localizer.cli import WORKING, add_overwrite
 from rs_localizer.cli.settings_args import add_settings, given_settings, row_time
-from rs_localizer.config import NodeConfig
-from rs_localizer.core import so3
-from rs_localizer.core.types import Estimate
-from rs_localizer.io.atomic_files import OutputError, atomic_files
-from rs_localizer.io.hloc import (
-    HlocError,
-    open_h5,
-    read_pairs,
-    read_queries,
-    result_line,
-    result_name,
-)
-from rs_localizer.offline.hloc import Answer, Reference, localize_queries
-from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
-from rs_localizer.solvers.table import find_solver
+
+if WORKING:
+    from tqdm import tqdm
+
+    from rs_localizer.config import NodeConfig
+    from rs_localizer.core import so3
+    from rs_localizer.core.types import Estimate
+    from rs_localizer.io.atomic_files import OutputError, atomic_files
+    from rs_localizer.io.hloc import (
+        HlocError,
+        open_h5,
+        read_pairs,
+        read_queries,
+        result_line,
+        result_name,
+    )
+    from rs_localizer.offline.hloc import Answer, Reference, localize_queries
+    from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
+    from rs_localizer.solvers.table import find_solver
 
 _ABOUT = {
     "angular_velocity": "rad/s, of the camera in its own axes",

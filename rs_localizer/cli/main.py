@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import rs_localizer
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import COMMON, LateParser, UsageError, add_common
 from rs_localizer.io.atomic_files import remove_unfinished
 from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import INTERRUPTED, StopRequest
@@ -35,14 +35,6 @@ _SIGPIPE = 141
 _STEERING = {
     code: f"\\x{code:02x}" for code in (*range(32), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"
 }
-
-
-# Of every command, wherever they stand behind its name.
-_COMMON = (
-    ("--json", "print the result as JSON"),
-    ("--quiet", "print nothing but faults"),
-    ("--verbose", "print the traceback of a fault"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +79,7 @@ COMMANDS = {
     ),
     "calibrate": Command(
         "rs_localizer.cli.calibrate",
-        "readout time, scan direction and lens of a camera, from a recording in which it moves",
+        "readout time, scan direction and lens of a camera that moves in a recording; or of a rig",
         "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --out shutter.yaml",
     ),
     "readout": Command(
@@ -197,7 +189,7 @@ def _said(name: str, error: Exception) -> int | None:
 
 def _common_options(words: Sequence[str]) -> tuple[set[str], list[str]]:
     """Options of all commands that are among the words, and the other words."""
-    names = {"-q": "--quiet", "-v": "--verbose"} | {name: name for name, _ in _COMMON}
+    names = {"-q": "--quiet", "-v": "--verbose"} | {name: name for name, _ in COMMON}
     end = words.index("--") if "--" in words else len(words)
     first, rest = list(words[1:end]), list(words[end:])
     common = {names[word] for word in first if word in names}
@@ -206,22 +198,14 @@ def _common_options(words: Sequence[str]) -> tuple[set[str], list[str]]:
 
 def _command_parser(name: str) -> argparse.ArgumentParser:
     command = COMMANDS[name]
-    return _with_common(
-        argparse.ArgumentParser(
-            prog=f"rs_localizer {name}",
-            description=_sentence(command.summary),
-            epilog=f"example:\n  {command.example}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
-        )
+    parser = argparse.ArgumentParser(
+        prog=f"rs_localizer {name}",
+        description=_sentence(command.summary),
+        epilog=f"example:\n  {command.example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
-
-
-def _with_common(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
-    group = parser.add_argument_group("of all commands")
-    for name, text in _COMMON:
-        short = (name[1:3],) if name != "--json" else ()
-        group.add_argument(*short, name, action="store_true", help=text, dest=f"common{name}")
+    add_common(parser)
     return parser
 
 
@@ -263,11 +247,11 @@ def complete() -> None:
     import argcomplete
 
     parser = argparse.ArgumentParser(prog="rs_localizer", allow_abbrev=False)
-    commands = parser.add_subparsers()
+    commands = parser.add_subparsers(parser_class=LateParser)
     for name, command in COMMANDS.items():
-        own = _with_common(commands.add_parser(name, help=command.summary))
-        if name in os.environ["COMP_LINE"].split()[1:2]:
-            importlib.import_module(command.module).add_arguments(own)
+        own = commands.add_parser(name, help=command.summary)
+        own.come_from(command.module)
+        add_common(own)
     argcomplete.autocomplete(parser)
 
 

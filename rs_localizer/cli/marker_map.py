@@ -11,13 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import UsageError, read_counts
-from rs_localizer.markers.consistency import other_units
-from rs_localizer.markers.map_files import read_marker_map
-from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Board, Chessboard, CircleGrid
+from rs_localizer.cli import WORKING, UsageError, read_counts
 from rs_localizer.process.arguments import number
+
+if WORKING:
+    from rs_localizer.markers.consistency import other_units
+    from rs_localizer.markers.map_files import read_marker_map
+    from rs_localizer.markers.maps import MarkerMap
+    from rs_localizer.markers.poses import Pose
+    from rs_localizer.markers.prints import Board, Chessboard, CircleGrid
 
 _CHESSBOARD, _CIRCLES, _ASYMMETRIC = "chessboard", "circles", "asymmetric_circles"
 _INVERTED = "inverted_"

@@ -9,16 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import UsageError, read_counts
-from rs_localizer.io.atomic_files import atomic_files
-from rs_localizer.markers.consistency import problems
+from rs_localizer.cli import WORKING, UsageError, add_common, read_counts
 from rs_localizer.markers.families import FAMILIES, family
-from rs_localizer.markers.map_files import read_marker_map, write_marker_map
-from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.printing import PAGES, page_files, plan, write_pages
-from rs_localizer.markers.prints import Board, Charuco, Chessboard
 from rs_localizer.process.arguments import integer, number
+
+if WORKING:
+    from rs_localizer.io.atomic_files import atomic_files
+    from rs_localizer.markers.consistency import problems
+    from rs_localizer.markers.map_files import read_marker_map, write_marker_map
+    from rs_localizer.markers.maps import MarkerMap, wall
+    from rs_localizer.markers.poses import Pose
+    from rs_localizer.markers.prints import Board, Charuco, Chessboard
 
 # Six markers that fill a page of A4 or letter.
 _FAMILY, _GRID, _SIZE, _GAP = "4x4_50", "2x3", 0.06, 0.02
@@ -82,6 +84,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         description="Read a map and look for overlaps, mirrored markers and sizes in other units.",
     )
     check.add_argument("map", type=Path, metavar="MAP")
+    for action in (make, check):
+        add_common(action)
 
 
 def run(args: argparse.Namespace) -> None:

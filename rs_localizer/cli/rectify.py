@@ -8,32 +8,34 @@ import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError, add_overwrite, replaced
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced
 from rs_localizer.cli.image_input import add_source_arguments, opened, shutter_values
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.shutter import Motion
-from rs_localizer.io.atomic_files import atomic_directory
-from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.images import Image, in_color
-from rs_localizer.io.maps.files import read_map_file
-from rs_localizer.io.trajectories import Trajectory, read_tum
-from rs_localizer.markers.map_files import read_marker_map
-from rs_localizer.offline.fleet.task import Figures
-from rs_localizer.offline.image_sources import Carried, Shot
-from rs_localizer.offline.rectified import (
-    Depths,
-    map_depths,
-    motion_between,
-    plane_depths,
-    rectified,
-)
-from rs_localizer.settings import build
+
+if WORKING:
+    import cv2
+    import numpy as np
+    from numpy.typing import NDArray
+    from scipy.spatial.transform import Rotation
+    from tqdm import tqdm
+
+    from rs_localizer.core.arrays import Array
+    from rs_localizer.core.shutter import Motion
+    from rs_localizer.io.atomic_files import atomic_directory
+    from rs_localizer.io.camera_info import read_camera_info
+    from rs_localizer.io.images import Image, in_color
+    from rs_localizer.io.maps.files import read_map_file
+    from rs_localizer.io.trajectories import Trajectory, read_tum
+    from rs_localizer.markers.map_files import read_marker_map
+    from rs_localizer.offline.fleet.task import Figures
+    from rs_localizer.offline.image_sources import Carried, Shot
+    from rs_localizer.offline.rectified import (
+        Depths,
+        map_depths,
+        motion_between,
+        plane_depths,
+        rectified,
+    )
+    from rs_localizer.settings import build
 
 _FIRST, _LAST = "poses_first.txt", "poses_last.txt"
 _LIST = "images.txt"  # the names of what was written

@@ -16,10 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NoReturn
 
-import numpy as np
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError, detect, import_ros
+from rs_localizer.cli import WORKING, UsageError, detect, import_ros
 from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
 from rs_localizer.cli.image_input import add_telemetry
 from rs_localizer.cli.replay_result import (
@@ -38,43 +35,48 @@ from rs_localizer.cli.replay_result import (
     write_frame,
 )
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
-from rs_localizer.config import FeatureKind, ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagError, BagReader, BagWriter, is_bag, open_bag
-from rs_localizer.io.maps.files import read_map_file
-from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.outputs import Localized
-from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
 from rs_localizer.io.remote import Location, is_url, location, url_name
-from rs_localizer.io.topics import IMU
-from rs_localizer.markers.formats import is_marker_file
-from rs_localizer.offline.fleet.task import Figures, Kind
-from rs_localizer.offline.image_sources import INFO_TYPE, holds_images, image_topics
-from rs_localizer.offline.replay import (
-    NO_FRAMES,
-    TF_TYPE,
-    Answer,
-    Topics,
-    find_topics,
-    has_frames,
-    imu_topics,
-    prepare,
-    replay,
-    tf_topics,
-)
-from rs_localizer.offline.smoothed import smooth_frames
-from rs_localizer.offline.table import (
-    FrameTable,
-    read_parquet,
-    schema,
-    write_parquet,
-    write_zarr,
-)
-from rs_localizer.offline.viewing import check_screen, write_view
-from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.rigs import frame_localizer
-from rs_localizer.settings import NODE_NAME
-from rs_localizer.trajectory.warm_up import warm_up
+
+if WORKING:
+    import numpy as np
+    from tqdm import tqdm
+
+    from rs_localizer.config import FeatureKind, ImuUse, NodeConfig
+    from rs_localizer.io.maps.files import read_map_file
+    from rs_localizer.io.maps.landmarks import Map
+    from rs_localizer.io.messages import stamp_ns
+    from rs_localizer.io.outputs import Localized
+    from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
+    from rs_localizer.io.topics import IMU
+    from rs_localizer.markers.formats import is_marker_file
+    from rs_localizer.offline.fleet.task import Figures, Kind
+    from rs_localizer.offline.image_sources import INFO_TYPE, holds_images, image_topics
+    from rs_localizer.offline.replay import (
+        NO_FRAMES,
+        TF_TYPE,
+        Answer,
+        Topics,
+        find_topics,
+        has_frames,
+        imu_topics,
+        prepare,
+        replay,
+        tf_topics,
+    )
+    from rs_localizer.offline.smoothed import smooth_frames
+    from rs_localizer.offline.table import (
+        FrameTable,
+        read_parquet,
+        schema,
+        write_parquet,
+        write_zarr,
+    )
+    from rs_localizer.offline.viewing import check_screen, write_view
+    from rs_localizer.pipeline.frames import FrameLocalizer
+    from rs_localizer.pipeline.rigs import frame_localizer
+    from rs_localizer.settings import NODE_NAME
+    from rs_localizer.trajectory.warm_up import warm_up
 
 if TYPE_CHECKING:  # an extra
     from pyarrow import Table
@@ -285,7 +287,7 @@ def _replay_matches(
         unused = IMU not in topics.of and config.imu.use != ImuUse.NONE
         if unused and (several := imu_topics(bag)):
             print(f"no IMU is used: choose {' or '.join(several)} with --imu")
-        if args.smooth and config.readout_time == 0.0:
+        if args.smooth and config.readout_time == 0.0 and not config.is_rig:
             raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
         localizer.warm_up()
         wanted = args.parquet is not None or args.zarr is not None
@@ -312,7 +314,7 @@ def _replay_matches(
 
 def _refuse_for_rigs(args: argparse.Namespace, config: NodeConfig) -> None:
     """Name what there is of one camera only."""
-    options = ("smooth", "nerfstudio", "gsplat", "ncore", "rerun", "view", "parquet", "zarr")
+    options = ("nerfstudio", "gsplat", "ncore", "rerun", "view", "parquet", "zarr")
     given = [name for name in options if getattr(args, name)] + (["row"] if args.rows else [])
     if config.is_rig and given:
         raise UsageError(f"--{given[0]} is for one camera: leave it out with cameras")

@@ -20,42 +20,45 @@ from pathlib import Path
 
 import numpy as np
 
+from rs_localizer.cli import WORKING
 from rs_localizer.cli.settings_args import row_time
-from rs_localizer.config import NodeConfig, PoseTime
-from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.camera import Camera
-from rs_localizer.io.atomic_files import atomic_directory
-from rs_localizer.io.bags import BagReader, BagWriter
-from rs_localizer.io.image_clock import readout_fault
-from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.neural_reconstruction import (
-    View,
-    exposed_rows,
-    middle_of_image,
-    sequence,
-    transforms,
-    write_gsplat,
-)
-from rs_localizer.io.outputs import Localized, Pose, messages
 from rs_localizer.io.remote import location
-from rs_localizer.io.topics import TF
-from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
-from rs_localizer.io.transforms import TransformError, make_transform
-from rs_localizer.offline.fleet.identity import MARKER
-from rs_localizer.offline.fleet.task import LOG, Figures
-from rs_localizer.offline.image_sources import IMAGE_TYPES
-from rs_localizer.offline.replay import TF_TYPE
-from rs_localizer.offline.smoothed import SmoothedFrames
-from rs_localizer.offline.table import FrameTable
-from rs_localizer.pipeline.broadcasts import broadcast
-from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.imu import ImuState
-from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
-from rs_localizer.pipeline.reasons import explained
-from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.settings import NODE_NAME
-from rs_localizer.solvers.table import find_solver
+
+if WORKING:
+    from rs_localizer.config import NodeConfig, PoseTime
+    from rs_localizer.core import so3
+    from rs_localizer.core.arrays import Array, IntArray
+    from rs_localizer.core.camera import Camera
+    from rs_localizer.io.atomic_files import atomic_directory
+    from rs_localizer.io.bags import BagReader, BagWriter
+    from rs_localizer.io.image_clock import readout_fault
+    from rs_localizer.io.messages import stamp_ns
+    from rs_localizer.io.neural_reconstruction import (
+        View,
+        exposed_rows,
+        middle_of_image,
+        sequence,
+        transforms,
+        write_gsplat,
+    )
+    from rs_localizer.io.outputs import Localized, Pose, messages
+    from rs_localizer.io.topics import TF
+    from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
+    from rs_localizer.io.transforms import TransformError, make_transform
+    from rs_localizer.offline.fleet.identity import MARKER
+    from rs_localizer.offline.fleet.task import LOG, Figures
+    from rs_localizer.offline.image_sources import IMAGE_TYPES
+    from rs_localizer.offline.replay import TF_TYPE
+    from rs_localizer.offline.smoothed import SmoothedFrames
+    from rs_localizer.offline.table import FrameTable
+    from rs_localizer.pipeline.broadcasts import broadcast
+    from rs_localizer.pipeline.frames import FrameLocalizer
+    from rs_localizer.pipeline.imu import ImuState
+    from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
+    from rs_localizer.pipeline.reasons import explained
+    from rs_localizer.pipeline.refusal import Refusal
+    from rs_localizer.settings import NODE_NAME
+    from rs_localizer.solvers.table import find_solver
 
 TRANSFORMS, IMAGES, NCORE = "transforms.json", "images", "ncore.json"
 _ROW_FILES = "poses_{}.txt"

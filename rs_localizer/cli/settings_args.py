@@ -9,10 +9,12 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import UsageError
-from rs_localizer.config import NodeConfig
+from rs_localizer.cli import WORKING, UsageError
 from rs_localizer.pipeline.inputs import INPUTS
-from rs_localizer.settings import build, load_params_file, parse_assignment
+
+if WORKING:
+    from rs_localizer.config import NodeConfig
+    from rs_localizer.settings import build, load_params_file, parse_assignment
 
 # Rows by name, as row times.
 _ROWS = {"first": -0.5, "middle": 0.0, "last": 0.5}
@@ -69,6 +71,14 @@ def given_settings(
 ) -> NodeConfig:
     """The settings of :func:`given_values`."""
     return build(given_values(args, also, check))
+
+
+def one_camera(config: NodeConfig) -> None:
+    """A check of :func:`given_values` for what is made with one camera."""
+    if config.is_rig:
+        raise ValueError(
+            "maps are made with one camera of a rig: leave out cameras, and choose its topics"
+        )
 
 
 def _check(values: dict[str, Any], check: Callable[[NodeConfig], object] | None) -> None:

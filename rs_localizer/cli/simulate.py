@@ -9,46 +9,55 @@ import shlex
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-from tqdm import tqdm
-
-from rs_localizer import data
-from rs_localizer.cli import UsageError, add_overwrite, replaced
-from rs_localizer.core.arrays import Array
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import STORAGES, BagWriter
-from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
-from rs_localizer.io.rigs import RigParts, read_camchain
-from rs_localizer.io.trajectories import read_tum
-from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import settings, write_parameters
-from rs_localizer.simulation.frames import FrameSettings, frame_stamps, simulate_frames
-from rs_localizer.simulation.image_sequence import FORMATS, Encoding, rendered_frames
-from rs_localizer.simulation.imu import ImuBagWriter, ImuSettings, Lever, simulate_imu
-from rs_localizer.simulation.recording import write_rendered, write_simulated
-from rs_localizer.simulation.renderer import ImageSettings, Renderer
-from rs_localizer.simulation.rig import (
-    camera_stamps,
-    rig_parameters,
-    simulate_rig,
-    write_mounts,
-    write_rig_frame,
-)
-from rs_localizer.simulation.scene import described, keypoint_rows, room
-from rs_localizer.simulation.true_motion import (
+from rs_localizer.simulation.settings import (
     BODY_FROM_CAMERA,
+    FORMATS,
     KNOT_SPACING,
-    ConstantVelocity,
-    RecordedMotion,
-    TrueMotion,
-    sampled_states,
-    shaken,
+    Encoding,
+    FrameSettings,
+    ImageSettings,
+    ImuSettings,
 )
 from rs_localizer.simulation.walls import SCENES
+
+if WORKING:
+    import numpy as np
+    from tqdm import tqdm
+
+    from rs_localizer import data
+    from rs_localizer.core.arrays import Array
+    from rs_localizer.io.atomic_files import atomic_directory
+    from rs_localizer.io.maps.files import write_map_file
+    from rs_localizer.io.rigs import RigParts, read_camchain
+    from rs_localizer.io.trajectories import read_tum
+    from rs_localizer.markers.map_files import write_marker_map
+    from rs_localizer.simulation.frames import frame_stamps, simulate_frames
+    from rs_localizer.simulation.image_sequence import rendered_frames
+    from rs_localizer.simulation.imu import ImuBagWriter, Lever, simulate_imu
+    from rs_localizer.simulation.recording import write_rendered, write_simulated
+    from rs_localizer.simulation.renderer import Renderer
+    from rs_localizer.simulation.rig import (
+        camera_stamps,
+        rig_parameters,
+        simulate_rig,
+        write_mounts,
+        write_rig_frame,
+    )
+    from rs_localizer.simulation.scene import described, keypoint_rows, room
+    from rs_localizer.simulation.true_motion import (
+        ConstantVelocity,
+        RecordedMotion,
+        TrueMotion,
+        sampled_states,
+        shaken,
+    )
 
 # A still hand is no example: without any motion given, the camera turns and walks like this.
 _ANGULAR_VELOCITY = (0.0, 1.0, 0.0)

@@ -11,14 +11,17 @@ import time
 import warnings
 from collections.abc import Callable
 
-from rs_localizer.config import NodeConfig
-from rs_localizer.core.simd import shipped
-from rs_localizer.core.simd.jit import cache_directory
-from rs_localizer.markers import detection
-from rs_localizer.pipeline.compiling import note_compiled
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.cli import WORKING
 from rs_localizer.solvers.table import SOLVERS
-from rs_localizer.trajectory import warm_up as trajectory
+
+if WORKING:
+    from rs_localizer.config import NodeConfig
+    from rs_localizer.core.simd import shipped
+    from rs_localizer.core.simd.jit import cache_directory
+    from rs_localizer.markers import detection
+    from rs_localizer.pipeline.compiling import note_compiled
+    from rs_localizer.pipeline.frames import FrameLocalizer
+    from rs_localizer.trajectory import warm_up as trajectory
 
 # Any that is known: with it, frames are tracked, too.
 _READOUT_TIME = 0.03

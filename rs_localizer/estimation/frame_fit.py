@@ -71,6 +71,8 @@ _RIDGE = 1.0 + 1e-13
 _CLOSING = 0.6
 # A last step this short, in squared standard deviations: the next one is its square.
 _SHORT = 1e-3
+# A step that raises the cost is halved, up to a thirtieth.
+_HALVINGS = 6
 # Fewer inliers determine nothing.
 _FEWEST = 6
 _TINY = 1e-300
@@ -103,8 +105,8 @@ class FrameFit(NamedTuple):
     agreement: float  # of neighbouring rows (see residual_tests)
     evidence: float  # logarithm, but for a constant of the inliers
     left: float  # squared errors beside all, in variances of the noise
-    prior_cost: float  # of motion and coefficients
-    log_determinant: float  # of the covariance over that of the prior of the coefficients
+    prior_cost: float  # of motion, coefficients and scales
+    log_determinant: float  # of the covariance over that of the prior of coefficients and scales
     finite: bool
 
 
@@ -608,32 +610,42 @@ def fit_frame(
     tau = _row_times(data, count)
     turns = np.zeros((FUNCTIONS if with_turns else 0, 3))
     inliers = squared_errors(data, count, state) < gate * gate
-    prior_cost, finite, done = 0.0, True, False
+    finite, done, groups = True, False, _groups(q)
     lines = linearized(data, count, state, shake_at(tau, turns))
     errors, squared = _beside(data, state, lines, inliers, coefficients[first:], bend)
+    information, slope, prior_cost = full_prior(prior, state, turns, size)
     for turn in range(most):
         kept = int(np.count_nonzero(inliers))
         if kept < _FEWEST:
             finite = False
             break
         normal = products_of(lines, inliers, errors, with_turns, with_smooth, bend)
-        information, slope, prior_cost = full_prior(prior, state, turns, size)
         solved = with_scales(
             normal, information, slope, coefficients, scales, hyper_mean, hyper_precision, noise,
             2 * kept, (_SCALE_ROUNDS if turn < 3 else _LATER_SCALE_ROUNDS) if q > 0 else 1,
         )  # fmt: skip
-        values, scales = solved.values, solved.log_scales
-        moved = _largest_move(values, coefficients, solved.covariance)
+        step, scales = solved.values.copy(), solved.log_scales
+        step[PARAMETERS:] -= coefficients
+        moved = _largest_move(step, solved.covariance)
         if not np.isfinite(moved):
             finite = False
             break
-        state = apply_step(state, values[:PARAMETERS])
-        coefficients = values[PARAMETERS:].copy()
-        for k in range(len(turns)):
-            for axis in range(3):
-                turns[k, axis] = coefficients[3 * k + axis]
-        lines = linearized(data, count, state, shake_at(tau, turns))
-        errors, squared = _beside(data, state, lines, inliers, coefficients[first:], bend)
+        precisions, origin, before = np.exp(-2.0 * scales[groups]), state, coefficients
+        most_cost = prior_cost + np.sum(before**2 * precisions)
+        most_cost += np.sum(squared[inliers]) / noise**2 + _SHORT
+        # What hardly determines a velocity is a valley that bends: a full step may leave it.
+        for _ in range(_HALVINGS):
+            state, coefficients = apply_step(origin, step[:PARAMETERS]), before + step[PARAMETERS:]
+            for k in range(len(turns)):
+                for axis in range(3):
+                    turns[k, axis] = coefficients[3 * k + axis]
+            lines = linearized(data, count, state, shake_at(tau, turns))
+            errors, squared = _beside(data, state, lines, inliers, coefficients[first:], bend)
+            information, slope, prior_cost = full_prior(prior, state, turns, size)
+            cost = prior_cost + np.sum(coefficients**2 * precisions)
+            if cost + np.sum(squared[inliers]) / noise**2 <= most_cost:
+                break
+            step *= 0.5
         noise = noise_deviation(squared, gate, max(2.0 * kept - solved.freedom, 0.0))
         closed = gate <= WIDEST_GATE * threshold
         gate = max(_CLOSING * gate, min(max(threshold, GATE * noise), WIDEST_GATE * threshold))
@@ -643,9 +655,15 @@ def fit_frame(
                 break
             done = True
     variance, chosen = noise * noise, PARAMETERS + first
-    cost = solved.left / variance + prior_cost + solved.prior_cost
+    left = np.sum(squared[inliers]) / variance
+    prior_cost += np.sum(coefficients**2 * np.exp(-2.0 * scales[groups]))
+    cost, volume = _of_scales(
+        scales - hyper_mean, scales, hyper_precision, solved.decided,
+        0 if with_turns else SCALES - 1, SCALES if with_smooth else SCALES - 1,
+    )  # fmt: skip
+    prior_cost, log_determinant = prior_cost + cost, solved.log_determinant + volume
     kept = int(np.count_nonzero(inliers))
-    evidence = 0.5 * (solved.log_determinant - cost) - kept * math.log(variance)
+    evidence = 0.5 * (log_determinant - left - prior_cost) - kept * math.log(variance)
     smooth = math.exp(scales[SCALES - 1]) if with_smooth else 0.0
     agreement = neighbours_agree(errors, tau, lines.image, inliers)
     finite = finite and bool(np.all(np.isfinite(solved.covariance)))
@@ -654,8 +672,33 @@ def fit_frame(
     return FrameFit(
         state, turns, own, noise, solved.freedom, inliers, squared, scales,
         solved.decided, smooth, agreement, evidence,
-        solved.left / variance, prior_cost + solved.prior_cost, solved.log_determinant, finite,
+        left, prior_cost, log_determinant, finite,
     )  # fmt: skip
+
+
+@inlined
+def _of_scales(
+    away: Array, scales: Array, precision: Array, decided: Array, first: int, last: int
+) -> tuple[float, float]:
+    """Cost of the log-scales from ``first`` to before ``last``, ``away`` from what is known of
+    them, and the logarithm of the determinant of their covariance over that of their hyperprior
+    (Laplace): modes and frames with an in-frame turn are not equally probable in them.
+    """
+    count, cost = last - first, 0.0
+    before = np.zeros((count, count))
+    for i in range(count):
+        g = first + i
+        cost += precision[g] * away[g] ** 2
+        before[i, i] += precision[g]
+        if i > 0 and g < SCALES - 1:
+            cost += _SMOOTH_SPECTRUM * (scales[g] - scales[g - 1]) ** 2
+            for j in (i - 1, i):
+                before[j, j] += _SMOOTH_SPECTRUM
+                before[j, 2 * i - 1 - j] -= _SMOOTH_SPECTRUM
+    after = before.copy()
+    for i in range(count):
+        after[i, i] += 2.0 * decided[first + i]
+    return cost, log_determinant_of_inverse(before) - log_determinant_of_inverse(after)
 
 
 @kernel
@@ -679,12 +722,11 @@ def _beside(
 
 
 @inlined
-def _largest_move(values: Array, coefficients: Array, covariance: Array) -> float:
+def _largest_move(step: Array, covariance: Array) -> float:
     """Square of the longest part of a step, in deviations; NaN where one is not finite."""
     longest = 0.0
-    for i in range(len(values)):
-        change = values[i] - (coefficients[i - PARAMETERS] if i >= PARAMETERS else 0.0)
-        part = change * change / max(covariance[i, i], _TINY)
+    for i in range(len(step)):
+        part = step[i] * step[i] / max(covariance[i, i], _TINY)
         if not part <= longest:
             longest = part
     return longest

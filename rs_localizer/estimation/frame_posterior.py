@@ -31,7 +31,7 @@ from rs_localizer.estimation.frame_fit import (
     fit_frame,
     score_products,
 )
-from rs_localizer.estimation.mirror import farthest, mirrored
+from rs_localizer.estimation.mirror import farthest, is_plane, mirrored
 from rs_localizer.estimation.modes import (
     FAR_LESS_PROBABLE,
     STEPS,
@@ -186,8 +186,8 @@ def _of_points(
     best = replace(best, agreement=agreement, near_outliers=near, declared=declared)
     # What turns within the frame would explain, errors of map and lens may explain as well.
     frame = _Frame(
-        observations, best, terms, threshold, assumed, hyper, smooth, other is not None,
-        np.zeros((len(observations), 0)),
+        observations, best, terms, threshold, assumed, hyper, smooth,
+        is_plane(observations.points, best.inliers), np.zeros((len(observations), 0)),
     )  # fmt: skip
     if smooth:
         bend = _bend(observations.points, best.inliers, depth / assumed.focal_length)

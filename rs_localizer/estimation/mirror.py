@@ -45,7 +45,7 @@ def facing(points: Array, inliers: BoolArray, state: Array) -> Array | None:
 
 def is_plane(points: Array, inliers: BoolArray) -> bool:
     """Whether the points (n,3) that count lie on a plane."""
-    return bool(_plane(points, inliers)[0])
+    return bool(plane_of(points, inliers)[0])
 
 
 @kernel
@@ -53,7 +53,7 @@ def leaning_less(
     points: Array, inliers: BoolArray, state: Array, leans: float
 ) -> tuple[bool, Array]:
     """Whether there is a state whose view of the plane leans by so many times its lean less."""
-    plane, centre, axis_of_plane = _plane(points, inliers)
+    plane, centre, axis_of_plane = plane_of(points, inliers)
     if not plane:
         return False, state
     seen, normal = state[9:12].copy(), np.zeros(3)
@@ -84,7 +84,7 @@ def leaning_less(
 
 
 @inlined
-def _plane(points: Array, inliers: BoolArray) -> tuple[bool, Array, Array]:
+def plane_of(points: Array, inliers: BoolArray) -> tuple[bool, Array, Array]:
     """Whether the points that count lie on a plane, their centre (3,) and its normal (3,)."""
     centre, spread, count = np.zeros(3), np.zeros((3, 3)), 0
     for i in range(len(points)):

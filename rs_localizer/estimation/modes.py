@@ -32,7 +32,7 @@ from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import MOVE, PARAMETERS, STATE_SIZE, TURN, step_between
 from rs_localizer.estimation.frame_fit import fit_frame, log_determinant_of_inverse
-from rs_localizer.estimation.mirror import leaning_less
+from rs_localizer.estimation.mirror import leaning_less, plane_of
 from rs_localizer.estimation.observations import weighted
 from rs_localizer.estimation.posterior import WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, terms_at
@@ -57,8 +57,16 @@ _SAME = 1e-2
 _MOST_BETTER = 0.01
 # No frame says more than this against a typical speed.
 _LEAST_LIKELY = -10.0
+# Gate from which a smooth error is fitted, in thresholds: what it will explain stands outside of
+# the widest one, and would stay there.
+_FIRST_GATE = 2.0 * WIDEST_GATE
 _FITS, _FINE = 4, 1e-6
 _NO_SCALE, _ITERATIONS = 1e6, 50
+# Deviation of a lean (rad, 2 deg) up to which one Gaussian will do.
+_KNOWN_LEAN = 0.035
+# Logarithm of the odds of the best part of the leans against those that are left out (of a Gaussian
+# what is beyond 3.7 deviations), how far they reach in deviations, and the most of them.
+_LEAST_PART, _REACH, _MOST_PARTS = 7.0, 8, 100
 # Probabilities that have no part in the covariance.
 _NO_PART = 1e-5
 
@@ -314,12 +322,16 @@ def _modes(
     for speed in range(slowest, len(SPEEDS)):
         prior = terms_at(terms, SPEEDS[speed], turn_known)
         mode = _mode(data, inliers, near, prior, odds[speed], smooth)
-        count = _keep(modes, count, speed, mode)
-        near, here = mode.state, mode.evidence
-        other = has_twin
+        near, other = mode.state, has_twin
         if leans and not has_twin:
             other, twin = leaning_less(inliers.points, inliers.chosen, near, 2.0)
-        if other:
+        whole, open_ = mode, False
+        if planar:
+            whole, open_ = _over_leans(
+                data, inliers, mode, twin if other else near, prior, odds[speed], smooth
+            )
+        count, here = _keep(modes, count, speed, whole), whole.evidence
+        if other and not open_:
             second = _mode(data, inliers, twin, prior, odds[speed], smooth)
             leans = has_twin = _apart(mode, second)
             if has_twin:
@@ -383,7 +395,7 @@ def _mode(
     if smooth.fitted and np.isfinite(evidence):
         fit = fit_frame(
             inliers.data, len(inliers.chosen), state, terms, inliers.threshold,
-            WIDEST_GATE * inliers.threshold, noise, smooth.first, smooth.mean, smooth.precision,
+            _FIRST_GATE * inliers.threshold, noise, smooth.first, smooth.mean, smooth.precision,
             False, True, smooth.bend, STEPS,
         )  # fmt: skip
         if fit.finite:
@@ -396,6 +408,86 @@ def _mode(
         return Mode(start, np.zeros((PARAMETERS, PARAMETERS)), -np.inf, np.inf, 0.0)
     covariance = along_arcs(inliers.inflation * covariance, state[9:12])
     return Mode(state, covariance, evidence + odds, cost, scale)
+
+
+@kernel
+def _over_leans(
+    data: Array, inliers: Inliers, mode: Mode, twin: Array, terms: PriorTerms, odds: float,
+    smooth: SmoothError,
+) -> tuple[Mode, bool]:  # fmt: skip
+    """The mode of a plane, integrated over its leans where they are hardly known; whether they are.
+
+    Nested Laplace approximation: the posterior times Gaussians of the lean that add up to one (two
+    of their deviations apart, to 1.5 %), each part a Gaussian about an optimum of its own.
+
+    Args:
+        twin: state (24,) of the mirrored lean, where the parts may be others; or that of the mode.
+    """
+    rotation, count = mode.state[:9].copy().reshape(3, 3), len(terms.informations)
+    plane, centre, normal = plane_of(inliers.points, inliers.chosen)
+    flat = np.eye(3) - np.outer(rotation @ normal, rotation @ normal)
+    sizes, axes = np.linalg.eigh(flat @ mode.covariance[TURN, TURN].copy() @ flat)
+    if not (plane and sizes[2] > _KNOWN_LEAN**2):
+        return mode, False
+    step = math.sqrt(sizes[2])
+    informations = np.zeros((count + 1, PARAMETERS, PARAMETERS))
+    references = np.empty((count + 1, STATE_SIZE))
+    informations[:count], references[:count] = terms.informations, terms.references
+    places, starts = np.zeros((_MOST_PARTS, 2), np.int64), np.empty((_MOST_PARTS, STATE_SIZE))
+    states, evidences = np.empty((_MOST_PARTS, STATE_SIZE)), np.empty(_MOST_PARTS)
+    covariances = np.empty((_MOST_PARTS, PARAMETERS, PARAMETERS))
+    queued = np.zeros((2 * _REACH + 1, 2 * _REACH + 1), np.bool_)
+    queued[_REACH, _REACH], starts[0], first, last = True, mode.state, 0, 1
+    away = np.round(axes.T @ step_between(mode.state, twin)[TURN] / step)
+    i, j = int(away[2]), int(away[1])
+    if max(abs(i), abs(j)) <= _REACH and not queued[_REACH + i, _REACH + j]:
+        queued[_REACH + i, _REACH + j], starts[1], last = True, twin, 2
+        places[1, 0], places[1, 1] = i, j
+    kept, best = 0, -np.inf
+    while first < last:
+        i, j = places[first, 0], places[first, 1]
+        turn = exp(-step * (i * axes[:, 2] + j * axes[:, 1]))
+        references[count] = starts[first]
+        references[count, :9] = (turn @ rotation).ravel()
+        across = turn @ rotation @ normal
+        informations[count, TURN, TURN] = 4.0 / sizes[2] * (np.eye(3) - np.outer(across, across))
+        part = _mode(
+            data, inliers, starts[first], PriorTerms(informations, references, terms.gravity),
+            odds, smooth,
+        )  # fmt: skip
+        first += 1
+        if not part.evidence > best - _LEAST_PART:
+            continue
+        best = max(best, part.evidence)
+        states[kept], covariances[kept] = part.state, part.covariance
+        evidences[kept], kept = part.evidence, kept + 1
+        old = part.state[:9].copy().reshape(3, 3)
+        for k in range(4):
+            m, n = i + (k == 0) - (k == 1), j + (k == 2) - (k == 3)
+            if (
+                max(abs(m), abs(n)) > _REACH
+                or queued[_REACH + m, _REACH + n]
+                or last == _MOST_PARTS
+            ):
+                continue
+            queued[_REACH + m, _REACH + n] = True
+            places[last, 0], places[last, 1] = m, n
+            # About the middle of the plane, from the nearest part.
+            new = exp(-step * (m * axes[:, 2] + n * axes[:, 1])) @ turn.T @ old
+            starts[last] = part.state
+            starts[last, :9] = new.ravel()
+            starts[last, 9:12] += old @ centre - new @ centre
+            last += 1
+    if kept == 0:
+        return mode, False
+    probable = np.exp(evidences[:kept] - best)
+    total = np.sum(probable)
+    state, covariance, _ = averaged(
+        states[:kept], covariances[:kept], int(np.argmax(probable)), probable / total,
+        probable / total,
+    )  # fmt: skip
+    evidence = best + math.log(2.0 / math.pi * total)
+    return Mode(state, covariance, evidence, mode.cost, mode.smooth), True
 
 
 @kernel

@@ -31,7 +31,6 @@ from rs_localizer.core.state import (
     PARAMETERS,
     STATE_ANGULAR,
     STATE_SIZE,
-    rotation_of,
 )
 
 # Numbers whose squares are finite.
@@ -303,13 +302,6 @@ def _turning(i: int) -> int:
     """Where a step has the turn rate, and its change six places behind it."""
     place: int = 6 + i + i // 3 * 3
     return place
-
-
-def gravity_cost(terms: PriorTerms, state: Array) -> float:
-    """What a state (24,) costs by the measured direction of gravity, in noise variances."""
-    gravity = terms.gravity
-    error = rotation_of(state) @ gravity[:3] - gravity[3:6]
-    return float(gravity[6] * (error @ error))
 
 
 def _single(information: Array, reference: Array) -> PriorTerms:

@@ -19,7 +19,7 @@ from rs_localizer.io.video import Image
 from rs_localizer.markers.prints import Marker
 from rs_localizer.simulation.frames import true_poses_at
 from rs_localizer.simulation.marker_frames import CAMERA, RATE, MarkerWalls
-from rs_localizer.simulation.renderer import ImageSettings
+from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import TrueMotion
 
 _BAR, _GAP = 30, 6  # px

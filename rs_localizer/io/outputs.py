@@ -56,6 +56,7 @@ class CameraShare:
     points: int
     inliers: int
     residual: float  # px, root mean square of the inliers
+    start_ns: int = 0  # exposure of its first row
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,6 +20,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import yaml
@@ -216,12 +217,37 @@ def _sensors(cameras: Any) -> Iterator[tuple[str, tuple[Array, Array]]]:
         yield name, (pose.rotation, pose.translation)
 
 
-def shutters(cameras: Mapping[str, Camera]) -> dict[str, Any]:
-    """Readout times and scan directions of cameras as parameters of the node."""
-    return {
-        f"{name}.{field}": value
-        for name, camera in cameras.items()
-        for field, value in zip(
-            _SHUTTER, (camera.readout_time, str(camera.scan_direction)), strict=True
-        )
-    }
+def optical_frame(name: str) -> str:
+    """The frame of a camera of a rig that nobody has named."""
+    return f"{name}_optical_frame"
+
+
+def node_parameters(parts: RigParts) -> dict[str, Any]:
+    """The node's parameters for a rig, but for where its cameras are, which TF says."""
+    own: dict[str, Any] = {}
+    for name, camera in parts.cameras.items():
+        values = (camera.readout_time, str(camera.scan_direction))
+        own |= {f"{name}.{of}": value for of, value in zip(_SHUTTER, values, strict=True)}
+        if (offset := parts.time_offset.get(name, 0.0)) != 0.0:
+            own[f"{name}.stamp_offset"] = offset
+    return {"cameras": list(parts.cameras), **own}
+
+
+def write_static_transforms(path: Path, parts: RigParts, frames: Mapping[str, str]) -> None:
+    """Write a launch file (XML) that publishes where cameras are in the axes of the first one.
+
+    Args:
+        frames: of the cameras' optical axes, by name.
+    """
+    first, *others = parts.cameras
+    root, lines = Transform(*parts.camera_from_rig[first]), ["<launch>"]
+    for name in others:
+        pose = root @ Transform(*parts.camera_from_rig[name]).inverse()
+        x, y, z = pose.translation.tolist()
+        qx, qy, qz, qw = so3.quaternion(np.ascontiguousarray(pose.rotation)).tolist()
+        values = {"x": x, "y": y, "z": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw}
+        args = " ".join(f"--{key} {value:.17g}" for key, value in values.items())
+        args += f" --frame-id {frames[first]} --child-frame-id {frames[name]}"
+        node = f'pkg="tf2_ros" exec="static_transform_publisher" name="{name}_on_{first}"'
+        lines.append(f"  <node {node} args={quoteattr(args)}/>")
+    path.write_text("\n".join([*lines, "</launch>", ""]), "utf-8")

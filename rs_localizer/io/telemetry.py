@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
 
 # Optical axes (x right, y down, z forward) from telemetry-parser's.
 CAMERA_FROM_SENSOR = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -30,6 +31,8 @@ _LOOKED_AT = 2**18  # bytes
 _READOUT_NAMES = ("0x53524f54", "FrameReadoutTime", "frame_readout_time")
 _STABILIZED, _STABILIZER = "0x45495345", "0x45495341"  # GoPro: EISE, whether, and EISA, how
 _OFF = ("", "N", "N/A", "OFF")
+# Models of gyroflow's lens profiles that OpenCV has as well; without a name it is the fisheye.
+_LENSES = {"opencv_fisheye": "equidistant", "opencv_standard": "plumb_bob"}
 _FIELD, _DIAGONAL = "0x56464f56", "0x5a464f56"  # GoPro: VFOV, its letter, and ZFOV, degrees
 
 
@@ -49,6 +52,7 @@ class Telemetry:
     exposure: float | None  # s, median
     stabilizer: str = ""  # what has changed the images; empty: nothing that is known
     lens: str = ""  # its setting
+    profile: Camera | None = None  # its lens, where the maker's profile is of a model of ours
 
     @property
     def rate(self) -> float:
@@ -107,16 +111,43 @@ def read_telemetry(path: Path) -> Telemetry | None:
         None if readout is None or not float(readout) > 0.0 else 1e-3 * float(readout),
         float(np.median(exposures)) if exposures else None,
         stabilizer,
-        _lens(found),
+        _lens(found, tags),
+        _profile(tags),
     )
 
 
-def _lens(values: dict[str, Any]) -> str:
-    """The setting of a GoPro's lens: each needs a calibration of its own."""
+def _lens(values: dict[str, Any], tags: list[dict[str, Any]]) -> str:
+    """A profile, or the setting of a GoPro's lens: each needs a calibration of its own."""
+    if kept := _kept_profile(tags):
+        fx = float(np.ravel(kept["fisheye_params"]["camera_matrix"])[0])
+        model = kept.get("distortion_model") or "opencv_fisheye"
+        return f"lens profile by {kept.get('calibrated_by') or 'its maker'} ({model}, {fx:.0f} px)"
     letter, degrees = values.get(_FIELD), values.get(_DIAGONAL)
     if letter is None:
         return ""
     return f"field of view {letter}" + ("" if degrees is None else f" ({float(degrees):.0f} deg)")
+
+
+def _kept_profile(tags: list[dict[str, Any]]) -> dict[str, Any]:
+    """The lens profile in gyroflow's format; empty: there is none with a camera matrix."""
+    for group in tags:
+        data = group.get("Lens", {}).get("Data")
+        if isinstance(data, dict) and "camera_matrix" in (data.get("fisheye_params") or {}):
+            return data
+    return {}
+
+
+def _profile(tags: list[dict[str, Any]]) -> Camera | None:
+    """The camera of a lens profile, as far as its model is one of ours."""
+    kept = _kept_profile(tags)
+    model = _LENSES.get(kept.get("distortion_model") or "opencv_fisheye") if kept else None
+    if model is None:
+        return None
+    size, lens = kept["calib_dimension"], kept["fisheye_params"]
+    try:
+        return Camera(size["w"], size["h"], lens["camera_matrix"], lens["distortion_coeffs"], model)
+    except ValueError:  # of a model that has grown, or numbers that are none
+        return None
 
 
 def _spread(forces: Array, times: Array) -> Array:

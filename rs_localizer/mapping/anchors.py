@@ -97,26 +97,26 @@ class Placement:
     similarity: Similarity  # to metres
     scaled: bool
     levelled: bool  # z is up by what was measured, and not only by how the camera was held
-    told: str
+    basis: str
     doubt: str = ""  # why it may be wrong
     up: str = "as the camera was held on average (a guess)"
 
 
 def placement(
-    anchors: Anchors, found: Triangulated, rotations: Array, positions: Array
+    anchors: Anchors, triangulated: Triangulated, rotations: Array, positions: Array
 ) -> Placement:
     """The frame of the map in metres.
 
     Args:
         anchors: what is known.
-        found: where they are in the map.
+        triangulated: where they are in the map.
         rotations, positions: (g,3,3), (g,3) map_from_camera of all views, as they were held.
 
     Raises:
         MappingError: when what is known contradicts itself or was not seen.
     """
     if anchors.marker_map is not None:
-        return _by_markers(anchors.marker_map, found)
+        return _by_markers(anchors.marker_map, triangulated)
     turn = upright(_down(rotations))
     if not anchors.distances:
         return Placement(
@@ -124,7 +124,9 @@ def placement(
         )
     factors = []
     for distance in anchors.distances:
-        one, other = (found.points[_row(anchors, name)] for name in (distance.one, distance.other))
+        one, other = (
+            triangulated.points[_row(anchors, name)] for name in (distance.one, distance.other)
+        )
         apart = float(np.linalg.norm(one - other))
         if not apart > 0.0:  # NaN: one of them is seen by one image only, or far away
             raise MappingError(
@@ -153,26 +155,28 @@ def _row(anchors: Anchors, name: str) -> int:
     return anchors.corners + anchors.names.index(name)
 
 
-def _by_markers(marker_map: MarkerMap, found: Triangulated) -> Placement:
+def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
     truth = marker_map.points
-    places = found.points[: len(truth)]
-    known: BoolArray = np.isfinite(places).all(axis=1) & (found.counts[: len(truth)] > 2)
-    if np.count_nonzero(known) < _LEAST_CORNERS:
+    places = triangulated.points[: len(truth)]
+    determined: BoolArray = np.isfinite(places).all(axis=1) & (
+        triangulated.counts[: len(truth)] > 2
+    )
+    if np.count_nonzero(determined) < _LEAST_CORNERS:
         raise MappingError(
-            f"{np.count_nonzero(known)} corners of the marker map are seen by three images or "
+            f"{np.count_nonzero(determined)} corners of the marker map are seen by three images or "
             f"more, {_LEAST_CORNERS} are needed: show the markers from several places"
         )
-    similarity = through(places[known], truth[known])
-    errors = np.linalg.norm(similarity(places[known]) - truth[known], axis=1)
-    extent = float(np.linalg.norm(np.ptp(truth[known], axis=0)))
+    similarity = through(places[determined], truth[determined])
+    errors = np.linalg.norm(similarity(places[determined]) - truth[determined], axis=1)
+    extent = float(np.linalg.norm(np.ptp(truth[determined], axis=0)))
     misfit = float(np.sqrt(np.mean(errors**2)))
     if misfit > _MOST_MISFIT * extent:
         raise MappingError(
             f"the markers do not lie where their map says: corners are off by {1e3 * misfit:.0f} "
             f"mm (rms) over {extent:.2f} m; check sizes and places in the marker map"
         )
-    corners = int(np.count_nonzero(known))
-    told = f"{corners} corners of markers, within {1e3 * misfit:.1f} mm (rms) of their map"
+    corners = int(np.count_nonzero(determined))
+    basis = f"{corners} corners of markers, within {1e3 * misfit:.1f} mm (rms) of their map"
     metres, part = _USUAL_MISFIT
     doubt = ""
     if misfit > max(metres, part * extent):
@@ -180,7 +184,7 @@ def _by_markers(marker_map: MarkerMap, found: Triangulated) -> Placement:
             f"the markers' corners are {1e3 * misfit:.1f} mm (rms) off their map, and so may be "
             "the landmarks: check sizes and places in the marker map, and the readout time"
         )
-    return Placement(similarity, True, True, told, doubt, "as in the marker map")
+    return Placement(similarity, True, True, basis, doubt, "as in the marker map")
 
 
 def _down(rotations: Array) -> Array:

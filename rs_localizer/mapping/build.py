@@ -149,38 +149,38 @@ class Built:
         return times, self.positions, Rotation.from_matrix(self.rotations).as_quat()
 
 
-def build_map(given: Given, work: Workshop) -> Built:
+def build_map(inputs: Given, work: Workshop) -> Built:
     """Build a map.
 
     Raises:
         ValueError: when the images make no map, saying what was found.
     """
-    check_views(given.views)
-    if given.imu is not None and not given.anchors.tell_scale:
-        refuse_early(given.imu, given.stamps_ns)
-    unsharp = blurred(given.views)
-    keyframes = choose_keyframes(given.stamps_ns, given.views)
-    structure = _structure(given, keyframes, work)
+    check_views(inputs.views)
+    if inputs.imu is not None and not inputs.anchors.tell_scale:
+        refuse_early(inputs.imu, inputs.stamps_ns)
+    unsharp = blurred(inputs.views)
+    keyframes = choose_keyframes(inputs.stamps_ns, inputs.views)
+    structure = _structure(inputs, keyframes, work)
     camera = replace(
         structure.camera,
-        readout_time=given.readout_time or 0.0,
-        scan_direction=given.scan_direction or likely_axes(structure.camera.size)[0],
+        readout_time=inputs.readout_time or 0.0,
+        scan_direction=inputs.scan_direction or likely_axes(structure.camera.size)[0],
     )
-    with work.stage("track", len(given.views)) as step:
-        tracked = track_on_map(given.views, structure, camera, lambda: step(1))
-    refined, shutter, rows = _refined(given, tracked, structure, camera, work)
-    estimated = None if given.camera is not None else structure.camera.focal_length
+    with work.stage("track", len(inputs.views)) as step:
+        tracked = track_on_map(inputs.views, structure, camera, lambda: step(1))
+    refined, shutter, rows = _refined(inputs, tracked, structure, camera, work)
+    estimated = None if inputs.camera is not None else structure.camera.focal_length
     check_fit(float(np.mean(refined.inliers)), estimated)
     motion = Motion(rows, refined.times, refined)
     shown = motion.sights(tracked.views[tracked.images], tracked.points, tracked.pixels)
     triangulated = triangulate(refined.camera, shown, len(structure.points))
-    place = place_by_imu(_placement(given, motion), refined, given.imu)
+    place = place_by_imu(_placement(inputs, motion), refined, inputs.imu)
     similarity = place.placement.similarity
     kept = _kept(triangulated, motion)
     rotations, positions = motion.poses()
     return Built(
         landmarks=_landmarks(
-            triangulated, kept, structure.descriptors, similarity, given.frame
+            triangulated, kept, structure.descriptors, similarity, inputs.frame
         ),
         camera=refined.camera_as_found,
         place=place,
@@ -253,10 +253,10 @@ def choose_keyframes(stamps_ns: IntArray, views: Sequence[View]) -> IntArray:
     return np.array([max(slot, key=lambda row: views[row].sharpness) for slot in slots], np.int64)
 
 
-def _structure(given: Given, keyframes: IntArray, work: Workshop) -> Structure:
+def _structure(inputs: Given, keyframes: IntArray, work: Workshop) -> Structure:
     """The first structure, of about the right size."""
     structure = build_structure(
-        given.views[0].image.parent, keyframes, given.camera, work.folder, work.effort, work.stage
+        inputs.views[0].image.parent, keyframes, inputs.camera, work.folder, work.effort, work.stage
     )
     total = len(keyframes)
     if structure.parts[0] < max(_LEAST_VIEWS, _LEAST_PART * total):
@@ -271,7 +271,7 @@ def _structure(given: Given, keyframes: IntArray, work: Workshop) -> Structure:
 
 
 def _refined(
-    given: Given, tracked: Tracked, structure: Structure, camera: Camera, work: Workshop
+    inputs: Given, tracked: Tracked, structure: Structure, camera: Camera, work: Workshop
 ) -> tuple[RefinedMap, ShutterFit | None, IntArray]:
     """The refined map, what is found of an unknown shutter, and the rows of its views."""
     chosen = np.zeros(len(structure.points), np.bool_)
@@ -281,7 +281,7 @@ def _refined(
     used, images = np.unique(tracked.images[of], return_inverse=True)
     rows = tracked.views[used]
     observations = MapObservations(
-        given.stamps_ns[rows], images, tracked.points[of], tracked.pixels[of]
+        inputs.stamps_ns[rows], images, tracked.points[of], tracked.pixels[of]
     )
     start = Start(structure.points, tracked.rotations[used], tracked.positions[used])
     freedom = MapFreedom()
@@ -290,23 +290,23 @@ def _refined(
         1e-9 * (observations.stamps_ns - observations.stamps_ns[0]), start.rotations,
         start.positions,
     )  # fmt: skip
-    if given.anchors.marker_map is not None:
-        corners = _corners(given, observations.stamps_ns)
-        places = given.anchors.marker_map.points
+    if inputs.anchors.marker_map is not None:
+        corners = _corners(inputs, observations.stamps_ns)
+        places = inputs.anchors.marker_map.points
         observations, start, freedom = marker_constraints(
             camera, observations, start, corners, places
         )
     freedom = replace(
         freedom,
-        lens=given.camera is None,
+        lens=inputs.camera is None,
         lens_deviations=LENS_DEVIATIONS,
         angular_acceleration=max(freedom.angular_acceleration, angular),
         linear_acceleration=max(freedom.linear_acceleration, linear),
     )
     directions = [ScanDirection(camera.scan_direction)]
-    if given.scan_direction is None:
+    if inputs.scan_direction is None:
         directions = likely_axes(camera.size)
-    unknown = given.readout_time is None
+    unknown = inputs.readout_time is None
     with work.stage("refine", 3 * (1 + len(directions)) if unknown else 3) as step:
 
         def done(_: str) -> None:
@@ -317,10 +317,10 @@ def _refined(
         return *fit_shutter(camera, observations, start, freedom, directions, done), rows
 
 
-def _corners(given: Given, stamps_ns: IntArray) -> MapObservations:
+def _corners(inputs: Given, stamps_ns: IntArray) -> MapObservations:
     """Corners of markers in the images with these stamps."""
-    views, corners, pixels = given.anchors.seen(given.views)
-    stamps = given.stamps_ns[views]
+    views, corners, pixels = inputs.anchors.seen(inputs.views)
+    stamps = inputs.stamps_ns[views]
     images = np.minimum(np.searchsorted(stamps_ns, stamps), len(stamps_ns) - 1)
     known = stamps_ns[images] == stamps
     return MapObservations(stamps_ns, images[known], corners[known], pixels[known])
@@ -349,10 +349,10 @@ def check_fit(share: float, focal_length: float | None) -> None:
     )
 
 
-def _placement(given: Given, motion: Motion) -> Placement:
-    shown = motion.sights(*given.anchors.seen(given.views))
-    triangulated = triangulate(motion.refined.camera, shown, given.anchors.count)
-    return placement(given.anchors, triangulated, *motion.poses())
+def _placement(inputs: Given, motion: Motion) -> Placement:
+    shown = motion.sights(*inputs.anchors.seen(inputs.views))
+    triangulated = triangulate(motion.refined.camera, shown, inputs.anchors.count)
+    return placement(inputs.anchors, triangulated, *motion.poses())
 
 
 def _kept(triangulated: Triangulated, motion: Motion) -> IntArray:

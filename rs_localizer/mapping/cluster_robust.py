@@ -72,36 +72,36 @@ _DOUBT = 4.0
 class Pull:
     """What errors pull at what is estimated, in its own covariance, all seconds together."""
 
-    found: float
+    measured: float
     expected: float  # of independent errors of the noise that the covariance stands for
 
     def inflation(self, independent: float) -> float:
         """Of the covariance, if it would be so large for independent errors."""
-        share = (self.found + _DOUBT * independent) / (self.expected + _DOUBT)
+        share = (self.measured + _DOUBT * independent) / (self.expected + _DOUBT)
         return max(share, independent)
 
 
-def cluster_robust(problem: Problem, found: Fit) -> Fit:
+def cluster_robust(problem: Problem, fitted: Fit) -> Fit:
     """The estimate with covariances as large as its own errors show.
 
     Args:
         problem: whose minimum it is, with the same freedom and without delays of images.
     """
-    of_errors = steepness(found.squared_errors[found.inliers], found.deviation) ** 2
-    pull = _pull(problem, found)
-    inflation = Pull(of_errors * pull.found, pull.expected).inflation(found.inflation)
+    of_errors = steepness(fitted.squared_errors[fitted.inliers], fitted.deviation) ** 2
+    pull = _pull(problem, fitted)
+    inflation = Pull(of_errors * pull.measured, pull.expected).inflation(fitted.inflation)
     return replace(
-        found,
-        border_covariance=found.border_covariance * (inflation / found.inflation),
+        fitted,
+        border_covariance=fitted.border_covariance * (inflation / fitted.inflation),
         inflation=inflation,
     )
 
 
-def _pull(problem: Problem, found: Fit) -> Pull:
-    curve, parts = problem.look(found.state)
-    terms = problem.terms(found.state, found.deviation)
-    lifted = found.factored.lifted
-    whitening = np.linalg.cholesky(found.border_covariance / found.inflation)
+def _pull(problem: Problem, fitted: Fit) -> Pull:
+    curve, parts = problem.look(fitted.state)
+    terms = problem.terms(fitted.state, fitted.deviation)
+    lifted = fitted.factored.lifted
+    whitening = np.linalg.cholesky(fitted.border_covariance / fitted.inflation)
     total, expected, start = 0.0, 0.0, 0
     for sights in parts:
         times = problem.observations.times[start : start + len(sights.first)]

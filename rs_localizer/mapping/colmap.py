@@ -126,11 +126,11 @@ def build_structure(
     _run(folder / _TASK, stage)
     (folder / _TASK).unlink()
     with np.load(folder / _ARRAYS) as arrays:
-        left = dict(arrays)
+        output = dict(arrays)
     (folder / _ARRAYS).unlink()
-    if not left["parts"].size:
-        raise MappingError(_nothing(left, len(keyframes)))
-    return _structure(left, folder, lens)
+    if not output["parts"].size:
+        raise MappingError(_nothing(output, len(keyframes)))
+    return _structure(output, folder, lens)
 
 
 def pairs_of(count: int) -> list[tuple[int, int]]:
@@ -175,32 +175,32 @@ def _death(code: int, last: str) -> str:
     return f"COLMAP's process ended with {how}" + (f": {last}" if last else "")
 
 
-def _nothing(left: dict[str, Any], keyframes: int) -> str:
+def _nothing(output: dict[str, Any], keyframes: int) -> str:
     """Why there is no structure."""
     return (
         f"no two of the {keyframes} keyframes determine a structure "
-        f"({left['features'] / keyframes:.0f} features each, {left['pairs']} pairs of them agree): "
-        "the images need texture that does not repeat, overlap, and a camera that moves sideways "
-        "and does not only turn"
+        f"({output['features'] / keyframes:.0f} features each, {output['pairs']} pairs of them "
+        "agree): the images need texture that does not repeat, overlap, and a camera that moves "
+        "sideways and does not only turn"
     )
 
 
-def _structure(left: dict[str, Any], folder: Path, lens: Camera | None) -> Structure:
+def _structure(output: dict[str, Any], folder: Path, lens: Camera | None) -> Structure:
     described = read_colmap(folder / SPARSE, "map", folder / DATABASE)
     assert described.ids is not None
     assert described.descriptors is not None
     order = np.argsort(described.ids)
-    rows = np.array([int(Path(name).stem) for name in left["names"].tolist()])
+    rows = np.array([int(Path(name).stem) for name in output["names"].tolist()])
     return Structure(
         views=rows,
-        rotations=left["rotations"],
-        positions=left["positions"],
-        points=left["points"],
+        rotations=output["rotations"],
+        positions=output["positions"],
+        points=output["points"],
         descriptors=described.descriptors[order].astype(np.float32),
-        seen_points=left["tracks"][:, 0],
-        seen_views=rows[left["tracks"][:, 1]],
-        pixels=left["pixels"] - HALF,
-        camera=lens or colmap_camera(str(left["camera"]), None),
-        parts=tuple(left["parts"].tolist()),
-        error=float(left["error"]),
+        seen_points=output["tracks"][:, 0],
+        seen_views=rows[output["tracks"][:, 1]],
+        pixels=output["pixels"] - HALF,
+        camera=lens or colmap_camera(str(output["camera"]), None),
+        parts=tuple(output["parts"].tolist()),
+        error=float(output["error"]),
     )

@@ -98,12 +98,12 @@ _ROUNDS, _OUTLIERS = 5, 4.0
 def laid_over(points: Array, onto: Array, usable: BoolArray) -> tuple[Similarity, BoolArray]:
     """The similarity of the landmarks that hardly changed, and which (n,) these are."""
     kept = usable
-    found = through(points[kept], onto[kept])
+    similarity = through(points[kept], onto[kept])
     for _ in range(_ROUNDS):
-        off = np.linalg.norm(found(points) - onto, axis=1)
+        off = np.linalg.norm(similarity(points) - onto, axis=1)
         kept = usable & (off <= _OUTLIERS * max(float(np.median(off[usable])), 1e-12))
-        found = through(points[kept], onto[kept])
-    return found, kept
+        similarity = through(points[kept], onto[kept])
+    return similarity, kept
 
 
 class Floating:

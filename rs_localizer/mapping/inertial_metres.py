@@ -111,11 +111,11 @@ def inertial_metres(refined: RefinedMap, imu: ImuRecording) -> InertialMetres:
     means = mean_accelerations(refined.spline, samples, mount.mount.camera_from_imu, spacing)
     _check(means, refined)
     try:
-        found = metric(means, _lever(imu))
+        scale_fit = metric(means, _lever(imu))
     except NoMetric as error:
         raise NoMetres(str(error)) from error
-    covered = found.means * spacing / _length(refined)
-    return InertialMetres(found, mount, found.inflation * found.share, turned, covered)
+    covered = scale_fit.means * spacing / _length(refined)
+    return InertialMetres(scale_fit, mount, scale_fit.inflation * scale_fit.share, turned, covered)
 
 
 def _mount(refined: RefinedMap, imu: ImuRecording) -> tuple[ImuExtrinsics, float | None]:
@@ -296,7 +296,7 @@ def _scaled(placement: Placement, metres: InertialMetres, origin: Array) -> Plac
         placement,
         similarity=Similarity(scale, turn, -scale * turn @ origin),
         scaled=True,
-        told=f"the IMU, to {100.0 * metres.share:.2f} % (standard deviation)",
+        basis=f"the IMU, to {100.0 * metres.share:.2f} % (standard deviation)",
     )
 
 

@@ -308,7 +308,7 @@ class _Refinement:
         pull = pull_at_landmarks(rows.values[..., -4:], seen.points, seen.times, rows.precisions)
         own = steepness(inside, deviation) ** 2
         own *= left_over(len(inside), _freedoms(self.state.spline, seen.frames))
-        return Pull(own * pull.found, pull.expected).inflation(independent)
+        return Pull(own * pull.measured, pull.expected).inflation(independent)
 
     def _asked(self, deviation: float, inflation: float) -> ReadoutCheck | None:
         """Whether a readout time that was given is the one of the images."""

@@ -42,7 +42,7 @@ def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
         ("noise after it", f"{refined.after:.2f} px"),
         *_of_shutter(built),
         ("lens", _lens(built)),
-        ("scale", built.placement.told),
+        ("scale", built.placement.basis),
         ("z is up", built.placement.up),
         *_of_imu(built.place),
     ]

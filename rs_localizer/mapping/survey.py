@@ -54,37 +54,39 @@ class Mirrored:
     state: State  # with those mirrored that fit better so
 
 
-def mirrored(camera: Camera, seen: Observations, found: Fit) -> Mirrored:
+def mirrored(camera: Camera, observations: Observations, fitted: Fit) -> Mirrored:
     """Compare each marker with its mirror image, the motion held.
 
     Args:
-        seen: corners, four of each marker; those of the first, the origin, are known.
-        found: the adjustment of these.
+        observations: corners, four of each marker; those of the first, the origin, are known.
+        fitted: the adjustment of these.
     """
-    count = len(found.state.landmarks) // 4
+    count = len(fitted.state.landmarks) // 4
     # The origin, too, may lie the other way among all others.
-    free = replace(seen, bodies=np.repeat(np.arange(count), 4))
-    problem = Problem(camera, free, found.state, replace(found.freedom, readout_time=False))
-    other = replace(found.state, landmarks=_turned_over(seen, found.state))
+    free = replace(observations, bodies=np.repeat(np.arange(count), 4))
+    problem = Problem(camera, free, fitted.state, replace(fitted.freedom, readout_time=False))
+    other = replace(fitted.state, landmarks=_turned_over(observations, fitted.state))
     for noise in _NOISES:
-        normal = problem.normal(other, noise * found.deviation)[1]
+        normal = problem.normal(other, noise * fitted.deviation)[1]
         still = np.zeros(len(normal.slope))
         other = problem.moved(other, normal, (still, _steps(normal, count)))
-    own, theirs = (_costs(problem, state, found.deviation) for state in (found.state, other))
+    own, theirs = (_costs(problem, state, fitted.deviation) for state in (fitted.state, other))
     better = theirs < own
-    doubtful = np.abs(theirs - own) < _LEAST_DIFFERENCE * found.inflation
+    doubtful = np.abs(theirs - own) < _LEAST_DIFFERENCE * fitted.inflation
     # What came back is the same pose.
-    apart = _normals(other) * _normals(found.state)
+    apart = _normals(other) * _normals(fitted.state)
     same = np.sum(apart, axis=1) > np.cos(0.02)
-    chosen = np.where(np.repeat(better & ~same, 4)[:, None], other.landmarks, found.state.landmarks)
-    return Mirrored(better & ~same, doubtful & ~same, _at_the_origin(found.state, chosen))
+    chosen = np.where(
+        np.repeat(better & ~same, 4)[:, None], other.landmarks, fitted.state.landmarks
+    )
+    return Mirrored(better & ~same, doubtful & ~same, _at_the_origin(fitted.state, chosen))
 
 
-def _turned_over(seen: Observations, state: State) -> Array:
+def _turned_over(observations: Observations, state: State) -> Array:
     """Corners (p,3) of each marker mirrored in depth as its images see it."""
     layout, corners = state.spline.layout, state.landmarks.reshape(-1, 4, 3)
-    times = np.clip(seen.times, layout.starts.min(), layout.ends.max())
-    markers, middles = seen.points // 4, corners.mean(axis=1)
+    times = np.clip(observations.times, layout.starts.min(), layout.ends.max())
+    markers, middles = observations.points // 4, corners.mean(axis=1)
     toward: Array = state.spline.states(times).positions - middles[markers]
     toward /= np.linalg.norm(toward, axis=1)[:, None]
     sums = [np.bincount(markers, of, len(corners)) for of in toward.T]
@@ -220,36 +222,38 @@ def _adjusted(
     stamp_offset: float,
 ) -> Survey:  # fmt: skip
     own = _often(images, chained)
-    seen, times = _observations(camera, images, markers, chained, own, stamp_offset)
+    observations, times = _observations(camera, images, markers, chained, own, stamp_offset)
     rotations = np.array([pose.rotation for pose in chained.poses])
     positions = np.array([pose.translation for pose in chained.poses])
     spline = initial_trajectory(times[chained.images], rotations, positions, camera.readout_time)
-    seen = seen.subset(spline.layout.inside(seen.times))
+    observations = observations.subset(spline.layout.inside(observations.times))
     freedom = Freedom(
         readout_time=not camera.readout_time > 0.0,
         angular_velocity=ANGULAR_VELOCITY,
         linear_velocity=LINEAR_VELOCITY,
         least_noise=_LEAST_NOISE,
     )
-    start = start_state(camera, seen, spline, camera.readout_time)
+    start = start_state(camera, observations, spline, camera.readout_time)
     # Where a chain ends far off, its errors are large and no outliers.
-    errors = np.sqrt(Problem(camera, seen, start, freedom).errors(start))
-    found = fit(camera, seen, start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE)))
-    calmer = acceleration_prior(found.state, freedom)
+    errors = np.sqrt(Problem(camera, observations, start, freedom).errors(start))
+    fitted = fit(
+        camera, observations, start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE))
+    )
+    calmer = acceleration_prior(fitted.state, freedom)
     if calmer is not None:
-        found = fit(camera, seen, found.state, calmer, found.deviation)
-    found, doubtful = _right_side_up(camera, seen, found)
-    found = _less_noise(camera, seen, found)
-    _check_fit(found)
-    found = _believable(camera, seen, found)
-    corners = found.state.landmarks.reshape(-1, 4, 3)
+        fitted = fit(camera, observations, fitted.state, calmer, fitted.deviation)
+    fitted, doubtful = _right_side_up(camera, observations, fitted)
+    fitted = _less_noise(camera, observations, fitted)
+    _check_fit(fitted)
+    fitted = _believable(camera, observations, fitted)
+    corners = fitted.state.landmarks.reshape(-1, 4, 3)
     placed = [
         Marker(markers[m].family, markers[m].id, of) for m, of in zip(own, corners, strict=True)
     ]
-    counts = np.bincount(seen.points[found.inliers] // 4, minlength=len(own)) // 4
+    counts = np.bincount(observations.points[fitted.inliers] // 4, minlength=len(own)) // 4
     known = [k for k in range(1, len(own)) if counts[k] >= _LEAST_SIGHTS and not doubtful[k]]
     order = [0, *sorted(known, key=lambda k: own[k])]
-    covariance = _covariance(found, order)
+    covariance = _covariance(fitted, order)
     done = Survey(
         tuple(placed[k] for k in order),
         covariance,
@@ -258,53 +262,57 @@ def _adjusted(
         tuple(tuple(markers[m] for m in part) for part in chained.apart),
         tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}),
         len(chained.images),
-        found,
-        None if found.freedom.readout_time else _asked(camera, seen, found),
+        fitted,
+        None if fitted.freedom.readout_time else _asked(camera, observations, fitted),
     )
     _check_places(done)
     return done
 
 
-def _right_side_up(camera: Camera, seen: Observations, found: Fit) -> tuple[Fit, BoolArray]:
+def _right_side_up(
+    camera: Camera, observations: Observations, fitted: Fit
+) -> tuple[Fit, BoolArray]:
     """With all markers turned as they fit best, and for which (m,) that cannot be told."""
     for _ in range(_MOST_TURNS):
-        other = mirrored(camera, seen, found)
+        other = mirrored(camera, observations, fitted)
         if not other.better.any():
             break
-        turned = fit(camera, seen, other.state, found.freedom, found.deviation)
-        problem = Problem(camera, seen, found.state, found.freedom)
-        if problem.normal(turned.state, found.deviation)[0] > found.cost:
+        turned = fit(camera, observations, other.state, fitted.freedom, fitted.deviation)
+        problem = Problem(camera, observations, fitted.state, fitted.freedom)
+        if problem.normal(turned.state, fitted.deviation)[0] > fitted.cost:
             break
-        found = turned
-    return found, other.doubtful
+        fitted = turned
+    return fitted, other.doubtful
 
 
-def _less_noise(camera: Camera, seen: Observations, found: Fit) -> Fit:
+def _less_noise(camera: Camera, observations: Observations, fitted: Fit) -> Fit:
     """With corners that are better than was taken for granted: weighed too little, they lose to
     what is known of accelerations beforehand, and the readout time with them.
     """
-    noise = found.deviation * math.sqrt(found.inflation)
-    if found.deviation > _LEAST_NOISE or noise > _LEAST_NOISE:
-        return found
-    return fit(camera, seen, found.state, replace(found.freedom, least_noise=noise), noise)
+    noise = fitted.deviation * math.sqrt(fitted.inflation)
+    if fitted.deviation > _LEAST_NOISE or noise > _LEAST_NOISE:
+        return fitted
+    return fit(
+        camera, observations, fitted.state, replace(fitted.freedom, least_noise=noise), noise
+    )
 
 
-def _believable(camera: Camera, seen: Observations, found: Fit) -> Fit:
+def _believable(camera: Camera, observations: Observations, fitted: Fit) -> Fit:
     """With covariances as large as the corners' errors show."""
-    return cluster_robust(Problem(camera, seen, found.state, found.freedom), found)
+    return cluster_robust(Problem(camera, observations, fitted.state, fitted.freedom), fitted)
 
 
-def _covariance(found: Fit, order: list[int]) -> Array:
+def _covariance(fitted: Fit, order: list[int]) -> Array:
     """Of the markers (6 m, 6 m) in an order whose first is the origin, number 0."""
-    shared = len(found.border_covariance) - BODY * (len(found.state.landmarks) // 4 - 1)
+    shared = len(fitted.border_covariance) - BODY * (len(fitted.state.landmarks) // 4 - 1)
     columns = shared + (BODY * (np.array(order[1:]) - 1)[:, None] + np.arange(BODY)).ravel()
     covariance = np.zeros((BODY * len(order),) * 2)
-    covariance[BODY:, BODY:] = found.border_covariance[np.ix_(columns, columns)]
+    covariance[BODY:, BODY:] = fitted.border_covariance[np.ix_(columns, columns)]
     return covariance
 
 
-def _check_fit(found: Fit) -> None:
-    share = float(np.mean(found.inliers))
+def _check_fit(fitted: Fit) -> None:
+    share = float(np.mean(fitted.inliers))
     if share < _LEAST_FIT:
         raise ValueError(
             f"{100 * share:.0f} % of the corners fit the survey, {100 * _LEAST_FIT:.0f} % should: "
@@ -312,23 +320,27 @@ def _check_fit(found: Fit) -> None:
         )
 
 
-def _check_places(found: Survey) -> None:
-    if np.mean(found.poor) > 0.5:
-        off = np.median(np.linalg.norm(found.deviations_of_shape[:, :PLACE], axis=1))
-        size = np.median([marker.size for marker in found.markers])
+def _check_places(survey: Survey) -> None:
+    if np.mean(survey.poor) > 0.5:
+        off = np.median(np.linalg.norm(survey.deviations_of_shape[:, :PLACE], axis=1))
+        size = np.median([marker.size for marker in survey.markers])
         raise ValueError(
             f"most markers would be known to {1e3 * off:.0f} mm only, of {1e3 * size:.0f} mm: go "
             "nearer, for longer, with a sharper picture, and show more of them at once"
         )
 
 
-def _asked(camera: Camera, seen: Observations, found: Fit) -> ReadoutCheck:
+def _asked(camera: Camera, observations: Observations, fitted: Fit) -> ReadoutCheck:
     """The readout time that the corners ask for where one was given."""
     free = fit(
-        camera, seen, found.state, replace(found.freedom, readout_time=True), found.deviation
+        camera,
+        observations,
+        fitted.state,
+        replace(fitted.freedom, readout_time=True),
+        fitted.deviation,
     )
-    free = _believable(camera, seen, free)
-    given = float(found.state.readout_time)
+    free = _believable(camera, observations, free)
+    given = float(fitted.state.readout_time)
     return ReadoutCheck(given, float(free.state.readout_time), free.readout_time_deviation)
 
 
@@ -364,7 +376,7 @@ def _observations(
         for m in own
     ])  # fmt: skip
     all_pixels, all_frames = np.concatenate(pixels), np.concatenate(frames)
-    seen = Observations(
+    observations = Observations(
         times=times[all_frames],
         row_times=camera.row_time(all_pixels),
         pixels=all_pixels,
@@ -374,4 +386,4 @@ def _observations(
         trusted=np.ones(len(all_frames), np.bool_),
         bodies=np.repeat(np.arange(len(own)) - 1, 4),
     )
-    return seen, times
+    return observations, times

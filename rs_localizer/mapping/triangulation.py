@@ -43,21 +43,21 @@ class Triangulated:
     deviation: float  # px, of the noise of u and of v
 
 
-def triangulate(camera: Camera, seen: Sights, count: int) -> Triangulated:
+def triangulate(camera: Camera, sights: Sights, count: int) -> Triangulated:
     """The most likely places of points, robustly.
 
     Args:
         camera: its lens.
-        seen: of what is given; the order does not matter.
+        sights: of what is given; the order does not matter.
         count: of the points.
     """
-    if len(seen.points) == 0:
+    if len(sights.points) == 0:
         empty = np.full((count, 3), np.nan)
         return Triangulated(empty, np.full((count, 3, 3), np.nan), np.zeros(count, int), np.nan)
-    points = _nearest_to_rays(camera, seen, count)
+    points = _nearest_to_rays(camera, sights, count)
     deviation = np.inf
     for k in range(_STEPS):
-        errors, jacobians = _errors(camera, seen, points)
+        errors, jacobians = _errors(camera, sights, points)
         squared = np.sum(errors**2, axis=1)
         usable = np.isfinite(squared)
         noise = np.sqrt(np.median(squared[usable]) / _MEDIAN) if usable.any() else np.inf
@@ -66,10 +66,10 @@ def triangulate(camera: Camera, seen: Sights, count: int) -> Triangulated:
         weights = np.where(usable, np.maximum(1.0 - squared / limit**2, 0.0) ** 2, 0.0)
         errors, jacobians = np.nan_to_num(errors), np.nan_to_num(jacobians)
         weighted = weights[:, None, None] * jacobians
-        normal = _sums(np.swapaxes(weighted, 1, 2) @ jacobians, seen.points, count)
-        slope = _sums(np.einsum("nij,ni->nj", weighted, errors), seen.points, count)
+        normal = _sums(np.swapaxes(weighted, 1, 2) @ jacobians, sights.points, count)
+        slope = _sums(np.einsum("nij,ni->nj", weighted, errors), sights.points, count)
         points = points - np.einsum("pij,pj->pi", _inverses(normal), slope)
-    counts = np.bincount(seen.points[weights > 0.0], minlength=count)
+    counts = np.bincount(sights.points[weights > 0.0], minlength=count)
     determined = (counts > 1) & np.isfinite(points).all(axis=1)
     covariances = np.where(determined[:, None, None], deviation**2 * _inverses(normal), np.nan)
     return Triangulated(
@@ -77,31 +77,31 @@ def triangulate(camera: Camera, seen: Sights, count: int) -> Triangulated:
     )
 
 
-def _nearest_to_rays(camera: Camera, seen: Sights, count: int) -> Array:
+def _nearest_to_rays(camera: Camera, sights: Sights, count: int) -> Array:
     """Points (p,3) with the least squared distances to the rays; NaN: parallel rays."""
-    rays = camera.rays(seen.pixels)
+    rays = camera.rays(sights.pixels)
     directions = np.einsum(
-        "nij,nj->ni", seen.rotations, np.column_stack([rays, np.ones(len(rays))])
+        "nij,nj->ni", sights.rotations, np.column_stack([rays, np.ones(len(rays))])
     )
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     usable = np.isfinite(directions).all(axis=1)
     directions = np.nan_to_num(directions)
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     across[~usable] = 0.0
-    sums = _sums(across, seen.points, count)
-    places = _sums(np.einsum("nij,nj->ni", across, seen.positions), seen.points, count)
+    sums = _sums(across, sights.points, count)
+    places = _sums(np.einsum("nij,nj->ni", across, sights.positions), sights.points, count)
     least = np.linalg.eigvalsh(sums)[:, 0] / np.maximum(
-        np.bincount(seen.points[usable], minlength=count), 1
+        np.bincount(sights.points[usable], minlength=count), 1
     )
-    found: Array = np.einsum("pij,pj->pi", _inverses(sums), places)
-    found[least < _LEAST_SPREAD] = np.nan
-    return found
+    nearest: Array = np.einsum("pij,pj->pi", _inverses(sums), places)
+    nearest[least < _LEAST_SPREAD] = np.nan
+    return nearest
 
 
-def _errors(camera: Camera, seen: Sights, points: Array) -> tuple[Array, Array]:
+def _errors(camera: Camera, sights: Sights, points: Array) -> tuple[Array, Array]:
     """Errors (n,2) px and their derivatives (n,2,3) by the points; NaN behind the camera."""
-    inverse = np.swapaxes(seen.rotations, 1, 2)
-    local = np.einsum("nij,nj->ni", inverse, points[seen.points] - seen.positions)
+    inverse = np.swapaxes(sights.rotations, 1, 2)
+    local = np.einsum("nij,nj->ni", inverse, points[sights.points] - sights.positions)
     depth = np.where(local[:, 2] > 0.0, local[:, 2], np.nan)
     rays = local[:, :2] / depth[:, None]
     by_ray = camera.pixel_jacobian(rays)
@@ -109,7 +109,7 @@ def _errors(camera: Camera, seen: Sights, points: Array) -> tuple[Array, Array]:
     by_local[:, 0, 0] = by_local[:, 1, 1] = 1.0
     by_local[:, :, 2] = -rays
     by_point = by_ray @ (by_local / depth[:, None, None]) @ inverse
-    return camera.project(local) - seen.pixels, by_point
+    return camera.project(local) - sights.pixels, by_point
 
 
 def _sums(values: Array, groups: IntArray, count: int) -> Array:

@@ -23,14 +23,11 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.transforms import Transform
 from rs_localizer.markers.detection import MarkerDetector
-from rs_localizer.markers.families import Family
+from rs_localizer.markers.families import LEAST_SIDE, Family
 from rs_localizer.markers.map_check import whole_markers
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
-
-# Smaller ones (px) may be anything, and their corners say little.
-LEAST_SIDE = 12.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,13 +214,13 @@ def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Tran
     return Transform(turn, weights @ places / weights.sum()), float(support[best])
 
 
-def _parts(seen: list[int], scores: dict[tuple[int, int], float]) -> list[list[int]]:
+def _parts(markers: list[int], scores: dict[tuple[int, int], float]) -> list[list[int]]:
     """Markers that hang together, the most first."""
-    place = {marker: k for k, marker in enumerate(seen)}
-    pairs = np.array([[place[a], place[b]] for a, b in scores], np.int64).reshape(-1, 2)
-    graph = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(seen),) * 2)
+    place = {marker: k for k, marker in enumerate(markers)}
+    pairs = np.array([[place[a], place[b]] for a, b in scores], np.int32).reshape(-1, 2)
+    graph = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(markers),) * 2)
     count, labels = connected_components(graph, directed=False)
-    parts = [[m for m, of in zip(seen, labels, strict=True) if of == k] for k in range(count)]
+    parts = [[m for m, of in zip(markers, labels, strict=True) if of == k] for k in range(count)]
     return sorted(parts, key=lambda part: (-len(part), part[0]))
 
 
@@ -234,7 +231,8 @@ def _placed(
     """origin_from_marker along the chains of what most images say."""
     place = {marker: k for k, marker in enumerate(own)}
     inside = [(pair, score) for pair, score in scores.items() if pair[0] in place]
-    pairs = np.array([[place[a], place[b]] for (a, b), _ in inside], np.int64).reshape(-1, 2)
+    # SciPy 1.11 has no trees of other indices.
+    pairs = np.array([[place[a], place[b]] for (a, b), _ in inside], np.int32).reshape(-1, 2)
     costs = 1.0 / np.array([score for _, score in inside])
     tree = minimum_spanning_tree(
         csr_array((costs, (pairs[:, 0], pairs[:, 1])), shape=(len(own),) * 2)

@@ -65,8 +65,8 @@ class Looker:
         path.write_bytes(cv2.imencode(".jpg", image.pixels, quality)[1].tobytes())
         corners, ids = np.zeros((0, 2)), np.zeros(0, np.int64)
         if self._detector is not None:
-            found = self._detector.detect(image.pixels, image.stamp_ns)
-            corners, ids = found.pixels, found.ids
+            detections = self._detector.detect(image.pixels, image.stamp_ns)
+            corners, ids = detections.pixels, detections.ids
         features = self._extractor.extract(image.pixels)
         return View(image.stamp_ns, path, features, sharpness(image.pixels), corners, ids)
 

@@ -51,8 +51,8 @@ def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = Non
     small, scale = _shrunk(image)
     if min(small.shape) < _SMALLEST_SEARCH:
         return None
-    found, corners = cv2.findChessboardCorners(small, (board.columns, board.rows))
-    if not found:
+    complete, corners = cv2.findChessboardCorners(small, (board.columns, board.rows))
+    if not complete:
         return None
     corners = scale * np.asarray(corners, np.float64) + 0.5 * (scale - 1)
     grid = corners.reshape(board.rows, board.columns, 2)
@@ -79,7 +79,7 @@ class BoardSizes:
         self._images = self._next = 0
         self._sizes: list[tuple[int, int]] = []
 
-    def look(self, image: Gray, seen: bool) -> None:
+    def look(self, image: Gray, complete_board: bool) -> None:
         """Take an image, and whether the board as it is said to be was found in it."""
         self._images += 1
         if self._board is None or self._images <= self._next or len(self._sizes) >= _SIZES:
@@ -90,12 +90,12 @@ class BoardSizes:
         if min(small.shape) < _SMALLEST_SEARCH:
             return
         flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
-        found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
-        if found and meta is not None:
+        complete, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
+        if complete and meta is not None:
             rows, columns = sorted(meta.shape)
             own = sorted((self._board.columns, self._board.rows))
             larger = rows >= own[0] and columns >= own[1]
-            if larger or not seen:  # smaller ones are parts of it
+            if larger or not complete_board:  # smaller ones are parts of it
                 self._sizes.append((columns, rows))
 
     def fault(self) -> str | None:
@@ -240,10 +240,10 @@ def find_circles(image: Gray, grid: CircleGrid, previous: Array | None = None) -
     if grid.inverted:
         image = np.asarray(cv2.bitwise_not(image), np.uint8)
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if grid.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
-    found, centres = cv2.findCirclesGrid(
+    complete, centres = cv2.findCirclesGrid(
         image, (grid.columns, grid.rows), flags=kind, blobDetector=_blobs(image)
     )
-    if not found:
+    if not complete:
         return None
     pixels = np.asarray(centres, np.float64).reshape(-1, 2)
     if grid.asymmetric:

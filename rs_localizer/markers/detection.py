@@ -33,14 +33,14 @@ _LARGE, _FIRST_IMAGES, _ONE_IN = 100, 5, 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class MarkerQuads:
     """Markers of one kind in an image."""
 
     family: Family
     ids: IntArray  # (m,)
     quads: Array  # (m,4,2) px
-    found: NDArray[np.bool_]  # (m,4) which corners are exact
-    known: NDArray[np.bool_]  # (m,) which are in the map, and only once in the image
+    exact: NDArray[np.bool_]  # (m,4) which corners are exact
+    mapped: NDArray[np.bool_]  # (m,) which are in the map, and only once in the image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,7 @@ class Detections:
     points: Array  # (n,3) m, map frame
     pixels: Array  # (n,2) raw pixels, centre of the first one at 0, 0
     scores: Array  # (n,) px: shortest side of the marker, or distance to the next corner
-    markers: tuple[Seen, ...]  # all that were seen, for pictures and messages
+    markers: tuple[MarkerQuads, ...]  # all that were seen, for pictures and messages
     boards: tuple[tuple[str, Array], ...]  # names and pixels (k,2) of those that were seen
     unknown: tuple[str, ...]  # markers that are not in the map
     repeated: tuple[str, ...]  # markers that the image shows more than once: not used
@@ -115,12 +115,14 @@ class MarkerDetector:
         image = np.ascontiguousarray(image)
         everything = self._images < _FIRST_IMAGES or self._images % _ONE_IN == 0
         self._images += 1
-        seen = [self._seen(all_ if everything else own, image) for own, all_ in self._finders]
-        parts = [self._corners(item) for item in seen]
+        observations = [
+            self._quads(all_ if everything else own, image) for own, all_ in self._finders
+        ]
+        parts = [self._corners(item) for item in observations]
         boards = []
         for row, board in self._boards:
             looking = time.perf_counter()
-            rows, pixels = self._board(image, board, seen, stamp_ns)
+            rows, pixels = self._board(image, board, observations, stamp_ns)
             if not isinstance(board, Charuco):
                 self.opencv_seconds += time.perf_counter() - looking
             if len(rows):
@@ -132,22 +134,24 @@ class MarkerDetector:
             points=self._points[rows],
             pixels=np.concatenate([np.empty((0, 2)), *(part[1] for part in parts)]),
             scores=np.concatenate([np.empty(0), *(part[2] for part in parts)]),
-            markers=tuple(seen),
+            markers=tuple(observations),
             boards=tuple(boards),
             unknown=tuple(
                 f"{item.family.name} {i}"
-                for item in seen
+                for item in observations
                 for i in np.unique(item.ids).tolist()
                 if not self._knows(item.family, i)
             ),
             repeated=tuple(
-                f"{item.family.name} {i}" for item in seen for i in _twice(item.ids).tolist()
+                f"{item.family.name} {i}"
+                for item in observations
+                for i in _twice(item.ids).tolist()
             ),
         )
         self.seconds += time.perf_counter() - started
         return detections
 
-    def _seen(self, finder: MarkerFinder, image: Gray) -> Seen:
+    def _quads(self, finder: MarkerFinder, image: Gray) -> MarkerQuads:
         family = finder.family
         started = time.perf_counter()
         ids, quads = finder.find(image)
@@ -156,34 +160,36 @@ class MarkerDetector:
         ids, quads = ids[order], np.ascontiguousarray(quads[order])
         large = _sides(quads) >= self._min_side
         ids, quads = ids[large], quads[large]
-        found = refine(image, quads, np.full(len(ids), family.cells))
-        different = _different(ids, quads, found)
-        ids, quads, found = ids[different], quads[different], found[different]
-        known = np.array([self._knows(family, i) for i in ids.tolist()], bool)
-        return Seen(family, ids, quads, found, known & ~np.isin(ids, _twice(ids)))
+        exact = refine(image, quads, np.full(len(ids), family.cells))
+        different = _different(ids, quads, exact)
+        ids, quads, exact = ids[different], quads[different], exact[different]
+        mapped = np.array([self._knows(family, i) for i in ids.tolist()], bool)
+        return MarkerQuads(family, ids, quads, exact, mapped & ~np.isin(ids, _twice(ids)))
 
     def _knows(self, family: Family, id_: int) -> bool:
         key = (family.kind, id_)
         return key in self._places or key in self._on_boards
 
-    def _corners(self, seen: Seen) -> tuple[IntArray, Array, Array]:
+    def _corners(self, observations: MarkerQuads) -> tuple[IntArray, Array, Array]:
         """Rows, pixels and scores of the single markers."""
-        rows = [self._places.get((seen.family.kind, i), -1) for i in seen.ids.tolist()]
+        rows = [
+            self._places.get((observations.family.kind, i), -1) for i in observations.ids.tolist()
+        ]
         first = np.array(rows, np.int64)
-        used = seen.found & (seen.known & (first >= 0))[:, None]
+        used = observations.exact & (observations.mapped & (first >= 0))[:, None]
         corners = (first[:, None] + np.arange(4))[used]
-        scores = np.broadcast_to(_sides(seen.quads)[:, None], used.shape)[used]
-        return corners, seen.quads[used], scores
+        scores = np.broadcast_to(_sides(observations.quads)[:, None], used.shape)[used]
+        return corners, observations.quads[used], scores
 
     def _board(
-        self, image: Gray, board: Board, seen: list[Seen], stamp_ns: int
+        self, image: Gray, board: Board, observations: list[MarkerQuads], stamp_ns: int
     ) -> tuple[IntArray, Array]:
         """Rows of the board's points, and their pixels."""
         if isinstance(board, Charuco):
-            (item,) = (item for item in seen if item.family.kind == board.family.kind)
+            (item,) = (item for item in observations if item.family.kind == board.family.kind)
             last = board.first_id + len(board.cells)
-            own = item.known & (item.ids >= board.first_id) & (item.ids < last)
-            own &= item.found.all(axis=1)
+            own = item.mapped & (item.ids >= board.first_id) & (item.ids < last)
+            own &= item.exact.all(axis=1)
             return find_charuco(image, board, item.ids[own], item.quads[own])
         if not 0 <= stamp_ns - self._last_board_ns <= _LONGEST_LOSS_NS:
             self._last_board = None
@@ -222,14 +228,14 @@ def _finders(marker_map: MarkerMap) -> list[tuple[MarkerFinder, MarkerFinder]]:
         raise MarkerMapError(str(error)) from error
 
 
-def _different(ids: IntArray, quads: Array, found: NDArray[np.bool_]) -> IntArray:
+def _different(ids: IntArray, quads: Array, exact: NDArray[np.bool_]) -> IntArray:
     """Which quadrilaterals to keep when OpenCV (4.6) gives one marker twice."""
     keep: list[int] = []
     for m in range(len(ids)):
         if keep and ids[keep[-1]] == ids[m]:
             apart = np.linalg.norm(quads[m].mean(axis=0) - quads[keep[-1]].mean(axis=0))
             if apart < 0.5 * _sides(quads[m : m + 1])[0]:
-                if found[m].sum() > found[keep[-1]].sum():
+                if exact[m].sum() > exact[keep[-1]].sum():
                     keep[-1] = m
                 continue
         keep.append(m)
@@ -284,15 +290,15 @@ def recognized(image: Gray) -> list[str]:
             continue
         corners = np.array([quad for _, quad in good])
         exact = np.all(refine(image, corners, np.full(len(good), finder.family.cells)), axis=1)
-        found = []
+        named = []
         for (id_, quad), certain in zip(good, exact, strict=True):
             if certain and not any(_same(quad, other) for other in taken):
                 taken.append(quad)
-                found.append(id_)
-        if found:
-            listed = ", ".join(map(str, sorted(set(found))[:_MOST_IDS]))
-            more = ", ..." if len(set(found)) > _MOST_IDS else ""
-            said.append(f"{_smallest(finder.family, max(found)).name} {listed}{more}")
+                named.append(id_)
+        if named:
+            listed = ", ".join(map(str, sorted(set(named))[:_MOST_IDS]))
+            more = ", ..." if len(set(named)) > _MOST_IDS else ""
+            said.append(f"{_smallest(finder.family, max(named)).name} {listed}{more}")
     board = chessboard_size(image)
     if board is not None:
         said.append(f"a chessboard of {board[0]}x{board[1]} inner corners")
@@ -302,12 +308,12 @@ def recognized(image: Gray) -> list[str]:
 def chessboard_size(image: Gray) -> tuple[int, int] | None:
     """Inner corners, the larger number first, of a chessboard that an image shows."""
     try:
-        found, corners, meta = cv2.findChessboardCornersSBWithMeta(
+        complete, corners, meta = cv2.findChessboardCornersSBWithMeta(
             image, (3, 3), cv2.CALIB_CB_LARGER
         )
     except cv2.error:
         return None
-    if not found or len(corners) < _LEAST_CORNERS:
+    if not complete or len(corners) < _LEAST_CORNERS:
         return None
     rows, columns = sorted(np.asarray(meta).shape[:2])
     return columns, rows

@@ -121,9 +121,9 @@ def _bits(family: Family, id_: int) -> NDArray[np.uint8]:
 @lru_cache(maxsize=32)
 def _turns(family: Family) -> int:
     """By how many quarters, anticlockwise, OpenCV's pattern has to be turned to be upright."""
-    found = _bits(family, 0)
+    bits = _bits(family, 0)
     for turns in range(4):
-        if int("".join(map(str, np.rot90(found, turns).ravel())), 2) == family.first:
+        if int("".join(map(str, np.rot90(bits, turns).ravel())), 2) == family.first:
             return turns
     raise DictionaryError(
         f"OpenCV {cv2.__version__} has another pattern for {family.name} 0 than is known here"

@@ -33,8 +33,8 @@ class Entry:
         if name not in self._left and default:
             return default[0]
         if name not in self._left:
-            found = ", ".join(map(str, self._left)) or "nothing else"
-            raise EntryError(f"{self.where} has no {name}; it has {found}")
+            names = ", ".join(map(str, self._left)) or "nothing else"
+            raise EntryError(f"{self.where} has no {name}; it has {names}")
         value = self._left.pop(name)
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise EntryError(f"{self.where}: {name} cannot be {value!r}")

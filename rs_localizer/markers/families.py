@@ -51,6 +51,9 @@ def _table() -> dict[str, Family]:
 
 
 FAMILIES = _table()
+# Markers that nobody has listed, where they are smaller (px), may be anything, and their corners
+# say little.
+LEAST_SIDE = 12.0
 
 
 def family(name: object) -> Family:

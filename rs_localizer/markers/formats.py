@@ -43,16 +43,14 @@ from typing import Any
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.yaml_text import YamlError, check_tree, load_yaml
 from rs_localizer.markers.entries import Entry
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.map_files import read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.poses import Pose, rotation_of_quaternion
+from rs_localizer.markers.poses import Pose, quaternion_of_rotation, rotation_of_quaternion
 from rs_localizer.markers.prints import Marker
 
 # Key of the family's name: a parameter of apriltag_ros, which reads it beside the bundles. The
@@ -149,6 +147,8 @@ def _tagslam_body(body: Entry, family: Family) -> list[Marker]:
 
 
 def _tagslam_pose(entry: Entry) -> tuple[Array, Array]:
+    from rs_localizer.core import so3
+
     pose = _below(entry, "pose", ": pose")
     place = _vector(_below(pose, "position", ": position"), "xyz")
     return place, so3.exp(_vector(_below(pose, "rotation", ": rotation"), "xyz"))
@@ -156,16 +156,18 @@ def _tagslam_pose(entry: Entry) -> tuple[Array, Array]:
 
 def _write_tagslam(marker_map: MarkerMap, family: str) -> str:
     """One static body."""
+    from scipy.spatial.transform import Rotation
+
     tags = []
     for marker in marker_map.markers:
-        known = marker.deviations
-        if known is None:
-            known = np.repeat([_POSITION_NOISE, _ROTATION_NOISE], 3)
+        deviations = marker.deviations
+        if deviations is None:
+            deviations = np.repeat([_POSITION_NOISE, _ROTATION_NOISE], 3)
         pose = {
             "position": _xyz(marker.pose.position),
             "rotation": _xyz(Rotation.from_matrix(marker.pose.rotation).as_rotvec()),
-            "position_noise": _xyz(known[:3]),
-            "rotation_noise": _xyz(known[3:]),
+            "position_noise": _xyz(deviations[:3]),
+            "rotation_noise": _xyz(deviations[3:]),
         }
         tags.append({"id": marker.id, "size": _rounded([marker.size])[0], "pose": pose})
     # Each of its own: YAML would refer from one to the other.
@@ -318,7 +320,7 @@ def _rounded(values: Any) -> list[float]:
 
 def _quaternion(rotation: Array) -> list[float]:
     """x y z w."""
-    return _rounded(so3.quaternion(np.ascontiguousarray(rotation)))
+    return _rounded(quaternion_of_rotation(rotation))
 
 
 def _xyz(values: Array) -> dict[str, float]:

@@ -45,25 +45,27 @@ class MapCheck:
         self._planes = _planes(marker_map.markers)
         self._rotations = [pose.rotation for pose in poses]
 
-    def fault(self, seen: Detections) -> str | None:
+    def fault(self, detections: Detections) -> str | None:
         """What is wrong with the map according to this image; None if nothing can be said."""
-        whole = whole_markers(seen, 4 * len(self._names))
+        whole = whole_markers(detections, 4 * len(self._names))
         for plane in sorted({self._planes[m] for m in whole}):
             flat = {m: rows for m, rows in whole.items() if self._planes[m] == plane}
-            for some in _neighbourhoods(seen, flat):
-                text = self._flat(seen, some)
+            for some in _neighbourhoods(detections, flat):
+                text = self._flat(detections, some)
                 if text is not None:
                     return text
-        return self._solid(seen, self._meeting(seen, whole))
+        return self._solid(detections, self._meeting(detections, whole))
 
-    def _flat(self, seen: Detections, whole: dict[int, IntArray]) -> str | None:
+    def _flat(self, detections: Detections, whole: dict[int, IntArray]) -> str | None:
         """Markers that the map puts into one plane."""
         if len(whole) < 2:
             return None
         rows = np.concatenate(list(whole.values()))
         first = next(iter(whole))
-        points = (seen.points[rows] - seen.points[rows[0]]) @ self._rotations[first][:, :2]
-        pixels = seen.pixels[rows]
+        points = (detections.points[rows] - detections.points[rows[0]]) @ self._rotations[first][
+            :, :2
+        ]
+        pixels = detections.pixels[rows]
         if _misfit(points, pixels) < _MISFITS:
             return None
         names = self._listed(whole)
@@ -76,9 +78,9 @@ class MapCheck:
             )
         return _MISFIT_TEXT.format(names)
 
-    def _meeting(self, seen: Detections, whole: dict[int, IntArray]) -> dict[int, IntArray]:
+    def _meeting(self, detections: Detections, whole: dict[int, IntArray]) -> dict[int, IntArray]:
         """The markers around where two of different planes are nearest to each other."""
-        markers, apart = _apart(seen, whole)
+        markers, apart = _apart(detections, whole)
         planes = np.array([self._planes[m] for m in markers])
         other = np.where(planes[:, None] == planes, np.inf, apart)
         if not np.isfinite(other).any():
@@ -88,12 +90,12 @@ class MapCheck:
         chosen = np.argsort(nearest, kind="stable")[:_AROUND].tolist()
         return {markers[k]: whole[markers[k]] for k in sorted(chosen)}
 
-    def _solid(self, seen: Detections, whole: dict[int, IntArray]) -> str | None:
+    def _solid(self, detections: Detections, whole: dict[int, IntArray]) -> str | None:
         """All markers together: in a mirrored map, planes at an angle fit, each by itself."""
         rows = np.concatenate(list(whole.values())) if whole else np.empty(0, np.int64)
-        if len(whole) < _ENOUGH or _thickness(seen.points[rows]) < _SOLID:
+        if len(whole) < _ENOUGH or _thickness(detections.points[rows]) < _SOLID:
             return None
-        misfit, mirrored = _projection(seen.points[rows], seen.pixels[rows])
+        misfit, mirrored = _projection(detections.points[rows], detections.pixels[rows])
         names = self._listed(whole)
         if misfit > _MISFITS:
             return _MISFIT_TEXT.format(names)
@@ -127,26 +129,30 @@ def _planes(markers: tuple[Marker, ...]) -> list[int]:
     return numbers
 
 
-def whole_markers(seen: Detections, end: int) -> dict[int, IntArray]:
+def whole_markers(detections: Detections, end: int) -> dict[int, IntArray]:
     """Rows of the detections for each single marker of which all four corners were found."""
-    place = {int(id_): row for row, id_ in enumerate(seen.ids) if id_ < end}
+    place = {int(id_): row for row, id_ in enumerate(detections.ids) if id_ < end}
     markers = sorted({id_ // 4 for id_ in place})
     corners = {m: [place.get(4 * m + k, -1) for k in range(4)] for m in markers}
     return {m: np.array(rows) for m, rows in corners.items() if min(rows) >= 0}
 
 
-def _apart(seen: Detections, whole: dict[int, IntArray]) -> tuple[list[int], Array]:
+def _apart(detections: Detections, whole: dict[int, IntArray]) -> tuple[list[int], Array]:
     """The markers, and the distances (m,m) of their middles, px."""
-    middles = np.array([seen.pixels[rows].mean(axis=0) for rows in whole.values()]).reshape(-1, 2)
+    middles = np.array([detections.pixels[rows].mean(axis=0) for rows in whole.values()]).reshape(
+        -1, 2
+    )
     return list(whole), np.linalg.norm(middles[:, None] - middles, axis=2)
 
 
-def _neighbourhoods(seen: Detections, whole: dict[int, IntArray]) -> Iterator[dict[int, IntArray]]:
+def _neighbourhoods(
+    detections: Detections, whole: dict[int, IntArray]
+) -> Iterator[dict[int, IntArray]]:
     """Each marker with those that are nearest to it in the image, each set once."""
-    markers, apart = _apart(seen, whole)
+    markers, apart = _apart(detections, whole)
     sets = set()
     for m, distances in enumerate(apart):
-        limit = _FAR * _mean_side(seen.pixels[whole[markers[m]]])
+        limit = _FAR * _mean_side(detections.pixels[whole[markers[m]]])
         near = np.argsort(distances, kind="stable")[:_NEIGHBOURS]
         sets.add(tuple(sorted(k for k in near.tolist() if distances[k] < limit)))
     for some in sorted(sets):
@@ -296,16 +302,16 @@ class LeaveOneOut:
         self._views: dict[int, list[_View]] = {}
         self._images = 0
 
-    def add(self, camera: Camera, seen: Detections) -> None:
+    def add(self, camera: Camera, detections: Detections) -> None:
         """Take in what an image shows."""
-        whole = whole_markers(seen, 4 * len(self._names))
+        whole = whole_markers(detections, 4 * len(self._names))
         if len(whole) < _LEAST_MARKERS:
             return
         self._images += 1
         if self._images > _ALL_UNTIL and self._images % _ONE_IN:
             return
         rows = np.concatenate(list(whole.values()))
-        points, pixels = seen.points, seen.pixels
+        points, pixels = detections.points, detections.pixels
         pose = still_pose(points[rows], camera.rays(pixels[rows]))
         still = still_fit(camera, points[rows], pixels[rows])
         if pose is None or still is None:

@@ -57,13 +57,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.yaml_text import YamlError, load_yaml
 from rs_localizer.markers.entries import Entry, EntryError
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.poses import Pose, finite
+from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation
 from rs_localizer.markers.poses import rotation_of_quaternion as _rotation
 from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid, Marker
 
@@ -121,12 +120,12 @@ def _marker(entry: Entry) -> Marker:
         with entry.named():
             return replace(Marker.at(name, number, size, pose), deviations=deviations)
     corners = entry.take("corners", list)
-    told = entry.number("size") if "size" in entry else None
+    stated = entry.number("size") if "size" in entry else None
     entry.finish()
     with entry.named():
         marker = Marker(family(name), number, corners, deviations)
-        if told is not None and abs(marker.size - told) > _SIZE_TOLERANCE * abs(told):
-            raise ValueError(f"its corners are {marker.size:.4g} m apart, but size is {told:g}")
+        if stated is not None and abs(marker.size - stated) > _SIZE_TOLERANCE * abs(stated):
+            raise ValueError(f"its corners are {marker.size:.4g} m apart, but size is {stated:g}")
         return marker
 
 
@@ -212,14 +211,14 @@ def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:
 
 def _marker_entry(marker: Marker) -> dict[str, Any]:
     entry: dict[str, Any] = {"family": marker.family.name, "id": marker.id}
-    known: dict[str, Any] = {}
+    deviations: dict[str, Any] = {}
     if marker.deviations is not None:
-        known["position_deviation"] = _significant(marker.deviations[:3])
-        known["rotation_deviation"] = _significant(marker.deviations[3:])
+        deviations["position_deviation"] = _significant(marker.deviations[:3])
+        deviations["rotation_deviation"] = _significant(marker.deviations[3:])
     square = Marker.at(marker.family.name, marker.id, marker.size, marker.pose)
     if np.abs(square.corners - marker.corners).max() > _SAME * marker.size:
-        return entry | {"corners": _numbers(marker.corners)} | known
-    return entry | {"size": _rounded(marker.size)} | _pose_entry(marker.pose) | known
+        return entry | {"corners": _numbers(marker.corners)} | deviations
+    return entry | {"size": _rounded(marker.size)} | _pose_entry(marker.pose) | deviations
 
 
 def _board_entry(board: Board) -> dict[str, Any]:
@@ -251,7 +250,7 @@ def _board_entry(board: Board) -> dict[str, Any]:
 
 
 def _pose_entry(pose: Pose) -> dict[str, Any]:
-    quaternion = so3.quaternion(np.ascontiguousarray(pose.rotation))
+    quaternion = quaternion_of_rotation(pose.rotation)
     return {"position": _numbers(pose.position), "quaternion": _numbers(quaternion)}
 
 

@@ -64,27 +64,27 @@ class CameraPath:
         return back, -np.einsum("nij,nj->ni", back, places)
 
 
-def draw_detections(image: Gray, seen: Detections) -> Picture:
+def draw_detections(image: Gray, detections: Detections) -> Picture:
     """The image with outlines: blue what is used, orange and crossed what is not in the map or
     seen twice.
     """
     picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
-    for item in seen.markers:
-        for quad, id_, known in zip(item.quads, item.ids.tolist(), item.known, strict=True):
-            color = _KNOWN if known else _FOREIGN
-            _line(picture, np.vstack([quad, quad[:1]]), color, 2 if known else 1)
-            if not known:
+    for item in detections.markers:
+        for quad, id_, mapped in zip(item.quads, item.ids.tolist(), item.mapped, strict=True):
+            color = _KNOWN if mapped else _FOREIGN
+            _line(picture, np.vstack([quad, quad[:1]]), color, 2 if mapped else 1)
+            if not mapped:
                 _line(picture, quad[[0, 2]], color)
                 _line(picture, quad[[1, 3]], color)
             _text(picture, str(id_), quad.mean(axis=0), color)
-    for pixel, id_ in zip(seen.pixels, seen.ids.tolist(), strict=True):
+    for pixel, id_ in zip(detections.pixels, detections.ids.tolist(), strict=True):
         _dot(picture, pixel, _FIRST_RADIUS if id_ % 4 == 0 else _RADIUS)
     return picture
 
 
 def draw_world(
     picture: Picture,
-    seen: Detections,
+    detections: Detections,
     marker_map: MarkerMap,
     camera: Camera,
     path: CameraPath,
@@ -94,7 +94,7 @@ def draw_world(
 
     Args:
         picture: is drawn into.
-        seen: what the image shows.
+        detections: what the image shows.
         marker_map: where the prints are.
         camera: with its readout time.
         path: of the camera.
@@ -108,7 +108,7 @@ def draw_world(
 
     lines: list[tuple[Array, tuple[int, int, int]]] = []
     sizes = []
-    for pose, size in _standing(seen, marker_map):
+    for pose, size in _standing(detections, marker_map):
         sizes.append(size)
         lines += [(line, _CUBE) for line in _cube(pose, size)]
     length = max(sizes, default=0.0)
@@ -133,18 +133,18 @@ def draw_world(
         start = end
 
 
-def _standing(seen: Detections, marker_map: MarkerMap) -> Iterator[tuple[Pose, float]]:
+def _standing(detections: Detections, marker_map: MarkerMap) -> Iterator[tuple[Pose, float]]:
     """Poses and sizes of the prints that are seen large enough."""
     shown = {
         (item.family.kind, id_)
-        for item in seen.markers
-        for id_, quad, known in zip(item.ids.tolist(), item.quads, item.known, strict=True)
-        if known and np.linalg.norm(np.ptp(quad, axis=0)) > _LEAST_SIDE
+        for item in detections.markers
+        for id_, quad, mapped in zip(item.ids.tolist(), item.quads, item.mapped, strict=True)
+        if mapped and np.linalg.norm(np.ptp(quad, axis=0)) > _LEAST_SIDE
     }
     for marker in marker_map.markers:
         if (marker.family.kind, marker.id) in shown:
             yield marker.pose, marker.size
-    names = {name for name, _ in seen.boards}
+    names = {name for name, _ in detections.boards}
     for board in marker_map.boards:
         if board.name in names:
             yield board.pose, min(board.extent)

@@ -47,6 +47,13 @@ class Pose:
         return np.asarray(points @ self.rotation.T + self.position)
 
 
+def quaternion_of_rotation(rotation: Array) -> Array:
+    """Unit quaternion (4,) ``x y z w`` of a rotation matrix (3,3)."""
+    from rs_localizer.core import so3  # kernels: a command that shows its help imports none
+
+    return so3.quaternion(np.ascontiguousarray(rotation))
+
+
 def rotation_of_quaternion(quaternion: ArrayLike) -> Array:
     """Rotation matrix (3,3) of ``x y z w`` of unit length, but for the rounding of what is written.
 

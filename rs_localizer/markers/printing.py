@@ -53,10 +53,10 @@ def _room(size: tuple[float, float]) -> tuple[float, float]:
 
 def _turned(size: tuple[float, float], width: float, height: float) -> tuple[float, float] | None:
     """The page, upright or on its side, on which this fits."""
-    for way in (size, size[::-1]):
-        room = _room(way)
+    for paper in (size, size[::-1]):
+        room = _room(paper)
         if width <= room[0] + 1e-9 and height <= room[1] + 1e-9:
-            return way
+            return paper
     return None
 
 
@@ -70,14 +70,14 @@ def _too_large(what: str, width: float, height: float, size: tuple[float, float]
 
 def _board_page(board: Board, size: tuple[float, float], page: str) -> Page:
     figure = _board_figure(board)
-    way = _turned(size, figure.width, figure.height)
-    if way is None:
+    paper = _turned(size, figure.width, figure.height)
+    if paper is None:
         raise PrintError(_too_large(board.name, figure.width, figure.height, size, page))
     note = f"{figure.label}; mount it on something flat"
-    page_ = _middle(way, [(0.0, 0.0, figure)], figure.width, figure.height, note)
+    page_ = _middle(paper, [(0.0, 0.0, figure)], figure.width, figure.height, note)
     x, y, _ = page_.figures[0]
     middle = (x + 0.5 * figure.width, y + 0.5 * figure.height)
-    return replace(page_, axes=_axes(board.pose, middle, way))
+    return replace(page_, axes=_axes(board.pose, middle, paper))
 
 
 def _together(markers: tuple[Marker, ...], size: tuple[float, float]) -> Page | None:
@@ -96,15 +96,15 @@ def _together(markers: tuple[Marker, ...], size: tuple[float, float]) -> Page | 
     left, bottom = min(x for x, _, _ in figures), min(y for _, y, _ in figures)
     width = max(x + figure.width for x, _, figure in figures) - left
     height = max(y + figure.height for _, y, figure in figures) - bottom
-    way = _turned(size, width, height)
-    if way is None:
+    paper = _turned(size, width, height)
+    if paper is None:
         return None
     moved = [(x - left, y - bottom, figure) for x, y, figure in figures]
     note = "all markers are where the map has them" if len(markers) > 1 else ""
-    laid = _middle(way, moved, width, height, note)
+    laid = _middle(paper, moved, width, height, note)
     x, y, figure = laid.figures[0]
     middle = (x + 0.5 * figure.width, y + 0.5 * figure.height)
-    return replace(laid, axes=_axes(first, middle, way))
+    return replace(laid, axes=_axes(first, middle, paper))
 
 
 def _axes(pose: Pose, middle: tuple[float, float], size: tuple[float, float]) -> Axes:
@@ -134,10 +134,10 @@ def _apart(markers: tuple[Marker, ...], size: tuple[float, float], page: str) ->
     figures = [_marker_figure(marker, placed=True) for marker in markers]
     width = max(figure.width for figure in figures)
     height = max(figure.height for figure in figures)
-    way = _turned(size, width, height)
-    if way is None:
+    paper = _turned(size, width, height)
+    if paper is None:
         raise PrintError(_too_large(markers[0].name, width, height, size, page))
-    columns, rows, way = max(
+    columns, rows, paper = max(
         ((int(_room(w)[0] // width), int(_room(w)[1] // height), w) for w in (size, size[::-1])),
         key=lambda item: item[0] * item[1],
     )
@@ -148,21 +148,21 @@ def _apart(markers: tuple[Marker, ...], size: tuple[float, float], page: str) ->
             column, row = k % columns, k // columns
             placed.append((column * width, (rows - 1 - row) * height, figure))
         note = "cut along the lines and put each marker where the map has it"
-        pages.append(_middle(way, placed, columns * width, rows * height, note))
+        pages.append(_middle(paper, placed, columns * width, rows * height, note))
     return pages
 
 
 def _middle(
-    way: tuple[float, float],
+    paper: tuple[float, float],
     figures: list[tuple[float, float, Figure]],
     width: float,
     height: float,
     note: str,
 ) -> Page:
-    room = _room(way)
+    room = _room(paper)
     x = MARGIN + 0.5 * (room[0] - width)
     y = MARGIN + _TEXT_HEIGHT + 0.5 * (room[1] - height)
-    return Page(*way, tuple((x + a, y + b, figure) for a, b, figure in figures), note)
+    return Page(*paper, tuple((x + a, y + b, figure) for a, b, figure in figures), note)
 
 
 # -- figures ------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,7 +117,7 @@ def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> 
     if not stamps:
         raise RecordingError(f"{bag.path} has no usable message on {topic}{fault}")
     specific_forces = np.array(forces)
-    hung = _camera_from_imu(bag, camera_frame, frame)
+    hung = transform_between(bag, camera_frame, frame)
     return ImuRecording(
         np.array(stamps, np.int64),
         np.array(rates),
@@ -142,8 +143,38 @@ def optical_frame(bag: BagReader, info: str | None = None, image: str | None = N
     return ""
 
 
-def _camera_from_imu(bag: BagReader, camera: str, imu: str) -> Transform | None:
-    """By TF; None where it does not connect them."""
+def camera_topics(
+    bag: BagReader, cameras: Sequence[str] | None = None
+) -> dict[str, dict[str, str]]:
+    """The topics of each camera of a rig by the names of their inputs: camera_info, and one of
+    correspondences, keypoints and image.
+
+    Args:
+        cameras: their names, which stand before those of the topics; None: all that there are.
+
+    Raises:
+        RecordingError: when one has no camera_info or nothing to localize.
+    """
+    there: dict[str, dict[str, str]] = {}
+    for info in sorted(topic for topic, kind in bag.topics.items() if kind == INFO_TYPE):
+        prefix = info.rpartition("/")[0]
+        own = {topic: kind for topic, kind in bag.topics.items() if topic.startswith(f"{prefix}/")}
+        found = [(name, f"{prefix}/{name}") for name in (CORRESPONDENCES, KEYPOINTS)]
+        found = [pair for pair in found if pair[1] in own]
+        found += [("image", topic) for topic in sorted(own) if own[topic] in IMAGE_TYPES]
+        if prefix and found:
+            there[prefix.rpartition("/")[2]] = {CAMERA_INFO: info, **dict(found[:1])}
+    names = list(there) if cameras is None else list(cameras)
+    if missing := [name for name in names if name not in there] or (len(names) < 2 and ["another"]):
+        raise RecordingError(
+            f"{bag.path} has no camera_info beside correspondences, keypoints or images of "
+            f"{', '.join(missing)}; it has those of {', '.join(there) or 'no camera'}"
+        )
+    return {name: there[name] for name in names}
+
+
+def transform_between(bag: BagReader, camera: str, imu: str) -> Transform | None:
+    """``camera_from_imu``, or of any two frames, by TF; None where it does not connect them."""
     tree = TransformTree()
     for topic in tf_topics(bag, TF_TYPE):
         for _, _, message in bag.messages((topic,)):

@@ -10,8 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import griddata
-from scipy.ndimage import map_coordinates
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
@@ -77,6 +75,7 @@ def map_depths(points: Array) -> Depths:
     """Depths between the points (n,3) of a map that the camera has before it, their inverses
     interpolated in the image; around them, those of the nearest. Who hides whom is not known.
     """
+    from scipy.interpolate import griddata  # 20 MB, which a node without this output does not need
 
     def depths(rotation: Array, translation: Array, rays: Array) -> Array:
         seen = points @ rotation.T + translation
@@ -113,6 +112,8 @@ def rectified(
     Returns:
         the image, and (h,w) which pixels are known: the others are 0.
     """
+    from scipy.ndimage import map_coordinates
+
     height, width = image.shape[:2]
     columns, rows = (np.unique([*range(0, size, _STEP), size - 1]) for size in (width, height))
     grid = np.stack(np.meshgrid(columns, rows), axis=2).reshape(-1, 2).astype(float)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -12,18 +13,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.config import PoseTime
 from rs_localizer.core.arrays import IntArray
+from rs_localizer.core.rig import RigEstimate
 from rs_localizer.io.outputs import Localized
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.pose_at_time import pose_at, published_moment, twist_at
 from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.rigs import RigLocalizer
 from rs_localizer.trajectory.observe import Observed
-from rs_localizer.trajectory.smoothing import smooth
+from rs_localizer.trajectory.smoothing import RigFrame, Smoothed, smooth, smooth_rig
 from rs_localizer.trajectory.spline import LEAST_FRAMES, stretches
 
 # Recordings are smoothed in windows of so many seconds and so much on both sides of them: what an
-# image farther away says is forgotten, since accelerations fade within 0.1 s.
-_WINDOW_NS, _MARGIN_NS = 60_000_000_000, 2_000_000_000
+# image farther away says is forgotten, since accelerations fade within 0.1 s. An image of 60 points
+# takes 0.18 MB of its window.
+_WINDOW_NS, _MARGIN_NS = 20_000_000_000, 2_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,20 +71,27 @@ def smooth_frames(
     pending = deque(_windows(np.array(stamps_ns, np.int64)))
     first_ns, last_ns = min(stamps_ns, default=0), max(stamps_ns, default=0)
     places = {stamp: place for place, stamp in reversed(list(enumerate(stamps_ns)))}
+    in_order = sorted(places)
     near: dict[int, Localized] = {}
     maps: set[str] = set()
     count = smoothed = 0
+    end_ns = 0
 
     def finish() -> SmoothedFrames:
-        nonlocal smoothed
+        nonlocal smoothed, end_ns
         window = pending.popleft()
-        known = sorted(s for s in near if window.first_ns <= s <= window.last_ns)
+        # A frame of a rig without its first camera has the stamp of another, maybe beyond all.
+        earliest_ns = window.first_ns if end_ns else min(near, default=0)
+        latest_ns = window.last_ns if pending else max(near, default=0)
+        known = sorted(s for s in near if earliest_ns <= s <= latest_ns)
         frames = [near[s] for s in known]
         for stamp in [s for s in known if pending and s < pending[0].first_ns]:
             del near[stamp]
-        inputs = window.stamps_ns
+        begin_ns, end_ns = end_ns, int(pending[0].stamps_ns[0]) if pending else latest_ns + 1
+        others = np.array([s for s in known if begin_ns <= s < end_ns], np.int64)
+        inputs = np.union1d(window.stamps_ns, others)
         if rate is not None:
-            inputs = _moments(inputs, first_ns, last_ns if not pending else None, rate)
+            inputs = _moments(window.stamps_ns, first_ns, last_ns if not pending else None, rate)
         if not stretches((np.array(known, np.int64) - first_ns).astype(np.float64) * 1e-9):
             return SmoothedFrames([], inputs[:0], len(inputs), 0)
         smoothed += 1
@@ -90,7 +102,8 @@ def smooth_frames(
         maps.add(frame.map_frame)
         if len(maps) > 1:
             raise ValueError(f"points lie in several frames: {', '.join(sorted(maps))}")
-        while pending and pending[0].last_place < places[frame.input_stamp_ns]:
+        before = in_order[max(bisect_right(in_order, frame.input_stamp_ns) - 1, 0)]
+        while pending and pending[0].last_place < places[before]:
             yield finish()
         near[frame.input_stamp_ns] = frame
     while count and pending:
@@ -100,12 +113,12 @@ def smooth_frames(
 
 
 def _windows(stamps_ns: IntArray) -> Iterator[_Window]:
-    """Those that hold images; the last one takes a rest that would be short."""
+    """Those that hold images; the last one takes a rest of less than half a window."""
     if not len(stamps_ns):
         return
     order = np.argsort(stamps_ns, kind="stable")
     stamps = stamps_ns[order]
-    most = max(int(stamps[-1] - stamps[0]) // _WINDOW_NS - 1, 0)
+    most = max(round(int(stamps[-1] - stamps[0]) / _WINDOW_NS) - 1, 0)
     numbers = np.minimum((stamps - stamps[0]) // _WINDOW_NS, most)
     for number in np.unique(numbers).tolist():
         begin, end = np.searchsorted(numbers, [number, number + 1]).tolist()
@@ -140,16 +153,7 @@ def _smoothed(
     localizer: FrameLocalizer, frames: list[Localized], inputs: IntArray, sampled_evenly: bool
 ) -> SmoothedFrames:
     """Frames at the stamps ``inputs`` (m,) by the motion through ``frames``."""
-    config, calibration = localizer.config, localizer.calibration
-    assert calibration is not None
-    camera = calibration.camera(config.readout_time, config.scan_direction)
-    images = [
-        Observed(frame.input_stamp_ns, _columns(frame, "xyz"), _columns(frame, "uv"))
-        for frame in frames
-    ]
-    motion = smooth(camera, images, [frame.estimate for frame in frames], config.stamp_offset)
-    delay, _ = published_moment(config, camera, 0)
-    moments = inputs + delay
+    motion, moments = _motion(localizer, frames, inputs)
     sampled = motion.sample(moments)
     once = {} if sampled_evenly else {frame.input_stamp_ns: frame for frame in frames}
     own_poses = {
@@ -173,12 +177,13 @@ def _smoothed(
                 input_stamp_ns=stamp,
                 stamp_ns=int(moments[k]),
                 map_frame=frames[0].map_frame,
-                body_frame=calibration.frame,
+                body_frame=localizer.camera_frame,
                 pose=pose_at(estimate, 0.0),
-                twist=twist_at(estimate, 0.0, config.readout_time),
+                twist=twist_at(estimate, 0.0, motion.readout_time),
                 inliers=nothing if own is None else own.inliers,
                 dropped=0 if own is None else own.dropped,
                 estimate=estimate,
+                cameras=() if own is None else own.cameras,
             )
         )
         if not isinstance(frame, Refusal):
@@ -187,6 +192,43 @@ def _smoothed(
     without = sampled.bridged if sampled_evenly else ~np.isin(inputs, list(once))
     undetermined = int(np.count_nonzero(~kept))
     return SmoothedFrames(result, moments[kept & without], undetermined, shaken)
+
+
+def _motion(
+    localizer: FrameLocalizer, frames: list[Localized], inputs: IntArray
+) -> tuple[Smoothed, IntArray]:
+    """The motion through frames, and the moments (m,) ns that are published of inputs (m,)."""
+    config, calibration = localizer.config, localizer.calibration
+    if isinstance(localizer, RigLocalizer):
+        rig = [_rig_frame(frame) for frame in frames]
+        if config.pose_time != PoseTime.MID_FRAME:
+            return smooth_rig(localizer.rig, rig), inputs
+        pairs = zip(frames, rig, strict=True)
+        delays = {f.input_stamp_ns: r.time_ns - f.input_stamp_ns for f, r in pairs}
+        usual = round(float(np.median(list(delays.values()))))
+        moments = inputs + np.array([delays.get(stamp, usual) for stamp in inputs.tolist()])
+        return smooth_rig(localizer.rig, rig), moments
+    assert calibration is not None
+    camera = calibration.camera(config.readout_time, config.scan_direction)
+    images = [
+        Observed(frame.input_stamp_ns, _columns(frame, "xyz"), _columns(frame, "uv"))
+        for frame in frames
+    ]
+    motion = smooth(camera, images, [frame.estimate for frame in frames], config.stamp_offset)
+    return motion, inputs + published_moment(config, camera, 0)[0]
+
+
+def _rig_frame(frame: Localized) -> RigFrame:
+    assert isinstance(frame.estimate, RigEstimate)
+    counts = np.cumsum([share.inliers for share in frame.cameras])[:-1]
+    points, pixels = (np.split(_columns(frame, names), counts) for names in ("xyz", "uv"))
+    images = {
+        share.name: Observed(share.start_ns, *own)
+        for share, *own in zip(frame.cameras, points, pixels, strict=True)
+    }
+    # Times of a rig's estimate count from its first image.
+    time_ns = frame.cameras[0].start_ns + round(1e9 * frame.estimate.time)
+    return RigFrame(time_ns, images, frame.estimate)
 
 
 def _columns(frame: Localized, names: str) -> NDArray[np.float64]:

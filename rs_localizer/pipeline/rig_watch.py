@@ -304,10 +304,8 @@ class RigWatch:
             text = f"extrinsics of {named} relative to {to} differ by {fit.described()}"
             self._say(Notice.EXTRINSICS, named, text)
             self.faults = self.faults | {str(Notice.EXTRINSICS): text}
-        else:
-            self.faults = {
-                key: text for key, text in self.faults.items() if f"of {name} " not in text
-            }
+        elif not any(other.off for other in self._fits.values()):
+            self.faults = {}
 
     def _follow_clock(self, name: str, time_ns: int) -> None:
         """Notice a jump of a clock, and follow it as far as the order of images tells."""

@@ -151,6 +151,11 @@ class RigLocalizer(FrameLocalizer):
         return Rig(cameras, {name: (it.rotation, it.translation) for name, it in mounts.items()})
 
     @property
+    def rig(self) -> Rig:
+        """As far as its cameras are known."""
+        return self._rig(self._config, self.calibrations, self._mounts)
+
+    @property
     def camera_frame(self) -> str:
         """The optical frame whose axes are the rig's; empty as long as it is unknown."""
         return next(
@@ -330,7 +335,7 @@ class RigLocalizer(FrameLocalizer):
             inliers=select_inliers(table, np.asarray(result.inliers), np.asarray(result.residuals)),
             dropped=sum(image.cloud.dropped for image in images),
             estimate=result,
-            cameras=tuple(_share(image.camera, result) for image in images),
+            cameras=tuple(_share(image, result) for image in images),
         )
 
 
@@ -360,10 +365,11 @@ def _table(names: Sequence[str], images: Sequence[Image]) -> NDArray[Any]:
     return rows
 
 
-def _share(name: str, result: RigEstimate) -> CameraShare:
+def _share(image: Image, result: RigEstimate) -> CameraShare:
+    name = image.camera
     assert isinstance(result.inliers, ByCamera)  # as all of a rig
     assert isinstance(result.residuals, ByCamera)
     inliers = result.inliers[name]
     kept = np.asarray(result.residuals[name][inliers])
     rms = float(np.sqrt(kept @ kept / max(len(kept), 1)))
-    return CameraShare(name, len(inliers), len(kept), rms)
+    return CameraShare(name, len(inliers), len(kept), rms, image.start_ns)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import TrueMotion, TrueState
 
 # No points closer than this (m): a lens sees them as a blur.
@@ -30,26 +31,6 @@ _FOLD_TOLERANCE = 1e-3
 _VIEW_MARGIN = 0.15
 # Row times beyond this are of no interest (the image ends at 0.5).
 _FARTHEST_ROW = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class FrameSettings:
-    """What is seen in each frame, and how badly."""
-
-    points: int = 150  # at most; fewer where the map shows fewer
-    noise: float = 1.0  # standard deviation of u and of v, raw pixels
-    outliers: float = 0.3  # share of the points whose pixel is uniform in the image
-    rate: float = 30.0  # frames per second
-
-    def __post_init__(self) -> None:
-        if self.points < 0:
-            raise ValueError(f"points must be 0 or more, got {self.points}")
-        if not 0.0 <= self.noise < np.inf:
-            raise ValueError(f"noise must be 0 or more pixels, got {self.noise}")
-        if not 0.0 <= self.outliers <= 1.0:
-            raise ValueError(f"outliers must lie between 0 and 1, got {self.outliers}")
-        if not 0.0 < self.rate < np.inf:
-            raise ValueError(f"rate must be more than 0 frames per second, got {self.rate}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

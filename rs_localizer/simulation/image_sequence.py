@@ -11,34 +11,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
 
-import cv2
 import numpy as np
 
-from rs_localizer.io.video import Image
 from rs_localizer.simulation.frames import middle_stamp
 from rs_localizer.simulation.renderer import Renderer
+from rs_localizer.simulation.settings import Encoding
 from rs_localizer.simulation.true_motion import TrueMotion, TrueState
-
-# As the format of sensor_msgs/CompressedImage says it.
-FORMATS = ("jpeg", "png")
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-
-@dataclass(frozen=True, slots=True)
-class Encoding:
-    """How images are compressed."""
-
-    format: str = "jpeg"
-    quality: int = 95  # of JPEG: its artefacts stay below the noise of a corner
-
-    def __call__(self, image: Image) -> bytes:
-        parameters = [cv2.IMWRITE_JPEG_QUALITY, self.quality] if self.format == "jpeg" else []
-        done, data = cv2.imencode(f".{self.format}", image, parameters)
-        if not done:
-            raise ValueError(f"an image of {image.shape} cannot be written as {self.format}")
-        return bytes(data.tobytes())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

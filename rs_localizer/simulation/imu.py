@@ -23,24 +23,12 @@ from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.imu import make_reading
 from rs_localizer.io.recording import CAMERA_FRAME
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.simulation.true_motion import BODY_FROM_CAMERA, TrueMotion
+from rs_localizer.simulation.settings import BODY_FROM_CAMERA, ImuSettings
+from rs_localizer.simulation.true_motion import TrueMotion
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])  # m/s^2, in a map with z up
 _STEP = 1e-5  # s, of the difference that gives accelerations
 _CHUNK = 4096
-
-
-@dataclass(frozen=True, slots=True)
-class ImuSettings:
-    """How good an IMU is: that of a phone or a drone."""
-
-    rate: float = 400.0  # Hz
-    gyroscope_noise: float = math.radians(0.01)  # rad/s/sqrt(Hz)
-    gyroscope_bias: float = math.radians(0.5)  # rad/s, in any direction
-    gyroscope_bias_walk: float = math.radians(0.002)  # rad/s^2/sqrt(Hz)
-    accelerometer_noise: float = 2e-3  # m/s^2/sqrt(Hz)
-    accelerometer_bias: float = 0.05  # m/s^2, in any direction
-    time_offset: float = 0.0  # s to be added to its stamps to get the camera's time
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from rs_localizer.core.simd.jit import kernel
 from rs_localizer.io.video import Image
 from rs_localizer.simulation.frames import middle_stamp
 from rs_localizer.simulation.planes import TexturedPlane, pyramids
+from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import TrueMotion
 
 # Walls that meet in an edge overlap by this many texels, so that no ray slips between them.
@@ -144,23 +144,6 @@ _MOST_INSTANTS = 24
 _NEAREST = 0.5
 # Grey level of what meets no plane.
 _BACKGROUND = 60.0
-
-
-@dataclass(frozen=True, slots=True)
-class ImageSettings:
-    """What the sensor and the lens do to the picture."""
-
-    exposure: float = 0.0  # s that each row is exposed, around its row time; 0: an instant
-    noise: float = 0.0  # standard deviation of a grey level (of 255)
-    vignetting: float = 0.0  # share of the light that is lost in the corners
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.exposure < math.inf:
-            raise ValueError(f"exposure must be 0 or more seconds, got {self.exposure}")
-        if not 0.0 <= self.noise < math.inf:
-            raise ValueError(f"noise must be 0 or more grey levels, got {self.noise}")
-        if not 0.0 <= self.vignetting <= 1.0:
-            raise ValueError(f"vignetting must lie between 0 and 1, got {self.vignetting}")
 
 
 class Renderer:

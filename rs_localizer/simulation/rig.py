@@ -18,15 +18,11 @@ from rs_localizer.io import topics
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.recording import make_camera_info, make_correspondences
-from rs_localizer.io.rigs import RigParts, shutters
+from rs_localizer.io.rigs import RigParts, node_parameters, optical_frame
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.simulation.frames import (
-    FrameSettings,
-    SimulatedFrame,
-    frame_stamps,
-    simulate_frames,
-)
+from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
 from rs_localizer.simulation.recording import write_truth
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import TrueMotion, TrueState
 
 RIG_FRAME = "rig"
@@ -130,20 +126,9 @@ def simulate_rig(
         yield image
 
 
-def optical_frame(name: str) -> str:
-    """The frame of a camera of a simulated rig."""
-    return f"{name}_optical_frame"
-
-
 def rig_parameters(parts: RigParts) -> dict[str, Any]:
     """The node's parameters for a recording of the rig."""
-    offsets = {
-        f"{name}.stamp_offset": parts.time_offset[name]
-        for name in parts.cameras
-        if parts.time_offset.get(name, 0.0) != 0.0
-    }
-    named = {"cameras": list(parts.cameras), "base_frame": RIG_FRAME}
-    return named | shutters(parts.cameras) | offsets
+    return {**node_parameters(parts), "base_frame": RIG_FRAME}
 
 
 def write_mounts(bag: BagWriter, parts: RigParts, stamp_ns: int) -> None:

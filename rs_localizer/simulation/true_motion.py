@@ -19,21 +19,8 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import Trajectory, split_at_gaps
+from rs_localizer.simulation.settings import BODY_FROM_CAMERA, KNOT_SPACING
 
-# Camera axes (x right, y down, z forward) in the body axes of a recorded trajectory; columns are
-# the camera's axes. Motion capture of a rig or robot mostly gives REP-103's body, x forward and
-# z up; of a camera data set, the camera itself.
-BODY_FROM_CAMERA = {
-    "forward_left_up": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
-    "optical": np.eye(3),
-}
-
-# Motion capture at 100 Hz and more shakes by a few tenths of a degree from sample to sample: a
-# spline through every sample turns that into accelerations that no hand has (0.24 degrees median,
-# 8 at worst, off constant velocity within 30 ms on TUM VI room5; 0.04 and 0.27 with knots of
-# 50 ms, which stay within 0.15 mm and 0.07 degrees, median, of the samples). A hand moves below
-# 10 Hz, and knots of 50 ms follow that.
-KNOT_SPACING = 0.05
 # Fewer samples to a knot than this leave nothing to average: then every sample is a knot.
 _SAMPLES_PER_KNOT = 2.0
 _DEGREE = 3

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,7 +18,9 @@ from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.simulation.planes import TexturedPlane
-from rs_localizer.simulation.true_motion import TrueState
+
+if TYPE_CHECKING:
+    from rs_localizer.simulation.true_motion import TrueState
 
 # Shapes per square of this many texels, of all sizes between a few texels and a few hundred.
 _SHAPES_PER = 9000

@@ -131,7 +131,7 @@ def blocks_of(
     for start, end in pairwise(np.linspace(first, last + 1e-6, count + 1)):
         # Not only what fits the whole: a part that differs would be left out of its own estimate.
         part = observations.subset((observations.times >= start) & (observations.times < end))
-        state = _cut(whole.state, start, end)
+        state = cut(whole.state, start, end)
         if state is None or not np.any(part.trusted):
             continue
         try:
@@ -153,11 +153,11 @@ def _delay(own: Fit) -> tuple[float, float]:
     return own.state.mount.delay, math.sqrt(float(own.border_covariance[at, at]))
 
 
-def _cut(state: State, start: float, end: float) -> State | None:
+def cut(state: State, start: float, end: float) -> State | None:
     """The state with the motion between two times only."""
     layout = state.spline.layout
     intervals = np.column_stack([layout.starts, layout.ends])
-    margin = abs(state.readout_time)
+    margin = max(abs(one.readout_time) for one in (state, *state.others))
     kept = np.clip(intervals, start - margin, end + margin)
     kept = kept[kept[:, 1] - kept[:, 0] > layout.spacing]
     if len(kept) == 0:

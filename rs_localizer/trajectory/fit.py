@@ -9,6 +9,7 @@ limit closes from the first guess to the noise.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,8 +19,11 @@ from rs_localizer.trajectory.banded import Factored
 from rs_localizer.trajectory.descent import minimise, settle
 from rs_localizer.trajectory.lens import with_lens
 from rs_localizer.trajectory.model import Freedom, Observations, State
-from rs_localizer.trajectory.problem import LIMIT, Problem
+from rs_localizer.trajectory.problem import LIMIT, Problem, RigProblem
 from rs_localizer.trajectory.spline_kernels import CONTROL
+
+AnyProblem = TypeVar("AnyProblem", Problem, RigProblem)
+"""Of one camera, or of several."""
 
 _FEW_STEPS = 6
 # Richer models must lower the cost by this much per new parameter (Akaike).
@@ -77,9 +81,18 @@ def fit(
     Raises:
         Undetermined: when the keypoints do not determine what is free.
     """
-    problem, state = Problem(camera, observations, start, freedom), start
+    return solve(Problem(camera, observations, start, freedom), start, deviation)
+
+
+def solve(problem: AnyProblem, start: State, deviation: float | None = None) -> Fit:
+    """:func:`fit` of one camera or of a rig, whose noise is that of its first camera's keypoints.
+
+    Raises:
+        Undetermined: when the keypoints do not determine what is free.
+    """
+    state = start
     if deviation is None:
-        trusted = Problem(camera, observations.subset(observations.trusted), start, freedom)
+        trusted = problem.trusted(start)
         state, deviation = settle(trusted, start, trusted.noise(start, np.inf))
     state, deviation = settle(problem, state, deviation)
     return _finish(problem, state, deviation)
@@ -114,14 +127,13 @@ def image_speeds(camera: Camera, observations: Observations, state: State) -> Ar
     return np.concatenate(speeds)
 
 
-def _finish(problem: Problem, state: State, deviation: float) -> Fit:
+def _finish(problem: AnyProblem, state: State, deviation: float) -> Fit:
     """The estimate with its covariances."""
     squared = problem.errors(state)
     cost, normal = problem.normal(state, deviation)
-    factored = Factored(normal)
+    factored = problem.factored(normal)
     inliers = squared < (LIMIT * deviation) ** 2
-    frames = len(np.unique(problem.observations.frames[inliers]))
-    used = problem.border + CONTROL * min(frames, len(state.spline.positions))
+    used = problem.border + CONTROL * min(problem.images(inliers), len(state.spline.positions))
     inflation = inflation_of(squared[inliers], deviation, used)
     return Fit(
         state=state,

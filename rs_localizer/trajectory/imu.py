@@ -169,7 +169,7 @@ def mount_of(camera: Camera, found: Fit, samples: GyroSamples, inflation: float)
     assert mount is not None
     deviations = np.sqrt(np.diag(covariance))[-MOUNT:]
     # The spline's time of an image is its stamp at the middle row, the camera's at the first row.
-    by_offset, later = np.zeros(len(covariance)), _middle_row(camera, found.state.readout_time)
+    by_offset, later = np.zeros(len(covariance)), middle_row(camera, found.state.readout_time)
     by_offset[DELAY - MOUNT] = 1.0
     if found.freedom.readout_time:
         by_offset[0] = later
@@ -186,7 +186,7 @@ def mount_of(camera: Camera, found: Fit, samples: GyroSamples, inflation: float)
     )
 
 
-def _middle_row(camera: Camera, readout_time: float) -> float:
+def middle_row(camera: Camera, readout_time: float) -> float:
     """How much later than the first row the middle one is exposed, by (signed) readout time."""
     if readout_time >= 0.0:
         return -camera.first_row_time

@@ -5,10 +5,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.gyro import GyroMount, GyroSamples
@@ -38,6 +39,20 @@ class Observations:
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Extrinsics:
+    """Where a camera is on a rig, ``X_camera = axes (X_rig - centre)``, and its clock."""
+
+    axes: Array  # (3,3) camera_from_rig
+    centre: Array  # (3,) m
+    offset: float  # s, how much later than its stamp a middle row was exposed, by the rig's clock
+
+    def moved(self, step: Array) -> Extrinsics:
+        """After a step (7,): turn in camera axes, centre, offset."""
+        turned = so3.exp(np.ascontiguousarray(step[:3])) @ self.axes
+        return Extrinsics(turned, self.centre + step[3:6], self.offset + float(step[6]))
+
+
 @dataclass(frozen=True, slots=True)
 class Freedom:
     """What is estimated beside the motion."""
@@ -61,6 +76,7 @@ class Freedom:
     # The noise is at least this (px). Where images have hardly more keypoints than numbers of their
     # own, a robust estimate rejects all but those it can run through, and ends at no noise at all.
     least_noise: float = 1e-4  # recordings without noise are simulated
+    mounted: bool = False  # where the camera is on the rig that the motion is of, and its clock
 
     def accelerations(self, spacing: float) -> Accelerations:
         """What is expected of them at controls that are so far apart (s)."""
@@ -80,6 +96,10 @@ class State:
     landmarks: Array  # (p,3) m
     delays: Array  # (g,) s, how much later than stamped each image was exposed
     mount: GyroMount | None = None  # of the gyroscope, where there is one
+    # Of the camera; the motion is that of what it is mounted to.
+    extrinsics: Extrinsics = field(default_factory=lambda: Extrinsics(np.eye(3), np.zeros(3), 0.0))
+    # Of the other cameras of a rig; they move along this spline, whatever theirs are.
+    others: tuple[State, ...] = ()
 
 
 def start_state(

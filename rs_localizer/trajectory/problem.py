@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Factored, Undetermined
 from rs_localizer.trajectory.bodies import Pieces, paper_covariance
@@ -28,7 +29,14 @@ from rs_localizer.trajectory.normal_kernels import (
     add_rest,
     eliminate_stamps,
 )
-from rs_localizer.trajectory.sight_kernels import Curve, Sights, Terms, look, squared_errors
+from rs_localizer.trajectory.sight_kernels import (
+    EXTRINSICS,
+    Curve,
+    Sights,
+    Terms,
+    look,
+    squared_errors,
+)
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 
 LIMIT = 6.0
@@ -69,13 +77,15 @@ class Problem:
             covariance = paper_covariance(seen, freedom.landmarks)
             self.shape_information = np.asarray(np.linalg.inv(covariance), np.float64)
         readout = 1 if freedom.readout_time else 0
-        self.border = readout + self.lens_count + self.pieces.columns
+        extrinsics = EXTRINSICS if freedom.mounted else 0
+        self.border = readout + self.lens_count + extrinsics + self.pieces.columns
         self.gyro: GyroTerms | None = None
         if observations.gyro is not None and start.mount is not None:
             self.gyro = GyroTerms(observations.gyro, start, self.border)
             self.border += MOUNT
         self.lens_column = readout if self.lens_count else -1
-        self.point_column = readout + self.lens_count if self.pieces.count else -1
+        self.mount_column = readout + self.lens_count if freedom.mounted else -1
+        self.point_column = readout + self.lens_count + extrinsics if self.pieces.count else -1
 
     @property
     def point_columns(self) -> slice:
@@ -101,15 +111,18 @@ class Problem:
     def _part(self, state: State, curve: Curve, arms: Array, part: slice) -> Sights:
         seen = self.observations
         tau, points, frames = seen.row_times[part], seen.points[part], seen.frames[part]
-        times = seen.times[part] + state.delays[frames] + state.readout_time * tau
+        mounted = state.extrinsics
+        times = seen.times[part] + state.delays[frames] + state.readout_time * tau + mounted.offset
         first, u = state.spline.layout.locate(times)
         local, velocity = np.empty((len(first), 3)), np.empty((len(first), 3))
-        look(curve, first, u, state.landmarks[points], local, velocity)
+        axes, centre = mounted.axes, mounted.centre
+        look(curve, first, u, state.landmarks[points], axes, centre, local, velocity)
         ahead = np.where(local[:, 2:] > 0.0, local, (0.0, 0.0, 1.0))
         seen_as = project(self.camera, state.lens, ahead, self.lens_column >= 0)
         return Sights(
             first, u, tau, local, velocity, seen_as.pixels - seen.pixels[part],
             seen_as.by_ray, seen_as.by_lens, self.pieces.slots[points], arms[points], frames,
+            axes, centre,
         )  # fmt: skip
 
     def terms(self, state: State, deviation: float) -> Terms:
@@ -118,6 +131,7 @@ class Problem:
             self.camera.row_time_gradient,
             self.freedom.readout_time,
             self.lens_column >= 0,
+            self.mount_column >= 0,
             self.point_column,
             self.pieces.width,
             self.freedom.stamps > 0.0,
@@ -135,14 +149,10 @@ class Problem:
 
     def noise(self, state: State, deviation: float) -> float:
         """Standard deviation of the noise, from the errors that are not far off the last one."""
-        squared = self.errors(state)
-        near = squared[squared < (_SCALE_LIMIT * deviation) ** 2]
-        if len(near) == 0:
-            raise Undetermined("no keypoint agrees with the motion of the frames")
-        return max(float(np.sqrt(np.median(near) / _MEDIAN)), self.freedom.least_noise)
+        return max(noise_of(self.errors(state), deviation), self.freedom.least_noise)
 
-    def normal(self, state: State, deviation: float) -> tuple[float, Normal]:
-        """Cost and normal equations."""
+    def normal(self, state: State, deviation: float, motion: bool = True) -> tuple[float, Normal]:
+        """Cost and normal equations; without ``motion`` others add what is expected of it."""
         curve, parts = self.look(state)
         terms = self.terms(state, deviation)
         normals = self._empty(len(state.spline.positions), parts, len(state.delays))
@@ -153,21 +163,27 @@ class Problem:
         for other in normals[1:]:
             for field in _SUMS:
                 getattr(normal, field)[:] += getattr(other, field)
-        layout = state.spline.layout
-        expected = self.freedom.accelerations(layout.spacing)
-        cost += add_accelerations(curve, layout.firsts, expected, normal)
-        alone = layout.alone()
-        if len(alone) and self.freedom.angular_velocity < math.inf:
-            cost += add_rest(
-                curve, alone, float(self.freedom.angular_velocity),
-                float(self.freedom.linear_velocity), normal,
-            )  # fmt: skip
+        if motion:
+            cost += self.expected_motion(state, normal)
         cost += self._add_priors(state, normal)
         if self.gyro is not None:
             cost += self.gyro.add(state, normal)
         if self.freedom.stamps > 0.0:
             eliminate_stamps(normal)
         return cost, normal
+
+    def expected_motion(self, state: State, normal: Normal) -> float:
+        """Add what is known of the motion beforehand; returns its cost."""
+        curve, layout = self.look(state)[0], state.spline.layout
+        expected = self.freedom.accelerations(layout.spacing)
+        cost: float = add_accelerations(curve, layout.firsts, expected, normal)
+        alone = layout.alone()
+        if len(alone) and self.freedom.angular_velocity < math.inf:
+            cost += add_rest(
+                curve, alone, float(self.freedom.angular_velocity),
+                float(self.freedom.linear_velocity), normal,
+            )  # fmt: skip
+        return cost
 
     def _empty(self, controls: int, parts: list[Sights], images: int) -> list[Normal]:
         """Normal equations of zeros for each part, of the same shape."""
@@ -231,7 +247,9 @@ class Problem:
             lens = lens + border[self.lens_column : self.lens_column + self.lens_count]
         if self.point_column >= 0:
             landmarks = self.pieces.moved(landmarks, border[self.point_columns])
-        delays, mount = state.delays, state.mount
+        delays, mount, extrinsics = state.delays, state.mount, state.extrinsics
+        if self.mount_column >= 0:
+            extrinsics = extrinsics.moved(border[self.mount_column :][:EXTRINSICS])
         if self.gyro is not None and mount is not None:
             mount = self.gyro.moved(mount, border)
         if self.freedom.stamps > 0.0:
@@ -239,15 +257,132 @@ class Problem:
             own = controls[CONTROL * normal.image_first[:, None] + np.arange(width)]
             pull = np.einsum("gk,gk->g", normal.image_controls, own) + normal.image_border @ border
             delays = delays - (normal.image_slope + pull) / normal.image_information
-        return State(state.spline.moved(controls), readout_time, lens, landmarks, delays, mount)
+        return State(
+            state.spline.moved(controls), readout_time, lens, landmarks, delays, mount, extrinsics
+        )
 
-    def step(self, normal: Normal, damping: float) -> Step:
-        """Of controls and border, Levenberg's.
+    def factored(self, normal: Normal, damping: float = 0.0) -> Factored:
+        """The normal equations, with Levenberg's damping.
 
         Raises:
-            Undetermined: when the normal equations are not positive definite.
+            Undetermined: when they are not positive definite.
         """
-        return Factored(normal, damping).step()
+        return Factored(normal, damping)
+
+    def step(self, normal: Normal, damping: float) -> Step:
+        """Of controls and border, Levenberg's."""
+        return self.factored(normal, damping).step()
+
+    def trusted(self, start: State) -> Problem:
+        """The same with the trusted keypoints only."""
+        seen = self.observations
+        return Problem(self.camera, seen.subset(seen.trusted), start, self.freedom)
+
+    def images(self, inliers: BoolArray) -> int:
+        """How many images have some of these keypoints (n,)."""
+        return len(np.unique(self.observations.frames[inliers]))
+
+
+class RigNormal(NamedTuple):
+    """The normal equations of a rig."""
+
+    whole: Normal
+    own: list[Normal]  # of each camera
+
+
+class RigProblem:
+    """The cost of one motion that several cameras see, as of :class:`Problem`; their borders stand
+    one after the other, their keypoints as well.
+
+    Args:
+        cameras: of which the first has what is expected of the motion.
+        noises: (k,) px, of each camera's keypoints; they keep their ratios.
+    """
+
+    def __init__(self, cameras: list[Problem], noises: Array) -> None:
+        self.cameras, self.ratios = cameras, noises / noises[0]
+        self.camera, self.freedom = cameras[0].camera, cameras[0].freedom
+        ends = np.cumsum([0, *(camera.border for camera in cameras)]).tolist()
+        self.columns, self.border = [slice(a, b) for a, b in pairwise(ends)], ends[-1]
+        self._last: tuple[State, list[State]] | None = None
+
+    def states(self, state: State) -> list[State]:
+        """Those of the cameras, of one spline."""
+        if self._last is None or self._last[0] is not state:
+            others = [replace(other, spline=state.spline) for other in state.others]
+            self._last = state, [state, *others]
+        return self._last[1]
+
+    def normal(self, state: State, deviation: float) -> tuple[float, RigNormal]:
+        """Cost and normal equations."""
+        cost, own = 0.0, list[Normal]()
+        for camera, one, ratio in zip(self.cameras, self.states(state), self.ratios, strict=True):
+            added, normal = camera.normal(one, deviation * float(ratio), motion=not own)
+            own.append(normal)
+            cost += added
+        count = len(own[0].slope)
+        whole = own[0]._replace(
+            band=np.zeros((max(len(normal.band) for normal in own), count)),
+            cross=np.zeros((count, self.border)),
+            corner=np.zeros((self.border, self.border)),
+            slope=np.zeros(count),
+            border_slope=np.zeros(self.border),
+        )
+        for normal, at in zip(own, self.columns, strict=True):
+            whole.band[: len(normal.band)] += normal.band
+            whole.slope[:] += normal.slope
+            whole.cross[:, at] = normal.cross
+            whole.corner[at, at] = normal.corner
+            whole.border_slope[at] = normal.border_slope
+        return cost, RigNormal(whole, own)
+
+    def factored(self, normal: RigNormal, damping: float = 0.0) -> Factored:
+        return Factored(normal.whole, damping)
+
+    def step(self, normal: RigNormal, damping: float) -> Step:
+        return self.factored(normal, damping).step()
+
+    def moved(self, state: State, normal: RigNormal, step: Step) -> State:
+        """The state after a step that these normal equations led to."""
+        first, *others = (
+            camera.moved(one, own, (step[0], step[1][at]))
+            for camera, one, own, at in zip(
+                self.cameras, self.states(state), normal.own, self.columns, strict=True
+            )
+        )
+        return replace(first, others=tuple(others))
+
+    def errors(self, state: State) -> Array:
+        """Squared whitened errors (n,), px^2 of the first camera."""
+        parts = zip(self.cameras, self.states(state), self.ratios, strict=True)
+        return np.concatenate([camera.errors(one) / ratio**2 for camera, one, ratio in parts])
+
+    def noise(self, state: State, deviation: float) -> float:
+        """Standard deviation of the noise, px of the first camera."""
+        return max(noise_of(self.errors(state), deviation), self.freedom.least_noise)
+
+    def trusted(self, start: State) -> RigProblem:
+        """The same with the trusted keypoints only."""
+        pairs = zip(self.cameras, self.states(start), strict=True)
+        return RigProblem([camera.trusted(one) for camera, one in pairs], self.ratios)
+
+    def images(self, inliers: BoolArray) -> int:
+        """How many images of all cameras have some of these keypoints (n,)."""
+        counts = np.cumsum([len(camera.observations.times) for camera in self.cameras])
+        parts = np.split(inliers, counts[:-1])
+        return sum(camera.images(own) for camera, own in zip(self.cameras, parts, strict=True))
+
+
+def noise_of(squared: Array, deviation: float) -> float:
+    """Standard deviation of the noise, from squared errors (n,) that are not far off the last one.
+
+    Raises:
+        Undetermined: when there are none.
+    """
+    near = squared[squared < (_SCALE_LIMIT * deviation) ** 2]
+    if len(near) == 0:
+        raise Undetermined("no keypoint agrees with the motion of the frames")
+    return float(np.sqrt(np.median(near) / _MEDIAN))
 
 
 def _pieces(observations: Observations, freedom: Freedom) -> Pieces:

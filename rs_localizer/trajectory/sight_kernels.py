@@ -26,6 +26,9 @@ from rs_localizer.trajectory.spline_kernels import (
     rates,
 )
 
+EXTRINSICS = 7
+"""Numbers of a camera's mount: turn in its own axes, centre in the body's, offset of its clock."""
+
 # Where the rows overtake the image points to within this share, a keypoint's row says nothing.
 _LEAST_PACE = 0.1
 
@@ -54,6 +57,9 @@ class Sights(NamedTuple):
     slots: IntArray  # (n,) place of the landmark, or its body, among the free ones; -1: known
     arms: Array  # (n,3) from the middle of its body to the landmark, along the map's axes
     frames: IntArray  # (n,) number of the image
+    # Where the camera is mounted on what moves along the spline: X_camera = axes (X_body - centre).
+    axes: Array  # (3,3)
+    centre: Array  # (3,)
 
 
 class Terms(NamedTuple):
@@ -61,9 +67,10 @@ class Terms(NamedTuple):
 
     readout_time: float
     gradient: Array  # (2,) of the row time by the pixel
-    # The border has these columns, one after the other: readout time, lens, landmarks.
+    # The border has these columns, one after the other: readout time, lens, mount, landmarks.
     readout_free: bool
     lens_free: bool
+    mount_free: bool  # its columns follow those of the lens
     point_column: int  # first of the landmarks' columns; -1: all known
     point_width: int  # columns of each: 3 for the place, 6 for a rigid body's turn as well
     stamps_free: bool  # each image has a time of its own
@@ -73,11 +80,12 @@ class Terms(NamedTuple):
 
 @kernel
 def look(
-    curve: Curve, first: IntArray, u: Array, points: Array, local: Array, velocity: Array
-) -> None:
+    curve: Curve, first: IntArray, u: Array, points: Array, axes: Array, centre: Array,
+    local: Array, velocity: Array,
+) -> None:  # fmt: skip
     """Points (n,3) in camera axes at their own times, and their velocities there."""
     work, rotation, position = np.empty((8, 3, 3)), np.empty((3, 3)), np.empty(3)
-    rate, away = np.empty((4, 3)), np.empty(3)
+    rate, away, moving = np.empty((4, 3)), np.empty(3), np.empty(3)
     for n in range(len(first)):
         pose(curve.rotations, curve.positions, curve.vectors, first[n], u[n], work, rotation,
              position)  # fmt: skip
@@ -90,12 +98,19 @@ def look(
             )
         for i in range(3):
             a, b = (i + 1) % 3, (i + 2) % 3
-            velocity[n, i] = (
+            moving[i] = (
                 rate[0, b] * local[n, a]
                 - rate[0, a] * local[n, b]
                 - rotation[0, i] * rate[1, 0]
                 - rotation[1, i] * rate[1, 1]
                 - rotation[2, i] * rate[1, 2]
+            )
+        for i in range(3):
+            away[i] = local[n, i] - centre[i]
+        for i in range(3):
+            local[n, i] = axes[i, 0] * away[0] + axes[i, 1] * away[1] + axes[i, 2] * away[2]
+            velocity[n, i] = (
+                axes[i, 0] * moving[0] + axes[i, 1] * moving[1] + axes[i, 2] * moving[2]
             )
 
 
@@ -147,7 +162,7 @@ class Row(NamedTuple):
 
     error: Array  # (2,)
     by_controls: Array  # (2,24)
-    by_shared: Array  # (2,s) readout time and lens, as far as they are free
+    by_shared: Array  # (2,s) readout time, lens and mount, as far as they are free
     by_landmark: Array  # (2,3) along the map's axes
     by_time: Array  # (2,) per second
     work: Array  # (8,3,3)
@@ -161,10 +176,34 @@ class Row(NamedTuple):
 def make_row(sights: Sights, terms: Terms) -> Row:
     """Room for the derivatives of one keypoint after the other."""
     shared = (1 if terms.readout_free else 0) + (sights.by_lens.shape[2] if terms.lens_free else 0)
+    shared += EXTRINSICS if terms.mount_free else 0
     return Row(
         np.empty(2), np.zeros((2, LOCAL)), np.empty((2, shared)), np.empty((2, 3)), np.empty(2),
         np.empty((8, 3, 3)), np.empty((3, 3)), np.empty(3), np.empty((2, 3)), np.empty((4, 2)),
     )  # fmt: skip
+
+
+@kernel
+def _to_body(
+    sights: Sights, terms: Terms, n: int, row: Row, r: int, gradient: Array, point: Array
+) -> None:
+    """Fill the derivative (3,) of coordinate r and the landmark (3,) along the body's axes; and the
+    derivatives by the mount, where it is free.
+    """
+    axes, g, p = sights.axes, row.by_point[r], sights.local[n]
+    for i in range(3):
+        gradient[i] = 0.0
+        point[i] = sights.centre[i]
+        for j in range(3):
+            gradient[i] += axes[j, i] * g[j]
+            point[i] += axes[j, i] * p[j]
+    if terms.mount_free:
+        first = row.by_shared.shape[1] - EXTRINSICS
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            row.by_shared[r, first + i] = p[a] * g[b] - p[b] * g[a]
+            row.by_shared[r, first + 3 + i] = -gradient[i]
+        row.by_shared[r, first + 6] = row.by_time[r]
 
 
 @kernel
@@ -182,11 +221,13 @@ def differentiate(
     if not rest > 0.0:
         return 0.0, full
     rotation, turn, basis = row.rotation, row.position, row.work[7, 2]
+    shared = row.by_shared.shape[1] - (EXTRINSICS if terms.mount_free else 0)
     pose(curve.rotations, curve.positions, curve.vectors, sights.first[n], sights.u[n], row.work,
          rotation, row.position)  # fmt: skip
     for r in range(2):
         row.by_time[r] = flow[2 + r, 0] * flow[0, 0] + flow[2 + r, 1] * flow[0, 1]
-        g, p = by_point[r], sights.local[n]
+        g, p = row.work[7, 0], row.work[7, 1]
+        _to_body(sights, terms, n, row, r, g, p)
         turn[0] = g[1] * p[2] - g[2] * p[1]  # the position is not needed any more
         turn[1] = g[2] * p[0] - g[0] * p[2]
         turn[2] = g[0] * p[1] - g[1] * p[0]
@@ -195,7 +236,7 @@ def differentiate(
         if terms.readout_free:
             row.by_shared[r, 0] = sights.tau[n] * row.by_time[r]
             count = 1
-        for k in range(row.by_shared.shape[1] - count):
+        for k in range(shared - count):
             row.by_shared[r, count + k] = (
                 flow[2 + r, 0] * sights.by_lens[n, 0, k] + flow[2 + r, 1] * sights.by_lens[n, 1, k]
             )

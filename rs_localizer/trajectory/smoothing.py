@@ -11,7 +11,7 @@ keypoints do not tell; and their squares are the sum of as many numbers only as 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -20,17 +20,18 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Rig
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.motion_model import FADING
 from rs_localizer.inertial.settings import SCALE_DEVIATION
 from rs_localizer.inertial.turning import MOST_ROUGH
-from rs_localizer.trajectory.fit import Fit, cheaper, fit
-from rs_localizer.trajectory.model import Freedom, Observations, start_state
+from rs_localizer.trajectory.fit import AnyProblem, Fit, cheaper, solve
+from rs_localizer.trajectory.model import Extrinsics, Freedom, Observations, State, start_state
 from rs_localizer.trajectory.normal_kernels import changes
 from rs_localizer.trajectory.observe import Observed, collect
-from rs_localizer.trajectory.problem import LIMIT
+from rs_localizer.trajectory.problem import LIMIT, Problem, RigProblem
 from rs_localizer.trajectory.sight_kernels import Curve
 from rs_localizer.trajectory.spline import LONGEST_SPACING, States, first_spline, refined
 
@@ -281,6 +282,7 @@ class Smoothed:
                 joint_covariance=covariance,
                 global_shutter_inliers=0,
                 iterations=0,
+                span=self.readout_time,
             )
             for rotation, position, angular, linear, covariance in zip(
                 states.rotations, states.positions, states.angular, states.linear, joint,
@@ -316,16 +318,11 @@ def smooth(
         raise ValueError("smoothing needs the readout time of the camera, which is 0 (unknown)")
     if not images:
         raise ValueError("no image has a pose: there is nothing to smooth")
-    known = [
-        replace(one, inliers=np.ones(len(image.points), dtype=np.bool_))
-        for one, image in zip(estimates, images, strict=True)
-    ]
+    known = [_all_inliers(one, image) for one, image in zip(estimates, images, strict=True)]
     delay = stamp_offset - readout_time * camera.first_row_time
     posed = collect(camera, images, list(known), delay)
     seen = posed.observations
-    interval = float(np.median(np.diff(posed.times))) if len(posed.times) > 1 else 1.0
-    fading = FADING if interval < 0.5 * FADING else 0.0
-    spacing = min(_NARROW_SPACING if fading else LONGEST_SPACING, interval)
+    spacing, fading = _knots(posed.times)
     fast = fast_turn(posed.times, estimates, readout_time)
     rotations = posed.rotations
     if fast is not None:
@@ -338,21 +335,99 @@ def smooth(
             rotations = rotations @ np.swapaxes(fast.rotations(posed.times), 1, 2)
     spline = first_spline(posed.times, rotations, posed.positions, spacing, readout_time)
     seen = seen.subset(spline.layout.inside(seen.times) & np.isfinite(seen.pixels[:, 0]))
-    state = start_state(camera, seen, spline, readout_time)
-    found = _lively(
-        camera, seen, fit(camera, seen, state, Freedom(readout_time=False, fading=fading))
+    best = _best(
+        lambda state, freedom: Problem(camera, seen, state, freedom),
+        start_state(camera, seen, spline, readout_time),
+        fading,
     )
-    halved = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
-    finer = _lively(camera, seen, fit(camera, seen, halved, found.freedom, found.deviation))
-    more = np.sum(told(finer).numbers) - np.sum(told(found).numbers)
-    best = finer if cheaper(finer, found, float(more)) else found
-    shaken = _shaken(best, seen, estimates) | _turns_in_frame(camera, estimates)
+    shaken = _shaken(best, seen.frames, estimates) | _turns_in_frame(camera.focal_length, estimates)
     counted = shaken if fast is None else shaken[fast.covered]
     if counted.mean() > _MOST_SHAKEN:
         shaken[:] = True
     elif fast is not None and fast.vibrates:  # few images beside each other may look smooth
         shaken |= ~fast.covered
     return Smoothed(best, readout_time, posed.start_ns, posed.times, shaken, fast)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigFrame:
+    """A frame of a rig with a pose: what its cameras saw, by their names."""
+
+    time_ns: int  # of the pose
+    images: Mapping[str, Observed]  # their inliers; stamps are exposures of first rows
+    estimate: Estimate
+
+
+def smooth_rig(rig: Rig, frames: list[RigFrame]) -> Smoothed:
+    """The motion of a rig through frames with a pose, in their order; as :func:`smooth`, per
+    ``readout_time`` of the first camera.
+
+    Raises:
+        ValueError: when the frames determine no motion.
+    """
+    start_ns = frames[0].time_ns
+    times = np.array([(frame.time_ns - start_ns) * 1e-9 for frame in frames])
+    estimates = [frame.estimate for frame in frames]
+    spacing, fading = _knots(times)
+    rotations = np.array([one.rotation.T for one in estimates])
+    positions = np.array([one.position for one in estimates])
+    longest = max(one.span for one in estimates)
+    spline = first_spline(times, rotations, positions, spacing, longest)
+    parts: list[tuple[Camera, Observations]] = []
+    states: list[State] = []
+    for name, camera in rig.cameras.items():
+        own = [k for k, frame in enumerate(frames) if name in frame.images]
+        if not own:
+            continue
+        images = [frames[k].images[name] for k in own]
+        known = [_all_inliers(estimates[k], image) for k, image in zip(own, images, strict=True)]
+        delay = -camera.readout_time * camera.first_row_time
+        posed = collect(camera, images, list(known), delay)
+        seen = posed.observations
+        shift = (posed.start_ns - start_ns) * 1e-9
+        seen = replace(seen, times=seen.times + shift, frames=np.array(own)[seen.frames])
+        seen = seen.subset(spline.layout.inside(seen.times))
+        axes, moved = rig.camera_from_rig[name]
+        state = start_state(camera, seen, spline, camera.readout_time)
+        states.append(replace(state, extrinsics=Extrinsics(axes, -axes.T @ moved, 0.0)))
+        parts.append((camera, seen))
+
+    def problem(state: State, freedom: Freedom) -> RigProblem:
+        pairs = zip(parts, (state, *state.others), strict=True)
+        cameras = [Problem(*part, one, freedom) for part, one in pairs]
+        return RigProblem(cameras, np.ones(len(cameras)))
+
+    best = _best(problem, replace(states[0], others=tuple(states[1:])), fading)
+    numbers = np.concatenate([seen.frames for _, seen in parts])
+    shaken = _shaken(best, numbers, estimates) | _turns_in_frame(rig.focal_length, estimates)
+    if shaken.mean() > _MOST_SHAKEN:
+        shaken[:] = True
+    readout_time = next(iter(rig.cameras.values())).readout_time
+    return Smoothed(best, readout_time, start_ns, times, shaken)
+
+
+def _knots(times: Array) -> tuple[float, float]:
+    """Spacing of the knots, and time in which accelerations fade (0: they do not), s, of images at
+    times (f,).
+    """
+    interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    fading = FADING if interval < 0.5 * FADING else 0.0
+    return min(_NARROW_SPACING if fading else LONGEST_SPACING, interval), fading
+
+
+def _all_inliers(estimate: Estimate, image: Observed) -> Estimate:
+    return replace(estimate, inliers=np.ones(len(image.points), dtype=np.bool_))
+
+
+def _best(problem: Callable[[State, Freedom], AnyProblem], start: State, fading: float) -> Fit:
+    """With the accelerations that the motion shows, and finer knots if they are worth it."""
+    plain = solve(problem(start, Freedom(readout_time=False, fading=fading)), start)
+    found = _lively(problem, plain)
+    spline = found.state.spline
+    halved = replace(found.state, spline=refined(spline, 0.5 * spline.layout.spacing))
+    finer = _lively(problem, solve(problem(halved, found.freedom), halved, found.deviation))
+    more = np.sum(told(finer).numbers) - np.sum(told(found).numbers)
+    return finer if cheaper(finer, found, float(more)) else found
 
 
 def _turned_pixels(
@@ -364,36 +439,38 @@ def _turned_pixels(
     return camera.project(np.einsum("nij,nj->ni", turns, rays))
 
 
-def _shaken(found: Fit, seen: Observations, estimates: list[Estimate]) -> BoolArray:
-    """Which images (f,) shake in a way that the motion does not follow."""
+def _shaken(found: Fit, frames: IntArray, estimates: list[Estimate]) -> BoolArray:
+    """Which images (f,) shake in a way that the motion does not follow; keypoints (n,) are of these
+    ``frames``.
+    """
     own = np.array([max(one.residual_rms, found.freedom.least_noise) ** 2 for one in estimates])
-    count = np.bincount(seen.frames, minlength=len(estimates))
+    count = np.bincount(frames, minlength=len(estimates))
     # Robust, as the estimates are: outliers of the motion count as its limit.
     squared = np.minimum(found.squared_errors, (LIMIT * found.deviation) ** 2)
-    off = np.bincount(seen.frames, squared, len(estimates)) / np.maximum(count, 1)
+    off = np.bincount(frames, squared, len(estimates)) / np.maximum(count, 1)
     # An estimate's errors are those of two coordinates, less what it took to fit them.
     left = np.maximum(1.0 - PARAMETERS / np.maximum(2 * count, 1), 0.1)
     limit = np.maximum(_SHAKEN**2, 1.0 + _SHAKEN_SIGMAS / np.sqrt(np.maximum(count, 1)))
     return np.asarray((count > 0) & (off > limit * own / left), np.bool_)
 
 
-def _turns_in_frame(camera: Camera, estimates: list[Estimate]) -> BoolArray:
+def _turns_in_frame(focal_length: float, estimates: list[Estimate]) -> BoolArray:
     """Which images (f,) turn within their exposure in a way that knots follow only in part."""
     turns = [
         shake_at(_ROWS, one.shake)[:, :3] if len(one.shake) else np.zeros(3) for one in estimates
     ]
-    moved = camera.focal_length * np.array([np.sqrt(np.mean(3.0 * turn**2)) for turn in turns])
+    moved = focal_length * np.array([np.sqrt(np.mean(3.0 * turn**2)) for turn in turns])
     turning = moved > _IN_FRAME * np.array([one.residual_rms for one in estimates])
     around = np.ones(min(_NEXT, len(turning)))
     near, count = (np.convolve(of, around, "same") for of in (turning, np.ones(len(turning))))
     return np.asarray(turning & (near > 0.5 * count))
 
 
-def _lively(camera: Camera, seen: Observations, found: Fit) -> Fit:
+def _lively(problem: Callable[[State, Freedom], AnyProblem], found: Fit) -> Fit:
     """With a prior of the accelerations that the motion itself shows."""
     for _ in range(_ROUNDS):
         before, freedom = found.freedom, told(found).most_likely(found.freedom)
-        found = fit(camera, seen, found.state, freedom, found.deviation)
+        found = solve(problem(found.state, freedom), found.state, found.deviation)
         changed = (
             freedom.angular_acceleration / before.angular_acceleration,
             freedom.linear_acceleration / before.linear_acceleration,

@@ -4,6 +4,7 @@
 
 import csv
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -41,13 +42,14 @@ def published(rng: np.random.Generator, wider: float = 1.0) -> Score:
     return score(pose, twist, truth, int(rng.integers(2**31)))
 
 
-def scores(count: int, wider: float) -> Scores:
+@cache
+def scores(wider: float) -> Scores:
     rng = np.random.default_rng(0)
-    return Scores([published(rng, wider) for _ in range(count)])
+    return Scores([published(rng, wider) for _ in range(2000)])
 
 
 def test_truths_drawn_from_the_covariance_lie_inside():
-    honest = scores(2000, 1.0)
+    honest = scores(1.0)
     for part in ("pose", "twist"):
         assert np.mean(honest.inside(part)) == pytest.approx(0.95, abs=0.012)
     assert not honest.far_off().any()
@@ -57,7 +59,7 @@ def test_truths_drawn_from_the_covariance_lie_inside():
     ("wider", "verdict"), [(1.0, Verdict.HELD), (0.5, Verdict.NOT_HELD), (3.0, Verdict.NOT_HELD)]
 )
 def test_too_small_and_too_large_covariances_are_seen(wider, verdict):
-    some = scores(2500, wider)
+    some = scores(wider)
     found = {f"{motion}/all": Found(some, some) for motion in ("rest", "hand")}
     judged = {claim.name: claim.verdict for claim in claims.rendered_claims(found)}
     assert judged == {"honesty.rendered_pose": verdict, "honesty.rendered_twist": verdict}

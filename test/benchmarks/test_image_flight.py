@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images of a quick hand into both nodes: the same poses and twists as offline, to the last bit."""
 
-import re
 import subprocess
 import sys
 
 from benchmarks import image_flight
 from rs_localizer.cli.main import main
 
-FLIGHT = "--images --trajectory tum_vi_room5 --start 21.5 --duration 0.25 --exposure 0.002".split()
+FLIGHT = "--images --trajectory tum_vi_room5 --start 21.5 --duration 0.15 --exposure 0.002".split()
 
 
 def run(*words: str) -> None:
@@ -27,17 +26,7 @@ def test_nodes_and_replay_agree(tmp_path, capsys):
     capsys.readouterr()
     assert image_flight.main([images, poses, "-p", "pose_time:=mid_frame"]) == 0
     assert capsys.readouterr().out == (
-        "8 images\n"
-        "/rs_localizer/pose: 8 live, 8 replayed, 8 identical\n"
-        "/rs_localizer/twist: 8 live, 8 replayed, 8 identical\n"
+        "5 images\n"
+        "/rs_localizer/pose: 5 live, 5 replayed, 5 identical\n"
+        "/rs_localizer/twist: 5 live, 5 replayed, 5 identical\n"
     )
-    # At a camera's pace some may be left out on a busy machine.
-    assert image_flight.main([images, "--rate", "10"]) == 0
-    told = re.fullmatch(
-        r"(\d+) poses of 8 images at 10 Hz, from image to pose: "
-        r"p50 ([\d.]+) ms, p95 ([\d.]+) ms\n",
-        capsys.readouterr().out,
-    )
-    assert told
-    assert 0 < int(told[1]) <= 8
-    assert 1.0 < float(told[2]) <= float(told[3])

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.simulation.imu import ImuSettings, make_imu
+from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
+from rs_localizer.simulation.imu import make_imu
+from rs_localizer.simulation.settings import FrameSettings, ImuSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03

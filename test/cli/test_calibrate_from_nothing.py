@@ -1,7 +1,7 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
 """A film of a board and nothing else: lens, readout time and direction, against a small renderer
-that is the test's own (rays through a distorted lens, four by four in a pixel, row by row).
+that is the test's own (rays through a distorted lens, three by three in a pixel, row by row).
 """
 
 import json
@@ -22,13 +22,13 @@ from rs_localizer.settings import load_params_file
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 320, 240, 290.0, (161.5, 117.0)
 K1, K2 = -0.12, 0.05
-READOUT, RATE, SECONDS = 0.02, 30.0, 4.0
+READOUT, RATE, SECONDS = 0.02, 30.0, 3.0
 COLUMNS, ROWS, SQUARE = 9, 6, 0.03  # inner corners, m
-WITHIN = (np.arange(4) + 0.5) / 4.0 - 0.5  # of a pixel
+WITHIN = (np.arange(3) + 0.5) / 3.0 - 0.5  # of a pixel
 
 
 def rays() -> np.ndarray:
-    """Rays (HEIGHT, WIDTH, 16, 3) through each pixel: the distortion undone by iteration."""
+    """Rays (HEIGHT, WIDTH, 9, 3) through each pixel: the distortion undone by iteration."""
     v, u, b, a = np.meshgrid(
         np.arange(HEIGHT), np.arange(WIDTH), WITHIN, WITHIN, indexing="ij", sparse=True
     )
@@ -39,7 +39,7 @@ def rays() -> np.ndarray:
         scale = 1.0 + K1 * r2 + K2 * r2**2
         left, up = x / scale, y / scale
     out = np.stack([left, up, np.ones_like(left)], axis=-1)
-    return out.reshape(HEIGHT, WIDTH, 16, 3).astype(np.float32)
+    return out.reshape(HEIGHT, WIDTH, 9, 3).astype(np.float32)
 
 
 def pose(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +68,7 @@ def expose(stamp: float, through: np.ndarray) -> np.ndarray:
         column, line = np.floor(x).astype(np.int32), np.floor(y).astype(np.int32)
         board = (column >= -1) & (column < COLUMNS) & (line >= -1) & (line < ROWS)
         light = np.where(board & ((column + line) % 2 == 0), 20.0, 220.0)
-        image[row] = np.rint(light.reshape(WIDTH, 16).mean(axis=1))
+        image[row] = np.rint(light.reshape(WIDTH, 9).mean(axis=1))
     return image
 
 

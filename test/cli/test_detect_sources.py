@@ -19,6 +19,7 @@ from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import make_camera_info
+from rs_localizer.offline import detect as detecting
 
 K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(320, 240, K)
@@ -96,13 +97,14 @@ def test_a_video_has_its_own_times(here, capsys):
     assert "warning: the readout time of 60 ms is longer than the 50 ms from image to im" in said
 
 
-def test_another_board_is_named_after_the_first_images(here, capsys):
-    images = folder(here.path / "images", [board(7, 5)] * 66)
+def test_another_board_is_named_after_the_first_images(here, monkeypatch, capsys):
+    monkeypatch.setattr(detecting, "_PATIENCE", 4)
+    images = folder(here.path / "images", [board(7, 5)] * 6)
     assert detect(here, images, *here.board, "--rate", "30") == 1
     said = capsys.readouterr().err
     shows = r"shows anything of the map \(chessboard 6x4\); they show a chessboard of 7x5 inner"
-    assert re.search(f"note: none of the first 64 images {shows}", said)
-    assert re.search(f"detect: none of the 66 images {shows}", said)
+    assert re.search(f"note: none of the first 4 images {shows}", said)
+    assert re.search(f"detect: none of the 6 images {shows}", said)
     assert not here.out.exists()
 
 

@@ -144,20 +144,6 @@ def in_process(monkeypatch) -> None:
     monkeypatch.setattr(fleet, "perform_all", lambda tasks, where: map_closed(perform, tasks))
 
 
-@pytest.mark.usefixtures("in_process")
-def test_what_one_recording_s_replay_replaces_is_no_result_of_the_fleet(
-    recordings, tmp_path, capsys
-):
-    out = tmp_path / "out"
-    many = ["replay", *recordings[:2], *SHUTTER, "--out", str(out)]
-    assert main(many) == 0
-    alone = ["replay", recordings[0], "-p", "readout_time:=0.01", "--overwrite"]
-    assert main([*alone, "--out", str(out / "a_flight")]) == 0
-    assert not (out / "a_flight" / "log.txt").exists()
-    assert main(many) == 1
-    assert f"{out}/a_flight exists and is no result of replay" in capsys.readouterr().err
-
-
 def test_maps_are_found_from_any_directory(recordings, tmp_path, monkeypatch):
     """A worker of a scheduler has a working directory of its own."""
     seen: list[Path] = []

@@ -21,7 +21,7 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.mapping.gauge import through
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.offline.table import read_parquet
-from rs_localizer.simulation.renderer import ImageSettings
+from rs_localizer.simulation.settings import ImageSettings
 
 pytest.importorskip("pycolmap")
 pytest.importorskip("zarr", reason="needs Zarr (rs_localizer[zarr])")
@@ -30,7 +30,7 @@ READOUT, RATE = 0.03, 12.0
 K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(320, 240, K, readout_time=READOUT)
 WALK = Piece(37.4, 2.2, RATE)
-DEMOS = Piece(37.56, 0.8, RATE), Piece(38.3, 0.8, RATE)
+DEMOS = Piece(37.56, 0.5, RATE), Piece(38.3, 0.5, RATE)
 
 
 def film(room: Room, piece: Piece, path: Path) -> np.ndarray:

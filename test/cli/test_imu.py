@@ -10,16 +10,11 @@ import numpy as np
 import pytest
 
 from rs_localizer.cli.main import main
-from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import BagError, BagWriter, open_bag
+from rs_localizer.io.bags import open_bag
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.recording import write_frame
 from rs_localizer.io.transforms import TransformTree
-from rs_localizer.offline.replay import find_topics
-from rs_localizer.simulation.imu import ImuSettings, make_imu
 
-CAMERA = Camera(640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]))
 TURN = ("--angular-velocity", "0.5", "-1", "2", "--linear-velocity", "0.2", "0", "0")
 CLEAN = (
     "--gyroscope-noise", "0", "--gyroscope-bias", "0", "--gyroscope-bias-walk", "0",
@@ -76,26 +71,3 @@ def test_replay_uses_it_and_says_so(tmp_path, capsys):
     assert main([*replay, "--out", str(tmp_path / "n"), "--imu", "/nowhere"]) == 1
     assert "topic /nowhere does not exist" in capsys.readouterr().err
     assert main([*replay, "--out", str(tmp_path / "n"), "--imu", "/imu", "--no-imu"]) == 2
-
-
-def test_the_topic_is_found_by_its_type(tmp_path):
-    """Named so, else the only one: several that could be meant are none."""
-    settings = ImuSettings()
-    for names, expected in (
-        (("/camera/imu",), "/camera/imu"),
-        (("/mavros/data_raw",), "/mavros/data_raw"),
-        (("/mavros/data", "/mavros/data_raw"), None),
-        (("/mavros/data", "/front/imu"), "/front/imu"),
-        (("/rear/imu", "/front/imu"), None),
-    ):
-        path = tmp_path / "_".join(names).replace("/", "")
-        with BagWriter(path) as writer:
-            for name in names:
-                writer.write(name, make_imu(1, np.zeros(3), np.ones(3), settings), 1)
-            write_frame(writer, CAMERA, 1, np.zeros((1, 3)), np.zeros((1, 2)), np.zeros(1, int))
-        with open_bag(path) as bag:
-            assert find_topics(bag).of.get("imu") == expected
-            assert find_topics(bag, {"imu": names[-1]}).of["imu"] == names[-1]
-            assert "imu" not in find_topics(bag).without("imu").of
-            with pytest.raises(BagError, match="does not exist; topics of type sensor_msgs/msg/Im"):
-                find_topics(bag, {"imu": "/other"})

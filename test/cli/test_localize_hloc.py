@@ -195,16 +195,6 @@ def test_moving_queries_lose_half_of_the_error(tmp_path, capsys):
     assert np.all(np.median(ours, axis=0) < 0.5 * np.median(theirs, axis=0))
 
 
-def test_still_queries_lose_nothing(tmp_path):
-    truth = motions(6, still=True)
-    files = make(tmp_path, truth)
-    assert localize(files, "-p", f"readout_time:={READOUT}") == 0
-    found = read(files.results)
-    ours = [errors(found[name.split("/")[-1]], pose.at(0.0)) for name, pose in truth.items()]
-    theirs = [errors(global_shutter(files, name), pose.at(0.0)) for name, pose in truth.items()]
-    assert np.all(np.median(ours, axis=0) < 1.3 * np.median(theirs, axis=0) + [1e-4, 1e-3])
-
-
 def test_rows_names_and_older_files(tmp_path, capsys):
     truth = motions(2)
     new, old = make(tmp_path / "new", truth), make(tmp_path / "old", truth, old=True)

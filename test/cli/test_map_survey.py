@@ -36,9 +36,8 @@ def picture(turn: np.ndarray, place: np.ndarray) -> np.ndarray:
     for number, (axes, middle) in enumerate(PRINTS):
         side = 8 * CELL
         sheet = np.full((side, side), 235, np.uint8)
-        sheet[CELL:-CELL, CELL:-CELL] = cv2.aruco.generateImageMarker(
-            dictionary, number, 6 * CELL
-        ).clip(25, 235)
+        draw = getattr(cv2.aruco, "generateImageMarker", None) or cv2.aruco.drawMarker  # OpenCV 4.6
+        sheet[CELL:-CELL, CELL:-CELL] = draw(dictionary, number, 6 * CELL).clip(25, 235)
         texel = SIZE / (6 * CELL)
         corner = middle + axes @ (0.5 * (1 - side) * texel * np.array([1.0, -1.0, 0.0]))
         plane = np.column_stack([axes[:, 0] * texel, -axes[:, 1] * texel, corner - place])

@@ -13,9 +13,9 @@ from rs_localizer.cli.main import main
 from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.trajectories import read_tum, read_twists
-from rs_localizer.simulation.frames import FrameSettings
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 
 FRAMES = 6
 # Nanoseconds since 1970 that a float of seconds cannot hold.
@@ -132,17 +132,3 @@ def test_no_frame_localized_is_a_failure(recording, tmp_path, capsys):
     captured = capsys.readouterr()
     assert f"no frame of {bag} was localized" in captured.err
     assert "refused: empty_cloud" in captured.out
-
-
-def test_an_earlier_result_is_not_overwritten_unasked(recording, tmp_path, capsys):
-    out = tmp_path / "out"
-    arguments = ["replay", str(recording), "--out", str(out), *SHUTTER]
-    assert main(arguments) == 0
-    (out / "notes.txt").write_text("mine")
-    before = (out / "poses.txt").read_bytes()
-    assert main([*arguments, "-p", "pose_time:=mid_frame"]) == 1
-    assert f"{out} exists" in capsys.readouterr().err
-    assert (out / "poses.txt").read_bytes() == before
-    assert main([*arguments, "-p", "pose_time:=mid_frame", "--overwrite"]) == 0
-    assert (out / "poses.txt").read_bytes() != before
-    assert (out / "notes.txt").read_text() == "mine"

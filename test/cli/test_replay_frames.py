@@ -14,9 +14,9 @@ from rs_localizer.cli.main import main
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.trajectories import read_tum, read_twists
-from rs_localizer.simulation.frames import FrameSettings
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 
 FRAMES = 5
 EYE = "camera_optical_frame"
@@ -52,27 +52,6 @@ def replayed(bag: Path, out: Path, *settings: str) -> list[tuple[Array, Array, A
     poses, twists = read_tum(out / "poses.txt"), read_twists(out / "twists.txt")
     columns = (poses.positions, poses.quaternions, twists.linear, twists.angular)
     return list(zip(*columns, strict=True))
-
-
-@pytest.mark.parametrize("pose_time", ["stamp", "mid_frame"])
-def test_base_frame(record, tmp_path, pose_time):
-    bag = record(STATIC)
-    mode = ("-p", f"pose_time:={pose_time}")
-    of_camera = replayed(bag, tmp_path / "camera", *mode)
-    of_base = replayed(bag, tmp_path / "base", *mode, "-p", "base_frame:=base_link")
-    assert len(of_camera) == len(of_base) == FRAMES
-    arm = TURN.inv().apply(-LEVER)  # of the base's origin, in camera axes
-    for camera, base in zip(of_camera, of_base, strict=True):
-        map_from_camera = Rotation.from_quat(camera[1])
-        assert np.allclose(base[0], camera[0] + map_from_camera.apply(arm), atol=1e-8)
-        turn = map_from_camera.inv() * Rotation.from_quat(base[1])
-        assert np.allclose(turn.as_matrix(), TURN.inv().as_matrix(), atol=1e-8)
-        assert np.allclose(base[2], TURN.apply(camera[2] + np.cross(camera[3], arm)), atol=1e-8)
-        assert np.allclose(base[3], TURN.apply(camera[3]), atol=1e-8)
-    with open_bag(tmp_path / "base" / "result") as result:
-        for _, _, message in result.messages(["/rs_localizer/odometry"]):
-            assert message.child_frame_id == "base_link"
-        assert "/tf" not in result.topics
 
 
 def test_transforms_come_out(record, tmp_path):

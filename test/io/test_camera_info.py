@@ -60,17 +60,10 @@ def test_binning_and_region(make_camera_info):
     ("changes", "text"),
     [
         ({"k": np.zeros(9)}, r"not calibrated: K\[0\] is 0"),
-        ({"k": np.full(9, np.nan)}, "K must be a finite 3x3 matrix, got .*nan"),
         ({"k": np.ones(6)}, "K must have 9 values, found 6"),
-        ({"k": -K.ravel()}, "not calibrated: focal lengths are -500, -510"),
         ({"width": 0}, "image size must be given, found 0 x 480"),
-        ({"height": 0}, "image size must be given, found 640 x 0"),
         ({"distortion_model": "fisheye624"}, "must be one of plumb_bob, .*; found 'fisheye624'"),
-        ({"distortion_model": "", "d": np.full(5, 0.1)}, "must be one of plumb_bob, .*; found ''"),
-        ({"d": np.zeros(3)}, "plumb_bob takes .* coefficients, got 3"),
-        ({"d": np.full(5, np.inf)}, "D must be finite"),
         ({"roi": roi(600, 0, 100, 480)}, r"100 x 480 at \(600, 0\), does not lie in .*640 x 480"),
-        ({"roi": roi(10, 10, 0, 0)}, r"0 x 0 at \(10, 10\)"),
         ({"header": SimpleNamespace(frame_id="")}, "must name the camera's optical frame"),
     ],
 )

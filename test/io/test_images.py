@@ -101,17 +101,13 @@ def test_yuv():
     ("changes", "text"),
     [
         ({"encoding": "32FC1"}, "the encoding '32FC1' is not supported; supported are mono8"),
-        ({"encoding": ""}, "the encoding '' is not supported"),
         ({"width": 0}, "the image has no pixels: width 0, height 6"),
-        ({"height": 0}, "the image has no pixels: width 8, height 0"),
         ({"step": 7}, "step is 7, too small for 8 pixels of mono8: 8 bytes"),
-        ({"encoding": "bgr8"}, "step is 8, too small for 8 pixels of bgr8: 24 bytes"),
         ({"height": 7}, "truncated: 8 x 7 pixels of mono8 take 56 bytes, found 48"),
         (
             {"height": 2**32 - 1, "width": 2**32 - 1, "step": 2**32 - 1},
             "take 18446744065119617025 bytes, found 48",
         ),
-        ({"data": array.array("B")}, "found 0"),
     ],
 )
 def test_bad_images(changes, text):
@@ -145,9 +141,7 @@ def test_jpeg_and_png():
     ("data", "name", "text"),
     [
         (b"", "jpeg", "neither JPEG nor PNG: its format is 'jpeg' and its 0 bytes start with noth"),
-        (b"\0\0\0\1\x67B", "h264", "its format is 'h264' and its 6 bytes start with 00 00 00 01"),
         (JPEG[: len(JPEG) // 2], "jpeg", "the JPEG image is truncated: its .* no end mark"),
-        (JPEG[:-1], "jpeg", "the JPEG image is truncated"),
         (PNG[: len(PNG) // 2], "png", "the PNG image is truncated"),
         (b"\xff\xd8\xff\xd9", "jpeg", "the JPEG image of 4 bytes cannot be decoded"),
     ],
@@ -228,11 +222,3 @@ def test_planes_of_which_the_first_is_the_brightness(encoding):
     message.height = len(GRAY)
     with pytest.raises(MessageError, match="the data are truncated"):
         read_image(message)
-
-
-def test_planes_are_converted_as_opencv_does():
-    packed = np.random.default_rng(2).integers(0, 256, (9, 8), np.uint8)
-    message = image("nv12", [row.tobytes() for row in packed], 8)
-    message.height = 6
-    expected = cv2.cvtColor(packed, cv2.COLOR_YUV2GRAY_NV12)
-    np.testing.assert_array_equal(read_image(message).pixels, expected)

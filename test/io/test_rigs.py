@@ -184,17 +184,12 @@ def test_a_written_rig_config_comes_back_relative_to_its_first_camera(tmp_path):
     ("text", "reader", "expected"),
     [
         (CHAIN.replace("T_cn_cnm1", "T"), read_camchain, "no usable rig: cam1 has no 'T_cn_cnm1'"),
-        (CHAIN.replace("-0.2]", "-0.2, 1.0]"), read_camchain, "cam1: .*"),
         (CHAIN.replace("[0.0, 1.0, 0.0, 0.0]", "[0.0, -1.0, 0.0, 0.0]"), read_camchain,
          "cam1: T_cn_cnm1 is no rigid transform"),
-        (CHAIN.replace("-0.2, 0.59", "-2.0, 0.59"), read_camchain, "cam1: D of ds must lie within"),
         (CHAIN.replace("camera_model: ds", "camera_model: omni"), read_camchain,
          "cam1: camera_model must be pinhole, eucm or ds, found 'omni'"),
         ("[1, 2]", read_camchain, "a camchain has a mapping for each camera"),
-        ("[]", read_rig_config, "expected a list of one rig with cameras, found 0 rigs"),
         ('[{"cameras": [{"image_prefix": "a/"}]}]', read_rig_config, "the ref_sensor, found 0"),
-        ('[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}, {"image_prefix": "b/"}]}]',
-         read_rig_config, "no 'cam_from_rig_rotation'"),
     ],
 )  # fmt: skip
 def test_faults_are_named(tmp_path, text, reader, expected):

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -20,6 +20,7 @@ pytest.importorskip("telemetry_parser", reason="needs telemetry-parser (rs_local
 from rs_localizer.cli import image_input
 from rs_localizer.cli.main import main
 from rs_localizer.cli.map import build
+from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.telemetry import (
@@ -30,7 +31,6 @@ from rs_localizer.io.telemetry import (
 )
 from rs_localizer.settings import load_params_file
 
-SAMPLES = os.environ.get("RS_LOCALIZER_SAMPLES", "")
 RATE = 200.0
 
 
@@ -69,6 +69,45 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         read_telemetry(path)
     path.write_bytes(bytes(2**20))
     assert not has_telemetry(path)
+
+
+PROFILE = {  # as telemetry-parser makes them of DJI's files; there they name no model
+    "calibrated_by": "DJI",
+    "calib_dimension": {"w": 160, "h": 120},
+    "fisheye_params": {
+        "camera_matrix": [[70.0, 0.0, 80.0], [0.0, 70.0, 60.0], [0.0, 0.0, 1.0]],
+        "distortion_coeffs": [0.1, -0.02, 0.01, 0.001],
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("model", "known"), [({}, True), ({"distortion_model": "insta360"}, False)]
+)
+def test_lens_profiles(log: Path, monkeypatch: Any, model: dict[str, str], known: bool) -> None:
+    import telemetry_parser
+
+    real = telemetry_parser.Parser
+    tags = [{"Lens": {"Data": PROFILE | model}}]
+    parser = SimpleNamespace(
+        camera="DJI", model="Action 4", normalized_imu=real(str(log)).normalized_imu
+    )
+    parser.telemetry = lambda readable: tags
+    monkeypatch.setattr(telemetry_parser, "Parser", lambda path: parser)
+    read_telemetry.cache_clear()
+    found = read_telemetry(log)
+    read_telemetry.cache_clear()
+    assert found is not None
+    name = model.get("distortion_model", "opencv_fisheye")
+    assert found.lens == f"lens profile by DJI ({name}, 70 px)"
+    assert (found.profile is not None) == known
+    if found.profile is not None:
+        points = np.array([[[0.5, -0.3, 1.0], [-2.0, 1.0, 1.5]]])
+        K, D = (
+            np.array(PROFILE["fisheye_params"][k]) for k in ("camera_matrix", "distortion_coeffs")
+        )
+        pixels, _ = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, D)
+        np.testing.assert_allclose(found.profile.project(points[0]), pixels[0], atol=1e-9)
 
 
 @pytest.fixture
@@ -151,6 +190,24 @@ def test_what_is_given_goes_before(
         assert "/imu" not in bag.topics
 
 
+def test_a_lens_profile_takes_the_place_of_a_calibration(
+    video: Path, telemetry: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lens = Camera(160, 120, [[140.0, 0, 80], [0, 140, 60], [0, 0, 1]], np.zeros(4), "equidistant")
+    telemetry(lens="lens profile by DJI (opencv_fisheye, 140 px)", profile=lens)
+    out = video.parent / "seen"
+    words = ["detect", str(video), "--features", "orb", "--out", str(out)]
+    assert main(words) == 0
+    assert "lens profile by DJI (opencv_fisheye, 140 px), used;" in capsys.readouterr().out
+    with open_bag(out) as bag:
+        info = next(message for _, _, message in bag.messages(["/camera_info"]))
+    assert (info.distortion_model, info.k[0]) == ("equidistant", 140.0)
+    detect(video)
+    assert "140 px), not used;" in capsys.readouterr().out
+    with open_bag(out) as bag:
+        assert next(m for _, _, m in bag.messages(["/camera_info"])).k[0] == 150.0
+
+
 def test_a_stabilized_video_is_named(
     video: Path, telemetry: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -175,51 +232,3 @@ def test_maps_take_the_gyroscope_of_a_video(video: Path, telemetry: Any) -> None
     assert imu.recording.stamps_ns[0] == 10**9
     assert build.shutter_of(given).readout_time == pytest.approx(0.0205)
     assert build.imu_of(parser.parse_args([str(video), "--out", "map", "--no-telemetry"])) is None
-
-
-@pytest.mark.skipif(not SAMPLES, reason="RS_LOCALIZER_SAMPLES: karma.mp4 and max-heromode.mp4 of "
-                    "gopro/gpmf-parser, which are not ours to give away")  # fmt: skip
-def test_real_videos() -> None:
-    found = read_telemetry(Path(SAMPLES) / "karma.mp4")
-    assert found is not None
-    assert (found.camera, found.stabilizer) == ("GoPro HERO5 Black", "")
-    assert found.rate == pytest.approx(397.5, abs=0.5)
-    np.testing.assert_allclose(np.median(found.forces, axis=0), [0, -9.8, 0], atol=0.25)
-    times, turns = image_turns(Path(SAMPLES) / "karma.mp4")
-    smooth = [np.convolve(column, np.ones(13) / 13, "same") for column in found.rates.T]
-    felt = np.stack([np.interp(times, found.times, column) for column in smooth], axis=1)
-    # Its gimbal leaves a turn about the vertical.
-    assert np.corrcoef(turns[:, 1], felt[:, 1])[0, 1] > 0.95
-    other = read_telemetry(Path(SAMPLES) / "max-heromode.mp4")
-    assert other is not None
-    assert other.readout_time == pytest.approx(0.0206, abs=1e-4)
-    assert other.stabilizer == "HS HLevel"
-
-
-def image_turns(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) between images, and how a camera that only turns would do it there (n,3)."""
-    film, last, times, turns = cv2.VideoCapture(str(path)), None, [], []
-    while True:
-        more, image = film.read()
-        if not more:
-            return np.array(times), np.array(turns)
-        now = 1e-3 * film.get(cv2.CAP_PROP_POS_MSEC)
-        gray = cv2.cvtColor(cv2.resize(image, (480, 270)), cv2.COLOR_BGR2GRAY)
-        if last is not None:
-            points = cv2.goodFeaturesToTrack(last[1], 150, 0.01, 12)
-            moved, kept, _ = cv2.calcOpticalFlowPyrLK(last[1], gray, points, None)
-            before, after = points[kept == 1], moved[kept == 1]
-            focal = 0.65 * 480  # about that of a HERO5
-            x, y = ((before - (240.0, 135.0)) / focal).T
-            rows = np.empty((2 * len(x), 3))
-            rows[0::2] = np.c_[x * y, -(1 + x * x), y]
-            rows[1::2] = np.c_[1 + y * y, -x * y, -x]
-            flow = ((after - before) / focal).ravel()
-            fit = np.ones(len(flow), bool)
-            for _ in range(4):
-                turn = np.linalg.lstsq(rows[fit], flow[fit], rcond=None)[0]
-                errors = np.abs(rows @ turn - flow)
-                fit = errors < 3 * np.median(errors) + 1e-6
-            times.append(0.5 * (now + last[0]))
-            turns.append(turn / (now - last[0]))
-        last = now, gray

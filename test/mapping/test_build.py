@@ -33,7 +33,8 @@ from rs_localizer.mapping.inertial_metres import InertialPlace, inertial_metres
 from rs_localizer.mapping.report import written
 from rs_localizer.mapping.views import View
 from rs_localizer.simulation.frames import middle_stamp
-from rs_localizer.simulation.renderer import ImageSettings, Renderer
+from rs_localizer.simulation.renderer import Renderer
+from rs_localizer.simulation.settings import ImageSettings
 
 pytest.importorskip("pycolmap")
 

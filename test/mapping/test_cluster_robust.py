@@ -44,7 +44,7 @@ def test_what_errors_pull_at_landmarks_is_their_long_run_variance(share):
     pull = pull_at_landmarks(
         np.concatenate([own, left[..., None]], axis=2), landmarks, times, np.zeros(LANDMARKS)
     )
-    assert pull.found / pull.expected == pytest.approx((1.0 + share) / (1.0 - share), rel=0.2)
+    assert pull.measured / pull.expected == pytest.approx((1.0 + share) / (1.0 - share), rel=0.2)
 
 
 def surveyed(share: float) -> Survey:

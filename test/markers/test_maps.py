@@ -100,23 +100,15 @@ CORNERS = [[0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]]
     [
         (MARKER | {"family": "4x4_51"}, "unknown family '4x4_51'; did you mean 4x4_50?"),
         (MARKER | {"id": 50}, r"marker 1 \(4x4_50 50\): 4x4_50 has the ids 0 to 49, found 50"),
-        (MARKER | {"size": 0}, "size must be a length in metres above 0, found 0"),
         (MARKER | {"size": "big"}, "size cannot be 'big'"),
-        (MARKER | {"position": [0, 0]}, "position must have 3 values"),
         (MARKER | {"position": [0, 0, float("nan")]}, "position must be finite"),
-        (MARKER | {"quaternion": [0, 0, 0, 0]}, "quaternion .* must have the length 1, found 0"),
         (MARKER | {"rotation": np.eye(3).tolist()}, "both a rotation and a quaternion"),
-        (MARKER | {"colour": "red"}, "unknown colour"),
         ({"family": "4x4_50"}, "marker 1 has no id; it has nothing else"),
-        ({"family": "4x4_50", "id": 1, "size": 1}, "has no position"),
-        ("4x4_50", "marker 1 must be a mapping, found '4x4_50'"),
         (PLAIN | {"rotation": np.diag([-1.0, 1.0, 1.0]).tolist()}, "the rotation mirrors"),
-        ({"family": "4x4_50", "id": 1, "corners": CORNERS[:3]}, "corners must have 4 x 3 values"),
         (
             {"family": "4x4_50", "id": 1, "corners": [CORNERS[k] for k in (0, 2, 1, 3)]},
             "the corners are not a square in the order top left, top right",
         ),
-        ({"family": "4x4_50", "id": 1, "corners": CORNERS, "size": 0.5}, "1 m apart, but size is"),
     ],
 )
 def test_faults_of_markers(tmp_path, entry, text):
@@ -150,8 +142,6 @@ def test_points_of_a_board_are_known_as_paper_is_unless_its_file_says_better(tmp
     [
         ({"map_frame": "map", "markers": []}, "neither markers nor boards"),
         ({"markers": [MARKER]}, "the map has no map_frame"),
-        ({"map_frame": "", "markers": [MARKER]}, "map_frame is empty"),
-        ({"map_frame": "/map", "markers": [MARKER]}, "map_frame must not start with '/'"),
         ({"map_frame": "map", "markers": [MARKER, MARKER]}, "marker 4x4_50 3 is there twice"),
         # The small dictionaries are the beginning of the large ones.
         (
@@ -159,14 +149,9 @@ def test_points_of_a_board_are_known_as_paper_is_unless_its_file_says_better(tmp
             "there twice: as marker 4x4_50 3 and as marker 4x4_1000 3",
         ),
         (
-            {"map_frame": "map", "markers": [MARKER | {"family": "5x5_50"}], "boards": [CHARUCO]},
-            "there twice: as marker 5x5_50 3 and as charuco 3x4 of 5x5_100",
-        ),
-        (
             {"map_frame": "map", "boards": [CHESSBOARD, CHESSBOARD]},
             "2 boards without markers .*, which cannot be told apart",
         ),
-        ([1, 2], "the map must be a mapping"),
     ],
 )
 def test_faults_of_maps(tmp_path, tree, text):

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.markers.detection import Detections, Seen
+from rs_localizer.markers.detection import Detections, MarkerQuads
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.overlay import CameraPath, draw_world
 
@@ -39,7 +39,7 @@ def rolling(point: Any, late: float = 0.0) -> Any:
 def detections() -> Detections:
     quads = np.array([[rolling(corner) for corner in marker.corners] for marker in MAP.markers])
     true = np.ones((2, 4), bool)
-    seen = Seen(MAP.markers[0].family, np.arange(2), quads, true, true[:, 0])
+    seen = MarkerQuads(MAP.markers[0].family, np.arange(2), quads, true, true[:, 0])
     pixels = quads.reshape(-1, 2)
     return Detections(np.arange(8), MAP.points, pixels, np.ones(8), (seen,), (), (), ())
 

@@ -17,7 +17,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-pytest.importorskip("pyarrow", reason="needs pyarrow (rs_localizer[table])")
+pytest.importorskip(  # of today, which NumPy 1.26 cannot import
+    "pyarrow", reason="needs pyarrow (rs_localizer[table])", exc_type=ImportError
+)
 pytest.importorskip("fsspec", reason="needs fsspec (rs_localizer[table])")
 
 import fsspec
@@ -127,15 +129,12 @@ def test_the_same_bytes_from_one_process_from_dask_and_after_a_kill(
     flights: list[Path], tmp_path: Path
 ) -> None:
     distributed = pytest.importorskip("distributed", reason="needs Dask")
-    one, fleet, killed, cluster = (tmp_path / f"{name}.parquet" for name in "abcd")
+    one, killed, cluster = (tmp_path / f"{name}.parquet" for name in "abc")
     given = pickle.dumps((rsl.localize_recording, flights, SETTINGS, one))
     words = [sys.executable, "-c", _ALONE]
     done = subprocess.run(words, input=given, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
-    # The command, by two workers.
-    batch = [*flights, "--out", tmp_path / "two", "--workers", "2", "--parquet", fleet]
-    assert replay(batch).returncode == 0
-    # The command, killed as soon as some recordings are done, then again.
+    # The command, killed as soon as some recordings are done, then again by two workers.
     batch = [*flights, "--out", tmp_path / "half", "--workers", "1", "--parquet", killed]
     command = [sys.executable, "-m", "rs_localizer", "replay", *map(str, batch), *SHUTTER]
     with subprocess.Popen(
@@ -146,6 +145,7 @@ def test_the_same_bytes_from_one_process_from_dask_and_after_a_kill(
             time.sleep(0.01)
         os.killpg(process.pid, signal.SIGKILL)
     assert not killed.exists()
+    batch[batch.index("1")] = "2"
     again = replay(batch)
     assert again.returncode == 0
     assert "have been done before" in again.stdout
@@ -162,7 +162,7 @@ def test_the_same_bytes_from_one_process_from_dask_and_after_a_kill(
         write_parquet((future.result() for future in futures), cluster)
     assert one.read_bytes().startswith(b"PAR1")
     assert read_parquet(one).num_rows > 3 * 5
-    for other in (fleet, killed, cluster):
+    for other in (killed, cluster):
         assert other.read_bytes() == one.read_bytes()
 
 

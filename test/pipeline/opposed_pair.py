@@ -15,7 +15,6 @@ from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.rigs import RigParts
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import write_parameters
-from rs_localizer.simulation.frames import FrameSettings
 from rs_localizer.simulation.rig import (
     RigFrame,
     camera_stamps,
@@ -25,6 +24,7 @@ from rs_localizer.simulation.rig import (
     write_rig_frame,
 )
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
 
 K = np.array([[450.0, 0.0, 319.5], [0.0, 450.0, 239.5], [0.0, 0.0, 1.0]])

@@ -6,7 +6,6 @@ The chain is of 4x4 matrices, from the map to the body; velocities are differenc
 covariances come from differences of it and from a Monte Carlo simulation.
 """
 
-import dataclasses
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -23,12 +22,11 @@ from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.outputs import Localized, Pose, Twist, messages
-from rs_localizer.io.transforms import Transform, TransformError, TransformTree
+from rs_localizer.io.outputs import Localized, messages
+from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.published import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.refusal import Refusal
 
 READOUT_TIME = 0.03
@@ -315,38 +313,6 @@ def test_a_camera_on_a_moving_head(localize, robot, pose_time):
     assert isinstance(refused, Refusal)
     assert refused.reason == "no_transform"
     assert "'mast' is known from 4.975 s to 5.145 s, not at 5.155 s" in refused.detail
-
-
-def test_laws():
-    rng = np.random.default_rng(5)
-
-    def transform() -> Transform:
-        return Transform(Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
-
-    def mounted(pose: Pose, twist: Twist, by: Transform) -> tuple[Pose, Twist]:
-        tree = TransformTree()
-        tree.add(tf("a", "b", matrix(by.translation, by.rotation)), static=True)
-        mounting = find_mounting(tree, "a", "b", None, 0)
-        return base_pose(pose, mounting), base_twist(twist, mounting)
-
-    def same(a: Any, b: Any) -> bool:
-        return all(
-            np.allclose(getattr(a, item.name), getattr(b, item.name), atol=1e-12)
-            for item in dataclasses.fields(a)
-        )
-
-    root = rng.normal(size=(6, 6))
-    pose = Pose(rng.normal(size=3), transform().rotation, root @ root.T)
-    twist = Twist(rng.normal(size=3), rng.normal(size=3), root.T @ root)
-    assert same(mounted(pose, twist, Transform(np.eye(3), np.zeros(3)))[0], pose)
-    first, second = transform(), transform()
-    there = mounted(pose, twist, first)
-    at_once, one_by_one = mounted(pose, twist, first @ second), mounted(*there, second)
-    back = mounted(*there, first.inverse())
-    for index, original in enumerate((pose, twist)):
-        assert same(at_once[index], one_by_one[index])
-        assert same(back[index], original)
-        assert not same(there[index], original)
 
 
 def test_a_missing_transform_refuses_the_frame_only(localize):

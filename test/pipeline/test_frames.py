@@ -28,8 +28,9 @@ from rs_localizer.io.recording import make_camera_info
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.frames import simulate_frames
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 FIELDS = [(name, 8 * i, 8) for i, name in enumerate("xyzuv")]

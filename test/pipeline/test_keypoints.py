@@ -20,8 +20,9 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03

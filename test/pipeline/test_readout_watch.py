@@ -24,8 +24,9 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.offline.replay import find_topics, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.frames import simulate_frames
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 
 READOUT = 0.02
@@ -207,7 +208,7 @@ def sideways(count: int, **settings: Any) -> tuple[FrameLocalizer, list[str], li
     return frames, notices, [bool(result) for result in results]
 
 
-@pytest.mark.parametrize("tracking", [True, False])
+@pytest.mark.parametrize("tracking", [True, pytest.param(False, marks=pytest.mark.bench)])
 def test_the_wrong_axis_is_named_and_no_pose_comes_of_it(tracking):
     # Before: more than half of the frames had poses 0.5 to 2.5 degrees off, all beyond 5 sigma,
     # and the advice was to calibrate again, or that the shutter is a global one.

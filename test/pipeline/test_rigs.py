@@ -16,6 +16,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import prepare, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.rig_watch import RigWatch
 from rs_localizer.settings import build, load_params_file
 
 from .opposed_pair import PARTS, hand, record, rich
@@ -216,3 +217,16 @@ def test_cameras_do_not_go_with_what_is_of_one():
     with pytest.raises(ValueError, match=r"rear\.readout_time: no such camera; cameras names left"):
         build({"cameras": ["left"], "readout_time": 0.03, "rear.readout_time": 0.02})
     assert not NodeConfig().is_rig
+
+
+def test_a_fault_of_the_reference_ends_when_all_agree_again():
+    config = build({"cameras": ["left", "right", "rear"], "readout_time": 0.03})
+    watch = RigWatch(config, lambda *_: None)
+    for position in (0.1, 0.0):  # m, of both beside the first one
+        for name, fit in watch._fits.items():
+            fit.count, fit.covariance = 30, np.eye(7) * 1e-6
+            fit.mean = np.r_[position, np.zeros(6)]
+            watch._conclude(name, fit)
+        if position:
+            assert "of left relative to the others" in watch.faults["extrinsics"]
+    assert not watch.faults

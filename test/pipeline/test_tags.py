@@ -103,7 +103,7 @@ def test_pixels_and_corners_are_those_of_our_own_detector(walls: Path) -> None:
         found = read_detections(message)
         (seen,) = (item for item in ours.detect(image).markers if "36h11" in item.family.name)
         known = dict(zip(found.ids.tolist(), found.corners, strict=True))
-        for number, quad, exact in zip(seen.ids.tolist(), seen.quads, seen.found, strict=True):
+        for number, quad, exact in zip(seen.ids.tolist(), seen.quads, seen.exact, strict=True):
             if number in known and exact.all():
                 offsets.append(known[number] - quad)
     assert len(offsets) > 20
@@ -191,9 +191,7 @@ def test_both_messages_are_read_by_their_fields(walls: Path, kind: str) -> None:
     ("order", "named"),
     [
         ([3, 2, 1, 0], "upper left, upper right, lower right, lower left"),
-        ([1, 2, 3, 0], "lower right, upper right, upper left, lower left"),
         ([2, 3, 0, 1], "upper right, upper left, lower left, lower right"),
-        ([0, 3, 2, 1], "lower left, upper left, upper right, lower right"),
     ],
 )
 def test_another_order_of_corners_is_named(walls: Path, order: list[int], named: str) -> None:

@@ -341,7 +341,7 @@ def test_nav2_manages_the_node():
     assert (config.autostart, config.publish_tf) == (False, "map_to_odom")
     manager = yaml.safe_load(file.read_text())["/**/lifecycle_manager_localization"]
     assert NODE_NAME in manager["ros__parameters"]["node_names"]
-    assert manager["ros__parameters"]["bond_timeout"] == 0.0  # a Python node has none
+    assert manager["ros__parameters"]["bond_timeout"] == config.bond_heartbeat_period == 0.0
 
 
 def test_robot_localization_listens_to_what_the_node_publishes():

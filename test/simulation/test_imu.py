@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer import data
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.imu import ImuSettings, Lever, simulate_imu
+from rs_localizer.simulation.imu import Lever, simulate_imu
+from rs_localizer.simulation.settings import ImuSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity, RecordedMotion, Shaken, shaken
 
 PERFECT = ImuSettings(2000.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated frames: every point where its own row sees it, noise and outliers as ordered."""
 
-import cv2
 import numpy as np
 import pytest
 
@@ -10,13 +9,9 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import Trajectory
-from rs_localizer.simulation.frames import (
-    FrameSettings,
-    SimulatedFrame,
-    frame_stamps,
-    simulate_frames,
-)
+from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
 from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
@@ -63,21 +58,6 @@ def test_each_point_is_seen_at_the_time_of_its_row(direction):
         local = np.einsum("nji,nj->ni", state.rotations, frame.points - state.positions)
         np.testing.assert_allclose(u, 400 * local[:, 0] / local[:, 2] + 319.5, atol=1e-6)
         np.testing.assert_allclose(v, 410 * local[:, 1] / local[:, 2] + 239.5, atol=1e-6)
-
-
-@pytest.mark.parametrize("lens", LENSES)
-def test_distortion_is_that_of_opencv(lens):
-    model, coefficients = LENSES[lens]
-    for frame in frames(lens=lens)[::10]:
-        assert len(frame.points) == 100
-        state = MOTION.state(frame.stamp_ns, 0.03 * frame.pixels[:, 1] / 479)
-        local = np.einsum("nji,nj->ni", state.rotations, frame.points - state.positions)
-        zero, D = np.zeros((3, 1)), np.array(coefficients)
-        if model == DistortionModel.EQUIDISTANT:
-            expected = cv2.fisheye.projectPoints(local[:, None], zero, zero, K, D)[0]
-        else:
-            expected = cv2.projectPoints(local[:, None], zero, zero, K, D)[0]
-        np.testing.assert_allclose(frame.pixels, expected[:, 0], atol=1e-5)
 
 
 def test_points_that_a_lens_folds_back_are_not_seen():

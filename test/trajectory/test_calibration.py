@@ -15,7 +15,7 @@ from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import Calibration, calibrate, discrepancy, examine
 from rs_localizer.trajectory.first_lens import first_lens
 from rs_localizer.trajectory.lens import lens_difference
-from rs_localizer.trajectory.observe import Observed, in_order
+from rs_localizer.trajectory.observe import Observed
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 
@@ -170,19 +170,6 @@ def test_a_bent_board_is_found_and_its_lens_with_it():
     off = lens_difference(CAMERA, found.fit.camera)
     for error, deviation in zip(off, found.lens, strict=True):
         assert error < 4.0 * deviation
-
-
-def test_a_lens_from_nothing():
-    images = list(recording(0.02, seconds=3.0, turn=0.15))
-    camera = first_lens((projector.WIDTH, projector.HEIGHT), in_order(images))
-    assert camera.K[0, 0] == pytest.approx(projector.FOCAL, rel=0.3)
-    found = calibrate(camera, images, intrinsics=True)
-    agrees(found, 0.02, 2e-4)
-    lens = np.array(found.fit.state.lens)
-    deviations = np.sqrt(np.diag(found.fit.border_covariance)[1:5])
-    truth = projector.K[[0, 1, 0, 1], [0, 1, 2, 2]]
-    assert np.all(np.abs(lens[:4] - truth) < 5.0 * deviations)
-    assert lens[0] == pytest.approx(projector.FOCAL, rel=0.01)
 
 
 @pytest.mark.parametrize("model", ["equidistant", "plumb_bob"])

@@ -6,10 +6,10 @@ from __future__ import annotations
 
 import argparse
 import importlib
-from types import ModuleType
 
-# Each module offers ``add_arguments(parser)`` and ``run(arguments)``. All are imported for the
-# help: what only its work needs is imported late.
+from rs_localizer.cli import LateParser, add_common
+
+# Each module offers ``add_arguments(parser)`` and ``run(arguments)``.
 ACTIONS = {
     "build": "make a map from images",
     "info": "describe a map",
@@ -21,15 +21,14 @@ ACTIONS = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    actions = parser.add_subparsers(
+        dest="action", required=True, metavar="ACTION", parser_class=LateParser
+    )
     for name, summary in ACTIONS.items():
         action = actions.add_parser(name, help=summary, allow_abbrev=False)
-        _module(name).add_arguments(action)
+        add_common(action)
+        action.come_from(f"{__name__}.{name}")
 
 
 def run(args: argparse.Namespace) -> object:
-    return _module(args.action).run(args)
-
-
-def _module(action: str) -> ModuleType:
-    return importlib.import_module(f"{__name__}.{action}")
+    return importlib.import_module(f"{__name__}.{args.action}").run(args)

@@ -10,15 +10,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import WORKING, UsageError
 from rs_localizer.cli.map import either
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.mapping.gauge import Similarity, upright
-from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Marker
 from rs_localizer.process.arguments import number
+
+if WORKING:
+    from rs_localizer.io.maps.landmarks import Map
+    from rs_localizer.mapping.gauge import Similarity, upright
+    from rs_localizer.markers.maps import MarkerMap
+    from rs_localizer.markers.poses import Pose
+    from rs_localizer.markers.prints import Marker
 
 _LEAST_FLOOR = 3  # points make a plane
 # A floor whose points lie within this part of their extent of a line has no direction.

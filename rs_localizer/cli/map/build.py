@@ -11,10 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError, add_overwrite, replaced, stage
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced, stage
 from rs_localizer.cli.image_input import (
     add_source_arguments,
     opened,
@@ -25,35 +22,39 @@ from rs_localizer.cli.image_input import (
     time_faults,
     video_imu,
 )
-from rs_localizer.cli.marker_map import read_checked_map
 from rs_localizer.config import FeatureConfig
-from rs_localizer.core.camera import Camera
-from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.evaluation.map_pictures import save_pictures
-from rs_localizer.io.atomic_files import atomic_directory
-from rs_localizer.io.bags import is_bag, open_bag
-from rs_localizer.io.calibration import write_calibration
-from rs_localizer.io.image_clock import DEFAULT_START_NS
-from rs_localizer.io.images import Image
-from rs_localizer.io.imu import read_imu_csv
-from rs_localizer.io.maps.npz import write_npz
-from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
-from rs_localizer.io.topics import IMU
-from rs_localizer.io.trajectories import Trajectory, write_tum
-from rs_localizer.mapping.anchors import Anchors, Distance, PointSight
-from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_features
-from rs_localizer.mapping.colmap import Effort, require
-from rs_localizer.mapping.inertial_metres import GivenImu
-from rs_localizer.mapping.report import advice, rows, written
-from rs_localizer.mapping.views import Looker, View
-from rs_localizer.offline.detect import Cameras
-from rs_localizer.offline.image_sources import Carried
-from rs_localizer.offline.recordings import RecordingError, optical_frame, read_imu_recording
-from rs_localizer.offline.replay import imu_topics
-from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.process.arguments import integer, number
-from rs_localizer.settings import build, write_parameters
-from rs_localizer.trajectory.imu import ImuRecording
+
+if WORKING:
+    import numpy as np
+    from tqdm import tqdm
+
+    from rs_localizer.cli.marker_map import read_checked_map
+    from rs_localizer.core.camera import Camera
+    from rs_localizer.core.scanning import ScanDirection
+    from rs_localizer.io.atomic_files import atomic_directory
+    from rs_localizer.io.bags import is_bag, open_bag
+    from rs_localizer.io.calibration import write_calibration
+    from rs_localizer.io.image_clock import DEFAULT_START_NS
+    from rs_localizer.io.images import Image
+    from rs_localizer.io.imu import read_imu_csv
+    from rs_localizer.io.maps.npz import write_npz
+    from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
+    from rs_localizer.io.topics import IMU
+    from rs_localizer.io.trajectories import Trajectory, write_tum
+    from rs_localizer.mapping.anchors import Anchors, Distance, PointSight
+    from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_features
+    from rs_localizer.mapping.colmap import Effort, require
+    from rs_localizer.mapping.inertial_metres import GivenImu
+    from rs_localizer.mapping.report import advice, rows, written
+    from rs_localizer.mapping.views import Looker, View
+    from rs_localizer.offline.detect import Cameras
+    from rs_localizer.offline.image_sources import Carried
+    from rs_localizer.offline.recordings import RecordingError, optical_frame, read_imu_recording
+    from rs_localizer.offline.replay import imu_topics
+    from rs_localizer.pipeline.refusal import Refusal
+    from rs_localizer.settings import build, write_parameters
+    from rs_localizer.trajectory.imu import ImuRecording
 
 # After so many, images without features are refused: two seconds of a usual video.
 _EARLY_VIEWS = 30
@@ -277,7 +278,7 @@ def run(args: argparse.Namespace) -> None:
     if not args.images.exists():
         raise ValueError(f"{args.images} does not exist")
     markers = None if args.markers is None else read_checked_map(args.markers)
-    tell_telemetry(args)
+    tell_telemetry(args, lens=False)
     shutter, imu = shutter_of(args), imu_of(args)
     with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
@@ -321,6 +322,8 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
     if looked.camera is None:
         write_calibration(out / CAMERA, replace(built.camera, readout_time=0.0))
+    from rs_localizer.evaluation.map_pictures import save_pictures
+
     save_pictures(built, out)
     (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")
 

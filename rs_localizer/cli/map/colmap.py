@@ -8,22 +8,24 @@ import argparse
 import re
 from pathlib import Path
 
-import cv2
-import numpy as np
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError, replaced
-from rs_localizer.cli.map import contradiction
+from rs_localizer.cli import WORKING, UsageError, replaced
 from rs_localizer.cli.settings_args import given_values, row_time
-from rs_localizer.io.atomic_files import atomic_directory
-from rs_localizer.io.calibration import read_calibration
-from rs_localizer.io.maps.colmap import read_camera, read_images, read_model, write_model
-from rs_localizer.io.maps.landmarks import MapError
-from rs_localizer.mapping.global_shutter import GlobalShutterModel, Shutter, undo_shutter
-from rs_localizer.offline.image_sources import have_times
-from rs_localizer.offline.rectified import map_depths, motion_between, rectified
 from rs_localizer.process.arguments import number
-from rs_localizer.settings import build
+
+if WORKING:
+    import cv2
+    import numpy as np
+    from tqdm import tqdm
+
+    from rs_localizer.cli.map import contradiction
+    from rs_localizer.io.atomic_files import atomic_directory
+    from rs_localizer.io.calibration import read_calibration
+    from rs_localizer.io.maps.colmap import read_camera, read_images, read_model, write_model
+    from rs_localizer.io.maps.landmarks import MapError
+    from rs_localizer.mapping.global_shutter import GlobalShutterModel, Shutter, undo_shutter
+    from rs_localizer.offline.image_sources import have_times
+    from rs_localizer.offline.rectified import map_depths, motion_between, rectified
+    from rs_localizer.settings import build
 
 _LIST, _IMAGES = "images.txt", "images"
 _NUMBER = re.compile(r"\d+")

@@ -6,7 +6,10 @@ from __future__ import annotations
 
 import argparse
 
-from rs_localizer.mapping.readout_check import ReadoutCheck
+from rs_localizer.cli import WORKING
+
+if WORKING:
+    from rs_localizer.mapping.readout_check import ReadoutCheck
 
 _KEEP = "--keep-readout-time"
 

@@ -7,14 +7,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
-
-from rs_localizer.cli import UsageError, refuse_existing
-from rs_localizer.io.atomic_files import atomic_files
+from rs_localizer.cli import WORKING, UsageError, refuse_existing
 from rs_localizer.io.maps.files import WRITERS, read_map_file
-from rs_localizer.io.maps.landmarks import Map, make_map
-from rs_localizer.io.maps.ply import write_ply
-from rs_localizer.markers.families import family
 from rs_localizer.markers.formats import (
     FORMATS,
     OWN,
@@ -25,8 +19,16 @@ from rs_localizer.markers.formats import (
     read_any,
     write_any,
 )
-from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.process.arguments import number
+
+if WORKING:
+    import numpy as np
+
+    from rs_localizer.io.atomic_files import atomic_files
+    from rs_localizer.io.maps.landmarks import Map, make_map
+    from rs_localizer.io.maps.ply import write_ply
+    from rs_localizer.markers.families import family
+    from rs_localizer.markers.maps import MarkerMap
 
 _KINDS = (
     "landmarks: a .npz or .ply file or a folder of COLMAP; markers: a .yaml or .json file of "

@@ -8,12 +8,15 @@ import argparse
 from collections import Counter
 from pathlib import Path
 
-import numpy as np
-
+from rs_localizer.cli import WORKING
 from rs_localizer.cli.map import either
-from rs_localizer.core.arrays import Array
-from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.markers.maps import MarkerMap
+
+if WORKING:
+    import numpy as np
+
+    from rs_localizer.core.arrays import Array
+    from rs_localizer.io.maps.landmarks import Map
+    from rs_localizer.markers.maps import MarkerMap
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

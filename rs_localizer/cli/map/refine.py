@@ -8,25 +8,33 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError, refuse_existing
+from rs_localizer.cli import WORKING, UsageError, refuse_existing
 from rs_localizer.cli.map import colmap, contradiction
-from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
-from rs_localizer.io.atomic_files import atomic_files
-from rs_localizer.io.bags import open_bag
-from rs_localizer.io.calibration import read_calibration, write_calibration
+from rs_localizer.cli.settings_args import (
+    add_settings,
+    add_topics,
+    given_settings,
+    given_topics,
+    one_camera,
+)
 from rs_localizer.io.maps.files import WRITERS, read_map_file
-from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.topics import IMU
-from rs_localizer.mapping.observations import RecordedMap, from_recording
-from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
-from rs_localizer.offline.recordings import Recorded, read_recording
-from rs_localizer.offline.replay import find_topics
 from rs_localizer.process.arguments import number
+
+if WORKING:
+    import numpy as np
+    from tqdm import tqdm
+
+    from rs_localizer.core.arrays import Array
+    from rs_localizer.core.camera import Camera
+    from rs_localizer.io.atomic_files import atomic_files
+    from rs_localizer.io.bags import open_bag
+    from rs_localizer.io.calibration import read_calibration, write_calibration
+    from rs_localizer.io.maps.landmarks import Map
+    from rs_localizer.mapping.observations import RecordedMap, from_recording
+    from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
+    from rs_localizer.offline.recordings import Recorded, read_recording
+    from rs_localizer.offline.replay import find_topics
 
 _GIVEN, _ESTIMATED, _GLOBAL = "given", "estimated", "global"
 _HOLD = 0.001
@@ -90,7 +98,7 @@ def run(args: argparse.Namespace) -> None:
         raise UsageError("give RECORDING and --out OUT, or --colmap IN OUT")
     if args.out.suffix not in WRITERS:
         raise UsageError(f"--out must end in {' or '.join(WRITERS)}, got {args.out}")
-    config = given_settings(args)
+    config = given_settings(args, check=one_camera)
     refuse_existing(args)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     with open_bag(args.recording) as bag:

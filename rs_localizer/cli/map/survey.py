@@ -8,28 +8,30 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from tqdm import tqdm
-
-from rs_localizer.cli import UsageError, refuse_existing
-from rs_localizer.cli.image_input import opened, tell_times
+from rs_localizer.cli import WORKING, UsageError, refuse_existing
 from rs_localizer.cli.map import contradiction
-from rs_localizer.cli.settings_args import add_settings, given_settings
-from rs_localizer.config import NodeConfig
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
-from rs_localizer.io.atomic_files import atomic_files
-from rs_localizer.io.camera_info import Calibration, read_camera_info
-from rs_localizer.io.images import Image
-from rs_localizer.mapping.survey import Survey, survey
-from rs_localizer.mapping.unknown_markers import LEAST_SIDE, Spotted, Spotter, every_marker
-from rs_localizer.markers.consistency import problems
-from rs_localizer.markers.families import FAMILIES, Family, family
-from rs_localizer.markers.map_files import write_marker_map
-from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.prints import Marker
-from rs_localizer.offline.image_sources import Carried
+from rs_localizer.cli.settings_args import add_settings, given_settings, one_camera
+from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family, family
 from rs_localizer.process.arguments import number
+
+if WORKING:
+    import numpy as np
+    from tqdm import tqdm
+
+    from rs_localizer.cli.image_input import opened, tell_times
+    from rs_localizer.config import NodeConfig
+    from rs_localizer.core.arrays import Array
+    from rs_localizer.core.camera import Camera
+    from rs_localizer.io.atomic_files import atomic_files
+    from rs_localizer.io.camera_info import Calibration, read_camera_info
+    from rs_localizer.io.images import Image
+    from rs_localizer.mapping.survey import Survey, survey
+    from rs_localizer.mapping.unknown_markers import Spotted, Spotter, every_marker
+    from rs_localizer.markers.consistency import problems
+    from rs_localizer.markers.map_files import write_marker_map
+    from rs_localizer.markers.maps import MarkerMap
+    from rs_localizer.markers.prints import Marker
+    from rs_localizer.offline.image_sources import Carried
 
 _LISTED = 12
 _SHAPE, _ORIGIN = "shape", "origin"
@@ -89,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     if args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
-    config, markers = given_settings(args), _markers(args)
+    config, markers = given_settings(args, check=one_camera), _markers(args)
     origin = _origin(args, markers)
     refuse_existing(args)
     if not args.recording.exists():

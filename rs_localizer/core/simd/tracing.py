@@ -196,39 +196,11 @@ def traced_sums(inputs: int, *bodies: tuple[Callable[[list[Lanes]], Sequence[Num
         def compile_call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             source_data, target_data = (_data(context, builder, signature, args, i) for i in (0, 2))
             for body, count in bodies:
-                _sum_over(builder, [(source_data, inputs)], args[1], body, count, target_data)
+                _sum_over(builder, (source_data, inputs), args[1], body, count, target_data)
                 target_data = builder.gep(target_data, [ir.Constant(ir.IntType(64), count)])
             return context.get_dummy_value()
 
         return types.void(source, blocks, target), compile_call
-
-    return sums
-
-
-def traced_products(columns: int) -> Any:
-    """Make a Numba-callable ``function(source, other, blocks, target)`` of sums over points.
-
-    Args:
-        columns: how many values a block of either source holds, at most four: the sums of their
-            products stay in registers.
-
-    Returns:
-        a function for use inside kernels: the target gets the sum over all lanes of the first
-        ``blocks`` blocks for each value of the source times each of the other one.
-    """
-
-    def products(values: list[Lanes]) -> Sequence[Number]:
-        return [a * b for a in values[:columns] for b in values[columns:]]
-
-    @intrinsic
-    def sums(typingctx: Any, source: Any, other: Any, blocks: Any, target: Any) -> Any:
-        def compile_call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            first, second, data = (_data(context, builder, signature, args, i) for i in (0, 1, 3))
-            sources = [(first, columns), (second, columns)]
-            _sum_over(builder, sources, args[2], products, columns * columns, data)
-            return context.get_dummy_value()
-
-        return types.void(source, other, blocks, target), compile_call
 
     return sums
 
@@ -239,21 +211,21 @@ def _data(context: Any, builder: Any, signature: Any, args: Any, argument: int) 
 
 
 def _sum_over(
-    builder: Any, sources: Sequence[tuple[Any, int]], blocks: Any,
+    builder: Any, source: tuple[Any, int], blocks: Any,
     body: Callable[[list[Lanes]], Sequence[Number]], count: int, target: Any,
 ) -> None:  # fmt: skip
-    """Sum the terms of a body over all lanes of the first blocks of sources of so many values."""
+    """Sum the terms of a body over all lanes of the first blocks of so many values each."""
     totals = [_alloca_once(builder, _VECTOR) for _ in range(count)]
     for total in totals:
         builder.store(_operand(0.0), total)
     with cgutils.for_range(builder, blocks) as loop:
+        data, inputs = source
+        offset = builder.mul(loop.index, ir.Constant(loop.index.type, inputs))
+        base = builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [offset])
         lanes = []
-        for data, inputs in sources:
-            offset = builder.mul(loop.index, ir.Constant(loop.index.type, inputs))
-            base = builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [offset])
-            for i in range(inputs):
-                value = builder.gep(base, [ir.Constant(ir.IntType(64), i)])
-                lanes.append(Lanes(builder, builder.load(value, align=8)))
+        for i in range(inputs):
+            value = builder.gep(base, [ir.Constant(ir.IntType(64), i)])
+            lanes.append(Lanes(builder, builder.load(value, align=8)))
         for total, term in zip(totals, body(lanes), strict=True):
             so_far = Lanes(builder, builder.load(total))
             builder.store(_operand(so_far + term), total)

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
@@ -188,6 +187,8 @@ def _read_binary_images(data: bytes) -> dict[str, ModelImage]:
 def _model_image(
     number: int, camera: int, pose: list[float], features: NDArray[np.void]
 ) -> ModelImage:
+    from scipy.spatial.transform import Rotation
+
     w, x, y, z = pose[:4]
     return ModelImage(
         number,
@@ -282,6 +283,8 @@ def write_model(
     Raises:
         ValueError: for a lens that COLMAP has no name for.
     """
+    from scipy.spatial.transform import Rotation
+
     lens = colmap_parameters(camera)
     width, height = camera.size
     tracks: dict[int, list[str]] = {point: [] for point in points.ids.tolist()}

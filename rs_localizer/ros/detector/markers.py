@@ -47,7 +47,7 @@ def tell(detected: Detected) -> tuple[int, MarkerSight]:
     """Stamp of an image (ns), and what the statistics keep of it."""
     detections = detected.detections
     sight = MarkerSight(
-        markers=sum(int(item.known.sum()) for item in detections.markers),
+        markers=sum(int(item.mapped.sum()) for item in detections.markers),
         boards=len(detections.boards),
         corners=len(detections.ids),
         unknown=len(detections.unknown),

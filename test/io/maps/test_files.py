@@ -9,7 +9,6 @@ with the medoids worked out beside it in plain loops.
 
 import io
 import json
-import pickle
 import shutil
 import sqlite3
 import struct
@@ -114,10 +113,7 @@ FIRST_FEATURE_OF_IMAGE_2 = (
     ("change", "text"),
     [
         ("UPDATE descriptors SET rows = 4000000000000", "4000000000000 descriptors of 128 bytes"),
-        ("UPDATE descriptors SET cols = -1", "descriptors of -1 bytes"),
-        ("UPDATE descriptors SET data = NULL", "the descriptors of image 1 are none"),
         ("UPDATE descriptors SET cols = 64, rows = 2 * rows WHERE image_id = 2", "64 x uint8"),
-        ("DELETE FROM descriptors", "no descriptors of the images"),
         ("DROP TABLE descriptors", "no table of descriptors"),
         (FIRST_FEATURE_OF_IMAGE_2, "no point of the model"),
     ],
@@ -163,19 +159,11 @@ ONE = np.ones(3).tobytes()
         ({"points": npy((10**12, 3), "<f8", ONE)}, "takes 24000000000\\d* bytes, found"),
         ({"points": npy((2**62, 2**62), "<f8", ONE)}, "its shape takes"),
         ({"points": npy((1, 3, 10**9, 0), "<f8")}, r"must be \(n,3\) numbers"),
-        ({"points": npy((-1, 3), "<f8", ONE)}, "the shape"),
-        ({"points": npy((1, 3), "|O", pickle.dumps(None))}, "must hold numbers, found object"),
         ({"points": pickled()}, "must hold numbers, found object"),
-        ({"points": npy((3,), "<f8", ONE)}, r"must be \(n,3\) numbers, found \(3,\)"),
         ({"ids": npy((1,), "<i8", bytes(8))}, "no array 'points'; found ids.npy"),
-        ({"points": npy((1, 3), "<f8", ONE), "ids": npy((1,), "<f8", bytes(8))}, "ids must be"),
         (
             {"points": npy((1, 3), "<f8", ONE), "ids": npy((1,), "<i8", b"\xff" * 7 + b"\x7f")},
             "ids must lie between",
-        ),
-        (
-            {"points": npy((1, 3), "<f8", ONE), "descriptors": npy((1, 2), "<i2", bytes(4))},
-            "descriptors must be uint8 or floats, found int16",
         ),
         (
             {"points": npy((1, 3), "<f8", ONE), "descriptors": npy((2, 2), "|u1", bytes(4))},
@@ -232,27 +220,14 @@ LIST = XYZ + "property list uint float descriptor\n"
         (b"", "the first line is not 'ply'"),
         (b"ply\n" + b"comment\n" * 2000, "more than 1000 lines"),
         (ply(str(10**12), XYZ), f"truncated: {10**12} x vertex take at least {12 * 10**12} bytes"),
-        (ply("9" * 4000, XYZ), "truncated: 99999999999999999999 x vertex"),
-        (ply("1", XYZ, bytes(11)), "truncated"),
         (ply("1", LIST, bytes(12) + struct.pack("<I", 2**32 - 1)), "1 to 65535 values, found"),
-        (ply("1", LIST, bytes(12) + struct.pack("<I", 2**15)), "truncated: 1 x vertex"),
         (
             ply("2", LIST, bytes(12) + struct.pack("<If", 1, 0) + bytes(12) + bytes(8)),
             "must be equally long, found 0 to 1 values",
         ),
-        (
-            ply("1", XYZ + "property list uchar double id\n", bytes(12) + b"\x01" + bytes(8)),
-            "property id must be one number",
-        ),
         (ply("2", XYZ + "property int id\n", bytes(32)), "1 ids stand for several .* first .* 0"),
         (ply("1", XYZ, struct.pack("<3f", np.nan, 0, 0)), "no landmarks; 1 with NaN"),
-        (ply("1", XYZ, struct.pack("<3f", 1e30, 0, 0)), "within 1e\\+09 m"),
-        (
-            ply().replace(b"vertex 1\n", b"face 1\nproperty list uchar int v\nelement vertex 1\n"),
-            "face with lists stands before",
-        ),
         (text_ply(2, b"1 2 30\n1   2", XYZ), "vertex 2 of 2 must have 3 numbers, found 2"),
-        (text_ply(1, b"1 two 3\n", XYZ), "vertex 1 is not a line of numbers: '1 two 3'"),
         (
             text_ply(1, b"1 2 256\n", XYZ.replace("float z", "uchar z")),
             "z holds what is not a uchar",
@@ -269,16 +244,9 @@ def test_a_bad_ply(tmp_path, data, text):
 @pytest.mark.parametrize(
     ("name", "data", "text"),
     [
-        ("points3D.bin", b"", "truncated"),
         ("points3D.bin", struct.pack("<Q", 10**12), "truncated: 1000000000000 points"),
         ("points3D.bin", struct.pack("<Q", 1) + bytes(43) + b"\xff" * 8, "truncated at point 1"),
-        (
-            "points3D.bin",
-            struct.pack("<Q", 1) + b"\xff" * 8 + bytes(43),
-            "the id 18446744073709551615",
-        ),
         ("points3D.txt", b"1 2 3\n", "line 1: expected ID X Y Z"),
-        ("points3D.txt", b"x 2 3 4 0 0 0 0 5 6\n", "line 1: expected"),
         ("cameras.bin", b"", "neither points3D.bin nor points3D.txt"),
     ],
 )

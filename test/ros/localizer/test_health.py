@@ -184,19 +184,6 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
             "compiling",
             "the node is being configured: kernels are compiled",
         ),
-        (
-            {"life_cycle": "loading"},
-            Level.WARN,
-            "loading",
-            "the node is being configured: kernels are loaded",
-        ),
-        (
-            {"life_cycle": "unconfigured"},
-            Level.OK,
-            "inactive",
-            "the node is unconfigured: configure and activate it",
-        ),
-        ({"changing": True}, Level.WARN, "compiling", "the kernels for the new settings are"),
         # Frames come, so that the other one is what is wrong.
         (
             {
@@ -220,22 +207,10 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
             "waiting for camera_info and a map",
         ),
         (
-            {"silence": {"camera_info": COMES, "correspondences": silent("/c", "no publisher")}},
-            Level.WARN,
-            "waiting for frames",
-            "no frame has come; /c: no publisher",
-        ),
-        (
             {"silence": {"correspondences": silent("/c", "no publisher", heard=True)}},
             Level.STALE,
             "waiting for frames",
             "no frame has come for 7 s; /c: no publisher",
-        ),
-        (
-            {"silence": {"correspondences": silent("/c", "QoS", mismatch=True)}},
-            Level.ERROR,
-            "waiting for frames",
-            "no frame has come; /c: QoS",
         ),
         # One of two frame topics is enough.
         (

@@ -22,9 +22,10 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.ros.node.conversion import copy_message, make_message
-from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.recording import write_simulated
-from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
+from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
@@ -106,17 +107,6 @@ class Talk:
         found = [getattr(pose.pose.position, name) for name in "xyz"]
         assert np.allclose(found, frame.first_row.positions[0], atol=0.02)
         return pose
-
-
-def test_a_map_that_is_not_latched(start_node, peer, flight):
-    info, frames = flight
-    start_node("-p", f"readout_time:={READOUT_TIME}")
-    talk = Talk(peer, info)
-    volatile = peer.node.create_publisher(PointCloud2, "map_points", 1)
-    talk.connect()
-    assert peer.spin_until(volatile.get_subscription_count)
-    volatile.publish(make_cloud(make_message, 0, LANDMARKS.frame, map_rows(LANDMARKS)))
-    talk.localize(frames[0])
 
 
 def test_a_map_file(tmp_path, start_node, peer, flight):

@@ -30,14 +30,13 @@ def test_signals_end_it_in_order(start_node):
 SLOW = "import pathlib, time; pathlib.Path(__file__).with_suffix('.seen').touch(); time.sleep(60)"
 
 
-@pytest.mark.parametrize(("slow", "number"), [("numba", signal.SIGINT), ("rclpy", signal.SIGTERM)])
-def test_signals_while_it_imports(start_node, tmp_path, number, slow):
-    (tmp_path / f"{slow}.py").write_text(SLOW)
+def test_signals_while_it_imports(start_node, tmp_path):
+    (tmp_path / "rclpy.py").write_text(SLOW)
     node = start_node(PYTHONPATH=f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
-    while not (tmp_path / f"{slow}.seen").exists():
+    while not (tmp_path / "rclpy.seen").exists():
         assert node.process.poll() is None, node.log
         time.sleep(0.02)
-    assert node.stop(number) == 0
+    assert node.stop(signal.SIGTERM) == 0
     assert node.log == ""
 
 
@@ -63,19 +62,12 @@ def test_signals_while_it_compiles(start_node, tmp_path):
     assert "Traceback" not in node.log
 
 
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (("-p", "readout_time:=0"), r"readout_time must be of type float, got 0 \(write 0\.0\)"),
-        (("--params-file", "/nowhere.yaml"), "/nowhere.yaml"),
-    ],
-)
-def test_started_with_bad_parameters(start_node, arguments, text):
-    node = start_node(*arguments)
+def test_started_with_bad_parameters(start_node):
+    node = start_node("--params-file", "/nowhere.yaml")
     assert node.process.wait(60.0) == 1
     fatal = [line for line in node.log.splitlines() if line.startswith("[FATAL]")]
     assert len(fatal) == 1
-    assert re.search(text, fatal[0])
+    assert "/nowhere.yaml" in fatal[0]
     assert "Traceback" not in node.log
 
 

@@ -40,15 +40,6 @@ def rows(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[World], Any]:
     return lambda world: [world.cloud_of(change(world.table()))]
 
 
-def with_values(**columns: Any) -> Callable[[np.ndarray], np.ndarray]:
-    def change(table: np.ndarray) -> np.ndarray:
-        for name, value in columns.items():
-            table[name] = value
-        return table
-
-    return change
-
-
 def stamped(*seconds: float) -> Callable[[World], Any]:
     """Frames with these stamps, one after the other; each is to be localized."""
 

@@ -3,20 +3,12 @@
 """TF that is missing, contradicts or changes."""
 
 import contextlib
-import sys
 from typing import Any
 
 import numpy as np
-import pytest
 from geometry_msgs.msg import TransformStamped
 from live_world import CLOSE, World
 from robot import tf2_ros
-
-
-def without_tf2_ros(world: World) -> str:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(sys.modules, "tf2_ros", None)
-        return world.set(publish_tf="map_to_odom")
 
 
 def without_odometry(world: World) -> str:

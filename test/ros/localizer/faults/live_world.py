@@ -29,9 +29,10 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.managed import spin
-from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import random_descriptors, room
+from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 PATIENCE = 20.0  # s, of a machine that is busy

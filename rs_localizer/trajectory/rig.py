@@ -1,0 +1,268 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Where the cameras of a rig are on it, and how their clocks differ, from recordings of each.
+
+One motion runs through the keypoints of all cameras, that of the first one. Beside it each camera
+has what a calibration of its own has (:mod:`rs_localizer.trajectory.calibration`), and each but the
+first :class:`.Extrinsics`. Cameras need not see the same: they see parts of one map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import argrelmax, correlate, correlation_lags
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.trajectory.banded import Undetermined
+from rs_localizer.trajectory.calibration import Calibration, cut, disagreement, discrepancy
+from rs_localizer.trajectory.fit import Fit, solve
+from rs_localizer.trajectory.imu import middle_row
+from rs_localizer.trajectory.lens import with_lens
+from rs_localizer.trajectory.model import Extrinsics, Freedom, State
+from rs_localizer.trajectory.problem import Problem, RigProblem
+from rs_localizer.trajectory.sight_kernels import EXTRINSICS
+from rs_localizer.trajectory.spline import Spline, refined
+
+# Turn rates are compared at this interval (s), over at least this time and this part of the shorter
+# recording; so many of the offsets at which they agree best are tried.
+_STEP, _LEAST_SECONDS, _LEAST_SHARE, _TRIED = 0.01, 2.0, 0.3, 10
+# How far the axes of two cameras of one body turn about their mean (rad): half a step of the above
+# at 5 rad/s, and a degree of the splines of cameras whose lens is not known yet.
+_MOST_TURNED = 0.05
+# Parts of the recording that are estimated on their own.
+_PARTS = 3
+# An offset, a turn and a place are determined to these deviations (s, rad, m): a hand's 67 deg/s
+# makes 0.1 deg of 1.5 ms, and frames of a pair notice extrinsics that are 0.2 deg or 1 cm off
+# (docs/rigs.md): by two deviations.
+_MOST_OFFSET, _MOST_TURN, _MOST_PLACE = 1.5e-3, math.radians(0.1), 5e-3
+
+
+class Recording(NamedTuple):
+    """One camera's part: what it was calibrated with, and what came of it."""
+
+    camera: Camera
+    calibration: Calibration
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mounted:
+    """A camera of a rig as the recordings of all say; the axes are those of the first camera."""
+
+    camera: Camera  # with its lens; the readout time and scan direction it was assumed to have
+    readout_time: float  # s; negative: against that direction
+    rotation: Array  # (3,3) camera_from_rig
+    translation: Array  # (3,) m
+    time_offset: float  # s, to add to its stamps, of first rows, for the time of the first camera's
+    rotation_deviations: Array  # (3,) rad, of a turn about the camera's axes
+    centre_deviations: Array  # (3,) m, of its place, along the rig's axes
+    time_offset_deviation: float  # s
+    # Of the seven above one after the other: what parts of the recording say by themselves makes
+    # them so much larger; 1: nothing.
+    inflations: Array
+
+    @property
+    def undetermined(self) -> str:
+        """What the recording does not determine, with figures; empty: all is."""
+        turn, place = (
+            float(np.max(of)) for of in (self.rotation_deviations, self.centre_deviations)
+        )
+        values = (
+            ("rotation", math.degrees(turn), math.degrees(_MOST_TURN), "deg"),
+            ("position", 1e3 * place, 1e3 * _MOST_PLACE, "mm"),
+            ("clock", 1e3 * self.time_offset_deviation, 1e3 * _MOST_OFFSET, "ms"),
+        )
+        return ", ".join(
+            f"{name} +- {value:.2g} {unit} (known to less than {limit:.2g} it would be)"
+            for name, value, limit, unit in values
+            if not value < limit
+        )
+
+
+def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
+    """Extrinsics and clock offsets of the cameras of a rig, by their names; the first one's axes
+    and clock are those of the rig.
+
+    Raises:
+        ValueError: for a single camera, or when the motions of two cameras are not one, or do not
+            determine how the cameras are mounted; the message names the camera.
+    """
+    if len(recordings) < 2:
+        raise ValueError(f"a rig has several cameras, not {len(recordings)}")
+    first, *_ = recordings
+    own = recordings[first].calibration
+    spline, start_ns = own.fit.state.spline, own.posed.start_ns
+    spacing = min(each.calibration.fit.state.spline.layout.spacing for each in recordings.values())
+    if spacing < spline.layout.spacing:
+        spline = refined(spline, spacing)
+    cameras: list[Problem] = []
+    states: list[State] = []
+    for name, (camera, calibration) in recordings.items():
+        state, shift = calibration.fit.state, 1e-9 * (calibration.posed.start_ns - start_ns)
+        freedom = _freedom(own, calibration)
+        if name != first:
+            try:
+                extrinsics = first_extrinsics(spline, state.spline, shift)
+            except Undetermined as error:
+                raise ValueError(f"{name}: {error}") from error
+            state, freedom = replace(state, extrinsics=extrinsics), replace(freedom, mounted=True)
+        seen = calibration.posed.observations
+        seen = replace(seen, times=seen.times + shift)
+        seen = seen.subset(spline.layout.inside(seen.times + state.extrinsics.offset))
+        states.append(replace(state, spline=spline, mount=None))
+        cameras.append(Problem(camera, seen, states[-1], freedom))
+    noises = np.array([each.calibration.fit.deviation for each in recordings.values()])
+    problem = RigProblem(cameras, noises)
+    try:
+        whole = _Joint(problem, solve(problem, replace(states[0], others=tuple(states[1:]))))
+    except Undetermined as error:
+        raise ValueError(f"{', '.join(recordings)}: {error}") from error
+    parts = list(_parts(whole))
+    return {name: _mounted(place, whole, parts) for place, name in enumerate(recordings)}
+
+
+def _freedom(first: Calibration, own: Calibration) -> Freedom:
+    """What a camera's own calibration freed; the accelerations are the rig's."""
+    names = ("lens", "lens_deviations", "landmarks", "paper", "stamps")
+    return replace(first.fit.freedom, **{name: getattr(own.fit.freedom, name) for name in names})
+
+
+def first_extrinsics(rig: Spline, own: Spline, shift: float) -> Extrinsics:
+    """A first guess, from the motions of the rig and of the camera alone through one map.
+
+    Args:
+        shift: s, to add to the times of ``own`` for the stamps that the offset is to be added to.
+
+    Raises:
+        Undetermined: when the two do not turn alike at any offset.
+    """
+    grids = [_turning(spline) for spline in (rig, own)]
+    (begin, speeds, known), (own_begin, own_speeds, own_known) = grids
+    # Correlation coefficients of the turn rates at all offsets, where both are known.
+    sums = {
+        (a, b): correlate(known * speeds**a, own_known * own_speeds**b)
+        for a, b in ((0, 0), (0, 1), (1, 0), (0, 2), (2, 0), (1, 1))
+    }
+    count = np.maximum(sums[0, 0], 1.0)
+    products = sums[1, 1] - sums[1, 0] * sums[0, 1] / count
+    spreads = [sums[2, 0] - sums[1, 0] ** 2 / count, sums[0, 2] - sums[0, 1] ** 2 / count]
+    least = max(_LEAST_SECONDS / _STEP, _LEAST_SHARE * min(np.sum(known), np.sum(own_known)))
+    alike = products / np.sqrt(np.maximum(spreads[0] * spreads[1], 1e-12))
+    alike[sums[0, 0] < least] = -1.0
+    peaks = argrelmax(alike, mode="wrap")[0]
+    peaks = peaks[alike[peaks] > 0.0]
+    lags = correlation_lags(len(speeds), len(own_speeds))[peaks[np.argsort(-alike[peaks])[:_TRIED]]]
+    guesses = [
+        _at_offset(rig, own, begin - own_begin + float(lag) * _STEP) for lag in lags.tolist()
+    ]
+    best, turned = min(guesses, key=lambda guess: guess[1], default=(None, math.inf))
+    if best is None or not turned < _MOST_TURNED:
+        raise Undetermined(
+            "it does not turn as the first camera does"
+            + (f" (to {math.degrees(turned):.1f} deg at best)" if guesses else "")
+            + f": do both move as one, unevenly, and for {least * _STEP:.0f} s at the same time?"
+        )
+    return replace(best, offset=best.offset - shift)
+
+
+def _turning(spline: Spline) -> tuple[float, Array, Array]:
+    """Turn rates (n,) rad/s at even times from the first (s) on, and 1 where known, otherwise 0."""
+    layout = spline.layout
+    times = np.arange(layout.starts[0], layout.ends[-1], _STEP)
+    speeds = np.linalg.norm(spline.states(times).angular, axis=1)
+    return float(times[0]), speeds, layout.inside(times).astype(float)
+
+
+def _at_offset(rig: Spline, own: Spline, offset: float) -> tuple[Extrinsics, float]:
+    """Extrinsics if the rig's time is later by an offset (s), and how far (rad) the axes turn about
+    them in the median.
+    """
+    times = np.arange(own.layout.starts[0], own.layout.ends[-1], _STEP)
+    times = times[own.layout.inside(times) & rig.layout.inside(times + offset)]
+    body, camera = rig.states(times + offset), own.states(times)
+    axes = Rotation.from_matrix(np.swapaxes(camera.rotations, 1, 2) @ body.rotations)
+    centres = np.einsum("nji,nj->ni", body.rotations, camera.positions - body.positions)
+    mean = axes.mean()
+    turned = float(np.median((axes * mean.inv()).magnitude()))
+    return Extrinsics(mean.as_matrix(), np.median(centres, axis=0), offset), turned
+
+
+class _Joint(NamedTuple):
+    problem: RigProblem
+    fit: Fit
+
+    @property
+    def states(self) -> tuple[State, ...]:
+        """Of all cameras."""
+        return self.fit.state, *self.fit.state.others
+
+    def numbers(self, place: int, about: Extrinsics) -> tuple[Array, Array]:
+        """Turn and displacement of a camera beside some extrinsics, and the offset of the stamps of
+        first rows; and their deviations (7,) by the noise.
+        """
+        if place == 0:
+            return np.zeros(EXTRINSICS), np.zeros(EXTRINSICS)
+        camera, column = self.problem.cameras[place], self.problem.columns[place].start
+        own, first = self.states[place], self.states[0]
+        turn = so3.log(np.ascontiguousarray(own.extrinsics.axes @ about.axes.T))
+        # A stamp is that of the first row; the estimate compares the times of middle rows.
+        later = middle_row(camera.camera, own.readout_time)
+        first_later = middle_row(self.problem.camera, first.readout_time)
+        offset = own.extrinsics.offset - later * own.readout_time
+        offset += first_later * first.readout_time
+        by_border = np.zeros((EXTRINSICS, self.problem.border))
+        by_border[:, column + camera.mount_column :][:, :EXTRINSICS] = np.eye(EXTRINSICS)
+        by_border[6, [column, 0]] = -later, first_later
+        covariance = by_border @ self.fit.border_covariance @ by_border.T
+        moved = own.extrinsics.centre - about.centre
+        return np.r_[turn, moved, offset], np.sqrt(np.diag(covariance))
+
+
+def _parts(whole: _Joint) -> Iterator[_Joint]:
+    """Equal parts of the recording, each with all numbers of its own."""
+    layout = whole.fit.state.spline.layout
+    for start, end in pairwise(np.linspace(layout.starts[0], layout.ends[-1], _PARTS + 1)):
+        state = cut(whole.fit.state, start, end)
+        if state is None:
+            continue
+        cameras = []
+        for camera, one in zip(whole.problem.cameras, (state, *state.others), strict=True):
+            times = camera.observations.times + one.extrinsics.offset
+            seen = camera.observations.subset((times >= start) & (times < end))
+            cameras.append(Problem(camera.camera, seen, one, camera.freedom))
+        problem = RigProblem(cameras, whole.problem.ratios)
+        with suppress(ValueError):  # undetermined, or without one of the cameras
+            yield _Joint(problem, solve(problem, state))
+
+
+def _mounted(place: int, whole: _Joint, parts: list[_Joint]) -> Mounted:
+    state = whole.states[place]
+    extrinsics = state.extrinsics
+    values, deviations = whole.numbers(place, extrinsics)
+    inflations, beside = np.ones(EXTRINSICS), np.zeros(EXTRINSICS)
+    if place > 0 and len(parts) > 1:
+        each = np.array([part.numbers(place, extrinsics) for part in parts])
+        for k, (own, noise) in enumerate(each.transpose(2, 1, 0)):
+            inflations[k] = disagreement(own, noise)
+            beside[k] = discrepancy(float(values[k]), own, inflations[k] * noise)
+    deviations = np.hypot(inflations * deviations, beside)
+    return Mounted(
+        camera=with_lens(whole.problem.cameras[place].camera, state.lens),
+        readout_time=state.readout_time,
+        rotation=extrinsics.axes,
+        translation=-extrinsics.axes @ extrinsics.centre,
+        time_offset=float(values[6]),
+        rotation_deviations=deviations[:3],
+        centre_deviations=deviations[3:6],
+        time_offset_deviation=float(deviations[6]),
+        inflations=inflations,
+    )

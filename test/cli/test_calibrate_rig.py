@@ -1,0 +1,165 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``rs_localizer calibrate --rig`` and ``replay --smooth`` of a simulated pair that never sees the
+same, and faults.
+"""
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.cli.main import main
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.rigs import RigParts, read_camchain, write_camchain
+from rs_localizer.settings import build, load_params_file
+
+K = np.array([[420.0, 0.0, 320.0], [0.0, 422.0, 240.0], [0.0, 0.0, 1.0]])
+LENS = [-0.12, 0.04, 0.001, -0.0015]
+# The second camera looks back, 10 cm to the right; its stamps are 30 ms late.
+AXES = Rotation.from_euler("yx", [175.0, 10.0], degrees=True).as_matrix()
+CENTRE, OFFSET = np.array([0.1, -0.02, -0.05]), 0.03
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    return RigParts(
+        {
+            "front": Camera(640, 480, K, LENS, readout_time=0.02),
+            "rear": Camera(640, 480, K, LENS, "plumb_bob", 0.03, "bottom_to_top"),
+        },
+        {"front": (np.eye(3), np.zeros(3)), "rear": (AXES, -AXES @ CENTRE)},
+        {"front": 0.0, "rear": OFFSET},
+    )
+
+
+def record(folder, rig, *words):
+    write_camchain(folder / "chain.yaml", rig)
+    out = folder / "pair"
+    simulate = ["simulate", str(out), "--rig", str(folder / "chain.yaml"), "--noise", "0.3", *words]
+    assert main(simulate) == 0
+    return str(out)
+
+
+@pytest.fixture(scope="module")
+def pair(rig, tmp_path_factory):
+    words = "--trajectory tum_vi_room5 --duration 3 --points 60".split()
+    return record(tmp_path_factory.mktemp("pair"), rig, *words)
+
+
+def test_a_pair(pair, tmp_path, capsys):
+    assert main(["calibrate", "--rig", pair, "--out", str(tmp_path / "rig.yaml")]) == 0
+    said = capsys.readouterr().out
+    assert "rear <- front " in said
+    assert "TF has it 0.0" in said
+    values = load_params_file(tmp_path / "rig.yaml")
+    config = build(values)
+    assert config.cameras == ("front", "rear")
+    own = config.of_cameras["rear"]
+    assert own.scan_direction == "bottom_to_top"
+    assert own.readout_time == pytest.approx(0.03, abs=1e-3)
+    assert own.stamp_offset == pytest.approx(OFFSET, abs=1e-3)
+    parts = read_camchain(tmp_path / "rig_camchain.yaml")
+    assert parts.time_offset == {"front": 0.0, "rear": own.stamp_offset}
+    assert parts.cameras["rear"].readout_time == own.readout_time
+    rotation, translation = parts.camera_from_rig["rear"]
+    turned = Rotation.from_matrix(rotation @ AXES.T).magnitude()
+    assert np.degrees(turned) < 0.1
+    np.testing.assert_allclose(-rotation.T @ translation, CENTRE, atol=5e-3)
+    # What the launch file publishes is the same mounting.
+    (node,) = ElementTree.parse(tmp_path / "rig_transforms.launch.xml").getroot()
+    words = node.get("args").split()
+    given = dict(zip(words[::2], words[1::2], strict=True))
+    assert given["--frame-id"] == "front_optical_frame"
+    assert given["--child-frame-id"] == "rear_optical_frame"
+    place = np.array([float(given[f"--{axis}"]) for axis in "xyz"])
+    turn = Rotation.from_quat([float(given[f"--q{axis}"]) for axis in "xyzw"])
+    np.testing.assert_allclose(place, -rotation.T @ translation, atol=1e-12)
+    np.testing.assert_allclose(turn.as_matrix(), rotation.T, atol=1e-12)
+
+
+def test_cameras_are_chosen_with_an_axis_of_their_own(rig, tmp_path):
+    cameras = {
+        "front": rig.cameras["front"],
+        "rear": Camera(640, 480, K, LENS, "plumb_bob", 0.03, "right_to_left"),
+    }
+    sideways = RigParts(cameras, rig.camera_from_rig, rig.time_offset)
+    pair = record(tmp_path, sideways, *"--trajectory tum_vi_room5 --duration 3 --points 60".split())
+    settings = ("cameras:=[rear, front]", "rear.scan_direction:=left_to_right",
+                "rear.stamp_offset:=0.5")  # fmt: skip
+    words = [word for setting in settings for word in ("-p", setting)]
+    assert main(["calibrate", "--rig", pair, *words, "--out", str(tmp_path / "rig.yaml")]) == 0
+    config = build(load_params_file(tmp_path / "rig.yaml"))
+    assert config.cameras == ("rear", "front")
+    rear, front = config.of_cameras["rear"], config.of_cameras["front"]
+    assert (rear.scan_direction, front.scan_direction) == ("right_to_left", "top_to_bottom")
+    assert rear.stamp_offset == 0.5
+    assert front.stamp_offset == pytest.approx(0.5 - OFFSET, abs=1e-3)
+
+
+def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
+    words = "--duration 2 --points 40 --angular-velocity 0 0 0 --linear-velocity 0 0 0".split()
+    pair = record(tmp_path, rig, *words)
+    assert main(["calibrate", "--rig", pair, "--out", str(tmp_path / "rig.yaml")]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
+    assert "front: not observable" in line
+    assert "rear: not observable" in line
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_samples_of_the_motion(pair, tmp_path, capsys):
+    parameters = ["--params", f"{pair}/parameters.yaml", "--smooth", "--rate", "100"]
+    assert main(["replay", pair, *parameters, "--out", str(tmp_path / "fast")]) == 0
+    said = capsys.readouterr().out
+    # 3 s, of which the first and the last readout may be left out.
+    samples, lost = (
+        int(next(line for line in said.splitlines() if name in line).split()[-1])
+        for name in ("samples of the smoothed motion", "left out, not determined")
+    )
+    assert 285 <= samples <= 301
+    assert lost < 10
+
+
+def test_maps_are_made_with_one_camera(pair, tmp_path, capsys):
+    parameters, out = f"{pair}/parameters.yaml", str(tmp_path / "map")
+    refine = ["map", "refine", pair, "--params", parameters, "--out", f"{out}.npz"]
+    survey = ["map", "survey", pair, "--params", parameters, "--out", f"{out}.yaml"]
+    for words in (refine, [*survey, "--family", "apriltag_36h11", "--size", "0.1"]):
+        assert main(words) == 2
+        assert "maps are made with one camera of a rig" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["video.mp4"], "--rig needs the recordings of several cameras, or one bag"),
+        (["a/cam.mp4", "b/cam.mp4"], "cameras need different names"),
+        (["1.mp4", "b.mp4"], "names that begin with a letter: 1, b"),
+        (["a.mp4", "b.mp4", "--imu"], "--imu is for one camera"),
+    ],
+)
+def test_what_is_no_rig(words, expected, capsys):
+    assert main(["calibrate", "--rig", *words]) == 2
+    assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("pose_time", ["stamp", "mid_frame"])
+def test_smoothed_frames_are_nearer_to_the_truth(pair, pose_time, tmp_path, capsys):
+    settings = ["--params", str(Path(pair) / "parameters.yaml"), "-p", f"pose_time:={pose_time}"]
+    errors, counts = [], []
+    for name, words in (("plain", []), ("smooth", ["--smooth"])):
+        out = str(tmp_path / name)
+        assert main(["replay", pair, *settings, *words, "--out", out]) == 0
+        capsys.readouterr()
+        assert main(["evaluate", out, pair, "--json"]) == 0
+        errors.append(json.loads(capsys.readouterr().out)["result"])
+        counts.append(len((tmp_path / name / "poses.txt").read_text().splitlines()))
+    assert counts[0] == counts[1]
+    limits = {"position (m)": 0.9, "orientation (deg)": 0.9, "linear velocity (m/s)": 0.6,
+              "angular velocity (deg/s)": 0.6}  # fmt: skip
+    for quantity, limit in limits.items():
+        plain, smooth = (each[f"{quantity} median"] for each in errors)
+        assert smooth < limit * plain
