@@ -224,7 +224,7 @@ def tell_next(args: argparse.Namespace, more: str = "") -> None:
     """The command that makes poses of the recording, with further options."""
     out = shlex.quote(str(args.out))
     settings = f" --params {out}/{PARAMETERS}" if (args.out / PARAMETERS).exists() else ""
-    if "readout_time" not in shutter_values(args):
+    if not {"readout_time", "cameras"} & set(shutter_values(args)):
         settings += " -p readout_time:=SECONDS"
     poses = shlex.quote(f"{args.out}_poses")
     print(f"next: rs_localizer replay {out}{settings}{more} --out {poses}")
