@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rendered images of a pair: through a detector of each camera to poses, and to a map."""
+"""Rendered images of a pair: through a detector of each camera to poses."""
 
 from pathlib import Path
 
@@ -14,9 +14,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.recording import MARKER_MAP
 from rs_localizer.io.rigs import RigParts, write_camchain
-from rs_localizer.markers.map_files import read_marker_map
 
 K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
 # The second camera is upside down, 10 cm beside the first.
@@ -62,25 +60,6 @@ def test_poses_of_a_detector_of_each_camera(pair, tmp_path, capsys):
     assert count > 20
     # Of the 99 % that a region claims, nine in ten at least: frames share errors of the detector.
     assert np.mean(inside) > 0.9
-
-
-def test_markers_surveyed_with_both_cameras(pair, tmp_path, capsys):
-    images, wall = str(pair / "images"), tmp_path / "wall.yaml"
-    truth = {marker.id: marker for marker in read_marker_map(Path(images, MARKER_MAP)).markers}
-    size = next(iter(truth.values())).size
-    words = ["--family", next(iter(truth.values())).family.name, "--size", str(size)]
-    words += ["--params", f"{images}/parameters.yaml", "--out", str(wall)]
-    assert main(["map", "survey", images, *words]) == 0
-    said = capsys.readouterr().out
-    assert "up: images with a marker" in said
-    assert "down <- up" in said
-    found = read_marker_map(wall).markers
-    assert len(found) > 10
-    ours, true = (np.concatenate([of.corners for of in each])
-                  for each in (found, [truth[marker.id] for marker in found]))  # fmt: skip
-    back = Rotation.align_vectors(true - true.mean(axis=0), ours - ours.mean(axis=0))[0]
-    off = back.apply(ours - ours.mean(axis=0)) - (true - true.mean(axis=0))
-    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.05 * size
 
 
 def test_a_rig_that_nobody_mounted(pair, tmp_path, capsys):
