@@ -197,13 +197,15 @@ def _between(
 ) -> tuple[dict[tuple[int, int], Transform], dict[tuple[int, int], float]]:
     """Of each pair a < b, a_from_b, and by how many images it is said."""
     images: dict[tuple[int, int], list[tuple[_Sight, _Sight]]] = {}
+    apart: dict[tuple[int, int], list[tuple[_Sight, _Sight]]] = {}  # in images of two cameras
     for view in views:
         by_marker = sorted(view.sights, key=lambda sight: sight.marker)
         for one, other in combinations(by_marker, 2):
             if one.marker != other.marker:
-                images.setdefault((one.marker, other.marker), []).append((one, other))
+                pairs = images if one.camera == other.camera else apart
+                pairs.setdefault((one.marker, other.marker), []).append((one, other))
     between, scores = {}, {}
-    for (a, b), among in images.items():
+    for (a, b), among in (apart | images).items():
         step = -(-len(among) // _MOST_IMAGES)
         said = [
             (k, first.inverse() @ second, fit * other)
@@ -213,6 +215,9 @@ def _between(
         ]
         size = max(markers[a].size, markers[b].size)
         between[a, b], scores[a, b] = _agreed(said, size)
+        if (a, b) not in images:
+            # The rig moves between images of two cameras: what one image says goes before.
+            scores[a, b] /= len(views)
     return between, scores
 
 
