@@ -21,7 +21,6 @@ from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.calibration import CalibrationError, read_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.io.hloc import HlocError, open_h5, read_pairs, read_queries
 from rs_localizer.io.images import read_compressed_image, read_image
 from rs_localizer.io.imu import ImuFileError, read_imu, read_imu_csv
 from rs_localizer.io.keypoints import read_keypoints, read_map
@@ -34,6 +33,7 @@ from rs_localizer.io.video import VideoError, read_video
 from rs_localizer.markers.formats import Unsaid, read_any
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
+from rs_localizer.offline.hloc import HlocError, open_h5, read_pairs, read_queries
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import build, load_params_file, parse_assignment
 
