@@ -202,17 +202,21 @@ def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> Non
         print(f"kept for replay: {kept}")
 
 
-def time_faults(args: argparse.Namespace, clock: ImageClock | None, period: float) -> list[str]:
+def time_faults(
+    args: argparse.Namespace, clock: ImageClock | None, period: float, camera: str = ""
+) -> list[str]:
     """Say where the times are from; what speaks against them, and against the readout time.
 
     Args:
         period: s from one image to the next.
+        camera: of a rig, whose images these are.
     """
-    faults = []
+    faults, settings = [], build(shutter_values(args))
     if clock is not None:
         print(clock.description())
         faults.append(clock.fault())
-    faults.append(readout_fault(build(shutter_values(args)).readout_time, period))
+    own = settings.of_cameras.get(camera, settings)
+    faults.append(readout_fault(own.readout_time, period))
     return [fault for fault in faults if fault]
 
 
