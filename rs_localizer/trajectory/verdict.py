@@ -36,15 +36,22 @@ def scan_direction(found: Calibration) -> ScanDirection:
     return given if found.global_shutter or found.readout_time > 0.0 else REVERSED[given]
 
 
-def refusal(found: Calibration) -> str:
-    """One line with the figure when the recording does not determine the readout time; or ''."""
-    value = f"{1e3 * found.readout_time:.1f} +- {1e3 * found.deviation:.1f} ms"
+def lens_refusal(found: Calibration) -> str:
+    """One line with the figure when the recording determines no lens; or ''."""
     camera = found.fit.camera
-    if not np.all((camera.K[:2, 2] > 0.0) & (camera.K[:2, 2] < camera.size)):
-        return (
-            f"no lens: the principal point would be at {camera.K[0, 2]:.0f}, {camera.K[1, 2]:.0f}, "
-            "outside the image; show the map from several sides, in all parts of the image"
-        )
+    if np.all((camera.K[:2, 2] > 0.0) & (camera.K[:2, 2] < camera.size)):
+        return ""
+    return (
+        f"no lens: the principal point would be at {camera.K[0, 2]:.0f}, {camera.K[1, 2]:.0f}, "
+        "outside the image; show the map from several sides, in all parts of the image"
+    )
+
+
+def refusal(found: Calibration) -> str:
+    """One line with the figure when lens or readout time is not determined; or ''."""
+    value = f"{1e3 * found.readout_time:.1f} +- {1e3 * found.deviation:.1f} ms"
+    if text := lens_refusal(found):
+        return text
     if found.stabilised:
         return (
             f"not observable: {value}; parts of the recording disagree ({_parts(found)} ms): is "
