@@ -155,9 +155,9 @@ def in_color(message: Any, image: Image) -> NDArray[np.uint8]:
     height, width = image.pixels.shape
     if hasattr(message, "format"):
         data = np.frombuffer(bytes(message.data), np.uint8)
-        found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-        usable = found is not None and found.dtype == np.uint8 and found.shape[2:] == (3,)
-        return np.asarray(found, np.uint8) if usable else image.pixels
+        decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        usable = decoded is not None and decoded.dtype == np.uint8 and decoded.shape[2:] == (3,)
+        return np.asarray(decoded, np.uint8) if usable else image.pixels
     if message.encoding not in COLORS:
         return image.pixels
     step = int(message.step) or 3 * width

@@ -69,9 +69,9 @@ class Spotter:
 
     def spot(self, image: NDArray[np.uint8], stamp_ns: int) -> Spotted:
         """The markers of an image (h,w)."""
-        found = self._detector.detect(image, stamp_ns)
-        whole = whole_markers(found, self._end)
-        quads = [found.pixels[rows] for rows in whole.values()]
+        detections = self._detector.detect(image, stamp_ns)
+        whole = whole_markers(detections, self._end)
+        quads = [detections.pixels[rows] for rows in whole.values()]
         return Spotted(stamp_ns, np.array(list(whole), np.int64), np.array(quads).reshape(-1, 4, 2))
 
 
@@ -122,9 +122,9 @@ def chain(
             that hang together.
     """
     views = [_view(camera, one, markers) for one in spotted]
-    seen = sorted({marker for view in views for marker in view.poses})
+    ids = sorted({marker for view in views for marker in view.poses})
     between, scores = _between(views, markers)
-    parts = _parts(seen, scores)
+    parts = _parts(ids, scores)
     first = parts[0][0] if origin is None else origin
     own = next(part for part in parts if first in part)
     placed = _placed(first, own, between, scores)
@@ -136,9 +136,9 @@ def _view(camera: Camera, spotted: Spotted, markers: Sequence[Marker]) -> _View:
     rays, poses = {}, {}
     for marker, quad in zip(spotted.markers.tolist(), spotted.quads, strict=True):
         own = camera.rays(quad)
-        found = _square_poses(markers[marker].corners, own, _SHUTTER / camera.focal_length)
-        if np.isfinite(own).all() and found:
-            rays[marker], poses[marker] = own, found
+        candidates = _square_poses(markers[marker].corners, own, _SHUTTER / camera.focal_length)
+        if np.isfinite(own).all() and candidates:
+            rays[marker], poses[marker] = own, candidates
     return _View(spotted.stamp_ns, rays, poses)
 
 
@@ -151,7 +151,7 @@ def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Trans
     except cv2.error:
         return []
     fits = np.exp(-(np.ravel(errors) - np.min(errors)) / doubt)
-    found = [
+    candidates = [
         (
             Transform(
                 np.asarray(cv2.Rodrigues(turns[k])[0], np.float64),
@@ -161,7 +161,7 @@ def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Trans
         )
         for k in range(count)
     ]
-    return [(pose, float(fit)) for pose, fit in found if pose.translation[2] > 0.0]
+    return [(pose, float(fit)) for pose, fit in candidates if pose.translation[2] > 0.0]
 
 
 def _between(

@@ -115,11 +115,11 @@ def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
             except Undetermined as error:
                 raise ValueError(f"{name}: {error}") from error
             state, freedom = replace(state, extrinsics=extrinsics), replace(freedom, mounted=True)
-        seen = calibration.posed.observations
-        seen = replace(seen, times=seen.times + shift)
-        seen = seen.subset(spline.layout.inside(seen.times + state.extrinsics.offset))
+        part = calibration.posed.observations
+        part = replace(part, times=part.times + shift)
+        part = part.subset(spline.layout.inside(part.times + state.extrinsics.offset))
         states.append(replace(state, spline=spline, mount=None))
-        cameras.append(Problem(camera, seen, states[-1], freedom))
+        cameras.append(Problem(camera, part, states[-1], freedom))
     noises = np.array([each.calibration.fit.deviation for each in recordings.values()])
     problem = RigProblem(cameras, noises)
     try:
@@ -237,8 +237,8 @@ def _parts(whole: _Joint) -> Iterator[_Joint]:
         cameras = []
         for camera, one in zip(whole.problem.cameras, (state, *state.others), strict=True):
             times = camera.observations.times + one.extrinsics.offset
-            seen = camera.observations.subset((times >= start) & (times < end))
-            cameras.append(Problem(camera.camera, seen, one, camera.freedom))
+            observations = camera.observations.subset((times >= start) & (times < end))
+            cameras.append(Problem(camera.camera, observations, one, camera.freedom))
         problem = RigProblem(cameras, whole.problem.ratios)
         with suppress(ValueError):  # undetermined, or without one of the cameras
             yield _Joint(problem, solve(problem, state))

@@ -98,7 +98,7 @@ def test_a_few_markers_of_many_at_another_place_show_in_an_image():
     )
     places = iter(range(54))
     told = changed(true, lambda corners: corners + np.array([0, 0, 0.12 * (next(places) == 20)]))
-    assert "do not lie as it says" in str(shown(told, true))
+    assert "are misplaced" in str(shown(told, true))
 
 
 def marker(id_: int, x: float, size: float = 0.1, rotation: Any = None) -> Marker:
@@ -154,7 +154,7 @@ def said(shift: Any, marker=4, spin=0.0, noise=0.1, fit: Fit = still_fit, corner
 def test_a_centimetre_is_named_with_its_direction():
     text = said([0.01, 0.0, 0.0])
     assert text is not None
-    assert text.startswith("marker 4x4_50 4 is not where the map has it")
+    assert text.startswith("marker 4x4_50 4 is misplaced in the map")
     assert "about 1.0 cm (+0.01" in text
     text = said([0.0, -0.006, 0.004], marker=0)
     assert text is not None
@@ -171,7 +171,7 @@ def test_a_shaking_rolling_shutter_hides_no_marker():
     """The fit of detect: what the shutter does is tens of times what the marker does."""
     text = said([0.01, 0.0, 0.0], spin=4.0, fit=_RollingFit())
     assert text is not None
-    assert text.startswith("marker 4x4_50 4 is not where the map has it")
+    assert text.startswith("marker 4x4_50 4 is misplaced in the map")
     assert "about 1.0 cm (+0.0" in text
     assert said(0.0, spin=4.0, fit=_RollingFit()) is None
 

@@ -138,10 +138,10 @@ class Outcome:
 
 def finished(task: Task) -> Figures | None:
     """The figures of a complete result of just this task; None: there is none."""
-    found = read_marker(task.folder)
-    if found is None or found["identity"] != task.identity:
+    marker = read_marker(task.folder)
+    if marker is None or marker["identity"] != task.identity:
         return None
-    return dict(found["figures"])
+    return dict(marker["figures"])
 
 
 def perform(task: Task) -> Outcome:
