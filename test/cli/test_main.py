@@ -262,19 +262,6 @@ def test_ctrl_c_while_a_command_runs_leaves_nothing_in_the_way(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ctrl_c_between_two_imports_has_no_traceback():
-    code = (
-        "import os, signal, sys, rs_localizer.__main__ as m, rs_localizer.cli.main as c\n"
-        "def parser(): os.kill(os.getpid(), signal.SIGINT)\n"
-        "c._parser = parser\n"
-        "sys.exit(m.run())"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stderr) == (130, "rs_localizer: interrupted\n")
-
-
 def test_who_stops_reading_is_not_told_of_it():
     """As with ``| head -1``: more is written than the pipe holds."""
     code = (
