@@ -376,10 +376,10 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
         yield Answer(last[1], stamp_ns(last[2]), result)
 
 
-def _each(results: Results) -> Sequence[Localized | Refusal]:
+def _each(results: Results) -> Iterable[Localized | Refusal]:
     if results is None:
         return []
-    return results if isinstance(results, Sequence) else [results]
+    return results if isinstance(results, Iterator) else [results]
 
 
 def _list(topics: list[str]) -> str:

@@ -77,14 +77,14 @@ class Problem:
             covariance = paper_covariance(landmarks, freedom.landmarks)
             self.shape_information = np.asarray(np.linalg.inv(covariance), np.float64)
         readout = 1 if freedom.readout_time else 0
-        extrinsics = EXTRINSICS if freedom.mounted else 0
+        extrinsics = 0 if freedom.mounting is None else EXTRINSICS
         self.border = readout + self.lens_count + extrinsics + self.pieces.columns
         self.gyro: GyroTerms | None = None
         if observations.gyro is not None and start.mount is not None:
             self.gyro = GyroTerms(observations.gyro, start, self.border)
             self.border += MOUNT
         self.lens_column = readout if self.lens_count else -1
-        self.mount_column = readout + self.lens_count if freedom.mounted else -1
+        self.mount_column = readout + self.lens_count if extrinsics else -1
         self.point_column = readout + self.lens_count + extrinsics if self.pieces.count else -1
 
     @property
@@ -225,6 +225,13 @@ class Problem:
             normal.border_slope[at] += pull
             normal.corner[at, at] += np.tril(self.lens_prior.information)
             cost += float(offset @ pull)
+        if self.freedom.mounting is not None:
+            offset = state.extrinsics.beside(self.freedom.mounting.given)
+            precisions = self.freedom.mounting.deviations**-2.0
+            at = slice(self.mount_column, self.mount_column + EXTRINSICS)
+            normal.border_slope[at] += precisions * offset
+            normal.corner[diagonal[at], diagonal[at]] += precisions
+            cost += float(precisions @ offset**2)
         if self.point_column >= 0 and not self.pieces.rigid:
             free = self.pieces.slots >= 0
             offset = (state.landmarks - self.observations.landmarks)[free].ravel()
@@ -306,13 +313,18 @@ class RigProblem:
     Args:
         cameras: of which the first has what is expected of the motion.
         noises: (k,) px, of each camera's keypoints; they keep their ratios.
+        one_map: the free landmarks are the same of all; they come last, once.
     """
 
-    def __init__(self, cameras: list[Problem], noises: Array) -> None:
-        self.cameras, self.ratios = cameras, noises / noises[0]
+    def __init__(self, cameras: list[Problem], noises: Array, one_map: bool = False) -> None:
+        self.cameras, self.ratios, self._one_map = cameras, noises / noises[0], one_map
         self.camera, self.freedom = cameras[0].camera, cameras[0].freedom
-        ends = np.cumsum([0, *(camera.border for camera in cameras)]).tolist()
-        self.columns, self.border = [slice(a, b) for a, b in pairwise(ends)], ends[-1]
+        points = cameras[0].pieces.columns if one_map else 0
+        ends = np.cumsum([0, *(camera.border - points for camera in cameras)])
+        self.border = int(ends[-1]) + points
+        shared = np.arange(ends[-1], self.border)
+        # Where each camera's border stands in that of all.
+        self.columns = [np.r_[np.arange(a, b), shared] for a, b in pairwise(ends.tolist())]
         self._last: tuple[State, list[State]] | None = None
 
     def states(self, state: State) -> list[State]:
@@ -340,9 +352,9 @@ class RigProblem:
         for normal, at in zip(own, self.columns, strict=True):
             whole.band[: len(normal.band)] += normal.band
             whole.slope[:] += normal.slope
-            whole.cross[:, at] = normal.cross
-            whole.corner[at, at] = normal.corner
-            whole.border_slope[at] = normal.border_slope
+            whole.cross[:, at] += normal.cross
+            whole.corner[np.ix_(at, at)] += normal.corner
+            whole.border_slope[at] += normal.border_slope
         return cost, RigNormal(whole, own)
 
     def factored(self, normal: RigNormal, damping: float = 0.0) -> Factored:
@@ -373,7 +385,8 @@ class RigProblem:
     def trusted(self, start: State) -> RigProblem:
         """The same with the trusted keypoints only."""
         pairs = zip(self.cameras, self.states(start), strict=True)
-        return RigProblem([camera.trusted(one) for camera, one in pairs], self.ratios)
+        cameras = [camera.trusted(one) for camera, one in pairs]
+        return RigProblem(cameras, self.ratios, self._one_map)
 
     def images(self, inliers: BoolArray) -> int:
         """How many images of all cameras have some of these keypoints (n,)."""
