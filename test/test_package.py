@@ -174,10 +174,7 @@ def test_ros_is_accepted_in_its_place():
 
 DOCKERFILE = ROOT / "packaging" / "docker" / "Dockerfile"
 # conda's names, where they differ from pip's.
-CONDA = {
-    "opencv-python-headless": "py-opencv",
-    "PyYAML": "pyyaml",
-}
+CONDA = {"opencv-python-headless": "py-opencv", "PyYAML": "pyyaml"}
 
 
 @pytest.fixture

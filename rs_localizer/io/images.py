@@ -64,10 +64,7 @@ def _encodings() -> dict[str, _Encoding]:
 _ENCODINGS = _encodings()
 
 # Name, start and end of what can be decompressed.
-_FORMATS = (
-    ("JPEG", b"\xff\xd8", b"\xff\xd9"),
-    ("PNG", b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"),
-)
+_FORMATS = (("JPEG", b"\xff\xd8", b"\xff\xd9"), ("PNG", b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"))
 # Pixels per byte that nothing can be packed better than: a PNG of one bit per pixel, all alike.
 _DENSEST = 8 * 1032
 # No camera has more; decoded they take 8 bytes each at most.
@@ -130,10 +127,7 @@ def read_image(message: Any) -> Image:
         )
     pixel = encoding.channels * kind.itemsize
     raw: NDArray[Any] = np.ndarray(
-        (height, width, encoding.channels),
-        kind,
-        message.data,
-        strides=(step, pixel, kind.itemsize),
+        (height, width, encoding.channels), kind, message.data, strides=(step, pixel, kind.itemsize)
     )
     return Image(stamp_ns(message), str(message.header.frame_id), _gray(raw, encoding))
 

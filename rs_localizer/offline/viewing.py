@@ -456,8 +456,7 @@ class _Scene:
         ends = pairs.pixels + self._sizes.longer * (pairs.predicted - pairs.pixels)
         strips = np.stack([_centred(pairs.pixels), _centred(ends)], axis=1)
         self._stream.log(
-            MATCHES,
-            rr.Points2D(_centred(pairs.predicted), colors=pairs.colours, radii=-3.0),
+            MATCHES, rr.Points2D(_centred(pairs.predicted), colors=pairs.colours, radii=-3.0)
         )
         self._stream.log(self._residuals, rr.LineStrips2D(list(strips), colors=_ORANGE))
         self._stream.log(INLIERS, rr.Points3D(pairs.points, colors=pairs.colours, radii=-3.0))
@@ -467,8 +466,7 @@ class _Scene:
 
         rotation, translation = frame.estimate.at(0.0)
         self._stream.log(
-            CAMERA,
-            rr.Transform3D(translation=-rotation.T @ translation, mat3x3=rotation.T),
+            CAMERA, rr.Transform3D(translation=-rotation.T @ translation, mat3x3=rotation.T)
         )
         self._stream.log(
             BODY,

@@ -209,8 +209,7 @@ QUICK = ("stops", "begins late", "is set back", "is cut")
 
 
 @pytest.mark.parametrize(
-    "fault",
-    [*QUICK, *(pytest.param(f, marks=pytest.mark.bench) for f in FAULTS if f not in QUICK)],
+    "fault", [*QUICK, *(pytest.param(f, marks=pytest.mark.bench) for f in FAULTS if f not in QUICK)]
 )
 def test_the_camera_goes_on_alone(flight, fault):
     change, reason = FAULTS[fault]

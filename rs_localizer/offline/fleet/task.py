@@ -179,11 +179,7 @@ def _attempt(task: Task) -> tuple[Figures | None, str]:
     try:
         with write_errors(partial):
             partial.mkdir(parents=True)
-        with (
-            _PRINTING,
-            contextlib.redirect_stdout(said),
-            contextlib.redirect_stderr(said),
-        ):
+        with _PRINTING, contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             figures = _work(task, inner)
         with write_errors(inner):
             inner.mkdir(exist_ok=True)
