@@ -124,11 +124,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "camera_info": Target(_messages((seeds.camera_info(),)), _read_camera, message),
         "imu": Target(_messages((seeds.imu(),)), read_imu, message),
         "image": Target(_messages(pictures), read_image, message),
-        "image/compressed": Target(
-            _pictures,
-            _compressed,
-            message,
-        ),
+        "image/compressed": Target(_pictures, _compressed, message),
         "map .npz": Target(_bytes(maps[".npz"]), _file(folder / "a.npz", _map), map_error),
         "map .npz, arrays": Target(_archives, _file(folder / "b.npz", _map), map_error),
         "map .ply": Target(_bytes(maps[".ply"]), _file(folder / "a.ply", _map), map_error),

@@ -418,7 +418,7 @@ def _check_fit(fitted: Fit) -> None:
     if share < _LEAST_FIT:
         raise ValueError(
             f"{100 * share:.0f} % of the corners fit the survey, {100 * _LEAST_FIT:.0f} % should: "
-            "check the readout time, the calibration, and that no id hangs twice"
+            "check the readout time, the calibration, and that each id is used once"
         )
 
 

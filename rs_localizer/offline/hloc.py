@@ -110,9 +110,7 @@ def localize_queries(
         if id(camera) not in localizers:
             localizers[id(camera)] = Localizer(
                 replace(
-                    camera,
-                    readout_time=config.readout_time,
-                    scan_direction=config.scan_direction,
+                    camera, readout_time=config.readout_time, scan_direction=config.scan_direction
                 ),
                 config,
             )

@@ -109,8 +109,8 @@ def reprojection_error(camera: Camera, image: Observed) -> float:
     rays = camera.rays(image.pixels)
     if not np.isfinite(rays).all():
         return np.inf
-    found, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None)
-    if not found:
+    solved, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None)
+    if not solved:
         return np.inf
     # In pixels, not in rays: far from the middle they are not the same.
     rotation = cv2.Rodrigues(turn)[0]
@@ -208,8 +208,8 @@ def _speed(before: Observed, after: Observed) -> float:
     first, second = np.nonzero(common)
     if len(first) == 0:
         return np.inf
-    way = np.linalg.norm(before.pixels[first] - after.pixels[second], axis=1)
-    return float(np.median(way)) / max((after.stamp_ns - before.stamp_ns) * 1e-9, 1e-9)
+    displacement = np.linalg.norm(before.pixels[first] - after.pixels[second], axis=1)
+    return float(np.median(displacement)) / max((after.stamp_ns - before.stamp_ns) * 1e-9, 1e-9)
 
 
 def _starts(size: tuple[int, int], everything: Array) -> list[tuple[Array, int]]:
