@@ -79,8 +79,9 @@ setup(
         "mapping": ["pycolmap", "matplotlib"],
         "plots": ["matplotlib", "Pillow>=9.1"],
         "table": ["fsspec", "pyarrow"],
-        # There is no wheel for 3.13, and a build needs Rust.
-        "video": ["telemetry-parser; python_version < '3.13'"],
+        # Of telemetry-parser there is no wheel for 3.13, and a build needs Rust. PyAV reads the
+        # second stream of files of two lenses, which OpenCV does not.
+        "video": ["av", "telemetry-parser; python_version < '3.13'"],
         "view": ["rerun-sdk"],
         "zarr": ["fsspec", "pyarrow", "zarr>=3"],
         "test": [

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rs_localizer.cli import WORKING, UsageError, add_overwrite, refuse_existing
 from rs_localizer.cli.batch import (
@@ -25,6 +26,8 @@ from rs_localizer.cli.batch import (
 from rs_localizer.cli.image_input import (
     add_telemetry,
     clock_of,
+    clock_of_lens,
+    lenses_of,
     of_bag,
     of_files,
     telemetry_of,
@@ -182,8 +185,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rig",
         action="store_true",
         help="the recordings are those of cameras on one body, one each, or one bag has topics of "
-        "several: find where the cameras are, and their clocks, too; the first one's axes and "
-        "clock are the rig's. Cameras are named as their files, or as their topics begin; "
+        "several, or one video several lenses (.insv): find where the cameras are, and their "
+        "clocks, too; the first one's axes and clock are the rig's. "
+        "Cameras are named as their files, or as their topics begin; "
         "--calibration is a camchain, or FILE of all as FILE#NAME",
     )
     parser.add_argument(
@@ -343,7 +347,9 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
         imu = _imu_of_video(args, path)
         known = args.calibration is not None
         camera = read_calibration(args.calibration) if known else _unknown((2, 2))
-        source = of_files(path, camera, clock_of(path, args.rate))
+        lens: int | None = getattr(args, "lens", None)
+        clock = clock_of(path, args.rate) if lens is None else clock_of_lens()
+        source = of_files(path, camera, clock, lens)
         found = _detected(args, source.shots)
         tell_times(source.clock)
         return replace(found, own_stamps=path.is_dir() and args.rate is None, imu=imu)
@@ -566,13 +572,14 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
                 "parts of the recording differ by more than their noise: the deviations of "
                 f"rotation, place and offset are {_numbers(mounted.inflations, 1)} times that"
             )
-        if len(args.recordings) == 1:
+        if len(args.recordings) == 1 and is_bag(args.recordings[0]):
             _tell_tf(args.recordings[0], mounted, cameras[name].frame, cameras[first].frame)
     refusals |= {name: text for name, one in rig.items() if (text := one.undetermined)}
     if args.out is not None and (args.force or not refusals):
         frames = {name: own.frame for name, own in cameras.items()}
         values = _of_maps(config, maps) | (_of_lenses(recordings) if intrinsics else {})
         _write_rig(args.out, _parts(rig, recordings, config), frames, values, comments, intrinsics)
+        print(f"next: {_next_of_rig(args)}")
     if refusals:
         raise ValueError(
             "not observable: " + "; ".join(f"{name}: {text}" for name, text in refusals.items())
@@ -588,14 +595,7 @@ def _cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, _OfRi
         frames = [f"{name}_optical_frame" for name in names]
     else:
         (path,) = args.recordings
-        if not is_bag(path):
-            raise UsageError(f"--rig needs the recordings of several cameras, or one bag; {path}")
-        given = config.cameras if config.is_rig else None
-        with open_bag(path) as bag:
-            by_name = camera_topics(bag, given)
-            frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
-        names = list(by_name)
-        topics = [{"recording": path, **own} for own in by_name.values()]
+        names, topics, frames = _in_one_file(path, config.cameras if config.is_rig else None)
     if len(set(names)) < max(len(names), 2) or not all(name[:1].isalpha() for name in names):
         raise UsageError(
             f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
@@ -613,6 +613,27 @@ def _cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, _OfRi
         )
         for name, own, frame in zip(names, topics, frames, strict=True)
     }  # fmt: skip
+
+
+def _in_one_file(
+    path: Path, given: Sequence[str] | None
+) -> tuple[list[str], list[dict[str, Any]], list[str]]:
+    """Names of the cameras of a bag or of the lenses of a video, where each is, and its frame."""
+    if path.exists() and not is_bag(path) and not path.is_dir():
+        there = lenses_of(path)
+        names = [name for name in given or there if name in there]
+        if len(names) > 1:
+            places = [{"recording": path, "lens": there.index(name)} for name in names]
+            return names, places, [""] * len(names)
+    if not is_bag(path):
+        raise UsageError(
+            f"--rig needs the recordings of several cameras, one bag or a video of several lenses; "
+            f"{path}"
+        )
+    with open_bag(path) as bag:
+        by_name = camera_topics(bag, given)
+        frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
+    return list(by_name), [{"recording": path, **own} for own in by_name.values()], frames
 
 
 def _without_k3(camera: Camera) -> Camera:
@@ -708,7 +729,17 @@ def _write_rig(
             write(file)
     for file in writers:
         print(f"written: {file}")
-    print(f"next: ros2 launch {shlex.quote(str(transforms))}")
+
+
+def _next_of_rig(args: argparse.Namespace) -> str:
+    """The command that goes on: poses of a video of several lenses, or TF for a live rig."""
+    path, stem, recording = args.out, args.out.stem, args.recordings[0]
+    if len(args.recordings) > 1 or is_bag(recording) or args.map is None:
+        return shlex.join(["ros2", "launch", str(path.with_name(f"{stem}_transforms.launch.xml"))])
+    chain, poses = path.with_name(f"{stem}_camchain.yaml"), path.with_name(f"{stem}_poses")
+    files = {"--map": args.map, "--calibration": chain, "--params": path, "--out": poses}
+    words = [word for name, value in files.items() for word in (name, str(value))]
+    return shlex.join(["rs_localizer", "replay", str(recording), *words])
 
 
 def _calibrate_batch(args: argparse.Namespace) -> None:

@@ -103,7 +103,7 @@ def detect_one(args: argparse.Namespace) -> Recorded:
     detector = FrameDetector(config, lambda _, text: notices.update((text,)), marker_map)
     detector.warm_up()
     with (
-        opened(args, args.images, args.start) as source,
+        opened(args, args.images, args.start, cameras=_cameras(args)) as source,
         atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
     ):
         recorded = _record(args, source, detector, out)
@@ -153,6 +153,12 @@ def _tell(args: argparse.Namespace, recorded: Recorded, notices: Counter[str]) -
         print(f"note ({count} images): {text}")
 
 
+def _cameras(args: argparse.Namespace) -> tuple[str, ...]:
+    """Of a rig, by the settings."""
+    config = build(shutter_values(args))
+    return config.cameras if config.is_rig else ()
+
+
 def _options(args: argparse.Namespace) -> Options:
     direction = build(shutter_values(args)).scan_direction
     return Options(args.storage, args.with_images, direction)
@@ -185,7 +191,7 @@ def detect_features(args: argparse.Namespace) -> None:
     extractor = FrameExtractor(config)
     options = _options(args)
     with (
-        opened(args, args.images, args.start) as source,
+        opened(args, args.images, args.start, cameras=_cameras(args)) as source,
         atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
         tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress,
     ):

@@ -8,7 +8,7 @@ import argparse
 import contextlib
 import importlib.util
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,16 +27,19 @@ if WORKING:
 
     from rs_localizer.core.camera import Camera
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
+    from rs_localizer.io.rigs import read_camchain
     from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_log, read_telemetry
-    from rs_localizer.io.video import has_times
+    from rs_localizer.io.video import count_lenses, has_times
     from rs_localizer.offline.image_sources import (
         IMAGE_TYPES,
         INFO_TYPE,
+        LENSES,
         Carried,
         Shot,
         find_topic,
         from_bag,
         from_files,
+        from_lenses,
         from_video,
         have_times,
         image_files,
@@ -237,8 +240,9 @@ class Source:
 
 @contextlib.contextmanager
 def opened(
-    args: argparse.Namespace, path: Path, start: float | None = None, calibrated: bool = True
-) -> Iterator[Source]:
+    args: argparse.Namespace, path: Path, start: float | None = None, calibrated: bool = True,
+    cameras: Sequence[str] = (),
+) -> Iterator[Source]:  # fmt: skip
     """Images with the lens of ``args.calibration`` or, of a bag, its camera_info.
 
     Args:
@@ -246,6 +250,7 @@ def opened(
         path: of the images.
         start: time of the first one, s; not of a bag.
         calibrated: refuse images without a calibration.
+        cameras: of a rig that filmed into one file; ``args.calibration`` is its camchain.
 
     Raises:
         UsageError: for options that do not go with it, or that are missing.
@@ -254,6 +259,9 @@ def opened(
         for name in ("image", "camera_info"):
             if getattr(args, name) is not None:
                 raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
+        if cameras:
+            yield _of_lenses(args, path, cameras, start)
+            return
         telemetry = telemetry_of(path, args)
         camera = None if args.calibration is None else read_calibration(args.calibration)
         if camera is None and calibrated:
@@ -272,6 +280,36 @@ def opened(
     with open_bag(path) as bag:
         camera = None if args.calibration is None else read_calibration(args.calibration)
         yield of_bag(bag, camera, args, calibrated)
+
+
+def lenses_of(path: Path) -> tuple[str, ...]:
+    """The names of the cameras that filmed into one file."""
+    return LENSES[: count_lenses(path)]
+
+
+def _of_lenses(
+    args: argparse.Namespace, path: Path, names: Sequence[str], start: float | None
+) -> Source:
+    """The images of several lenses of one file, with where they are by the camchain."""
+    there = () if path.is_dir() else lenses_of(path)
+    if missing := [name for name in names if name not in there]:
+        raise UsageError(
+            f"cameras: {path} is of {', '.join(there) or 'images'}, not of {', '.join(missing)}"
+        )
+    if args.rate is not None:
+        raise UsageError("--rate is for one camera: leave it out with cameras")
+    if args.calibration is None:
+        raise UsageError("cameras in one file: --calibration FILE_camchain.yaml of calibrate --rig")
+    parts = read_camchain(args.calibration)
+    if missing := [name for name in names if name not in parts.cameras]:
+        raise UsageError(f"--calibration: {args.calibration} has no {', '.join(missing)}")
+    clocks = {name: clock_of_lens(start) for name in names}
+    return Source(from_lenses(path, parts, clocks), None, clocks[names[0]])
+
+
+def clock_of_lens(start: float | None = None) -> ImageClock:
+    """One of several: their common zero is the first image of the first one."""
+    return ImageClock(None, None if start is None else round(start * 1e9), zero_ns=0)
 
 
 def of_bag(
@@ -299,10 +337,12 @@ def clock_of(path: Path, rate: float | None, start: float | None = None) -> Imag
     return ImageClock(rate, None if start is None else round(start * 1e9))
 
 
-def of_files(path: Path, camera: Camera | None, clock: ImageClock) -> Source:
-    """The images of a video or folder."""
+def of_files(
+    path: Path, camera: Camera | None, clock: ImageClock, lens: int | None = None
+) -> Source:
+    """The images of a video, of one of its lenses, or of a folder."""
     if not path.is_dir():
-        return Source(from_video(path, camera, clock), None, clock)
+        return Source(from_video(path, camera, clock, lens), None, clock)
     files = image_files(path)
     return Source(from_files(files, camera, clock), len(files), clock)
 

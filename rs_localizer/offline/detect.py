@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from rs_localizer.markers.map_check import LeaveOneOut, Predict, rms, still_erro
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
+from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.refusal import Refusal
 
 # Fewer corners than this say nothing about how well a pose fits.
@@ -112,7 +113,8 @@ def record(
                 detected = detector.detect(shot.image)
                 tally.add(cameras.of(shot, shot.image), detected)
                 if len(detected.detections.ids):
-                    _write(bag, shot, detected, options.with_images)
+                    found = correspondences(detected, make_message)
+                    _write(bag, shot, CORRESPONDENCES_TOPIC, found, options.with_images)
                 if tally.images == _PATIENCE and tally.are_few:
                     count = len(tally.counts) or "none"
                     tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
@@ -227,7 +229,7 @@ class Cameras:
 
     def __init__(self, scan_direction: str) -> None:
         self._scan_direction = scan_direction
-        self._last: tuple[Calibration, Camera] | None = None
+        self._last: dict[str, tuple[Calibration, Camera]] = {}  # by their names
 
     def of(self, shot: Shot, image: Image) -> Camera:
         """Of one image.
@@ -237,11 +239,12 @@ class Cameras:
         """
         try:
             calibration = read_camera_info(shot.camera_info)
-            if self._last is None or self._last[0] != calibration:
-                self._last = calibration, calibration.camera(0.0, self._scan_direction)
+            if shot.name not in self._last or self._last[shot.name][0] != calibration:
+                camera = calibration.camera(0.0, self._scan_direction)
+                self._last[shot.name] = calibration, camera
         except MessageError as error:
             raise DetectError(f"the camera_info cannot be used: {error}") from error
-        camera = self._last[1]
+        camera = self._last[shot.name][1]
         height, width = image.pixels.shape
         if (width, height) != camera.size:
             raise DetectError(
@@ -263,11 +266,13 @@ def _why(found: tuple[int, int], calibrated: tuple[int, int]) -> str:
     return ": another mode or camera; calibrate in the mode that is used"
 
 
-def _write(bag: BagWriter, shot: Shot, detected: Detected, with_images: bool) -> None:
-    bag.write(CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
-    bag.write(CORRESPONDENCES_TOPIC, correspondences(detected, make_message), shot.recorded_ns)
+def _write(bag: BagWriter, shot: Shot, topic: str, found: Any, with_images: bool) -> None:
+    """Camera info, what was found in the image, and the image itself."""
+    prefix = f"/{shot.name}" if shot.name else ""
+    bag.write(prefix + CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
+    bag.write(prefix + topic, found, shot.recorded_ns)
     if with_images and shot.compressed is not None:
-        bag.write(IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
+        bag.write(prefix + IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
 
 
 def static_residual(camera: Camera, detected: Detected) -> float:
@@ -334,16 +339,10 @@ def record_features(
                 extracted = extractor.extract(shot.image)
                 if len(extracted.features):
                     told.counts.append(len(extracted.features))
-                    _write_keypoints(bag, shot, extracted, options.with_images)
+                    found = keypoints(extracted, make_message)
+                    _write(bag, shot, KEYPOINTS_TOPIC, found, options.with_images)
             done()
         if not told.counts:
             reasons = "".join(f"; {detail}" for detail in told.refused.values())
             raise DetectError(f"none of the {told.images} images has any keypoint{reasons}")
     return told
-
-
-def _write_keypoints(bag: BagWriter, shot: Shot, extracted: Extracted, with_images: bool) -> None:
-    bag.write(CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
-    bag.write(KEYPOINTS_TOPIC, keypoints(extracted, make_message), shot.recorded_ns)
-    if with_images and shot.compressed is not None:
-        bag.write(IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
