@@ -307,6 +307,7 @@ def _calibrated(
     tell_telemetry(
         argparse.Namespace(images=args.recording, no_telemetry=args.no_telemetry),
         verdict.readout_time(found),
+        found.fit.camera,
         lens=False,
     )
     if intrinsics:

@@ -47,8 +47,9 @@ if WORKING:
     )
     from rs_localizer.trajectory.imu import ImuRecording
 
-# Readout times that differ by less are called the same: what a file says counts rows its own way.
-_SAME_READOUT = 0.05
+# Readout times and focal lengths that differ by less are called the same: what a file says counts
+# rows its own way, and is of no single camera.
+_SAME = 0.05
 
 
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
@@ -149,17 +150,26 @@ def add_telemetry(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def tell_telemetry(args: argparse.Namespace, used: float | None = None, lens: bool = True) -> None:
+def tell_telemetry(
+    args: argparse.Namespace, used: float | None = None, measured: Camera | None = None,
+    lens: bool = True,
+) -> None:  # fmt: skip
     """Say what a video knows of its camera, and what is not used of it.
 
     Args:
         args: with ``images`` and ``no_telemetry``.
         used: the readout time that was measured, s; None: that of the settings is used.
+        measured: the camera, if it was measured.
         lens: whether a lens profile takes the place of a calibration.
     """
     path = args.images
     if args.no_telemetry:
         return
+    is_rig = measured is None and build(shutter_values(args)).is_rig
+    if path.suffix == ".insv" and importlib.util.find_spec("av") is not None:
+        names = lenses_of(path)
+        if len(names) > 1 and measured is None and not is_rig:
+            print(f"note: of {', '.join(names)} the first one is used; calibrate --rig takes all")
     found = _telemetry(path)
     if found is None:
         missing = importlib.util.find_spec("telemetry_parser") is None
@@ -173,18 +183,27 @@ def tell_telemetry(args: argparse.Namespace, used: float | None = None, lens: bo
             "readout time are not used"
         )
         return
-    said = [f"gyroscope at {found.rate:.0f} Hz"]
+    said = [f"gyroscope at {found.rate:.0f} Hz" + (" (not used of a rig)" if is_rig else "")]
     if found.readout_time is not None:
         said.append(f"readout time {1e3 * found.readout_time:.2f} ms")
         how = "given" if used is None else "measured"
         used = build(shutter_values(args)).readout_time if used is None else used
-        if abs(used / found.readout_time - 1.0) > _SAME_READOUT:
+        if abs(used / found.readout_time - 1.0) > _SAME:
             said[-1] += f" (not used: {1e3 * used:.2f} ms was {how})"
     if found.exposure is not None:
         said.append(f"exposure {1e3 * found.exposure:.2f} ms (median)")
     if found.lens:
-        how = "used" if lens and args.calibration is None else "not used"
-        said.append(found.lens + (f", {how}" if found.profile is not None else ""))
+        said.append(found.lens)
+        if (profile := found.profile) is not None:
+            used_one = lens and args.calibration is None
+            said[-1] += ", used" if used_one else ", not used"
+            if measured is not None:
+                focal = measured.K[0, 0] * profile.width / measured.width
+                if abs(focal / profile.K[0, 0] - 1.0) > _SAME:
+                    said[-1] += (
+                        f" (its focal length is {profile.K[0, 0]:.0f} px, {focal:.0f} px was "
+                        "measured: of another mode?)"
+                    )
     print(f"{found.camera}: {', '.join(said)}; --no-telemetry ignores them")
 
 

@@ -295,3 +295,18 @@ def test_maps_take_the_gyroscope_of_a_video(video: Path, telemetry: Any) -> None
     assert imu.recording.stamps_ns[0] == 10**9
     assert build.shutter_of(given).readout_time == pytest.approx(0.0205)
     assert build.imu_of(parser.parse_args([str(video), "--out", "map", "--no-telemetry"])) is None
+
+
+@pytest.mark.parametrize(("focal", "doubted"), [(280.0, False), (300.0, True)])
+def test_a_focal_length_that_disagrees_is_named(
+    video: Path, telemetry: Any, capsys: pytest.CaptureFixture[str], focal: float, doubted: bool
+) -> None:
+    """Of another resolution of the same shape: half of the measured one is to be compared."""
+    lens = Camera(160, 120, [[140.0, 0, 80], [0, 140, 60], [0, 0, 1]], np.zeros(4), "equidistant")
+    telemetry(lens="lens profile", profile=lens)
+    measured = Camera(320, 240, [[focal, 0, 160], [0, focal, 120], [0, 0, 1]])
+    args = argparse.Namespace(images=video, no_telemetry=False, calibration=None)
+    image_input.tell_telemetry(args, 0.0205, measured, lens=False)
+    said = capsys.readouterr().out
+    assert "lens profile, not used" in said
+    assert ("(its focal length is 140 px, 150 px was measured" in said) == doubted
