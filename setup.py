@@ -90,7 +90,7 @@ setup(
             "codespell==2.4.*",
             "hypothesis",
             # AprilRobotics' detector, for what it publishes; elsewhere its build needs CMake.
-            "pupil-apriltags; platform_machine == 'x86_64'",
+            "pupil-apriltags; platform_machine == 'x86_64' and python_version < '3.14'",
             "mypy==2.4.*",  # pinned, as is Ruff: what passes today passes with the next release
             "pytest",
             "pytest-timeout",
