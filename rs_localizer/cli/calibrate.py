@@ -24,6 +24,7 @@ from rs_localizer.cli.batch import (
 from rs_localizer.cli.image_input import (
     add_telemetry,
     clock_of,
+    clock_of_lens,
     of_bag,
     of_files,
     replay_command,
@@ -177,8 +178,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rig",
         action="store_true",
         help="the recordings are those of cameras on one body, one each, or one bag has topics of "
-        "several: find where the cameras are, and their clocks, too; the first one's axes and "
-        "clock are the rig's. Cameras are named as their files, or as their topics begin; "
+        "several, or one video several lenses (.insv): find where the cameras are, and their "
+        "clocks, too; the first one's axes and clock are the rig's. "
+        "Cameras are named as their files, or as their topics begin; "
         "--calibration is a camchain, or FILE of all as FILE#NAME",
     )
     parser.add_argument(
@@ -304,6 +306,7 @@ def _calibrated(
     tell_telemetry(
         argparse.Namespace(images=args.recording, no_telemetry=args.no_telemetry),
         verdict.readout_time(found),
+        found.fit.camera,
         lens=False,
     )
     if intrinsics:
@@ -344,7 +347,9 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
         imu = _imu_of_video(args, path)
         known = args.calibration is not None
         camera = read_calibration(args.calibration) if known else _unknown((2, 2))
-        source = of_files(path, camera, clock_of(path, args.rate))
+        lens: int | None = getattr(args, "lens", None)
+        clock = clock_of(path, args.rate) if lens is None else clock_of_lens()
+        source = of_files(path, camera, clock, lens)
         found = _detected(args, source.shots)
         tell_times(source.clock)
         return replace(found, own_stamps=path.is_dir() and args.rate is None, imu=imu)
@@ -571,13 +576,14 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
                 "parts of the recording differ by more than their noise: the deviations of "
                 f"rotation, place and offset are {numbers(mounted.inflations, 1)} times that"
             )
-        if len(args.recordings) == 1:
+        if len(args.recordings) == 1 and is_bag(args.recordings[0]):
             _tell_tf(args.recordings[0], mounted, cameras[name].frame, cameras[first].frame)
     refusals |= {name: text for name, one in rig.items() if (text := one.undetermined)}
     if args.out is not None and (args.force or not refusals):
         frames = {name: own.frame for name, own in cameras.items()}
         values = _of_maps(config, maps) | (_of_lenses(recordings) if intrinsics else {})
         _write_rig(args.out, _parts(rig, recordings, config), frames, values, comments, intrinsics)
+        print(f"next: {_next_of_rig(args)}")
     if refusals:
         raise ValueError(
             "not observable: " + "; ".join(f"{name}: {text}" for name, text in refusals.items())
@@ -666,7 +672,17 @@ def _write_rig(
             write(file)
     for file in writers:
         print(f"written: {file}")
-    print(f"next: ros2 launch {shlex.quote(str(transforms))}")
+
+
+def _next_of_rig(args: argparse.Namespace) -> str:
+    """The command that goes on: poses of a video of several lenses, or TF for a live rig."""
+    path, stem, recording = args.out, args.out.stem, args.recordings[0]
+    if len(args.recordings) > 1 or is_bag(recording) or args.map is None:
+        return shlex.join(["ros2", "launch", str(path.with_name(f"{stem}_transforms.launch.xml"))])
+    chain, poses = path.with_name(f"{stem}_camchain.yaml"), path.with_name(f"{stem}_poses")
+    files = {"--map": args.map, "--calibration": chain, "--params": path, "--out": poses}
+    words = [word for name, value in files.items() for word in (name, str(value))]
+    return shlex.join(["rs_localizer", "replay", str(recording), *words])
 
 
 def _calibrate_batch(args: argparse.Namespace) -> None:

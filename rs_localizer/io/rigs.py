@@ -28,15 +28,17 @@ import yaml
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import make_message
 from rs_localizer.io.calibration import (
     CalibrationError,
     colmap_parameters,
     kalibr_camera,
     kalibr_fields,
 )
-from rs_localizer.io.transforms import Transform, TransformError, from_numbers
+from rs_localizer.io.transforms import Transform, TransformError, from_numbers, make_transform
 from rs_localizer.io.yaml_text import YamlError, load_yaml
 
+RIG_FRAME = "rig"
 _CHAIN, _IMU, _SHIFT = "T_cn_cnm1", "T_cam_imu", "timeshift_cam_imu"
 _SHUTTER = ("readout_time", "scan_direction")
 # Entries of R R^T - I beyond this are no rounding of a file's digits.
@@ -231,6 +233,18 @@ def node_parameters(parts: RigParts) -> dict[str, Any]:
         if (offset := parts.time_offset.get(name, 0.0)) != 0.0:
             own[f"{name}.stamp_offset"] = offset
     return {"cameras": list(parts.cameras), **own}
+
+
+def make_mounts(parts: RigParts) -> Any:
+    """A tf2_msgs/TFMessage that says where the cameras are on the rig."""
+    transforms = [
+        make_transform(
+            make_message, 0, RIG_FRAME, optical_frame(name),
+            Transform(*parts.camera_from_rig[name]).inverse(),
+        )
+        for name in parts.cameras
+    ]  # fmt: skip
+    return make_message("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 
 def write_static_transforms(path: Path, parts: RigParts, frames: Mapping[str, str]) -> None:

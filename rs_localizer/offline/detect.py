@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from rs_localizer.markers.map_check import LeaveOneOut, Predict, rms, still_erro
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
+from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.refusal import Refusal
 
 # Fewer corners than this say nothing about how well a pose fits.
@@ -110,7 +111,8 @@ def record(
             detected = detector.detect(shot.image)
             tally.add(cameras.of(shot, shot.image), detected)
             if len(detected.detections.ids):
-                _write(bag, shot, detected, options)
+                corners = correspondences(detected, make_message)
+                _write(bag, shot, CORRESPONDENCES_TOPIC, corners, options)
             if tally.images == _PATIENCE and tally.are_few:
                 count = len(tally.counts) or "none"
                 tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
@@ -262,11 +264,11 @@ def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
     return ": another mode or camera; calibrate in the mode that is used"
 
 
-def _write(bag: BagWriter, shot: Shot, detected: Detected, options: Options) -> None:
+def _write(bag: BagWriter, shot: Shot, topic: str, message: Any, options: Options) -> None:
+    """What the image shows, its camera, and the image itself."""
     own = f"/{options.camera}" if options.camera else ""
-    corners = correspondences(detected, make_message)
     bag.write(own + CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
-    bag.write(own + CORRESPONDENCES_TOPIC, corners, shot.recorded_ns)
+    bag.write(own + topic, message, shot.recorded_ns)
     if options.with_images and shot.compressed is not None:
         bag.write(own + IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
 
@@ -334,16 +336,9 @@ def record_features(
             extracted = extractor.extract(shot.image)
             if len(extracted.features):
                 extraction.counts.append(len(extracted.features))
-                _write_keypoints(bag, shot, extracted, options.with_images)
+                _write(bag, shot, KEYPOINTS_TOPIC, keypoints(extracted, make_message), options)
         done()
     if not extraction.counts:
         reasons = "".join(f"; {detail}" for detail in extraction.refused.values())
         raise DetectError(f"none of the {extraction.images} images has any keypoint{reasons}")
     return extraction
-
-
-def _write_keypoints(bag: BagWriter, shot: Shot, extracted: Extracted, with_images: bool) -> None:
-    bag.write(CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
-    bag.write(KEYPOINTS_TOPIC, keypoints(extracted, make_message), shot.recorded_ns)
-    if with_images and shot.compressed is not None:
-        bag.write(IMAGE_TOPIC, shot.compressed, shot.recorded_ns)

@@ -132,7 +132,7 @@ def test_maps_are_refined_with_one_camera(pair, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["video.mp4"], "--rig needs the recordings of several cameras, or one bag"),
+        (["video.mp4"], "--rig needs the recordings of several cameras, one bag or a video"),
         (["a/cam.mp4", "b/cam.mp4"], "cameras need different names"),
         (["1.mp4", "b.mp4"], "names that begin with a letter: 1, b"),
         (["a.mp4", "b.mp4", "--imu"], "--imu is for one camera"),
