@@ -117,8 +117,7 @@ def shutter_values(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def telemetry_of(path: Path, args: argparse.Namespace) -> Telemetry | None:
-    """What a video, or a log of a phone beside it, says of its camera; None: nothing, or it is not
-    to be used.
+    """What a video, or a log beside it, says of its camera; None: nothing, or it is not to be used.
 
     Raises:
         ValueError: for telemetry that cannot be read.

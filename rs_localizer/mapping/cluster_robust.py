@@ -31,8 +31,7 @@ from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 def border_rows(
     curve: Curve, sights: Sights, terms: Terms, lifted: Array, first: int, out: Array
 ) -> None:
-    """Fill the rows of as many keypoints as there is room for, from one on; zeros for those that
-    do not count.
+    """Fill the rows of as many keypoints as there is room for; zeros for those that do not count.
 
     Args:
         lifted: (6 n, b) H^-1 C of the bordered system: how the controls follow the border.

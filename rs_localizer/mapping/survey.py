@@ -1,8 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where markers are, from one recording that shows them: continuous-time adjustment with the poses
-of the markers free, each a rigid square of known size. The first marker is the origin; whatever
-shows several of them closes loops.
+"""Where markers are, from one recording that shows them.
+
+Continuous-time adjustment with the poses of the markers free, each a rigid square of known size.
+The first marker is the origin; whatever shows several of them closes loops.
 
 A square that is seen from one side fits two poses. From few directions the wrong one is a minimum,
 too, which no adjustment leaves (Collins and Bartoli, *Infinitesimal plane-based pose estimation*,
@@ -286,8 +287,10 @@ def _right_side_up(
 
 
 def _less_noise(camera: Camera, observations: Observations, fitted: Fit) -> Fit:
-    """With corners that are better than was taken for granted: weighed too little, they lose to
-    what is known of accelerations beforehand, and the readout time with them.
+    """With corners that are better than was taken for granted.
+
+    Weighed too little, they lose to what is known of accelerations beforehand, and the readout time
+    with them.
     """
     noise = fitted.deviation * math.sqrt(fitted.inflation)
     if fitted.deviation > _LEAST_NOISE or noise > _LEAST_NOISE:

@@ -87,9 +87,7 @@ class Input:
         return f"--{self.topic.replace('_', '-')}"
 
     def take(self, localizer: FrameLocalizer, message: Any) -> Results:
-        """Read and use a message at once; of a frame, its result, or the results of all frames that
-        are complete with it.
-        """
+        """Read and use a message at once; the results of frames that are complete with it."""
         frames = self.role is Role.FRAMES
         try:
             return self.use(localizer, self.read(message))

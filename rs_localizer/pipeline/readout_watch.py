@@ -91,9 +91,7 @@ class ScanAxis:
 
     @property
     def wrong(self) -> bool:
-        """Whether it must be the other axis: its motions also agree from frame to frame, which
-        errors of map and lens do not.
-        """
+        """Whether it must be the other axis: its motions agree from frame to frame."""
         return self._evidence > _CERTAIN and self.direction is not None
 
     @property

@@ -289,9 +289,7 @@ class RigLocalizer(FrameLocalizer):
         return self.mounted(self._localized(images, result, origin_ns))
 
     def _mount(self, images: Sequence[Image]) -> Refusal | None:
-        """Look up where the cameras are, of each that has not been or that moves; why one that has
-        a part in this frame is not known.
-        """
+        """Look up where cameras are that move; why one of this frame is not known."""
         frame, stamp_ns = self.camera_frame, images[0].cloud.stamp_ns or None
         mounts, refusal = dict(self._mounts), None
         for image in images:

@@ -32,9 +32,7 @@ _CLOCK_STREAM = 28
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountedMotion:
-    """The motion of a camera that is mounted to a moving rig: ``X_camera = rotation X_rig +
-    translation``.
-    """
+    """The motion of a camera on a moving rig: ``X_camera = rotation X_rig + translation``."""
 
     rig: TrueMotion
     rotation: Array  # (3,3)
@@ -136,9 +134,7 @@ def write_rig_frame(
     image: RigFrame,
     keypoints: NDArray[Any] | None = None,
 ) -> None:
-    """Camera info and correspondences (or keypoints) of a camera, and the truth of the rig when its
-    first and its middle row were exposed.
-    """
+    """Camera info, points of a camera, and the rig's truth at its first and its middle row."""
     camera, frame, stamp_ns = parts.cameras[image.name], image.frame, image.stamp_ns
     recorded_ns = frame.stamp_ns + round(camera.readout_time * 1e9)
     for time_ns in sorted({frame.stamp_ns, frame.middle_ns}):
