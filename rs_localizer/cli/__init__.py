@@ -68,8 +68,7 @@ def add_overwrite(parser: argparse._ActionsContainer) -> None:
 
 
 def replaced(args: argparse.Namespace, mark: str) -> Callable[[Path], None] | None:
-    """What removes an earlier result from ``--out``, where that is wanted; every result has a file
-    of the name ``mark``.
+    """What removes an earlier result (it has a file ``mark``) from ``--out``, where wanted.
 
     Raises:
         ValueError: when what is there is something else.

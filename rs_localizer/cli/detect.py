@@ -128,8 +128,9 @@ def detect_one(args: argparse.Namespace) -> list[Recorded]:
 
 
 def _cameras(args: argparse.Namespace, bag: BagWriter) -> dict[str, argparse.Namespace]:
-    """The arguments of each camera of a rig by its name, or of one that is alone, by ""; where the
-    lenses of one video are goes into the bag.
+    """The arguments of each camera of a rig by its name, or of one that is alone, by "".
+
+    Where the lenses of one video are goes into the bag.
     """
     settings = build(shutter_values(args))
     if not settings.is_rig:

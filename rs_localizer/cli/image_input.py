@@ -115,8 +115,7 @@ def shutter_values(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def telemetry_of(path: Path, args: argparse.Namespace) -> Telemetry | None:
-    """What a video, or a log of a phone beside it, says of its camera; None: nothing, or it is not
-    to be used.
+    """What a video, or a log beside it, says of its camera; None: nothing, or it is not to be used.
 
     Raises:
         ValueError: for telemetry that cannot be read.
@@ -252,9 +251,7 @@ def tell_next(args: argparse.Namespace, more: str = "") -> None:
 
 
 def replay_command(recording: Path, *, known: bool = True) -> str:
-    """The command that makes poses of what ``detect`` wrote, with the parameters beside it if they
-    are ``known``.
-    """
+    """The command that makes poses of what ``detect`` wrote, with the parameters beside it."""
     params = ["--params", str(recording / PARAMETERS)] if known else []
     words = ["replay", str(recording), *params, "--out", f"{recording}_poses"]
     return shlex.join(["rs_localizer", *words])

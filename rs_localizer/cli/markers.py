@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``rs_localizer markers make|check``: prints with their map file; is a map file consistent?"""
+"""``rs_localizer markers make|check``: prints with their map file, and checks of map files."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cameras of a rig that a command takes: which recording and topics are whose, and how they are
-mounted.
-"""
+"""The cameras of a rig: which recording and topics are whose, and how they are mounted."""
 
 from __future__ import annotations
 

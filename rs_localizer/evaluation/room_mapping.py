@@ -97,9 +97,7 @@ class Room:
         done: Callable[[], object] = lambda: None,
         markers: bool = True,
     ) -> list[View]:
-        """The views of a piece, with the markers or without looking for them; their images go to a
-        folder.
-        """
+        """The views of a piece, with the markers or without; their images go to a folder."""
         looker = Looker(self._most, images, self.marker_map if markers else None)
         views = []
         for image in self.images(piece):

@@ -494,8 +494,10 @@ class GyroscopeAid:
             self._doubt()
 
     def _doubt(self) -> None:
-        """Take the time offset for less well known, and look for it again: of all that a gyroscope
-        is off by, only its stamps change at once, with the clock of one of the two.
+        """Take the time offset for less well known, and look for it again.
+
+        Of all that a gyroscope is off by, only its stamps change at once, with the clock of one of
+        the two.
         """
         if self._settings.estimate_time_offset:
             self.filter.doubt_offset()

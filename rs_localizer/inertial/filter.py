@@ -441,9 +441,7 @@ def _carried(
 def _learned(
     before: Array, after: Array, with_parameters: Array, of_parameters: Array, step: Array
 ) -> tuple[Array, Array, Array]:
-    """How the parameters (4,) change, their covariance (4,4) then, and what is left of the one
-    with the motion (k,4).
-    """
+    """How the parameters (4,) change, their covariance (4,4), and that with the motion (k,4)."""
     gain, gained, tied = _gain(before, after, with_parameters)
     covariance = of_parameters - gained
     for i in range(4):

@@ -78,9 +78,7 @@ class ImageClock:
         return None if own_ns is None else self.start_ns + own_ns - (self.zero_ns or 0)
 
     def at(self, own_ns: int) -> int | None:
-        """Stamp of a moment of a video's own clock, once its first image has come; None: with a
-        rate that is not its own.
-        """
+        """Stamp of a moment of a video's clock, after its first image; None: with a rate."""
         if self.rate is not None or self.start_ns is None:
             return None
         return self.start_ns + own_ns - (self.zero_ns or 0)

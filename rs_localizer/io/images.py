@@ -143,9 +143,7 @@ def read_compressed_image(message: Any) -> Image:
 
 
 def in_color(message: Any, image: Image) -> NDArray[np.uint8]:
-    """The pixels of a message that has been read: (h,w,3) where it holds colours of 8 bits, as
-    they stand in it, else the gray ones (h,w).
-    """
+    """The pixels of a message: (h,w,3) of colours of 8 bits, else gray ones (h,w)."""
     height, width = image.pixels.shape
     if hasattr(message, "format"):
         data = np.frombuffer(bytes(message.data), np.uint8)

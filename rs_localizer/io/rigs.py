@@ -1,7 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How cameras are mounted to each other, in files of other programs: Kalibr's camchain, COLMAP's
-``rig_config.json``.
+"""How cameras are mounted to each other, in Kalibr's camchain and COLMAP's ``rig_config.json``.
 
 A camchain has a mapping for each camera, in their order. Its names are Kalibr's, ``cam0``, or any
 other; besides what Kalibr writes, each may have ``readout_time`` (s) and ``scan_direction``.
@@ -54,8 +53,7 @@ class RigParts(NamedTuple):
 
 
 def read_camchain(path: Path | str) -> RigParts:
-    """The cameras of a camchain (see the module); without ``T_cam_imu`` the rig's axes are those of
-    the first camera.
+    """The cameras of a camchain; without ``T_cam_imu`` in the axes of the first camera.
 
     Raises:
         CalibrationError: for anything else, saying what was found.
@@ -92,9 +90,9 @@ def write_camchain(path: Path, parts: RigParts) -> None:
 
 
 def read_rig_config(path: Path | str) -> dict[str, tuple[Array, Array]]:
-    """Rotation (3,3) and translation (3,) camera_from_rig of each camera of COLMAP's
-    ``rig_config.json``, by the last folder of its ``image_prefix``; the rig's axes are those of
-    ``ref_sensor``.
+    """Rotation (3,3) and translation (3,) camera_from_rig by name, of COLMAP's ``rig_config.json``.
+
+    The name is the last folder of ``image_prefix``; the rig's axes are those of ``ref_sensor``.
 
     Raises:
         CalibrationError: for anything else, or several rigs.

@@ -186,8 +186,9 @@ def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
 
 
 def _down(rotations: Array) -> Array:
-    """The direction that is most often at right angles to the images' rows: people hold cameras
-    level. Its sign is that of the images' mean downward direction.
+    """The direction most often at right angles to the images' rows: people hold cameras level.
+
+    Its sign is that of the images' mean downward direction.
     """
     across = rotations[:, :, 0]
     _, vectors = np.linalg.eigh(across.T @ across)

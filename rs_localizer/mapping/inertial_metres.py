@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scale and gravity of a refined map, from the IMU that went along with the camera: scale where
-nothing else tells it, z up, and a check of others.
-"""
+"""Scale and gravity of a refined map, from the IMU that went along, and a check of others."""
 
 from __future__ import annotations
 

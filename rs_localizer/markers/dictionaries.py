@@ -104,9 +104,7 @@ def _dictionary(family: Family) -> Any:
 
 
 def _part(family: Family, ids: NDArray[np.int64]) -> Any:
-    """A dictionary of some ids: those that differ by as many bits as the family's are kept apart,
-    and as many wrong bits are corrected.
-    """
+    """A dictionary of some ids, that are told apart by as many bits as the family's."""
     whole = _dictionary(family)
     part = _aruco.getPredefinedDictionary(getattr(_aruco, family.constant))  # a copy
     part.bytesList = np.ascontiguousarray(whole.bytesList[ids])

@@ -223,8 +223,9 @@ def _width(rises: Array) -> float:
 
 @inlined
 def _levels(rises: Array, at: int, cell: float) -> tuple[float, float]:
-    """The level half way up the edge of a side, and how far around it to go, where its rises
-    (4,5) of the round before are not whole; else NaN.
+    """The level half way up the edge of a side, and how far around it to go; else NaN.
+
+    Where its rises (4,5) of the round before are whole.
     """
     none = (math.nan, math.nan)
     for k in range(4):
@@ -252,8 +253,10 @@ def _side(
     rises: Array,
     c: Array,
 ) -> bool:
-    """Fit the edge near the side that corner ``at`` begins: offsets c0 + c1 s + c2 s^2 outward, s
-    in -1..1. ``before`` (4,5) are the rises of the last round, ``rises`` (5,) those of this one.
+    """Fit the edge near the side that corner ``at`` begins.
+
+    Offsets c0 + c1 s + c2 s^2 outward, s in -1..1. ``before`` (4,5) are the rises of the last
+    round, ``rises`` (5,) those of this one.
     """
     a, b, last = q[at], q[(at + 1) % 4], (at + 3) % 4
     length = math.hypot(b[0] - a[0], b[1] - a[1])

@@ -85,9 +85,7 @@ def from_video(
 def with_telemetry(
     shots: Iterable[Shot | Carried], telemetry: Telemetry, clock: ImageClock
 ) -> Iterator[Shot | Carried]:
-    """The images of a video, and its gyroscope as ``imu``, in the axes and by the clock of the
-    camera; without a clock of its own, none.
-    """
+    """The images of a video, and its gyroscope as ``imu``, in the camera's axes and clock."""
     times_ns = np.round(1e9 * telemetry.times).astype(np.int64)
     sent = 0
     for shot in shots:

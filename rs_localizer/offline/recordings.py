@@ -146,8 +146,7 @@ def optical_frame(bag: BagReader, info: str | None = None, image: str | None = N
 def camera_topics(
     bag: BagReader, cameras: Sequence[str] | None = None
 ) -> dict[str, dict[str, str]]:
-    """The topics of each camera of a rig by the names of their inputs: camera_info, and one of
-    correspondences, keypoints and image.
+    """The topics of each camera of a rig by the names of their inputs.
 
     Args:
         cameras: their names, which stand before those of the topics; None: all that there are.

@@ -72,8 +72,9 @@ def plane_depths(points: Array) -> Depths:
 
 
 def map_depths(points: Array) -> Depths:
-    """Depths between the points (n,3) of a map that the camera has before it, their inverses
-    interpolated in the image; around them, those of the nearest. Who hides whom is not known.
+    """Depths between the points (n,3) of a map before the camera: who hides whom is not known.
+
+    Their inverses are interpolated in the image; around them are those of the nearest.
     """
     from scipy.interpolate import griddata  # 20 MB, which a node without this output does not need
 

@@ -365,9 +365,7 @@ class FrameLocalizer:
             )
 
     def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
-        """Whether readings of the frame with this stamp are missing that may come within so many
-        seconds.
-        """
+        """Whether readings of the frame with this stamp may yet come within so many s."""
         time_ns = self._middle_row_ns(stamp_ns)
         return self.imu.awaits(self._tracker, self._config, time_ns, patience)
 

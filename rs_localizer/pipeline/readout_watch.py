@@ -103,8 +103,9 @@ class ScanAxis:
 
     @property
     def wrong(self) -> bool:
-        """Whether it must be the other axis: its motions also agree from frame to frame, which
-        errors of map and lens do not.
+        """Whether it must be the other axis.
+
+        Its motions also agree from frame to frame, which errors of map and lens do not.
         """
         return self.direction is not None and (self._certain or self._evidence > _CERTAIN)
 

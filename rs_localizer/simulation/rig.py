@@ -39,9 +39,7 @@ Frame = SimulatedFrame | RenderedFrame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountedMotion:
-    """The motion of a camera that is mounted to a moving rig: ``X_camera = rotation X_rig +
-    translation``.
-    """
+    """The motion of a camera on a moving rig: ``X_camera = rotation X_rig + translation``."""
 
     rig: TrueMotion
     rotation: Array  # (3,3)
@@ -133,8 +131,9 @@ def write_rig_frame(
     image: RigFrame,
     keypoints: NDArray[Any] | None = None,
 ) -> None:
-    """Camera info and image, correspondences or keypoints of a camera, and the truth of the rig
-    when its first and its middle row were exposed.
+    """Camera info and image, correspondences or keypoints of a camera, and the rig's truth.
+
+    The truth is of when its first and its middle row were exposed.
     """
     camera, frame, stamp_ns = parts.cameras[image.name], image.frame, image.stamp_ns
     recorded_ns = frame.stamp_ns + round(camera.readout_time * 1e9)

@@ -168,9 +168,7 @@ def cut(state: State, start: float, end: float) -> State | None:
 
 
 def disagreement(values: Array, deviations: Array) -> float:
-    """By how much deviations (b,) are too small for the scatter of values (b,) (Birge's ratio),
-    1 if that may be chance.
-    """
+    """By how much deviations (b,) are too small (Birge's ratio), at least 1."""
     if len(values) < 2:
         return 1.0
     weights = deviations**-2.0
@@ -186,8 +184,7 @@ def disagreement(values: Array, deviations: Array) -> float:
 
 
 def discrepancy(value: float, values: Array, deviations: Array) -> float:
-    """By how much the value of the whole differs from the mean of its parts (b,), beyond the noise
-    of that mean.
+    """By how much the whole's value differs from the mean of its parts (b,), beyond its noise.
 
     Corners that are off in all images of a part alike bend its lens and shape. The shorter it is,
     the more of the shutter is taken for those: then the whole lies beside all of its parts.
@@ -310,9 +307,7 @@ class Calibration:
 
     @property
     def shape_deviation(self) -> float:
-        """Of the landmarks that were estimated (m, rms): by the noise, and by half of what the
-        halves differ by but for a rigid motion.
-        """
+        """Of the estimated landmarks (m, rms): by the noise, and half of the halves' difference."""
         count = 3 * len(np.unique(self.posed.observations.points))
         first = 1 + len(self.fit.state.lens)
         variances = np.diag(self.fit.border_covariance)[first : first + count]
@@ -416,9 +411,7 @@ def _freedom(observations: Observations, intrinsics: bool) -> Freedom:
 
 
 def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fit:
-    """Readout time first, then all that is free; then times of the images' own, and finer knots,
-    if the residuals ask for them.
-    """
+    """Readout time first, then all that is free, then the images' times and finer knots."""
     spacing = min(LONGEST_SPACING, interval)
     spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, 0.5 * interval)
     observations = within(posed.observations, spline)

@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A first lens, and its distortion model, from images in which the camera hardly moves (Zhang
-2000, by OpenCV).
-"""
+"""A first lens, and its model, from images in which the camera hardly moves (Zhang 2000)."""
 
 from __future__ import annotations
 
@@ -87,9 +85,7 @@ def first_lens(size: tuple[int, int], images: list[Observed]) -> Camera:
 
 
 def _unseen_error(lens: Camera, images: list[Observed], candidate: _Candidate) -> float:
-    """Error (px rms) of each half of the images under a lens that the other half finds near this
-    one.
-    """
+    """Error (px rms) of each half of the images under a lens of the other half."""
     halves = images[::2], images[1::2]
     squared, count = 0.0, 0
     for known, unseen in (halves, halves[::-1]):
@@ -103,9 +99,7 @@ def _unseen_error(lens: Camera, images: list[Observed], candidate: _Candidate) -
 
 
 def reprojection_error(camera: Camera, image: Observed) -> float:
-    """Error (px rms, of u and v together) of the best global-shutter pose of an image; where the
-    lens has no ray for a pixel, or there is no pose, infinite.
-    """
+    """Error (px rms) of the best global-shutter pose of an image; infinite where there is none."""
     rays = camera.rays(image.pixels)
     if not np.isfinite(rays).all():
         return np.inf
@@ -144,9 +138,7 @@ def _calibrated(
     candidate: _Candidate,
     start: Array | None = None,
 ) -> Camera | None:
-    """The lens of this kind that fits the images best, from ``start`` (3,3) or from anywhere;
-    None: none does.
-    """
+    """The best lens of this kind, from ``start`` (3,3) or anywhere; None: none fits."""
     points = [np.asarray(image.points, np.float32)[:, None] for image in images]
     pixels = [np.asarray(image.pixels, np.float32)[:, None] for image in images]
     best: tuple[float, Any, Any] | None = None
@@ -179,8 +171,10 @@ def _calibrated(
 
 
 def _folds(lens: Camera) -> bool:
-    """Whether pixels of the image have no ray: a series that fits the middle of the image, where
-    the board was shown, may turn back towards the rim.
+    """Whether pixels of the image have no ray.
+
+    A series that fits the middle of the image, where the board was shown, may turn back towards the
+    rim.
     """
     if lens.distortion_model == DistortionModel.EQUIDISTANT:  # looks sideways there, and has none
         return False

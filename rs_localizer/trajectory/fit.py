@@ -52,9 +52,7 @@ class Fit:
         return float(np.sqrt(self.border_covariance[0, 0])) if free else np.nan
 
     def state_covariances(self, times: Array) -> Array:
-        """Covariances (m,12,12) at times (m,): turn in camera axes, position in the map, body
-        rate (rad/s), velocity in the map (m/s).
-        """
+        """Covariances (m,12,12) at times (m,): turn, position, body rate, velocity."""
         first, jacobians = self.state.spline.jacobians(times)
         inner = self.inflation * self.factored.local_covariances(first)
         covariances: Array = jacobians @ inner @ np.swapaxes(jacobians, 1, 2)
@@ -99,8 +97,9 @@ def solve(problem: AnyProblem, start: State, deviation: float | None = None) -> 
 
 
 def cost_at(camera: Camera, observations: Observations, fitted: Fit, readout_time: float) -> float:
-    """The least cost with this readout time (s), to be compared with ``found.cost``; less exactly
-    where it is far from the least of all.
+    """The least cost with this readout time (s), to be compared with ``fitted.cost``.
+
+    Less exact where it is far from the least of all.
     """
     held = replace(fitted.freedom, readout_time=False)
     start = replace(fitted.state, readout_time=readout_time)
@@ -169,7 +168,5 @@ def steepness(squared: Array, deviation: float) -> float:
 
 
 def left_over(keypoints: int, used: int) -> float:
-    """By how much the noise's variance is larger than the mean square of what is left of it, when
-    so many numbers were estimated.
-    """
+    """By how much the noise's variance exceeds the mean square that is left."""
     return 2.0 * keypoints / max(2.0 * keypoints - used, 1.0)

@@ -126,8 +126,10 @@ class _Shown:
         return self._all.turns(times, whiles)
 
     def changes(self, times: Array, whiles: Array) -> Array:
-        """How they change with the times (m,), rad/s, without vibration: with it, an offset would
-        be found at which the tone of a motor happens to be zero at these times.
+        """How they change with the times (m,), rad/s, without vibration.
+
+        With it, an offset would be found at which the tone of a motor happens to be zero at these
+        times.
         """
         ahead, behind = (self._calm.turns(times + shift, whiles) for shift in (_STEP, -_STEP))
         return np.asarray((ahead - behind) / (2.0 * _STEP))
@@ -156,8 +158,9 @@ class _Turned:
 
 
 def _times(layout: Layout, sampled: Array) -> tuple[Array, Array]:
-    """When turns begin (m,), and how long they last (m,), s: one after the other, each within a
-    stretch and without a gap. Not evenly: a tone in step with them would be no noise.
+    """When turns begin (m,), and how long they last (m,), s: each within a stretch, without a gap.
+
+    Not evenly: a tone in step with them would be no noise.
     """
     parts = [
         _unevenly(np.arange(start + _MARGIN, end - _MARGIN - _UNEVEN, _WHILE))

@@ -218,9 +218,7 @@ def _noises(count: int, spacing: float) -> tuple[Array, Array]:
 
 
 def _overlaps(degree: int, count: int) -> Array:
-    """Integrals (n,n) of the products of B-splines a spacing apart, by it: one of twice the degree
-    and one more.
-    """
+    """Integrals (n,n) of the products of B-splines a spacing apart, by it."""
     order = 2 * degree + 1
     knots = np.arange(order + 2) - 0.5 * (order + 1)
     values = BSpline.basis_element(knots, extrapolate=False)(np.arange(count, dtype=float))
@@ -427,8 +425,7 @@ def _part(part: Means, kept: BoolArray, fit: _Fitted) -> tuple[float, float]:
 
 
 def excess(values: Array, deviations: Array) -> float:
-    """By how much the deviation of the weighted mean of values (b,) is too small, as they scatter
-    more than by their deviations (b,); 1 if that may be chance.
+    """By how much a weighted mean's deviation is too small, as values (b,) scatter; at least 1.
 
     Blocks may be known very differently well; all are taken to differ by the same on top
     (DerSimonian and Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 1986).

@@ -268,9 +268,7 @@ class ShutterHypotheses:
 
     @property
     def logarithm(self) -> float:
-        """Logarithm of the odds for a global shutter; negative where nothing else than a rolling
-        one can be, 0 where nothing is known.
-        """
+        """Logarithm of the odds for a global shutter; 0 where nothing is known."""
         return self._odds(_NONE, _SET)
 
     @property
@@ -302,8 +300,10 @@ class ShutterHypotheses:
 
 @kernel
 def changed(of: Equations, readout_time: float) -> tuple[float, float]:
-    """Square of what changes between the last two triples at a readout time, in variances of the
-    newer one's noise; and how far that readout time is from none, beyond the noise of the way.
+    """Square of what changes between the last two triples at a readout time, in their variances.
+
+    In variances of the newer one's noise; and how far that readout time is from none, beyond the
+    noise of the way.
     """
     last = len(of.x) - 1
     change, displacement, spread = np.empty(SIDE), np.empty(SIDE), np.empty((SIDE, SIDE))

@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cost of a trajectory and its normal equations, on the whitened errors of
-:mod:`rs_localizer.trajectory.sight_kernels`.
-"""
+"""The cost of a trajectory and its normal equations, on whitened errors."""
 
 from __future__ import annotations
 
@@ -307,8 +305,7 @@ class RigNormal(NamedTuple):
 
 
 class RigProblem:
-    """The cost of one motion that several cameras see, as of :class:`Problem`; their borders stand
-    one after the other, their keypoints as well.
+    """The cost of one motion that several cameras see; borders and keypoints stand in their order.
 
     Args:
         cameras: of which the first has what is expected of the motion.

@@ -149,9 +149,10 @@ class Score(NamedTuple):
 
 @kernel
 def score(of: Equations, value: float) -> Score:
-    """``sum of x*^T W (y - T x)``, where ``x*`` is the best estimate of the displacement: what
-    its noise shares with that of ``y - T x`` is removed, so that both are independent, and it is
-    shrunk towards rest where it is only noise.
+    """``sum of x*^T W (y - T x)``, where ``x*`` is the best estimate of the displacement.
+
+    What its noise shares with that of ``y - T x`` is removed, so that both are independent, and it
+    is shrunk towards rest where it is only noise.
 
     NaN where a covariance is none.
     """
@@ -203,9 +204,10 @@ def _decorrelate(
     displacement: Array,
     covariance: Array,
 ) -> Array:
-    """Write displacement (6,) and covariance (6,6) of ``x`` without what its noise shares with that
-    of the error (6,), whose inverse covariance is weight (6,6); return the matrix (6,6) that
-    shrinks the displacement towards rest.
+    """Write displacement (6,) and covariance (6,6) of ``x`` without the noise of the error (6,).
+
+    The error's inverse covariance is weight (6,6); return the matrix (6,6) that shrinks the
+    displacement towards rest.
     """
     shared, gain = np.empty((SIDE, SIDE)), np.empty((SIDE, SIDE))
     for i in range(SIDE):
@@ -273,9 +275,7 @@ def equation(
 
 @kernel
 def jumps(before: View, now: View, after: View, first: float, second: float) -> bool:
-    """Whether three views cannot be of one way, whatever the shutter; arguments of
-    :func:`equation`.
-    """
+    """Whether three views are of no one way, whatever the shutter; as :func:`equation`."""
     back, on = np.ascontiguousarray(before.rotation.T), np.ascontiguousarray(now.rotation.T)
     turn = log(on @ after.rotation) / second - log(back @ now.rotation) / first
     displacement = (after.position - now.position) / second - (

@@ -145,8 +145,9 @@ class FastTurn:
 
 
 def fast_turn(times: Array, estimates: list[Estimate], readout_time: float) -> FastTurn | None:
-    """The fast part of the turns that gyroscopes know of frames at times (f,), s, of their middle
-    rows; None: too few of the frames have one, or frames lie too far apart.
+    """The fast part of the turns that gyroscopes know at times (f,), s, of frames' middle rows.
+
+    None: too few of the frames have one, or frames lie too far apart.
     """
     # These take a third of a second, which programs that smooth nothing do not wait for.
     from scipy.interpolate import CubicSpline
@@ -363,8 +364,7 @@ class RigFrame:
 
 
 def smooth_rig(rig: Rig, frames: list[RigFrame]) -> Smoothed:
-    """The motion of a rig through frames with a pose, in their order; as :func:`smooth`, per
-    ``readout_time`` of the first camera.
+    """The motion of a rig through frames in their order; as :func:`smooth`, of its first camera.
 
     Raises:
         ValueError: when the frames determine no motion.
@@ -411,9 +411,7 @@ def smooth_rig(rig: Rig, frames: list[RigFrame]) -> Smoothed:
 
 
 def _knots(times: Array) -> tuple[float, float]:
-    """Spacing of the knots, and time in which accelerations fade (0: they do not), s, of images at
-    times (f,).
-    """
+    """Spacing of the knots, and time in which accelerations fade (0: never), s, of times (f,)."""
     interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     fading = FADING if interval < 0.5 * FADING else 0.0
     return min(_NARROW_SPACING if fading else LONGEST_SPACING, interval), fading
@@ -444,9 +442,7 @@ def _turned_pixels(
 
 
 def _shaken(fitted: Fit, frames: IntArray, estimates: list[Estimate]) -> BoolArray:
-    """Which images (f,) shake in a way that the motion does not follow; keypoints (n,) are of these
-    ``frames``.
-    """
+    """Which images (f,) shake in a way that the motion does not follow, by their keypoints (n,)."""
     own = np.array([max(one.residual_rms, fitted.freedom.least_noise) ** 2 for one in estimates])
     count = np.bincount(frames, minlength=len(estimates))
     # Robust, as the estimates are: outliers of the motion count as its limit.

@@ -96,9 +96,7 @@ def check_output(args: argparse.Namespace) -> None:
 
 
 def write(args: argparse.Namespace, any_map: Map | MarkerMap) -> None:
-    """Write the map to OUT: markers to a file of landmarks as their corners, whose ids are those
-    of ``detect``.
-    """
+    """Write the map to OUT: markers as landmarks, their corners, with ids of ``detect``."""
     path: Path = args.out
     if isinstance(any_map, Map) and path.suffix not in WRITERS:
         raise UsageError(f"{args.file} holds landmarks, which go to {' or '.join(WRITERS)}")
