@@ -66,7 +66,7 @@ class Mirrored:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjustable:
-    """What the cameras saw: corners, four of each marker; the first marker, the origin, is known."""
+    """What the cameras saw: four corners of each marker; the first, the origin, is known."""
 
     filmed: Sequence[Filmed]
     seen: Sequence[Observations]  # of the landmarks that all see

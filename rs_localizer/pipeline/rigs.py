@@ -213,7 +213,7 @@ class RigLocalizer(FrameLocalizer):
         self._use(calibration, self._config)
 
     def add(self, name: str, kind: str, message: Any) -> Iterator[Localized | Refusal]:
-        """Take an image; the results of frames that are complete with it, before cameras are compared."""
+        """Take an image; the results of frames that are complete, before cameras are compared."""
         if name not in self.calibrations:
             text = f"no usable camera_info of {name} has come yet"
             self._notice(Notice.NO_IMAGES, f"{name} is left out: {text}")
