@@ -275,8 +275,8 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
         written = _write(args, found, source.map, intrinsics, config, refused)
         if refused and written:
             refusal += (
-                "; without readout time and scan direction, which stay unknown (no twists; "
-                "--force writes them, too), lens and map are written"
+                f". Written to {args.out} and beside it: lens, map. Not written: readout time and "
+                "scan direction, which stay unknown: no twists (--force writes them, too)"
             )
     if refusal:
         raise ValueError(refusal)

@@ -149,7 +149,7 @@ def test_lens_and_board_come_without_a_readout_time(film, tmp_path, capsys):
     assert main(["calibrate", str(late), *board, "--out", str(out)]) == 1
     said = capsys.readouterr()
     assert "beside their stamps" in said.err
-    assert "without readout time and scan direction, which stay unknown" in said.err
+    assert "beside it: lens, map. Not written: readout time and scan direction" in said.err
     values = load_params_file(out)
     assert "readout_time" not in values
     camera = read_calibration(tmp_path / "camera_camera_info.yaml")
