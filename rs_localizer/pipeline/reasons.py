@@ -163,7 +163,7 @@ IMU_REASONS: dict[str, Meaning] = {
         "another solver",
     ),
     ImuReason.DOUBTED: Meaning(
-        "the points of this image fit better without the gyroscope",
+        "the points of this image fit better without the gyroscope, or its stamps have stepped",
         "nothing, if it is rare; otherwise imu.gyroscope_noise, imu.time_offset",
     ),
     ImuReason.DISAGREES: Meaning(
