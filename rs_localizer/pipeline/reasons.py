@@ -160,7 +160,7 @@ IMU_REASONS: dict[str, Meaning] = {
     ),
     ImuReason.NOT_TRACKING: Meaning("the solver is for global shutters", "another solver"),
     ImuReason.DOUBTED: Meaning(
-        "the points of this image fit better without the gyroscope",
+        "the points of this image fit better without the gyroscope, or its stamps have stepped",
         "nothing, if it is rare; otherwise imu.gyroscope_noise, imu.time_offset",
     ),
     ImuReason.DISAGREES: Meaning(

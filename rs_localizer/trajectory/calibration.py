@@ -197,6 +197,9 @@ def discrepancy(value: float, values: Array, deviations: Array) -> float:
 
 
 _LEAST_IMAGES = 20
+# Keypoints of all images together: each image keeps its part. A fisheye of 285 images with 352
+# corners each took minutes longer, for a lens and a readout time that errors of the corners limit.
+_MOST_SIGHTS = 40_000
 # A board: few landmarks, seen often. Each is where it should be to about this part of its size (a
 # quarter of a millimetre of an A4 sheet), beside what bends all of it.
 _MOST_BOARD_POINTS, _LEAST_SIGHTS, _BOARD_SHARE = 400, 30, 1e-3
@@ -367,7 +370,7 @@ def calibrate(
         ValueError: when the recording determines nothing, saying what was found.
     """
     taken = np.unique([image.stamp_ns for image in images])
-    images = in_order(images)
+    images = _thinned(in_order(images))
     if len(images) < _LEAST_IMAGES:
         raise ValueError(f"{len(images)} images show the map, at least {_LEAST_IMAGES} are needed")
     results = localize_each(camera, images, done)
@@ -396,6 +399,19 @@ def calibrate(
             no_mount = str(error)
     judged = _judged(camera, posed, observations, stamps, fitted, len(images))
     return replace(judged, no_mount=no_mount, own_stamps=own_stamps or stamps.irregular)
+
+
+def _thinned(images: list[Observed]) -> list[Observed]:
+    """Images with no more keypoints in all than are worth their time, others in each image."""
+    every = sum(len(image.points) for image in images) / _MOST_SIGHTS
+    if every <= 1.0:
+        return images
+    kept = (np.floor(np.arange(k / len(images), len(image.points), every)).astype(np.int64)
+            for k, image in enumerate(images))  # fmt: skip
+    return [
+        replace(image, points=image.points[rows], pixels=image.pixels[rows])
+        for image, rows in zip(images, kept, strict=True)
+    ]
 
 
 def _freedom(observations: Observations, intrinsics: bool) -> Freedom:
