@@ -241,7 +241,7 @@ def time_faults(
 
 def tell_next(args: argparse.Namespace, more: str = "") -> None:
     """The command that makes poses of the recording, with further options."""
-    if "readout_time" not in shutter_values(args):
+    if not {"readout_time", "cameras"} & set(shutter_values(args)):
         print(
             "the readout time is not known: poses come without twists; calibrate measures it, and "
             "-p readout_time:=SECONDS gives it to the next command"

@@ -37,6 +37,13 @@ class OfRig:
     frame: str  # of its optical axes
 
 
+def check_there(recordings: Sequence[Path]) -> None:
+    """Raise ValueError for one that does not exist, before any other has been read."""
+    for path in recordings:
+        if not path.exists():
+            raise ValueError(f"{path} does not exist")
+
+
 def cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, OfRig]:
     """The cameras of ``args.recordings``, by name: of one bag, or of a recording of each."""
     if len(args.recordings) > 1:
@@ -50,6 +57,7 @@ def cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, OfRig]
         raise UsageError(
             f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
         )
+    check_there(args.recordings)
     if len(set(frames)) < len(frames):  # as of single recordings put together
         frames = [""] * len(frames)
     lens = args.calibration
@@ -135,10 +143,8 @@ def map_cameras(args: argparse.Namespace, config: NodeConfig) -> list[MapCamera]
     Raises:
         UsageError: when it is not known how they are mounted, or what their shutters are.
     """
-    for path in args.recordings:
-        if not path.exists():
-            raise ValueError(f"{path} does not exist")
     if len(args.recordings) == 1 and not config.is_rig:
+        check_there(args.recordings)
         alone = argparse.Namespace(**vars(args), recording=args.recordings[0])
         return [MapCamera("", alone, config, None)]
     sources = cameras_of(args, config)

@@ -143,6 +143,14 @@ def test_what_is_no_rig(words, expected, capsys):
     assert expected in capsys.readouterr().err
 
 
+def test_a_recording_that_is_missing_is_named_before_others_are_read(pair, tmp_path, capsys):
+    missing = tmp_path / "rear.mp4"
+    assert main(["calibrate", "--rig", pair, str(missing)]) == 1
+    said = capsys.readouterr()
+    assert f"{missing} does not exist" in said.err
+    assert said.out == ""
+
+
 @pytest.mark.parametrize("pose_time", ["stamp", "mid_frame"])
 def test_smoothed_frames_are_nearer_to_the_truth(pair, pose_time, tmp_path, capsys):
     settings = ["--params", str(Path(pair) / "parameters.yaml"), "-p", f"pose_time:={pose_time}"]
