@@ -39,7 +39,6 @@ class Posed:
     times: Array  # (f,) s, of the images with a pose
     rotations: Array  # (f,3,3) map_from_camera
     positions: Array  # (f,3) m
-    image_times: Array  # (g,) s, of all images, in their order
 
 
 def in_order(images: Iterable[Observed]) -> list[Observed]:
@@ -104,5 +103,4 @@ def collect(
         times[posed],
         np.array([estimate.rotation.T for estimate in estimates]).reshape(-1, 3, 3),
         np.array([estimate.position for estimate in estimates]).reshape(-1, 3),
-        times,
     )

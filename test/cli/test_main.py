@@ -123,25 +123,6 @@ def test_a_signal_while_the_workplace_is_removed(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["map.yaml"]
 
 
-def test_a_signal_while_the_workplace_is_made(tmp_path, monkeypatch):
-    make_folder = os.mkdir
-
-    def interrupted(path: str, *mode: int) -> None:
-        make_folder(path, *mode)
-        raise KeyboardInterrupt
-
-    def make(arguments: argparse.Namespace) -> None:
-        monkeypatch.setattr(os, "mkdir", interrupted)
-        with atomic_files(tmp_path / "map.yaml"):
-            pass
-
-    command = SimpleNamespace(add_arguments=lambda parser: None, run=make)
-    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
-    assert main(["replay"]) == 130
-    monkeypatch.undo()
-    assert not list(tmp_path.iterdir())
-
-
 def test_what_a_command_prints_as_json(monkeypatch, capsys):
     results: list[object] = [{"residual (px)": math.nan, "poses": 3}, None]
 

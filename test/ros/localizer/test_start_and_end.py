@@ -8,7 +8,6 @@ import signal
 import time
 from typing import Any
 
-import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
@@ -73,21 +72,6 @@ def test_started_with_bad_parameters(start_node):
     assert len(fatal) == 1
     assert "/nowhere.yaml" in fatal[0]
     assert "Traceback" not in node.log
-
-
-@pytest.mark.parametrize(
-    ("override", "text"),
-    [
-        ("/correspondences.subscription.depth:=ten", "not activated: .*ten"),
-        ("/rs_localizer/pose.publisher.depth:=ten", "not configured:"),
-    ],
-)
-def test_qos_overrides_that_make_no_qos(start_node, override, text):
-    node = start_node("-p", f"qos_overrides.{override}")
-    assert node.process.wait(60.0) == 1
-    errors = [line for line in node.log.splitlines() if line.startswith("[ERROR]")]
-    assert len(errors) == 1
-    assert re.search(text, errors[0], re.IGNORECASE)
 
 
 def test_publishers_are_active_before_a_frame_can_come(monkeypatch):
