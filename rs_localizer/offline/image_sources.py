@@ -108,10 +108,10 @@ def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> I
         stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
         header = SimpleNamespace(stamp=stamp, frame_id=CAMERA_FRAME)
         message = SimpleNamespace(header=header, format=name, data=data)
-        found = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
-        if isinstance(found, Refusal):
-            found = Refusal(found.reason, f"{file.name}: {found.detail}")
-        yield _shot(found, camera, data, name, now)
+        image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
+        if isinstance(image, Refusal):
+            image = Refusal(image.reason, f"{file.name}: {image.detail}")
+        yield _shot(image, camera, data, name, now)
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -131,8 +131,8 @@ def image_files(folder: Path) -> list[Path]:
 def holds_images(path: Path) -> str:
     """What a path that is not a recording holds of images, as ``is a video``; empty: nothing."""
     if path.is_dir():
-        found = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
-        return f"is a folder of {found} images" if found else ""
+        count = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
+        return f"is a folder of {count} images" if count else ""
     if path.suffix.lower() in SUFFIXES:
         return "is an image"
     return "is a video" if path.is_file() and path.suffix.lower() in _VIDEOS else ""

@@ -117,8 +117,8 @@ def _pose(camera: Camera, image: Observed) -> tuple[Array, Array] | None:
     rays = camera.rays(image.pixels)
     if not np.isfinite(rays).all():
         return None
-    found, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None)
-    if not found:
+    solved, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None)
+    if not solved:
         return None
     # In pixels, not in rays: far from the middle they are not the same.
     rotation = np.asarray(cv2.Rodrigues(turn)[0], float)
@@ -296,8 +296,8 @@ def _speed(before: Observed, after: Observed) -> float:
     first, second = np.nonzero(common)
     if len(first) == 0:
         return np.inf
-    way = np.linalg.norm(before.pixels[first] - after.pixels[second], axis=1)
-    return float(np.median(way)) / max((after.stamp_ns - before.stamp_ns) * 1e-9, 1e-9)
+    displacement = np.linalg.norm(before.pixels[first] - after.pixels[second], axis=1)
+    return float(np.median(displacement)) / max((after.stamp_ns - before.stamp_ns) * 1e-9, 1e-9)
 
 
 def _starts(size: tuple[int, int], everything: Array) -> list[tuple[Array, int]]:

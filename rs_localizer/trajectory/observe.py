@@ -89,7 +89,7 @@ def collect(
         for result, count in zip(results, counts, strict=True)
     ]
     posed = np.flatnonzero([bool(result) for result in results])
-    found = [result for result in results if isinstance(result, Estimate)]
+    estimates = [result for result in results if isinstance(result, Estimate)]
     return Posed(
         Observations(
             times=np.repeat(times, counts),
@@ -102,7 +102,7 @@ def collect(
         ),
         start_ns,
         times[posed],
-        np.array([estimate.rotation.T for estimate in found]).reshape(-1, 3, 3),
-        np.array([estimate.position for estimate in found]).reshape(-1, 3),
+        np.array([estimate.rotation.T for estimate in estimates]).reshape(-1, 3, 3),
+        np.array([estimate.position for estimate in estimates]).reshape(-1, 3),
         times,
     )

@@ -148,6 +148,7 @@ def test_images_without_the_board_are_not_missing():
     assert found.images == len(images) - 3
 
 
+@pytest.mark.bench
 def test_a_bent_board_is_found_and_its_lens_with_it():
     """A board that is bent by 1 %: shape and lens, and what the lens is off by."""
     rng = np.random.default_rng(3)
