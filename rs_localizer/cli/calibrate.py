@@ -160,6 +160,9 @@ def imu_parameters(found: Calibration, config: NodeConfig) -> str:
     return f"    imu.time_offset: {time_offset(found.mount, config)!r}\n"
 
 
+# Beside FILE.yaml, as FILE_...
+_LENS, _MAP = "camera_info.yaml", "map.yaml"
+_TRANSFORMS, _CAMCHAIN = "transforms.launch.xml", "camchain.yaml"
 # Of each result of many.
 _SHUTTER = "shutter.yaml"
 
@@ -264,7 +267,9 @@ def run(args: argparse.Namespace) -> Figures | None:
 def calibrate_one(args: argparse.Namespace) -> Calibration:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
-        refuse_existing(args)
+        lens = args.intrinsics or (args.calibration is None and not is_bag(args.recording))
+        beside = {_LENS: lens, _MAP: args.map or args.board, "share.csv": args.share}
+        refuse_existing(args, *(name for name, written in beside.items() if written))
     config = _config(args)
     source = _read(args, config)
     intrinsics = args.intrinsics or source.camera is None
@@ -502,10 +507,10 @@ def _write(
     if intrinsics:
         values = found.lens._asdict().items()
         text += "".join(f"    calibration.{name}: {value:.4g}\n" for name, value in values)
-        lens = path.with_name(f"{path.stem}_camera_info.yaml")
+        lens = path.with_name(f"{path.stem}_{_LENS}")
         writers[lens] = lambda part: write_calibration(part, found.fit.camera)
     if marker_map is not None and verdict.shape_is_free(found):
-        shape = path.with_name(f"{path.stem}_map.yaml")
+        shape = path.with_name(f"{path.stem}_{_MAP}")
         places = verdict.moved(found, marker_map.points)
         marker_map = marker_map.with_points(places, found.shape_deviation)
         writers[shape] = partial(write_marker_map, marker_map=marker_map)
@@ -545,7 +550,7 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
         if getattr(args, name) is not None:
             raise UsageError(f"--{name} is for one camera: leave it out with --rig")
     if args.out is not None:
-        refuse_existing(args)
+        refuse_existing(args, _TRANSFORMS, _CAMCHAIN)
     # Cameras by name need a readout time; what it is does not matter where it is estimated.
     args.assignments = ["readout_time:=0.03", *args.assignments]
     config, recordings, maps = _config(args), dict[str, Recording](), list[MarkerMap]()
@@ -645,9 +650,7 @@ def _write_rig(
 ) -> None:  # fmt: skip
     """FILE.yaml, and beside it the transforms, the camchain, and lenses that were found."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    transforms, chain = (
-        path.with_name(f"{path.stem}_{what}") for what in ("transforms.launch.xml", "camchain.yaml")
-    )
+    transforms, chain = (path.with_name(f"{path.stem}_{what}") for what in (_TRANSFORMS, _CAMCHAIN))
     writers: dict[Path, Callable[[Path], object]] = {
         transforms: partial(write_static_transforms, parts=parts, frames=frames),
         chain: partial(write_camchain, parts=parts),

@@ -111,22 +111,22 @@ def _pose(camera: Camera, image: Observed) -> tuple[Array, Array] | None:
     rays = camera.rays(image.pixels)
     if not np.isfinite(rays).all():
         return None
-    found, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None)
-    if not found:
+    solved, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None)
+    if not solved:
         return None
     # In pixels, not in rays: far from the middle they are not the same.
-    rotation = np.asarray(cv2.Rodrigues(turn)[0], float)
-    place = np.asarray(place, float).ravel()
+    pose = np.array(cv2.Rodrigues(turn)[0], np.float64), np.array(place, np.float64).ravel()
     for _ in range(_POSE_STEPS):
-        if (normal := _linear(camera, image, rotation, place)) is None:
+        linear = _linear(camera, image, *pose)
+        if linear is None:
             return None
-        errors, by_pose, _ = normal
-        rotation, place = _moved(rotation, place, np.linalg.lstsq(by_pose, -errors, rcond=None)[0])
-    return rotation, place
+        errors, by_pose, _ = linear
+        pose = _moved(*pose, np.linalg.lstsq(by_pose, -errors, rcond=None)[0])
+    return pose
 
 
-def _moved(rotation: Array, place: Array, step: Array) -> tuple[Array, Array]:
-    change = so3.exp(np.ascontiguousarray(step[:3]))
+def _moved(rotation: Array, place: Array, step: Any) -> tuple[Array, Array]:
+    change: Array = so3.exp(np.ascontiguousarray(step[:3]))
     return change @ rotation, change @ place + step[3:]
 
 
@@ -240,12 +240,12 @@ def _calibrated(
         try:
             if model == DistortionModel.EQUIDISTANT:
                 error, lens = _fisheye(size, images, K)
-                found, D = lens.K, lens.D
-            else:
-                flags |= candidate.flags
-                error, found, D, _, _ = cv2.calibrateCamera(
-                    points, pixels, size, K, np.zeros(candidate.numbers), flags=flags
-                )
+                best = (error, lens.K, lens.D) if best is None or error < best[0] else best
+                continue
+            flags |= candidate.flags
+            error, found, D, _, _ = cv2.calibrateCamera(
+                points, pixels, size, K, np.zeros(candidate.numbers), flags=flags
+            )
         except (cv2.error, ValueError, np.linalg.LinAlgError):
             continue
         if np.isfinite(error) and (best is None or error < best[0]):

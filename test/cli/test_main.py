@@ -127,12 +127,18 @@ def test_what_a_command_prints_as_json(monkeypatch, capsys):
     results: list[object] = [{"residual (px)": math.nan, "poses": 3}, None]
 
     def run(arguments: argparse.Namespace) -> object:
-        sys.stdout.write("a line\n")
+        sys.stdout.write(
+            "a line\nnext: rs_localizer evaluate\n" if len(results) > 1 else "a line\n"
+        )
         return results.pop(0)
 
     command = SimpleNamespace(add_arguments=lambda parser: None, run=run)
     monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
-    expected = {"command": "replay", "result": {"residual (px)": None, "poses": 3}}
+    expected = {
+        "command": "replay",
+        "result": {"residual (px)": None, "poses": 3},
+        "next": "rs_localizer evaluate",
+    }
     assert main(["replay", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == expected
     assert main(["replay", "--json"]) == 0
