@@ -107,12 +107,10 @@ def _clock(seconds: float, faults: bool) -> float | None:
 
 def _publish(node: Node, prefix: str, images: list[Any], faults: bool) -> list[Sent]:
     """Send the images of both cameras, each when it has been read and processed."""
-    from tf2_ros import StaticTransformBroadcaster  # noqa: PLC0415 - not on every machine
+    from tf2_ros import StaticTransformBroadcaster
 
     mounts = [
-        make_transform(
-            make_message, 0, RIG_FRAME, optical_frame(name), Transform(*mount).inverse()
-        )
+        make_transform(make_message, 0, RIG_FRAME, optical_frame(name), Transform(*mount).inverse())
         for name, mount in _PARTS.camera_from_rig.items()
     ]
     StaticTransformBroadcaster(node).sendTransform(mounts)
@@ -225,9 +223,7 @@ def main() -> int:
     heard = Heard()
     with tempfile.TemporaryDirectory() as directory:
         file = Path(directory) / "rig.yaml"
-        write_parameters(
-            file, rig_parameters(_PARTS) | {"rig.estimate_time_offsets": args.faults}
-        )
+        write_parameters(file, rig_parameters(_PARTS) | {"rig.estimate_time_offsets": args.faults})
         with running(1, "--params-file", str(file)) as (peer, [(namespace, pid)]):
             intake = _listen(peer, namespace, heard)
             before, start = cpu_time(pid), time.monotonic()

@@ -26,6 +26,7 @@ from rs_localizer.cli.image_input import (
     clock_of,
     of_bag,
     of_files,
+    replay_command,
     telemetry_of,
     tell_telemetry,
     tell_times,
@@ -222,7 +223,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--force",
         action="store_true",
-        help="write the files although the result is refused (the exit code stays 1)",
+        help="write the readout time although it is refused (the exit code stays 1)",
     )
     parser.add_argument(
         "--share",
@@ -267,8 +268,14 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
     intrinsics = args.intrinsics or source.camera is None
     found = _calibrated(args, source, _first_camera(source, config), config)
     refusal = verdict.refusal(found)
-    if args.out is not None and (args.force or not refusal):
-        _write(args, found, source.map, intrinsics, config)
+    if args.out is not None and (args.force or not verdict.lens_refusal(found)):
+        refused = "" if args.force else refusal
+        written = _write(args, found, source.map, intrinsics, config, refused)
+        if refused and written:
+            refusal += (
+                "; without readout time and scan direction, which stay unknown (no twists; "
+                "--force writes them, too), lens and map are written"
+            )
     if refusal:
         raise ValueError(refusal)
     if args.share:
@@ -467,14 +474,22 @@ def _write(
     marker_map: MarkerMap | None,
     intrinsics: bool,
     config: NodeConfig,
-) -> None:
-    """FILE.yaml, and beside it the lens and the map as they were found; and what comes next."""
+    refused: str,
+) -> bool:
+    """FILE.yaml, and beside it the lens and the map as they were found; and what comes next.
+
+    Args:
+        refused: why the shutter is not known, then it is left out; or ''.
+
+    Returns:
+        Whether there was anything to write.
+    """
     path: Path = args.out
-    path.parent.mkdir(parents=True, exist_ok=True)
     lens, shape = args.calibration, args.map
-    text = (
-        "/**:\n  ros__parameters:\n"
-        f"    readout_time: {verdict.readout_time(found)!r}\n"
+    text = "/**:\n  ros__parameters:\n" + (
+        f"    # readout_time {refused}\n    scan_direction: {config.scan_direction}\n"
+        if refused
+        else f"    readout_time: {verdict.readout_time(found)!r}\n"
         f"    readout_time_deviation: {found.deviation!r}\n"
         f"    scan_direction: {verdict.scan_direction(found)}\n" + imu_parameters(found, config)
     )
@@ -492,29 +507,31 @@ def _write(
     if marker_map is not None:
         declared = config.map_deviation or marker_map.settings.get("map_deviation", 0.0)
         text += f"    map_deviation: {declared:.3g}\n" if declared else ""
+    if refused and not writers:
+        return False
     writers[path] = lambda part: part.write_text(text, encoding="utf-8")
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_files(*writers) as parts:
         for part, write in zip(parts, writers.values(), strict=True):
             write(part)
     for file in writers:
         print(f"written: {file}")
     print(f"next: {_next(args, path, lens, shape)}")
+    return True
 
 
 def _next(args: argparse.Namespace, out: Path, lens: Path | None, shape: Path | None) -> str:
     """The commands that make poses of this recording with what was found."""
-    recording: Path = args.recording
-    seen, poses = (out.with_name(f"{out.stem}_{what}") for what in ("seen", "poses"))
+    recording, seen = str(args.recording), out.with_name(f"{out.stem}_seen")
+    params, poses = ["--params", str(out)], str(out.with_name(f"{out.stem}_poses"))
+    if shape is None:  # a recording of correspondences
+        return shlex.join(["rs_localizer", "replay", recording, *params, "--out", poses])
     options = {"--map": shape, "--calibration": lens, "--rate": args.rate, "--image": args.image}
     given = [
         word for name, value in options.items() if value is not None for word in (name, str(value))
     ]
-    replay = ["replay", str(recording), "--params", str(out), "--out", str(poses)]
-    if shape is None:  # a recording of correspondences
-        return shlex.join(["rs_localizer", *replay])
-    replay[1] = str(seen)
-    detect = ["rs_localizer", "detect", str(recording), *given, "--out", str(seen)]
-    return f"{shlex.join(detect)} && {shlex.join(['rs_localizer', *replay])}"
+    detect = ["rs_localizer", "detect", recording, *given, *params, "--out", str(seen)]
+    return f"{shlex.join(detect)} && {replay_command(seen)}"
 
 
 def _calibrate_rig(args: argparse.Namespace) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced
@@ -23,8 +24,9 @@ from rs_localizer.cli.image_input import (
     write_shutter,
 )
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
+from rs_localizer.cli.rig_input import cameras_of
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
-from rs_localizer.io.bags import STORAGES
+from rs_localizer.io.bags import STORAGES, BagWriter
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import build, settings
 
@@ -35,6 +37,7 @@ if WORKING:
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
     from rs_localizer.offline.fleet.task import Figures, Kind
+    from rs_localizer.offline.image_sources import Carried
     from rs_localizer.pipeline.images import FrameDetector
     from rs_localizer.pipeline.keypoints import FrameExtractor
 
@@ -84,7 +87,7 @@ def run(args: argparse.Namespace) -> Figures | None:
         if args.features is None:
             recorded = detect_one(alone)
             tell_next(alone)
-            return _figures(recorded)
+            return _figures(*recorded)
         detect_features(alone)
         tell_next(alone, " --map MAP")
         return None
@@ -95,25 +98,36 @@ def run(args: argparse.Namespace) -> Figures | None:
     return None
 
 
-def detect_one(args: argparse.Namespace) -> Recorded:
-    """Detect in the images of one recording, and say what came of it."""
-    marker_map = find_map(args)
-    notices: Counter[str] = Counter()
+def detect_one(args: argparse.Namespace) -> list[Recorded]:
+    """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
+    marker_map, settings = find_map(args), build(shutter_values(args))
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
-    detector = FrameDetector(config, lambda _, text: notices.update((text,)), marker_map)
-    detector.warm_up()
-    with (
-        opened(args, args.images, args.start) as source,
-        atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
-    ):
-        recorded = _record(args, source, detector, out)
+    cameras = {"": args}
+    if settings.is_rig:
+        rig = cameras_of(argparse.Namespace(**vars(args) | {"recordings": [args.images]}), settings)
+        cameras = {name: own.args for name, own in rig.items()}
+    told = []
+    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
+        with BagWriter(out, args.storage) as bag:
+            for name, own in cameras.items():
+                notices: Counter[str] = Counter()
+                detector = FrameDetector(config, partial(_count, notices), marker_map)
+                detector.warm_up()
+                with opened(own, args.images, args.start) as source:
+                    recorded = _record(own, name, source, detector, bag)
+                told.append((name, recorded, notices, detector.seconds, source.clock))
         write_shutter(args, out, marker_map.settings)
-    _tell(args, recorded, notices)
-    for fault in (*recorded.faults, *time_faults(args, source.clock, recorded.period)):
-        print(f"warning: {fault}")
-    if args.timing:
-        _tell_times(recorded.images, *detector.seconds)
-    return recorded
+    for name, recorded, notices, seconds, clock in told:
+        _tell(args, f"{args.out}{f', {name}' if name else ''}", recorded, notices)
+        for fault in (*recorded.faults, *time_faults(args, clock, recorded.period, name)):
+            print(f"warning: {fault}")
+        if args.timing:
+            _tell_times(recorded.images, *seconds)
+    return [recorded for _, recorded, *_ in told]
+
+
+def _count(notices: Counter[str], _: str, text: str) -> None:
+    notices[text] += 1
 
 
 def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
@@ -124,25 +138,28 @@ def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
 
 
 def _record(
-    args: argparse.Namespace, source: Source, detector: FrameDetector, out: Path
+    args: argparse.Namespace, name: str, source: Source, detector: FrameDetector, bag: BagWriter
 ) -> Recorded:
+    options, shots = _options(args, name), iter(source.shots)
+    if name and name != build(shutter_values(args)).cameras[0]:  # what goes along is there once
+        shots = (shot for shot in shots if not isinstance(shot, Carried))
     with tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress:
         return record(
-            source.shots,
+            shots,
             detector,
-            out,
-            _options(args),
+            bag,
+            options,
             done=progress.update,
             tell=lambda text: progress.write(f"note: {text}", file=sys.stderr),
         )
 
 
-def _tell(args: argparse.Namespace, recorded: Recorded, notices: Counter[str]) -> None:
+def _tell(args: argparse.Namespace, what: str, recorded: Recorded, notices: Counter[str]) -> None:
     fit = ""
     if np.isfinite(recorded.residual):
         fit = f", within {recorded.residual:.3f} px rms of a global-shutter pose (median)"
     print(
-        f"{args.out}: {recorded.with_corners} of {recorded.images} images, "
+        f"{what}: {recorded.with_corners} of {recorded.images} images, "
         f"{recorded.corners:.0f} corners each (median){fit}"
     )
     if recorded.with_corners < recorded.images:
@@ -153,9 +170,10 @@ def _tell(args: argparse.Namespace, recorded: Recorded, notices: Counter[str]) -
         print(f"note ({count} images): {text}")
 
 
-def _options(args: argparse.Namespace) -> Options:
-    direction = build(shutter_values(args)).scan_direction
-    return Options(args.storage, args.with_images, direction)
+def _options(args: argparse.Namespace, name: str = "") -> Options:
+    settings = build(shutter_values(args))
+    own = settings.of_cameras.get(name, settings)
+    return Options(args.with_images, own.scan_direction, name)
 
 
 def _add_feature_arguments(parser: argparse._ActionsContainer) -> None:
@@ -189,7 +207,8 @@ def detect_features(args: argparse.Namespace) -> None:
         atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
         tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress,
     ):
-        extraction = record_features(source.shots, extractor, out, options, progress.update)
+        with BagWriter(out, args.storage) as bag:
+            extraction = record_features(source.shots, extractor, bag, options, progress.update)
         write_shutter(args, out)
     _tell_features(args, extraction)
     for fault in time_faults(args, source.clock, extraction.period):
@@ -230,15 +249,15 @@ def _detect_warm(_: argparse.Namespace) -> None:
 def _detect_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
     """One of them: its result in ``out``, and figures for the summary."""
     return _figures(
-        detect_one(argparse.Namespace(**vars(args), images=recording, out=out, overwrite=False))
+        *detect_one(argparse.Namespace(**vars(args), images=recording, out=out, overwrite=False))
     )
 
 
-def _figures(recorded: Recorded) -> Figures:
+def _figures(*recorded: Recorded) -> Figures:
     return {
-        "images": recorded.images,
-        "with corners": recorded.with_corners,
-        "corners": recorded.corners,
-        "residual of a still pose (px)": recorded.residual,
-        "warnings": "; ".join(recorded.faults),
+        "images": sum(one.images for one in recorded),
+        "with corners": sum(one.with_corners for one in recorded),
+        "corners": min(one.corners for one in recorded),
+        "residual of a still pose (px)": max(one.residual for one in recorded),
+        "warnings": "; ".join(fault for one in recorded for fault in one.faults),
     }

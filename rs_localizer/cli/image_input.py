@@ -202,28 +202,42 @@ def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> Non
         print(f"kept for replay: {kept}")
 
 
-def time_faults(args: argparse.Namespace, clock: ImageClock | None, period: float) -> list[str]:
+def time_faults(
+    args: argparse.Namespace, clock: ImageClock | None, period: float, camera: str = ""
+) -> list[str]:
     """Say where the times are from; what speaks against them, and against the readout time.
 
     Args:
         period: s from one image to the next.
+        camera: of a rig, whose images these are.
     """
-    faults = []
+    faults, settings = [], build(shutter_values(args))
     if clock is not None:
         print(clock.description())
         faults.append(clock.fault())
-    faults.append(readout_fault(build(shutter_values(args)).readout_time, period))
+    own = settings.of_cameras.get(camera, settings)
+    faults.append(readout_fault(own.readout_time, period))
     return [fault for fault in faults if fault]
 
 
 def tell_next(args: argparse.Namespace, more: str = "") -> None:
     """The command that makes poses of the recording, with further options."""
-    out = shlex.quote(str(args.out))
-    settings = f" --params {out}/{PARAMETERS}" if (args.out / PARAMETERS).exists() else ""
     if "readout_time" not in shutter_values(args):
-        settings += " -p readout_time:=SECONDS"
-    poses = shlex.quote(f"{args.out}_poses")
-    print(f"next: rs_localizer replay {out}{settings}{more} --out {poses}")
+        print(
+            "the readout time is not known: poses come without twists; calibrate measures it, and "
+            "-p readout_time:=SECONDS gives it to the next command"
+        )
+    known = (args.out / PARAMETERS).exists()
+    print(f"next: {replay_command(args.out, known=known)}{more}")
+
+
+def replay_command(recording: Path, *, known: bool = True) -> str:
+    """The command that makes poses of what ``detect`` wrote, with the parameters beside it if they
+    are ``known``.
+    """
+    params = ["--params", str(recording / PARAMETERS)] if known else []
+    words = ["replay", str(recording), *params, "--out", f"{recording}_poses"]
+    return shlex.join(["rs_localizer", *words])
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -71,15 +70,15 @@ class Recorded:
 class Options:
     """How images are recorded."""
 
-    storage: str = "mcap"  # or sqlite3
     with_images: bool = False  # write these, too, as far as they are compressed
     scan_direction: str = ScanDirection.TOP_TO_BOTTOM  # for the check of the markers' places
+    camera: str = ""  # of a rig, whose topics these are
 
 
 def record(
     shots: Iterable[Shot | Carried],
     detector: FrameDetector,
-    out: Path,
+    bag: BagWriter,
     options: Options,
     *,
     done: Callable[[], object] = lambda: None,
@@ -90,7 +89,7 @@ def record(
     Args:
         shots: the images, and what else of their recording is to be kept.
         detector: looks for markers.
-        out: bag directory to create.
+        bag: where they are written.
         options: what is written, and how it was seen.
         done: called after each image.
         tell: called when many images in the beginning show nothing, with what they show instead.
@@ -100,25 +99,25 @@ def record(
     """
     tally = _Tally(detector.map)
     cameras = Cameras(options.scan_direction)
-    with BagWriter(out, options.storage) as bag:
-        for shot in shots:
-            if isinstance(shot, Carried):
-                tally.carried[shot.topic] += 1
-                bag.write(shot.topic, shot.message, shot.recorded_ns)
-                continue
-            if isinstance(shot.image, Refusal):
-                tally.refuse(shot.image)
-            else:
-                detected = detector.detect(shot.image)
-                tally.add(cameras.of(shot, shot.image), detected)
-                if len(detected.detections.ids):
-                    _write(bag, shot, detected, options.with_images)
-                if tally.images == _PATIENCE and tally.are_few:
-                    count = len(tally.counts) or "none"
-                    tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
-            done()
-        if not tally.counts:
-            raise DetectError(f"none of the {tally.images} images {tally.nothing()}")
+    for shot in shots:
+        if isinstance(shot, Carried):
+            tally.carried[shot.topic] += 1
+            bag.write(shot.topic, shot.message, shot.recorded_ns)
+            continue
+        if isinstance(shot.image, Refusal):
+            tally.refuse(shot.image)
+        else:
+            detected = detector.detect(shot.image)
+            tally.add(cameras.of(shot, shot.image), detected)
+            if len(detected.detections.ids):
+                _write(bag, shot, detected, options)
+            if tally.images == _PATIENCE and tally.are_few:
+                count = len(tally.counts) or "none"
+                tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
+        done()
+    if not tally.counts:
+        of = f" of {options.camera}" if options.camera else ""
+        raise DetectError(f"none of the {tally.images} images{of} {tally.nothing()}")
     return tally.recorded()
 
 
@@ -263,11 +262,13 @@ def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
     return ": another mode or camera; calibrate in the mode that is used"
 
 
-def _write(bag: BagWriter, shot: Shot, detected: Detected, with_images: bool) -> None:
-    bag.write(CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
-    bag.write(CORRESPONDENCES_TOPIC, correspondences(detected, make_message), shot.recorded_ns)
-    if with_images and shot.compressed is not None:
-        bag.write(IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
+def _write(bag: BagWriter, shot: Shot, detected: Detected, options: Options) -> None:
+    own = f"/{options.camera}" if options.camera else ""
+    corners = correspondences(detected, make_message)
+    bag.write(own + CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
+    bag.write(own + CORRESPONDENCES_TOPIC, corners, shot.recorded_ns)
+    if options.with_images and shot.compressed is not None:
+        bag.write(own + IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
 
 
 def static_residual(camera: Camera, detected: Detected) -> float:
@@ -301,7 +302,7 @@ class Extraction:
 def record_features(
     shots: Iterable[Shot | Carried],
     extractor: FrameExtractor,
-    out: Path,
+    bag: BagWriter,
     options: Options,
     done: Callable[[], object] = lambda: None,
 ) -> Extraction:
@@ -310,7 +311,7 @@ def record_features(
     Args:
         shots: the images, and what else of their recording is to be kept.
         extractor: looks for keypoints.
-        out: bag directory to create.
+        bag: where they are written.
         options: what is written.
         done: called after each image.
 
@@ -319,26 +320,25 @@ def record_features(
     """
     extraction = Extraction()
     cameras = Cameras(options.scan_direction)
-    with BagWriter(out, options.storage) as bag:
-        for shot in shots:
-            if isinstance(shot, Carried):
-                extraction.carried[shot.topic] += 1
-                bag.write(shot.topic, shot.message, shot.recorded_ns)
-                continue
-            extraction.images += 1
-            if isinstance(shot.image, Refusal):
-                extraction.refused.setdefault(shot.image.reason, shot.image.detail)
-            else:
-                cameras.of(shot, shot.image)
-                extraction.stamps_ns.append(shot.image.stamp_ns)
-                extracted = extractor.extract(shot.image)
-                if len(extracted.features):
-                    extraction.counts.append(len(extracted.features))
-                    _write_keypoints(bag, shot, extracted, options.with_images)
-            done()
-        if not extraction.counts:
-            reasons = "".join(f"; {detail}" for detail in extraction.refused.values())
-            raise DetectError(f"none of the {extraction.images} images has any keypoint{reasons}")
+    for shot in shots:
+        if isinstance(shot, Carried):
+            extraction.carried[shot.topic] += 1
+            bag.write(shot.topic, shot.message, shot.recorded_ns)
+            continue
+        extraction.images += 1
+        if isinstance(shot.image, Refusal):
+            extraction.refused.setdefault(shot.image.reason, shot.image.detail)
+        else:
+            cameras.of(shot, shot.image)
+            extraction.stamps_ns.append(shot.image.stamp_ns)
+            extracted = extractor.extract(shot.image)
+            if len(extracted.features):
+                extraction.counts.append(len(extracted.features))
+                _write_keypoints(bag, shot, extracted, options.with_images)
+        done()
+    if not extraction.counts:
+        reasons = "".join(f"; {detail}" for detail in extraction.refused.values())
+        raise DetectError(f"none of the {extraction.images} images has any keypoint{reasons}")
     return extraction
 
 

@@ -36,15 +36,22 @@ def scan_direction(result: Calibration) -> ScanDirection:
     return given if result.global_shutter or result.readout_time > 0.0 else REVERSED[given]
 
 
-def refusal(result: Calibration) -> str:
-    """One line with the figure when the recording does not determine the readout time; or ''."""
-    value = f"{1e3 * result.readout_time:.1f} +- {1e3 * result.deviation:.1f} ms"
+def lens_refusal(result: Calibration) -> str:
+    """One line with the figure when the recording determines no lens; or ''."""
     camera = result.fit.camera
-    if not np.all((camera.K[:2, 2] > 0.0) & (camera.K[:2, 2] < camera.size)):
-        return (
-            f"no lens: the principal point would be at {camera.K[0, 2]:.0f}, {camera.K[1, 2]:.0f}, "
-            "outside the image; show the map from several sides, in all parts of the image"
-        )
+    if np.all((camera.K[:2, 2] > 0.0) & (camera.K[:2, 2] < camera.size)):
+        return ""
+    return (
+        f"no lens: the principal point would be at {camera.K[0, 2]:.0f}, {camera.K[1, 2]:.0f}, "
+        "outside the image; show the map from several sides, in all parts of the image"
+    )
+
+
+def refusal(result: Calibration) -> str:
+    """One line with the figure when lens or readout time is not determined; or ''."""
+    value = f"{1e3 * result.readout_time:.1f} +- {1e3 * result.deviation:.1f} ms"
+    if text := lens_refusal(result):
+        return text
     if result.stabilised:
         return (
             f"not observable: {value}; parts of the recording disagree ({_parts(result)} ms): is "

@@ -219,3 +219,18 @@ def test_settings_are_passed_on(files, tmp_path):
     assert detect(files, files.video, *again, "--overwrite") == 0
     config = build(load_params_file(files.out / "parameters.yaml"))
     assert (config.readout_time, config.scan_direction) == (0.011, "top_to_bottom")
+
+
+def test_a_board_is_known_as_paper_is(files, capsys):
+    """0.2 mm in 10 cm, unless a setting says it; the next command still asks for the shutter."""
+    words = [*files.calibration, *files.board, "--rate", "20"]
+    assert detect(files, files.video, *words) == 0
+    y, x = np.mgrid[-1.5:2, -2.5:3] * SQUARE
+    paper = 0.002 * np.sqrt(np.mean(x**2 + y**2))
+    found = load_params_file(files.out / "parameters.yaml")
+    assert found == pytest.approx({"map_deviation": paper})
+    said = capsys.readouterr().out
+    assert f"--params {files.out}/parameters.yaml --out" in said
+    assert "-p readout_time:=SECONDS" in said
+    assert detect(files, files.video, *words, "--overwrite", "-p", "map_deviation:=0.0") == 0
+    assert load_params_file(files.out / "parameters.yaml") == {"map_deviation": 0.0}
