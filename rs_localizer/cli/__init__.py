@@ -91,8 +91,9 @@ def _clear(directory: Path) -> None:
 
 
 def refuse_existing(args: argparse.Namespace, *beside: str) -> None:
-    """Raise ``ValueError`` if ``args.out`` exists and is not to be replaced, or a file beside it:
-    ``OUT.yaml`` and ``lens.yaml`` for ``OUT_lens.yaml``.
+    """Raise ``ValueError`` if ``args.out`` exists and is not to be replaced, or a file beside it.
+
+    Beside ``OUT.yaml``, ``lens.yaml`` stands for ``OUT_lens.yaml``.
     """
     for path in (args.out, *(args.out.with_name(f"{args.out.stem}_{name}") for name in beside)):
         if path.exists() and not args.overwrite:
