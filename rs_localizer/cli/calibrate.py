@@ -24,8 +24,10 @@ from rs_localizer.cli.batch import (
 from rs_localizer.cli.image_input import (
     add_telemetry,
     clock_of,
+    clock_of_lens,
     of_bag,
     of_files,
+    replay_command,
     telemetry_of,
     tell_telemetry,
     tell_times,
@@ -158,6 +160,9 @@ def imu_parameters(found: Calibration, config: NodeConfig) -> str:
     return f"    imu.time_offset: {time_offset(found.mount, config)!r}\n"
 
 
+# Beside FILE.yaml, as FILE_...
+_LENS, _MAP = "camera_info.yaml", "map.yaml"
+_TRANSFORMS, _CAMCHAIN = "transforms.launch.xml", "camchain.yaml"
 # Of each result of many.
 _SHUTTER = "shutter.yaml"
 
@@ -176,8 +181,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rig",
         action="store_true",
         help="the recordings are those of cameras on one body, one each, or one bag has topics of "
-        "several: find where the cameras are, and their clocks, too; the first one's axes and "
-        "clock are the rig's. Cameras are named as their files, or as their topics begin; "
+        "several, or one video several lenses (.insv): find where the cameras are, and their "
+        "clocks, too; the first one's axes and clock are the rig's. "
+        "Cameras are named as their files, or as their topics begin; "
         "--calibration is a camchain, or FILE of all as FILE#NAME",
     )
     parser.add_argument(
@@ -222,7 +228,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--force",
         action="store_true",
-        help="write the files although the result is refused (the exit code stays 1)",
+        help="write the readout time although it is refused (the exit code stays 1)",
     )
     parser.add_argument(
         "--share",
@@ -261,14 +267,22 @@ def run(args: argparse.Namespace) -> Figures | None:
 def calibrate_one(args: argparse.Namespace) -> Calibration:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
-        refuse_existing(args)
+        lens = args.intrinsics or (args.calibration is None and not is_bag(args.recording))
+        beside = {_LENS: lens, _MAP: args.map or args.board, "share.csv": args.share}
+        refuse_existing(args, *(name for name, written in beside.items() if written))
     config = _config(args)
     source = _read(args, config)
     intrinsics = args.intrinsics or source.camera is None
     found = _calibrated(args, source, _first_camera(source, config), config)
     refusal = verdict.refusal(found)
-    if args.out is not None and (args.force or not refusal):
-        _write(args, found, source.map, intrinsics, config)
+    if args.out is not None and (args.force or not verdict.lens_refusal(found)):
+        refused = "" if args.force else refusal
+        written = _write(args, found, source.map, intrinsics, config, refused)
+        if refused and written:
+            refusal += (
+                f". Written to {args.out} and beside it: lens, map. Not written: readout time and "
+                "scan direction, which stay unknown: no twists (--force writes them, too)"
+            )
     if refusal:
         raise ValueError(refusal)
     if args.share:
@@ -297,6 +311,7 @@ def _calibrated(
     tell_telemetry(
         argparse.Namespace(images=args.recording, no_telemetry=args.no_telemetry),
         verdict.readout_time(found),
+        found.fit.camera,
         lens=False,
     )
     if intrinsics:
@@ -337,7 +352,9 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
         imu = _imu_of_video(args, path)
         known = args.calibration is not None
         camera = read_calibration(args.calibration) if known else _unknown((2, 2))
-        source = of_files(path, camera, clock_of(path, args.rate))
+        lens: int | None = getattr(args, "lens", None)
+        clock = clock_of(path, args.rate) if lens is None else clock_of_lens()
+        source = of_files(path, camera, clock, lens)
         found = _detected(args, source.shots)
         tell_times(source.clock)
         return replace(found, own_stamps=path.is_dir() and args.rate is None, imu=imu)
@@ -467,14 +484,22 @@ def _write(
     marker_map: MarkerMap | None,
     intrinsics: bool,
     config: NodeConfig,
-) -> None:
-    """FILE.yaml, and beside it the lens and the map as they were found; and what comes next."""
+    refused: str,
+) -> bool:
+    """FILE.yaml, and beside it the lens and the map as they were found; and what comes next.
+
+    Args:
+        refused: why the shutter is not known, then it is left out; or ''.
+
+    Returns:
+        Whether there was anything to write.
+    """
     path: Path = args.out
-    path.parent.mkdir(parents=True, exist_ok=True)
     lens, shape = args.calibration, args.map
-    text = (
-        "/**:\n  ros__parameters:\n"
-        f"    readout_time: {verdict.readout_time(found)!r}\n"
+    text = "/**:\n  ros__parameters:\n" + (
+        f"    # readout_time {refused}\n    scan_direction: {config.scan_direction}\n"
+        if refused
+        else f"    readout_time: {verdict.readout_time(found)!r}\n"
         f"    readout_time_deviation: {found.deviation!r}\n"
         f"    scan_direction: {verdict.scan_direction(found)}\n" + imu_parameters(found, config)
     )
@@ -482,39 +507,41 @@ def _write(
     if intrinsics:
         values = found.lens._asdict().items()
         text += "".join(f"    calibration.{name}: {value:.4g}\n" for name, value in values)
-        lens = path.with_name(f"{path.stem}_camera_info.yaml")
+        lens = path.with_name(f"{path.stem}_{_LENS}")
         writers[lens] = lambda part: write_calibration(part, found.fit.camera)
     if marker_map is not None and verdict.shape_is_free(found):
-        shape = path.with_name(f"{path.stem}_map.yaml")
+        shape = path.with_name(f"{path.stem}_{_MAP}")
         places = verdict.moved(found, marker_map.points)
         marker_map = marker_map.with_points(places, found.shape_deviation)
         writers[shape] = partial(write_marker_map, marker_map=marker_map)
     if marker_map is not None:
         declared = config.map_deviation or marker_map.settings.get("map_deviation", 0.0)
         text += f"    map_deviation: {declared:.3g}\n" if declared else ""
+    if refused and not writers:
+        return False
     writers[path] = lambda part: part.write_text(text, encoding="utf-8")
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_files(*writers) as parts:
         for part, write in zip(parts, writers.values(), strict=True):
             write(part)
     for file in writers:
         print(f"written: {file}")
     print(f"next: {_next(args, path, lens, shape)}")
+    return True
 
 
 def _next(args: argparse.Namespace, out: Path, lens: Path | None, shape: Path | None) -> str:
     """The commands that make poses of this recording with what was found."""
-    recording: Path = args.recording
-    seen, poses = (out.with_name(f"{out.stem}_{what}") for what in ("seen", "poses"))
+    recording, seen = str(args.recording), out.with_name(f"{out.stem}_seen")
+    params, poses = ["--params", str(out)], str(out.with_name(f"{out.stem}_poses"))
+    if shape is None:  # a recording of correspondences
+        return shlex.join(["rs_localizer", "replay", recording, *params, "--out", poses])
     options = {"--map": shape, "--calibration": lens, "--rate": args.rate, "--image": args.image}
     given = [
         word for name, value in options.items() if value is not None for word in (name, str(value))
     ]
-    replay = ["replay", str(recording), "--params", str(out), "--out", str(poses)]
-    if shape is None:  # a recording of correspondences
-        return shlex.join(["rs_localizer", *replay])
-    replay[1] = str(seen)
-    detect = ["rs_localizer", "detect", str(recording), *given, "--out", str(seen)]
-    return f"{shlex.join(detect)} && {shlex.join(['rs_localizer', *replay])}"
+    detect = ["rs_localizer", "detect", recording, *given, *params, "--out", str(seen)]
+    return f"{shlex.join(detect)} && {replay_command(seen)}"
 
 
 def _calibrate_rig(args: argparse.Namespace) -> None:
@@ -523,7 +550,7 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
         if getattr(args, name) is not None:
             raise UsageError(f"--{name} is for one camera: leave it out with --rig")
     if args.out is not None:
-        refuse_existing(args)
+        refuse_existing(args, _TRANSFORMS, _CAMCHAIN)
     # Cameras by name need a readout time; what it is does not matter where it is estimated.
     args.assignments = ["readout_time:=0.03", *args.assignments]
     config, recordings, maps = _config(args), dict[str, Recording](), list[MarkerMap]()
@@ -554,13 +581,14 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
                 "parts of the recording differ by more than their noise: the deviations of "
                 f"rotation, place and offset are {numbers(mounted.inflations, 1)} times that"
             )
-        if len(args.recordings) == 1:
+        if len(args.recordings) == 1 and is_bag(args.recordings[0]):
             _tell_tf(args.recordings[0], mounted, cameras[name].frame, cameras[first].frame)
     refusals |= {name: text for name, one in rig.items() if (text := one.undetermined)}
     if args.out is not None and (args.force or not refusals):
         frames = {name: own.frame for name, own in cameras.items()}
         values = _of_maps(config, maps) | (_of_lenses(recordings) if intrinsics else {})
         _write_rig(args.out, _parts(rig, recordings, config), frames, values, comments, intrinsics)
+        print(f"next: {_next_of_rig(args)}")
     if refusals:
         raise ValueError(
             "not observable: " + "; ".join(f"{name}: {text}" for name, text in refusals.items())
@@ -622,9 +650,7 @@ def _write_rig(
 ) -> None:  # fmt: skip
     """FILE.yaml, and beside it the transforms, the camchain, and lenses that were found."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    transforms, chain = (
-        path.with_name(f"{path.stem}_{what}") for what in ("transforms.launch.xml", "camchain.yaml")
-    )
+    transforms, chain = (path.with_name(f"{path.stem}_{what}") for what in (_TRANSFORMS, _CAMCHAIN))
     writers: dict[Path, Callable[[Path], object]] = {
         transforms: partial(write_static_transforms, parts=parts, frames=frames),
         chain: partial(write_camchain, parts=parts),
@@ -649,7 +675,17 @@ def _write_rig(
             write(file)
     for file in writers:
         print(f"written: {file}")
-    print(f"next: ros2 launch {shlex.quote(str(transforms))}")
+
+
+def _next_of_rig(args: argparse.Namespace) -> str:
+    """The command that goes on: poses of a video of several lenses, or TF for a live rig."""
+    path, stem, recording = args.out, args.out.stem, args.recordings[0]
+    if len(args.recordings) > 1 or is_bag(recording) or args.map is None:
+        return shlex.join(["ros2", "launch", str(path.with_name(f"{stem}_transforms.launch.xml"))])
+    chain, poses = path.with_name(f"{stem}_camchain.yaml"), path.with_name(f"{stem}_poses")
+    files = {"--map": args.map, "--calibration": chain, "--params": path, "--out": poses}
+    words = [word for name, value in files.items() for word in (name, str(value))]
+    return shlex.join(["rs_localizer", "replay", str(recording), *words])
 
 
 def _calibrate_batch(args: argparse.Namespace) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -26,7 +27,8 @@ from rs_localizer.cli.image_input import (
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.rig_input import cameras_of
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
-from rs_localizer.io.bags import STORAGES, BagWriter
+from rs_localizer.io.bags import STORAGES, BagWriter, is_bag
+from rs_localizer.io.image_clock import DEFAULT_START_NS
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import build, settings
 
@@ -35,9 +37,11 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer.io.atomic_files import atomic_directory
+    from rs_localizer.io.rigs import make_mounts, read_camchain
+    from rs_localizer.io.topics import TF_STATIC
     from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
     from rs_localizer.offline.fleet.task import Figures, Kind
-    from rs_localizer.offline.image_sources import Carried
+    from rs_localizer.offline.image_sources import Carried, Shot
     from rs_localizer.pipeline.images import FrameDetector
     from rs_localizer.pipeline.keypoints import FrameExtractor
 
@@ -100,16 +104,12 @@ def run(args: argparse.Namespace) -> Figures | None:
 
 def detect_one(args: argparse.Namespace) -> list[Recorded]:
     """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
-    marker_map, settings = find_map(args), build(shutter_values(args))
+    marker_map = find_map(args)
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
-    cameras = {"": args}
-    if settings.is_rig:
-        rig = cameras_of(argparse.Namespace(**vars(args) | {"recordings": [args.images]}), settings)
-        cameras = {name: own.args for name, own in rig.items()}
     told = []
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
         with BagWriter(out, args.storage) as bag:
-            for name, own in cameras.items():
+            for name, own in _cameras(args, bag).items():
                 notices: Counter[str] = Counter()
                 detector = FrameDetector(config, partial(_count, notices), marker_map)
                 detector.warm_up()
@@ -118,12 +118,28 @@ def detect_one(args: argparse.Namespace) -> list[Recorded]:
                 told.append((name, recorded, notices, detector.seconds, source.clock))
         write_shutter(args, out, marker_map.settings)
     for name, recorded, notices, seconds, clock in told:
-        _tell(args, f"{args.out}{f', {name}' if name else ''}", recorded, notices)
+        _tell(f"{args.out}{f', {name}' if name else ''}", recorded, notices)
         for fault in (*recorded.faults, *time_faults(args, clock, recorded.period, name)):
             print(f"warning: {fault}")
         if args.timing:
             _tell_times(recorded.images, *seconds)
+    tell_telemetry(args)
     return [recorded for _, recorded, *_ in told]
+
+
+def _cameras(args: argparse.Namespace, bag: BagWriter) -> dict[str, argparse.Namespace]:
+    """The arguments of each camera of a rig by its name, or of one that is alone, by "".
+
+    Where the lenses of one video are goes into the bag.
+    """
+    settings = build(shutter_values(args))
+    if not settings.is_rig:
+        return {"": args}
+    rig = cameras_of(argparse.Namespace(**vars(args) | {"recordings": [args.images]}), settings)
+    if args.calibration is not None and not is_bag(args.images):
+        start = DEFAULT_START_NS if args.start is None else round(1e9 * args.start)
+        bag.write(TF_STATIC, make_mounts(read_camchain(args.calibration)), start)
+    return {name: own.args for name, own in rig.items()}
 
 
 def _count(notices: Counter[str], _: str, text: str) -> None:
@@ -140,21 +156,25 @@ def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
 def _record(
     args: argparse.Namespace, name: str, source: Source, detector: FrameDetector, bag: BagWriter
 ) -> Recorded:
-    options, shots = _options(args, name), iter(source.shots)
-    if name and name != build(shutter_values(args)).cameras[0]:  # what goes along is there once
-        shots = (shot for shot in shots if not isinstance(shot, Carried))
     with tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress:
         return record(
-            shots,
+            _shots(args, name, source),
             detector,
             bag,
-            options,
+            _options(args, name),
             done=progress.update,
             tell=lambda text: progress.write(f"note: {text}", file=sys.stderr),
         )
 
 
-def _tell(args: argparse.Namespace, what: str, recorded: Recorded, notices: Counter[str]) -> None:
+def _shots(args: argparse.Namespace, name: str, source: Source) -> Iterator[Shot | Carried]:
+    """The images of a camera; what goes along comes with the first of a rig only."""
+    if name in ("", build(shutter_values(args)).cameras[0]):
+        return iter(source.shots)
+    return (shot for shot in source.shots if not isinstance(shot, Carried))
+
+
+def _tell(what: str, recorded: Recorded, notices: Counter[str]) -> None:
     fit = ""
     if np.isfinite(recorded.residual):
         fit = f", within {recorded.residual:.3f} px rms of a global-shutter pose (median)"
@@ -164,7 +184,6 @@ def _tell(args: argparse.Namespace, what: str, recorded: Recorded, notices: Coun
     )
     if recorded.with_corners < recorded.images:
         print(f"{recorded.images - recorded.with_corners} images show no part of the map")
-    tell_telemetry(args)
     tell_left_out(recorded.refused, recorded.carried)
     for text, count in notices.most_common(3):
         print(f"note ({count} images): {text}")
@@ -201,32 +220,37 @@ def detect_features(args: argparse.Namespace) -> None:
     if args.max_keypoints is not None:
         config = FeatureConfig(features=args.features, max_keypoints=args.max_keypoints)
     extractor = FrameExtractor(config)
-    options = _options(args)
-    with (
-        opened(args, args.images, args.start) as source,
-        atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
-        tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress,
-    ):
+    of_cameras = []
+    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
         with BagWriter(out, args.storage) as bag:
-            extraction = record_features(source.shots, extractor, bag, options, progress.update)
+            for name, own in _cameras(args, bag).items():
+                with (
+                    opened(own, args.images, args.start) as source,
+                    tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress,
+                ):
+                    shots, options = _shots(args, name, source), _options(args, name)
+                    extraction = record_features(shots, extractor, bag, options, progress.update)
+                of_cameras.append((name, extraction, source.clock))
         write_shutter(args, out)
-    _tell_features(args, extraction)
-    for fault in time_faults(args, source.clock, extraction.period):
-        print(f"warning: {fault}")
+    for name, extraction, clock in of_cameras:
+        _tell_features(args, f"{args.out}{f', {name}' if name else ''}", extraction)
+        for fault in time_faults(args, clock, extraction.period, name):
+            print(f"warning: {fault}")
+    tell_telemetry(args)
     if args.timing:
-        milliseconds = 1e3 * extractor.seconds / len(extraction.stamps_ns)
+        images = sum(len(extraction.stamps_ns) for _, extraction, _ in of_cameras)
+        milliseconds = 1e3 * extractor.seconds / images
         print(f"time per image: {milliseconds:.1f} ms, {1e3 / milliseconds:.0f} images/s")
 
 
-def _tell_features(args: argparse.Namespace, extraction: Extraction) -> None:
+def _tell_features(args: argparse.Namespace, what: str, extraction: Extraction) -> None:
     with_any = len(extraction.counts)
     print(
-        f"{args.out}: {with_any} of {extraction.images} images, "
+        f"{what}: {with_any} of {extraction.images} images, "
         f"{np.median(extraction.counts):.0f} keypoints ({args.features}) each (median)"
     )
     if bare := len(extraction.stamps_ns) - with_any:
         print(f"{bare} images have no keypoint")
-    tell_telemetry(args)
     tell_left_out(extraction.refused, extraction.carried)
 
 

@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cameras of a rig that a command takes: which recording and topics are whose, and how they are
-mounted.
-"""
+"""The cameras of a rig: which recording and topics are whose, and how they are mounted."""
 
 from __future__ import annotations
 
@@ -11,8 +9,10 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from rs_localizer.cli import WORKING, UsageError
+from rs_localizer.cli.image_input import lenses_of
 from rs_localizer.process.arguments import number
 
 if WORKING:
@@ -52,14 +52,7 @@ def cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, OfRig]
         frames = [f"{name}_optical_frame" for name in names]
     else:
         (path,) = args.recordings
-        if not is_bag(path):
-            raise UsageError(f"--rig needs the recordings of several cameras, or one bag; {path}")
-        given = config.cameras if config.is_rig else None
-        with open_bag(path) as bag:
-            by_name = camera_topics(bag, given)
-            frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
-        names = list(by_name)
-        topics = [{"recording": path, **own} for own in by_name.values()]
+        names, topics, frames = _in_one_file(path, config.cameras if config.is_rig else None)
     if len(set(names)) < max(len(names), 2) or not all(name[:1].isalpha() for name in names):
         raise UsageError(
             f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
@@ -77,6 +70,28 @@ def cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, OfRig]
         )
         for name, own, frame in zip(names, topics, frames, strict=True)
     }  # fmt: skip
+
+
+def _in_one_file(
+    path: Path, given: Sequence[str] | None
+) -> tuple[list[str], list[dict[str, Any]], list[str]]:
+    """Names of the cameras of a bag or of the lenses of a video, where each is, and its frame."""
+    if is_bag(path):
+        with open_bag(path) as bag:
+            by_name = camera_topics(bag, given)
+            frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
+        return list(by_name), [{"recording": path, **own} for own in by_name.values()], frames
+    lenses = () if path.is_dir() or not path.exists() else lenses_of(path)
+    if len(lenses) < 2:
+        raise UsageError(
+            f"--rig needs the recordings of several cameras, one bag or a video of several lenses; "
+            f"{path}"
+        )
+    names = list(given or lenses)
+    if missing := [name for name in names if name not in lenses]:
+        raise UsageError(f"cameras: {path} is of {', '.join(lenses)}, not of {', '.join(missing)}")
+    places = [{"recording": path, "lens": lenses.index(name)} for name in names]
+    return names, places, [""] * len(names)
 
 
 def mounting_lines(name: str, first: str, mounted: Extrinsics, deviations: Array) -> list[str]:

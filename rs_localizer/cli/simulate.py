@@ -35,7 +35,8 @@ if WORKING:
     from rs_localizer.core.arrays import Array
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.maps.files import write_map_file
-    from rs_localizer.io.rigs import RigParts, read_camchain
+    from rs_localizer.io.rigs import RigParts, make_mounts, read_camchain
+    from rs_localizer.io.topics import TF_STATIC
     from rs_localizer.io.trajectories import read_tum
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
@@ -48,7 +49,6 @@ if WORKING:
         camera_stamps,
         rig_parameters,
         simulate_rig,
-        write_mounts,
         write_rig_frame,
     )
     from rs_localizer.simulation.scene import described, keypoint_rows, room
@@ -428,7 +428,7 @@ def _write_rig(args: argparse.Namespace) -> dict[str, object]:
     total, counts = sum(map(len, stamps.values())), 0
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
         with BagWriter(built, args.storage) as bag:
-            write_mounts(bag, parts, min(some))
+            bag.write(TF_STATIC, make_mounts(parts), min(some))
             images = simulate_rig(parts, motion, see)
             for image in tqdm(images, total=total, unit="image", desc="simulate", disable=None):
                 rows = None

@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a map is refined from: keypoints of known landmarks and a first guess of all, as views or a
-recording of correspondences have them.
-"""
+"""What a map is refined from: keypoints of known landmarks and a first guess of all."""
 
 from __future__ import annotations
 
@@ -210,8 +208,7 @@ def _parts(observations: MapObservations, usable: BoolArray, frames: IntArray) -
 
 
 def most_observed(landmarks: IntArray, images: IntArray, wanted: int) -> BoolArray:
-    """Which landmarks (up to the last one) to adjust: those that are observed most often, each if
-    half of its images need more.
+    """Which landmarks to adjust: the most observed, more if half of an image needs them.
 
     Args:
         landmarks, images: (n,) of each keypoint.

@@ -1,7 +1,8 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where markers are, from recordings that show them, by one camera or by those of a rig:
-continuous-time adjustment with the poses of the markers free, each a rigid square of known size.
+"""Where markers are, from recordings that show them, by one camera or by those of a rig.
+
+Continuous-time adjustment with the poses of the markers free, each a rigid square of known size.
 The first marker is the origin; whatever shows several of them closes loops.
 
 A square that is seen from one side fits two poses. From few directions the wrong one is a minimum,
@@ -64,9 +65,7 @@ class Mirrored:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjustable:
-    """What the cameras saw: corners, four of each marker; those of the first, the origin, are
-    known.
-    """
+    """What the cameras saw: four corners of each marker; the first, the origin, is known."""
 
     filmed: Sequence[Filmed]
     seen: Sequence[Observations]  # of the landmarks that all see
@@ -378,8 +377,10 @@ def _right_side_up(given: Adjustable, fitted: Fit) -> tuple[Fit, BoolArray]:
 
 
 def _less_noise(given: Adjustable, fitted: Fit) -> Fit:
-    """With corners that are better than was taken for granted: weighed too little, they lose to
-    what is known of accelerations beforehand, and the readout time with them.
+    """With corners that are better than was taken for granted.
+
+    Weighed too little, they lose to what is known of accelerations beforehand, and the readout time
+    with them.
     """
     noise = fitted.deviation * math.sqrt(fitted.inflation)
     if fitted.deviation > _LEAST_NOISE or noise > _LEAST_NOISE:
@@ -401,7 +402,7 @@ def _check_fit(fitted: Fit) -> None:
     if share < _LEAST_FIT:
         raise ValueError(
             f"{100 * share:.0f} % of the corners fit the survey, {100 * _LEAST_FIT:.0f} % should: "
-            "check the readout time, the calibration, and that no id hangs twice"
+            "check the readout time, the calibration, and that each id is used once"
         )
 
 

@@ -222,9 +222,7 @@ def _between(
 
 
 def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Transform, float]:
-    """What most images say, each of which says several things that fit more or less; and by how
-    many it is said.
-    """
+    """What most images say, each of several things that fit more or less; and by how many."""
     image = np.array([k for k, _, _ in said])
     turns = np.array([of.rotation for _, of, _ in said])
     places = np.array([of.translation for _, of, _ in said])

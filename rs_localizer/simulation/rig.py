@@ -23,14 +23,12 @@ from rs_localizer.io.recording import (
     make_correspondences,
     make_image,
 )
-from rs_localizer.io.rigs import RigParts, node_parameters, optical_frame
-from rs_localizer.io.transforms import Transform, make_transform
+from rs_localizer.io.rigs import RIG_FRAME, RigParts, node_parameters, optical_frame
 from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps
 from rs_localizer.simulation.image_sequence import RenderedFrame
 from rs_localizer.simulation.recording import write_truth
 from rs_localizer.simulation.true_motion import TrueMotion, TrueState
 
-RIG_FRAME = "rig"
 # How far the rates of cameras' oscillators are off, as a part of themselves: common quartz.
 _RATE_ERROR = 5e-5
 # The random numbers of clocks are their own.
@@ -41,9 +39,7 @@ Frame = SimulatedFrame | RenderedFrame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountedMotion:
-    """The motion of a camera that is mounted to a moving rig: ``X_camera = rotation X_rig +
-    translation``.
-    """
+    """The motion of a camera on a moving rig: ``X_camera = rotation X_rig + translation``."""
 
     rig: TrueMotion
     rotation: Array  # (3,3)
@@ -128,20 +124,6 @@ def rig_parameters(parts: RigParts) -> dict[str, Any]:
     return {**node_parameters(parts), "base_frame": RIG_FRAME}
 
 
-def write_mounts(bag: BagWriter, parts: RigParts, stamp_ns: int) -> None:
-    """Where the cameras are on the rig, on /tf_static."""
-    transforms = [
-        make_transform(
-            make_message, 0, RIG_FRAME, optical_frame(name),
-            Transform(*parts.camera_from_rig[name]).inverse(),
-        )
-        for name in parts.cameras
-    ]  # fmt: skip
-    bag.write(
-        topics.TF_STATIC, make_message("tf2_msgs/msg/TFMessage", transforms=transforms), stamp_ns
-    )
-
-
 def write_rig_frame(
     bag: BagWriter,
     parts: RigParts,
@@ -149,8 +131,9 @@ def write_rig_frame(
     image: RigFrame,
     keypoints: NDArray[Any] | None = None,
 ) -> None:
-    """Camera info and image, correspondences or keypoints of a camera, and the truth of the rig
-    when its first and its middle row were exposed.
+    """Camera info and image, correspondences or keypoints of a camera, and the rig's truth.
+
+    The truth is of when its first and its middle row were exposed.
     """
     camera, frame, stamp_ns = parts.cameras[image.name], image.frame, image.stamp_ns
     recorded_ns = frame.stamp_ns + round(camera.readout_time * 1e9)

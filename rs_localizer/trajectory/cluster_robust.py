@@ -33,8 +33,7 @@ def border_rows(
     curve: Curve, sights: Sights, terms: Terms, places: IntArray, lifted: Array, first: int,
     out: Array,
 ) -> None:  # fmt: skip
-    """Fill the rows of as many keypoints as there is room for, from one on; zeros for those that
-    do not count.
+    """Fill the rows of as many keypoints as there is room for; zeros for those that do not count.
 
     Args:
         places: (c,) of the camera's own columns in the border.

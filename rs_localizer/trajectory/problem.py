@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cost of a trajectory and its normal equations, on the whitened errors of
-:mod:`rs_localizer.trajectory.sight_kernels`.
-"""
+"""The cost of a trajectory and its normal equations, on whitened errors."""
 
 from __future__ import annotations
 
@@ -73,8 +71,8 @@ class Problem:
         self.pieces = _pieces(observations, freedom)
         self.shape_information: Array | None = None
         if freedom.paper and self.pieces.count:
-            seen = observations.landmarks[self.pieces.slots >= 0]
-            covariance = paper_covariance(seen, freedom.landmarks)
+            landmarks = observations.landmarks[self.pieces.slots >= 0]
+            covariance = paper_covariance(landmarks, freedom.landmarks)
             self.shape_information = np.asarray(np.linalg.inv(covariance), np.float64)
         readout = 1 if freedom.readout_time else 0
         extrinsics = 0 if freedom.mounting is None else EXTRINSICS
@@ -109,10 +107,19 @@ class Problem:
         return list(self._workers.map(work, *parts))
 
     def _part(self, state: State, curve: Curve, arms: Array, part: slice) -> Sights:
-        seen = self.observations
-        tau, points, frames = seen.row_times[part], seen.points[part], seen.frames[part]
+        observations = self.observations
+        tau, points, frames = (
+            observations.row_times[part],
+            observations.points[part],
+            observations.frames[part],
+        )
         mounted = state.extrinsics
-        times = seen.times[part] + state.delays[frames] + state.readout_time * tau + mounted.offset
+        times = (
+            observations.times[part]
+            + state.delays[frames]
+            + state.readout_time * tau
+            + mounted.offset
+        )
         first, u = state.spline.layout.locate(times)
         local, velocity = np.empty((len(first), 3)), np.empty((len(first), 3))
         axes, centre = mounted.axes, mounted.centre
@@ -120,7 +127,7 @@ class Problem:
         ahead = np.where(local[:, 2:] > 0.0, local, (0.0, 0.0, 1.0))
         seen_as = project(self.camera, state.lens, ahead, self.lens_column >= 0)
         return Sights(
-            first, u, tau, local, velocity, seen_as.pixels - seen.pixels[part],
+            first, u, tau, local, velocity, seen_as.pixels - observations.pixels[part],
             seen_as.by_ray, seen_as.by_lens, self.pieces.slots[points], arms[points], frames,
             axes, centre,
         )  # fmt: skip
@@ -141,11 +148,11 @@ class Problem:
 
     def errors(self, state: State) -> Array:
         """Squared whitened errors (n,), px^2."""
-        terms, found = self.terms(state, 1.0), []
+        terms, squared = self.terms(state, 1.0), []
         for sights in self.look(state)[1]:
-            found.append(np.empty(len(sights.first)))
-            squared_errors(sights, terms, found[-1])
-        return np.concatenate(found)
+            squared.append(np.empty(len(sights.first)))
+            squared_errors(sights, terms, squared[-1])
+        return np.concatenate(squared)
 
     def noise(self, state: State, deviation: float) -> float:
         """Standard deviation of the noise, from the errors that are not far off the last one."""
@@ -282,8 +289,8 @@ class Problem:
 
     def trusted(self, start: State) -> Problem:
         """The same with the trusted keypoints only."""
-        seen = self.observations
-        return Problem(self.camera, seen.subset(seen.trusted), start, self.freedom)
+        observations = self.observations
+        return Problem(self.camera, observations.subset(observations.trusted), start, self.freedom)
 
     def images(self, inliers: BoolArray) -> int:
         """How many images have some of these keypoints (n,)."""
@@ -298,8 +305,7 @@ class RigNormal(NamedTuple):
 
 
 class RigProblem:
-    """The cost of one motion that several cameras see, as of :class:`Problem`; their borders stand
-    one after the other, their keypoints as well.
+    """The cost of one motion that several cameras see; borders and keypoints stand in their order.
 
     Args:
         cameras: of which the first has what is expected of the motion.
@@ -404,6 +410,6 @@ def _pieces(observations: Observations, freedom: Freedom) -> Pieces:
         return Pieces(observations.bodies, rigid=True)
     slots = np.full(len(observations.landmarks), -1)
     if freedom.landmarks > 0.0:
-        seen = np.unique(observations.points)
-        slots[seen] = np.arange(len(seen))
+        landmarks = np.unique(observations.points)
+        slots[landmarks] = np.arange(len(landmarks))
     return Pieces(slots, rigid=False)

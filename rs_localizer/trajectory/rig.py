@@ -85,8 +85,7 @@ class Mounted:
 
 
 def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
-    """Extrinsics and clock offsets of the cameras of a rig, by their names; the first one's axes
-    and clock are those of the rig.
+    """Extrinsics and clock offsets of the cameras of a rig, in the axes and clock of the first.
 
     Raises:
         ValueError: for a single camera, or when the motions of two cameras are not one, or do not
@@ -181,9 +180,7 @@ def _turning(spline: Spline) -> tuple[float, Array, Array]:
 
 
 def _at_offset(rig: Spline, own: Spline, offset: float) -> tuple[Extrinsics, float]:
-    """Extrinsics if the rig's time is later by an offset (s), and how far (rad) the axes turn about
-    them in the median.
-    """
+    """Extrinsics at a later time of the rig (s), and how far (rad) the axes turn about them."""
     times = np.arange(own.layout.starts[0], own.layout.ends[-1], _STEP)
     times = times[own.layout.inside(times) & rig.layout.inside(times + offset)]
     body, camera = rig.states(times + offset), own.states(times)
@@ -212,9 +209,7 @@ class _Joint(NamedTuple):
         return self.fit.state, *self.fit.state.others
 
     def numbers(self, place: int, about: Extrinsics) -> tuple[Array, Array]:
-        """Turn and displacement of a camera beside some extrinsics, and the offset of the stamps of
-        first rows; and their deviations (7,) by the noise.
-        """
+        """Turn, displacement and stamps' offset by some extrinsics; their deviations (7,)."""
         if place == 0:
             return np.zeros(EXTRINSICS), np.zeros(EXTRINSICS)
         camera, column = self.problem.cameras[place], self.problem.columns[place][0]

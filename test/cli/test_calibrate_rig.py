@@ -136,7 +136,7 @@ def test_a_map_refined_with_both_cameras(pair, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["video.mp4"], "--rig needs the recordings of several cameras, or one bag"),
+        (["video.mp4"], "--rig needs the recordings of several cameras, one bag or a video"),
         (["a/cam.mp4", "b/cam.mp4"], "cameras need different names"),
         (["1.mp4", "b.mp4"], "names that begin with a letter: 1, b"),
         (["a.mp4", "b.mp4", "--imu"], "--imu is for one camera"),

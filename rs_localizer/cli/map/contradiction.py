@@ -25,8 +25,9 @@ def add_argument(parser: argparse.ArgumentParser) -> None:
 def check(
     args: argparse.Namespace, readout: ReadoutCheck | None, instead: str, camera: str = ""
 ) -> None:
-    """Refuse a map that is made with the wrong readout time: it is bent by many times what its
-    deviations say, and fits its images nearly as well.
+    """Refuse a map that is made with the wrong readout time.
+
+    It is bent by many times what its deviations say, and fits its images nearly as well.
 
     Args:
         instead: what else the user can do.
