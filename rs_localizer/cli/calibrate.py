@@ -280,7 +280,7 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
         written = _write(args, found, source.map, intrinsics, config, refused)
         if refused and written:
             refusal += (
-                f". Written to {args.out} and beside it: lens, map. Not written: readout time and "
+                f"; written to {args.out} and beside it: lens, map; not written: readout time and "
                 "scan direction, which stay unknown: no twists (--force writes them, too)"
             )
     if refusal:

@@ -150,7 +150,7 @@ def test_lens_and_board_come_without_a_readout_time(film, tmp_path, capsys):
     assert main(["calibrate", str(few), *board, "--out", str(out)]) == 1
     said = capsys.readouterr()
     assert "0 of 3 parts" in said.err
-    assert "beside it: lens, map. Not written: readout time and scan direction" in said.err
+    assert "beside it: lens, map; not written: readout time and scan direction" in said.err
     values = load_params_file(out)
     assert "readout_time" not in values
     camera = read_calibration(tmp_path / "camera_camera_info.yaml")
