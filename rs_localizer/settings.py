@@ -17,13 +17,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
-from rs_localizer.config import (
-    NO_NAMES,
-    CameraSettings,
-    DetectorConfig,
-    FeatureConfig,
-    NodeConfig,
-)
+from rs_localizer.config import NO_NAMES, CameraSettings, DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.io.yaml_text import YamlError, load_yaml
 
 NODE_NAME = "rs_localizer"

@@ -8,7 +8,7 @@ import argparse
 import contextlib
 import importlib.util
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,6 @@ if WORKING:
 
     from rs_localizer.core.camera import Camera
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
-    from rs_localizer.io.rigs import read_camchain
     from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_log, read_telemetry
     from rs_localizer.io.video import count_lenses, has_times
     from rs_localizer.offline.image_sources import (
@@ -39,7 +38,6 @@ if WORKING:
         find_topic,
         from_bag,
         from_files,
-        from_lenses,
         from_video,
         have_times,
         image_files,
@@ -223,28 +221,40 @@ def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> Non
         print(f"kept for replay: {kept}")
 
 
-def time_faults(args: argparse.Namespace, clock: ImageClock | None, period: float) -> list[str]:
+def time_faults(
+    args: argparse.Namespace, clock: ImageClock | None, period: float, camera: str = ""
+) -> list[str]:
     """Say where the times are from; what speaks against them, and against the readout time.
 
     Args:
         period: s from one image to the next.
+        camera: of a rig, whose images these are.
     """
-    faults = []
+    faults, settings = [], build(shutter_values(args))
     if clock is not None:
         print(clock.description())
         faults.append(clock.fault())
-    faults.append(readout_fault(build(shutter_values(args)).readout_time, period))
+    own = settings.of_cameras.get(camera, settings)
+    faults.append(readout_fault(own.readout_time, period))
     return [fault for fault in faults if fault]
 
 
 def tell_next(args: argparse.Namespace, more: str = "") -> None:
     """The command that makes poses of the recording, with further options."""
-    out = shlex.quote(str(args.out))
-    settings = f" --params {out}/{PARAMETERS}" if (args.out / PARAMETERS).exists() else ""
-    if "readout_time" not in shutter_values(args):
-        settings += " -p readout_time:=SECONDS"
-    poses = shlex.quote(f"{args.out}_poses")
-    print(f"next: rs_localizer replay {out}{settings}{more} --out {poses}")
+    if not {"readout_time", "cameras"} & set(shutter_values(args)):
+        print(
+            "the readout time is not known: poses come without twists; calibrate measures it, and "
+            "-p readout_time:=SECONDS gives it to the next command"
+        )
+    known = (args.out / PARAMETERS).exists()
+    print(f"next: {replay_command(args.out, known=known)}{more}")
+
+
+def replay_command(recording: Path, *, known: bool = True) -> str:
+    """The command that makes poses of what ``detect`` wrote, with the parameters beside it."""
+    params = ["--params", str(recording / PARAMETERS)] if known else []
+    words = ["replay", str(recording), *params, "--out", f"{recording}_poses"]
+    return shlex.join(["rs_localizer", *words])
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +269,6 @@ class Source:
 @contextlib.contextmanager
 def opened(
     args: argparse.Namespace, path: Path, start: float | None = None, calibrated: bool = True,
-    cameras: Sequence[str] = (),
 ) -> Iterator[Source]:  # fmt: skip
     """Images with the lens of ``args.calibration`` or, of a bag, its camera_info.
 
@@ -268,7 +277,6 @@ def opened(
         path: of the images.
         start: time of the first one, s; not of a bag.
         calibrated: refuse images without a calibration.
-        cameras: of a rig that filmed into one file; ``args.calibration`` is its camchain.
 
     Raises:
         UsageError: for options that do not go with it, or that are missing.
@@ -277,8 +285,15 @@ def opened(
         for name in ("image", "camera_info"):
             if getattr(args, name) is not None:
                 raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
-        if cameras:
-            yield _of_lenses(args, path, cameras, start)
+        lens: int | None = getattr(args, "lens", None)  # one of several that filmed into one file
+        if lens is not None:
+            if args.rate is not None:
+                raise UsageError("--rate is for one camera: leave it out with cameras")
+            if args.calibration is None:
+                raise UsageError(
+                    "cameras in one file: --calibration FILE_camchain.yaml of calibrate --rig"
+                )
+            yield of_files(path, read_calibration(args.calibration), clock_of_lens(start), lens)
             return
         telemetry = telemetry_of(path, args)
         camera = None if args.calibration is None else read_calibration(args.calibration)
@@ -303,26 +318,6 @@ def opened(
 def lenses_of(path: Path) -> tuple[str, ...]:
     """The names of the cameras that filmed into one file."""
     return LENSES[: count_lenses(path)]
-
-
-def _of_lenses(
-    args: argparse.Namespace, path: Path, names: Sequence[str], start: float | None
-) -> Source:
-    """The images of several lenses of one file, with where they are by the camchain."""
-    there = () if path.is_dir() else lenses_of(path)
-    if missing := [name for name in names if name not in there]:
-        raise UsageError(
-            f"cameras: {path} is of {', '.join(there) or 'images'}, not of {', '.join(missing)}"
-        )
-    if args.rate is not None:
-        raise UsageError("--rate is for one camera: leave it out with cameras")
-    if args.calibration is None:
-        raise UsageError("cameras in one file: --calibration FILE_camchain.yaml of calibrate --rig")
-    parts = read_camchain(args.calibration)
-    if missing := [name for name in names if name not in parts.cameras]:
-        raise UsageError(f"--calibration: {args.calibration} has no {', '.join(missing)}")
-    clocks = {name: clock_of_lens(start) for name in names}
-    return Source(from_lenses(path, parts, clocks), None, clocks[names[0]])
 
 
 def clock_of_lens(start: float | None = None) -> ImageClock:

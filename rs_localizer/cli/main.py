@@ -259,9 +259,16 @@ def _output(name: str, common: Collection[str], shown: Callable[[str], str]) -> 
             yield
 
 
+_NEXT = "next: "
+
+
 def _json(name: str, result: Any, printed: str) -> str:
-    """The figures of a command, or the lines that it has printed."""
-    content = {"text": printed.splitlines()} if result is None else {"result": result}
+    """The figures of a command and what comes next, or the lines that it has printed."""
+    lines = printed.splitlines()
+    content: dict[str, Any] = {"text": lines} if result is None else {"result": result}
+    following = [line.removeprefix(_NEXT) for line in lines if line.startswith(_NEXT)]
+    if following and result is not None:
+        content["next"] = following[-1]
     return json.dumps({"command": name, **_as_json(content)}, indent=1)
 
 

@@ -133,9 +133,7 @@ class Room:
     ) -> dict[int, Localized | Refusal]:
         """The poses of the middle rows by the stamps of the images, as ``replay`` gives them."""
         config = NodeConfig(
-            solver=solver,
-            readout_time=self.camera.readout_time,
-            pose_time=PoseTime.MID_FRAME,
+            solver=solver, readout_time=self.camera.readout_time, pose_time=PoseTime.MID_FRAME
         )
         localizer = FrameLocalizer(config)
         localizer.use_map(landmarks)

@@ -115,10 +115,7 @@ def read_imu(message: Any) -> ImuReading:
         )
         force = acceleration if any(acceleration) else None
     return ImuReading(
-        stamp_ns=stamp_ns(message),
-        frame=frame,
-        angular_velocity=turn,
-        linear_acceleration=force,
+        stamp_ns=stamp_ns(message), frame=frame, angular_velocity=turn, linear_acceleration=force
     )
 
 

@@ -113,8 +113,8 @@ def fingerprint(url: str) -> str:
     """
     with _faults(url, "read"):
         files, path = _filesystem(url)
-        found = sorted(files.find(path)) or [path]
-        return " ".join(str(files.ukey(file)) for file in found)
+        paths = sorted(files.find(path)) or [path]
+        return " ".join(str(files.ukey(file)) for file in paths)
 
 
 def _filesystem(url: str) -> tuple[Any, str]:

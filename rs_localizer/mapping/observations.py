@@ -179,8 +179,8 @@ def from_recording(
     posed = [k for k, result in enumerate(results) if isinstance(result, Estimate)]
     if not posed:
         raise ValueError(f"none of {len(images)} images has a pose; of the last one, {results[-1]}")
-    found = [result for result in results if isinstance(result, Estimate)]
-    near = [estimate.residuals < _MOST_RESIDUAL for estimate in found]
+    estimates = [result for result in results if isinstance(result, Estimate)]
+    near = [estimate.residuals < _MOST_RESIDUAL for estimate in estimates]
     counts = [int(np.count_nonzero(of)) for of in near]
     seen = MapObservations(
         np.array([images[k].stamp_ns for k in posed], np.int64),
@@ -190,8 +190,8 @@ def from_recording(
     )
     start = Start(
         landmarks.points,
-        np.array([estimate.rotation.T for estimate in found]),
-        np.array([estimate.position for estimate in found]),
+        np.array([estimate.rotation.T for estimate in estimates]),
+        np.array([estimate.position for estimate in estimates]),
     )
     return RecordedMap(landmarks, seen, start, len(images))
 

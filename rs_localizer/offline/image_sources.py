@@ -4,9 +4,8 @@
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,9 +20,9 @@ from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.imu import make_reading
 from rs_localizer.io.messages import make_header, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
-from rs_localizer.io.rigs import RigParts, make_mounts, optical_frame
+from rs_localizer.io.rigs import optical_frame
 from rs_localizer.io.telemetry import Telemetry
-from rs_localizer.io.topics import IMU, TF_STATIC
+from rs_localizer.io.topics import IMU
 from rs_localizer.io.video import read_video
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
@@ -54,7 +53,6 @@ class Shot:
     camera_info: Any  # sensor_msgs/CameraInfo; None: nobody has calibrated it
     compressed: Any | None  # the image as sensor_msgs/CompressedImage, where it was compressed
     recorded_ns: int  # when it was recorded; of a file, its stamp
-    name: str = ""  # of the camera, where there are several
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,30 +72,14 @@ def from_video(
     Raises:
         ValueError: when it cannot be read, or has no times and the clock no rate.
     """
-    name = "" if lens is None else LENSES[lens]
+    frame = CAMERA_FRAME if lens is None else optical_frame(LENSES[lens])
     for jpeg, gray, seconds in read_video(path, lens):
         now = clock.relative(None if seconds is None else round(1e9 * seconds))
-        frame = optical_frame(name) if name else CAMERA_FRAME
         if now is None:
             lost = Refusal(Reason.NO_TIME, "it has no presentation time")
-            yield Shot(lost, _info(camera, 0, frame), None, 0, name)
+            yield Shot(lost, _info(camera, 0, frame), None, 0)
         else:
-            shot = _shot(Image(now, frame, gray), camera, jpeg, "jpeg")
-            yield replace(shot, name=name)
-
-
-def from_lenses(
-    path: Path, parts: RigParts, clocks: Mapping[str, ImageClock]
-) -> Iterator[Shot | Carried]:
-    """The images of the lenses of a video in the order of their stamps; first, where they are."""
-    streams = [
-        from_video(path, parts.cameras[name], clock, LENSES.index(name))
-        for name, clock in clocks.items()
-    ]
-    for k, shot in enumerate(heapq.merge(*streams, key=lambda shot: shot.recorded_ns)):
-        if k == 0:
-            yield Carried(TF_STATIC, shot.recorded_ns, make_mounts(parts))
-        yield shot
+            yield _shot(Image(now, frame, gray), camera, jpeg, "jpeg")
 
 
 def with_telemetry(
@@ -132,10 +114,10 @@ def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> I
         stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
         header = SimpleNamespace(stamp=stamp, frame_id=CAMERA_FRAME)
         message = SimpleNamespace(header=header, format=name, data=data)
-        found = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
-        if isinstance(found, Refusal):
-            found = Refusal(found.reason, f"{file.name}: {found.detail}")
-        yield _shot(found, camera, data, name, now)
+        image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
+        if isinstance(image, Refusal):
+            image = Refusal(image.reason, f"{file.name}: {image.detail}")
+        yield _shot(image, camera, data, name, now)
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -155,8 +137,8 @@ def image_files(folder: Path) -> list[Path]:
 def holds_images(path: Path) -> str:
     """What a path that is not a recording holds of images, as ``is a video``; empty: nothing."""
     if path.is_dir():
-        found = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
-        return f"is a folder of {found} images" if found else ""
+        count = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
+        return f"is a folder of {count} images" if count else ""
     if path.suffix.lower() in SUFFIXES:
         return "is an image"
     return "is a video" if path.is_file() and path.suffix.lower() in _VIDEOS else ""

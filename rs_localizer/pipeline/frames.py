@@ -463,7 +463,9 @@ class FrameLocalizer:
             return Refusal(result.reason, result.detail)
         if result.lens is not None and not watch.axis_in_doubt:
             self._notice(Notice.LENS, lens_is_off(result.lens))
-        readout = ReadoutKnown(deviation, watch.may_be_reversed, watch.surely_global)
+        readout = ReadoutKnown(
+            deviation, watch.may_be_reversed, watch.surely_global, watch.other_axis
+        )
         return self.mounted(of_camera(cloud, result, config, camera, frame, readout))
 
     def _thinned(self, cloud: Correspondences) -> Correspondences:

@@ -96,23 +96,23 @@ def solve(problem: AnyProblem, start: State, deviation: float | None = None) -> 
     return _finish(problem, state, deviation)
 
 
-def cost_at(camera: Camera, observations: Observations, found: Fit, readout_time: float) -> float:
-    """The least cost with this readout time (s), to be compared with ``found.cost``.
+def cost_at(camera: Camera, observations: Observations, fitted: Fit, readout_time: float) -> float:
+    """The least cost with this readout time (s), to be compared with ``fitted.cost``.
 
     Less exact where it is far from the least of all.
     """
-    held = replace(found.freedom, readout_time=False)
-    start = replace(found.state, readout_time=readout_time)
+    held = replace(fitted.freedom, readout_time=False)
+    start = replace(fitted.state, readout_time=readout_time)
     problem = Problem(camera, observations, start, held)
-    least = minimise(problem, start, found.deviation, _FEW_STEPS)
-    return problem.normal(least, found.deviation)[0]
+    least = minimise(problem, start, fitted.deviation, _FEW_STEPS)
+    return problem.normal(least, fitted.deviation)[0]
 
 
 def cheaper(richer: Fit, plainer: Fit, parameters: float) -> bool:
     """Whether so many more parameters are worth it, by the noise that the richer model leaves."""
     limit = (LIMIT * richer.deviation) ** 2
-    left = [float(np.sum(found.squared_errors.clip(max=limit))) for found in (plainer, richer)]
-    return (left[0] - left[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
+    costs = [float(np.sum(fitted.squared_errors.clip(max=limit))) for fitted in (plainer, richer)]
+    return (costs[0] - costs[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
 
 
 def image_speeds(camera: Camera, observations: Observations, state: State) -> Array:

@@ -88,14 +88,14 @@ def mean_accelerations(
         camera_from_imu: (3,3).
         spacing: s, of the means; half the period of the quickest motion that counts.
     """
-    found = []
+    means = []
     for start, end in _covered(spline.layout, samples.times):
         count = int((end - start) / spacing - _SUPPORT + 1.0 + 1e-9)
         for first in range(0, count, _MOST):
             numbers = np.arange(first, min(first + _MOST, count))
             times = np.asarray(start + spacing * (0.5 * _SUPPORT + numbers), np.float64)
-            found.append(_means(spline, samples, camera_from_imu, spacing, times))
-    return found
+            means.append(_means(spline, samples, camera_from_imu, spacing, times))
+    return means
 
 
 def _covered(layout: Layout, times: Array) -> list[tuple[float, float]]:
@@ -373,15 +373,15 @@ def _fit(whitened: Whitened, ratio: float, first: Array, lever: Lever) -> _Fitte
         right = rows.T @ values
         right[:INVERSE] += whitened.right / variance
         found = np.asarray(np.linalg.solve(normal, right), np.float64)
-        left = max(whitened.left(found), _EXACT * whitened.squared, _NOTHING)
-        variance = left / (whitened.count - INVERSE)
+        squared = max(whitened.left(found), _EXACT * whitened.squared, _NOTHING)
+        variance = squared / (whitened.count - INVERSE)
         inverse, down = float(found[INVERSE]), found[GRAVITY] / np.linalg.norm(found[GRAVITY])
     likelihood = -0.5 * (
         whitened.count * (1.0 + np.log(variance))
         + whitened.log_determinant
         + np.linalg.slogdet(normal)[1]
     )
-    explained = 1.0 - left / max(whitened.squared, _NOTHING)
+    explained = 1.0 - squared / max(whitened.squared, _NOTHING)
     covariance = np.asarray(np.linalg.inv(normal), np.float64)
     return _Fitted(found, covariance, ratio, variance, float(likelihood), explained)
 

@@ -251,10 +251,10 @@ def equation(
     onward = log(multiplied(before.rotation.T.copy(), now.rotation))
     further = log(multiplied(back, after.rotation))
     for i in range(3):
-        way = 0.0
+        displacement = 0.0
         for j in range(3):
-            way += back[i, j] * (after.position[j] - before.position[j])
-        of.x[place, i], of.x[place, 3 + i] = (onward[i] + further[i]) / span, way / span
+            displacement += back[i, j] * (after.position[j] - before.position[j])
+        of.x[place, i], of.x[place, 3 + i] = (onward[i] + further[i]) / span, displacement / span
     of.y[place], of.xx[place], of.yx[place], of.yy[place] = 0.0, 0.0, 0.0, 0.0
     views = (before, now, after)
     for k in range(3):
@@ -278,12 +278,14 @@ def jumps(before: View, now: View, after: View, first: float, second: float) -> 
     """Whether three views are of no one way, whatever the shutter; as :func:`equation`."""
     back, on = np.ascontiguousarray(before.rotation.T), np.ascontiguousarray(now.rotation.T)
     turn = log(on @ after.rotation) / second - log(back @ now.rotation) / first
-    way = (after.position - now.position) / second - (now.position - before.position) / first
+    displacement = (after.position - now.position) / second - (
+        now.position - before.position
+    ) / first
     views, paces = (before, now, after), (1.0 / first, 1.0 / first + 1.0 / second, 1.0 / second)
     for part in range(2):
         squared, noise = 0.0, 0.0
         for i in range(3):
-            squared += way[i] * way[i] if part else turn[i] * turn[i]
+            squared += displacement[i] * displacement[i] if part else turn[i] * turn[i]
             for k in range(3):
                 noise += paces[k] * paces[k] * views[k].covariance[3 * part + i, 3 * part + i]
         if np.sqrt(squared) > 0.5 * (first + second) * _JUMP[part] + _NOISE * np.sqrt(noise):

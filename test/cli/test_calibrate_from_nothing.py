@@ -98,6 +98,16 @@ def film(tmp_path_factory) -> Path:
     return folder
 
 
+def paste_next(said: str) -> str:
+    """Run what comes next as it is printed, and as each command says in its turn."""
+    (line,) = [row for row in said.splitlines() if row.startswith("next: ")]
+    for command in line.removeprefix("next: ").split(" && "):
+        words = shlex.split(command)
+        assert words[0] == "rs_localizer"
+        assert main(words[1:]) == 0
+    return line
+
+
 def test_a_film_gives_lens_readout_time_and_direction(film, tmp_path, capsys):
     out = tmp_path / "camera.yaml"
     board = ["--board", f"{COLUMNS}x{ROWS}", "--square", str(SQUARE)]
@@ -113,24 +123,45 @@ def test_a_film_gives_lens_readout_time_and_direction(film, tmp_path, capsys):
     r2 = np.array([0.1, 0.2])
     found = camera.D[0] * r2 + camera.D[1] * r2**2
     assert found == pytest.approx(K1 * r2 + K2 * r2**2, abs=0.005)
-    # What comes next works as it is printed: lens, shutter and map are passed on.
-    (line,) = [row for row in capsys.readouterr().out.splitlines() if row.startswith("next: ")]
-    for command in line.removeprefix("next: ").split(" && "):
-        words = shlex.split(command)
-        assert words[0] == "rs_localizer"
-        assert main(words[1:]) == 0
+    line = paste_next(capsys.readouterr().out)
     assert "camera_map.yaml" in line
     # The board's shape was measured: better known than that of any paper (0.1 m rms: 0.2 mm).
     measured = read_marker_map(tmp_path / "camera_map.yaml").settings
     assert load_params_file(out)["map_deviation"] == pytest.approx(measured["map_deviation"], 0.01)
     assert 0.0 < measured["map_deviation"] < 2e-4
     assert "camera_camera_info.yaml" in line
-    poses = read_tum(tmp_path / "camera_poses" / "poses.txt")
+    poses = read_tum(tmp_path / "camera_seen_poses" / "poses.txt")
     assert len(poses.positions) > 0.9 * SECONDS * RATE
     # A board of another size is named.
     smaller = ["--board", f"{COLUMNS - 2}x{ROWS}", "--square", str(SQUARE)]
     main(["calibrate", str(film), *smaller])
     assert f"a chessboard of {COLUMNS}x{ROWS} inner corners" in capsys.readouterr().err
+
+
+def test_lens_and_board_come_without_a_readout_time(film, tmp_path, capsys):
+    """Stamps that are not the images' own put the readout time in doubt, and nothing else."""
+    late, out = tmp_path / "late", tmp_path / "camera.yaml"
+    late.mkdir()
+    rng = np.random.default_rng(0)
+    for file in sorted(film.iterdir()):
+        (late / f"{int(file.stem) + round(4e6 * rng.normal())}.png").symlink_to(file)
+    board = ["--board", f"{COLUMNS}x{ROWS}", "--square", str(SQUARE)]
+    assert main(["calibrate", str(late), *board, "--out", str(out)]) == 1
+    said = capsys.readouterr()
+    assert "beside their stamps" in said.err
+    assert "beside it: lens, map. Not written: readout time and scan direction" in said.err
+    values = load_params_file(out)
+    assert "readout_time" not in values
+    camera = read_calibration(tmp_path / "camera_camera_info.yaml")
+    focal = values["calibration.focal_length"]
+    assert camera.K[0, 0] == pytest.approx(FOCAL, rel=4.0 * focal)
+    assert focal < 0.01
+    # Twists need it, poses do not; both commands name the same one to come next.
+    line = paste_next(said.out)
+    own = capsys.readouterr().out
+    assert f"next: {line.rpartition(' && ')[2]}" in own
+    assert "-p readout_time:=SECONDS" in own
+    assert len(read_tum(tmp_path / "camera_seen_poses" / "poses.txt").positions) > 80
 
 
 def test_a_video_with_the_log_of_a_phone(film, tmp_path, capsys):

@@ -24,12 +24,7 @@ from rs_localizer.cli.map import build
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.telemetry import (
-    Telemetry,
-    TelemetryError,
-    has_telemetry,
-    read_telemetry,
-)
+from rs_localizer.io.telemetry import Telemetry, TelemetryError, has_telemetry, read_telemetry
 from rs_localizer.settings import load_params_file
 
 RATE = 200.0

@@ -31,10 +31,7 @@ K = np.array([[450.0, 0.0, 319.5], [0.0, 450.0, 239.5], [0.0, 0.0, 1.0]])
 UPSIDE_DOWN = np.diag([-1.0, -1.0, 1.0])
 PARTS = RigParts(
     {name: Camera(640, 480, K, readout_time=0.03) for name in ("left", "right")},
-    {
-        "left": (np.eye(3), np.zeros(3)),
-        "right": (UPSIDE_DOWN, -UPSIDE_DOWN @ [0.1, 0.0, 0.0]),
-    },
+    {"left": (np.eye(3), np.zeros(3)), "right": (UPSIDE_DOWN, -UPSIDE_DOWN @ [0.1, 0.0, 0.0])},
     {"left": 0.0, "right": 0.004},
 )
 ANGULAR, LINEAR = np.array([0.3, -0.5, 0.2]), np.array([0.2, -0.3, 0.1])

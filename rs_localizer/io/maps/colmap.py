@@ -80,11 +80,7 @@ def _read_binary(data: bytes) -> Model:
     if count and int(ids.max()) >= 2**63:
         raise MapError(f"points3D.bin has a point with the id {ids.max()}")
     return Model(
-        ids.astype(np.int64),
-        points,
-        colors,
-        np.frombuffer(b"".join(tracks), _OBSERVATION),
-        starts,
+        ids.astype(np.int64), points, colors, np.frombuffer(b"".join(tracks), _OBSERVATION), starts
     )
 
 
