@@ -32,13 +32,13 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.io import topics
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import make_camera_info, make_correspondences
-from rs_localizer.io.rigs import RigParts, optical_frame
+from rs_localizer.io.rigs import RIG_FRAME, RigParts, optical_frame
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.ros.node.conversion import copy_message, make_message, message_class
 from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.settings import NODE_NAME, write_parameters
-from rs_localizer.simulation.rig import RIG_FRAME, camera_stamps, rig_parameters, simulate_rig
+from rs_localizer.simulation.rig import camera_stamps, rig_parameters, simulate_rig
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import TrueMotion, sampled_states
