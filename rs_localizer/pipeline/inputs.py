@@ -34,8 +34,8 @@ IMU_TYPE = "sensor_msgs/msg/Imu"
 
 
 Results = Union["Localized", Refusal, Iterator[Union["Localized", Refusal]], None]
-"""None: the message was no frame. Of a rig an image may complete no frame, or several, each of which
-is worked on when it is asked for.
+"""None: the message was no frame. Of a rig an image may complete no frame, or several, each of
+which is worked on when it is asked for.
 """
 
 
