@@ -47,9 +47,6 @@ from rs_localizer.tracking import Tracker
 _SURELY_SIX, _SURELY_ONE = 27.9, 3.9
 # Differences before a verdict, so that all cameras have some before one of them is blamed.
 _ENOUGH = 30
-# Share of so many frames that are refused because cameras disagree: of 72 kinds of frames of rigs
-# as they are said to be (benchmarks.rigs) none was.
-_MANY_REFUSED = 1.0 / 3.0
 # Innovations in a row that contradict: another mounting, or another time.
 _CHANGED = 5
 # s/sqrt(s), random walk of offsets: quartz is off by 5e-5, which the filter lags by 0.1 ms.
@@ -128,16 +125,8 @@ class _Fit:
 
     @property
     def off(self) -> bool:
-        """Whether the extrinsics are certainly others, whatever the lenses are off by."""
-        return self._surely_off(self.of_extrinsics[1])
-
-    @property
-    def disagrees(self) -> bool:
-        """Whether either extrinsics or lenses are certainly others."""
-        return self._surely_off(self.covariance[:6, :6])
-
-    def _surely_off(self, covariance: Array) -> bool:
-        mean = self.mean[:6]
+        """Whether the extrinsics are certainly others."""
+        mean, covariance = self.of_extrinsics
         score = float(mean @ np.linalg.solve(covariance, mean))
         return self.count >= _ENOUGH and score > _SURELY_SIX
 
@@ -190,8 +179,7 @@ class RigWatch:
         self._clocks = {name: _Clock() for name in self._names}
         self._lost: set[str] = set()  # whose clocks have jumped to where nobody knows exactly
         self._said: set[tuple[Notice, str]] = set()
-        self._judged: deque[bool] = deque([False], maxlen=_ENOUGH)  # whether frames were localized
-        self._frames = 0
+        self._refused, self._frames = True, 0
         self.values: dict[str, str] = {}
         """What is known of each camera, by readable names."""
         self.faults: dict[str, str] = {}
@@ -213,14 +201,14 @@ class RigWatch:
 
     def judge(self, localized: bool) -> None:
         """Take note of whether a frame of all was localized."""
-        self._judged.append(localized)
+        self._refused = not localized
 
     def add(self, image: Image, camera: Camera, mounts: Mapping[str, Transform]) -> None:
         """Take an image, and where the cameras are in the rig."""
         name, reference = image.camera, self._names[0]
         self._frames += name == reference
         sure = all(fit.count >= _ENOUGH and not fit.off for fit in self._fits.values())
-        idle = sure and self._judged[-1] and not self._applies and self._frames % _CYCLE >= _ON
+        idle = sure and not (self._applies or self._refused) and self._frames % _CYCLE >= _ON
         if idle or not self._rolling or len(self._names) < 2:
             return
         if name not in self._trackers:
@@ -316,14 +304,6 @@ class RigWatch:
             text = f"extrinsics of {named} relative to {to} differ by {fit.described()}"
             self._say(Notice.EXTRINSICS, named, text)
             self.faults = self.faults | {str(Notice.EXTRINSICS): text}
-        elif fit.disagrees and (refused := self._judged.count(False)) > _MANY_REFUSED * _ENOUGH:
-            text = (
-                f"{name} and {reference} disagree: extrinsics differ by {fit.described()}, or "
-                f"lenses, by what calibration.* leaves them; of {len(self._judged)} frames "
-                f"{refused} are refused"
-            )
-            self._say(Notice.EXTRINSICS, name, text)
-            self.faults = {str(Notice.EXTRINSICS): text}
         elif not any(other.off for other in self._fits.values()):
             self.faults = {}
 

@@ -110,16 +110,12 @@ SIDEWAYS = np.array([0.3, 0.8, -0.5]) / np.linalg.norm([0.3, 0.8, -0.5])
 
 
 @pytest.mark.parametrize(
-    ("degrees", "centimetres", "scene", "said"),
-    [
-        (1.0, 0.0, rich, "extrinsics of right relative to left differ by "),
-        (0.0, 1.0, rich, "extrinsics of right relative to left differ by "),
-        # Before a wall lenses of ordinary calibrations may be off by as much.
-        (0.0, 1.0, lambda motion: wall(), "right and left disagree: extrinsics differ by "),
-    ],
+    ("degrees", "centimetres", "scene", "seconds"),
+    # Before a wall, lenses of ordinary calibrations explain it for longer.
+    [(1.0, 0.0, rich, 3.0), (0.0, 1.0, rich, 3.0), (0.0, 1.0, lambda motion: wall(), 6.0)],
 )
-def test_a_wrong_extrinsic_is_named(tmp_path, degrees, centimetres, scene, said):
-    motion, (rotation, translation) = hand(5.0, 3.0), PARTS.camera_from_rig["right"]
+def test_a_wrong_extrinsic_is_named(tmp_path, degrees, centimetres, scene, seconds):
+    motion, (rotation, translation) = hand(5.0, seconds), PARTS.camera_from_rig["right"]
     mounted = (
         so3.exp(np.radians(degrees) * SIDEWAYS) @ rotation,
         translation + 0.01 * centimetres * SIDEWAYS,
@@ -129,7 +125,7 @@ def test_a_wrong_extrinsic_is_named(tmp_path, degrees, centimetres, scene, said)
     notices = localize(tmp_path / "bag")[2]
     texts = [text for name, text in notices if name == "extrinsics"]
     assert len(texts) == 1
-    assert texts[0].startswith(said)
+    assert texts[0].startswith("extrinsics of right relative to left differ by ")
     turn, turn_deviation, moved, moved_deviation = numbers(texts[0])
     assert turn == pytest.approx(degrees, abs=3.0 * turn_deviation)
     assert moved == pytest.approx(10.0 * centimetres, abs=3.0 * moved_deviation)
