@@ -290,7 +290,7 @@ class Exposure:
         if self.alone:
             return self
         first = Mounts(*(values[:1] for values in self.mounts))
-        return replace(self, sides=(Side(*self.cameras, 0, None),), mounts=first)
+        return replace(self, sides=(Side(self.cameras[0], 0, None),), mounts=first)
 
     def look(self, place: int, pixels: Array) -> tuple[Array, Array, IntArray]:
         """Rays (n,2) of raw pixels (n,2) of a camera, NaN where it has none, derivatives (n,2,2) of
