@@ -87,9 +87,7 @@ def with_lens(camera: Camera, coefficients: Array) -> Camera:
 
 
 def by_lens(camera: Camera, towards: Array) -> Array:
-    """Derivatives (n,2,k) by all coefficients of the pixels of rays (n,2), or of bearings (n,3) by
-    a lens that sees behind the image plane.
-    """
+    """Derivatives (n,2,k) by all coefficients of the pixels of rays (n,2) or bearings (n,3)."""
     projected = _law_of(camera).see(towards, camera.K, _distortion_of(camera))
     correctable = projected.by_coefficients[:, :, : _distorting(camera)]
     columns = np.concatenate([correctable, projected.by_matrix], axis=2)

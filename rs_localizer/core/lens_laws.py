@@ -146,7 +146,6 @@ def sphere_law(
         coefficients: how many it has; without any it is a pinhole where it has no limits.
         limits: of each.
     """
-
     sphere = Sphere(see, look)
 
     def project(rays: Array, K: Array, D: Array) -> Projection:

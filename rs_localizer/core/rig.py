@@ -293,8 +293,9 @@ class Exposure:
         return replace(self, sides=(Side(self.cameras[0], 0, None),), mounts=first)
 
     def look(self, place: int, pixels: Array) -> tuple[Array, Array, IntArray]:
-        """Rays (n,2) of raw pixels (n,2) of a camera, NaN where it has none, derivatives (n,2,2) of
-        the pixels by them, and of which side (n,) they are.
+        """Rays (n,2) of raw pixels (n,2) of a camera, their derivatives, and sides.
+
+        NaN where it has none; (n,2,2) of the pixels by the rays; (n,) of which side they are.
         """
         own = [i for i, side in enumerate(self.sides) if side.place == place]
         if len(own) == 1:

@@ -26,7 +26,6 @@ from rs_localizer.estimation.assumptions import Assumed
 from rs_localizer.estimation.frame_fit import (
     DEGREE_SIZES,
     SMOOTH_DEGREE,
-    SMOOTH_TERMS,
     FrameFit,
     fit_frame,
     score_products,
@@ -54,8 +53,6 @@ from rs_localizer.estimation.undetected_vibration import Undetected, undetected_
 _ASKS_TURNS, _ASKS_SMOOTH = float(-ndtri(0.3 / len(CYCLES))), float(-ndtri(0.05))
 # What chance explains in one frame of ten thousand may have moved points out of the gate.
 _WIDENS = float(-ndtri(1e-4 / len(CYCLES)))
-# Coefficients of each; six of the smooth error's twenty are as a pose's that is off.
-_COEFFICIENTS = np.append(np.full(len(CYCLES), 6.0), 2.0 * SMOOTH_TERMS - 6.0)
 # Likewise of the frames before (standard normal): one track in a thousand.
 _ASKS_REMEMBERED = 3.3
 # Of the typical speeds.
@@ -167,12 +164,12 @@ def _of_points(
     depth = max(observations.median_depth(best.state, best.inliers), _NEAREST)
     declared = assumed.map_deviation * assumed.focal_length / depth  # px
     hyper = _hyperprior(assumed, declared)
-    explained, agreement, vibration = _look(
+    explained, coefficients, agreement, vibration = _look(
         observations.packed, observations.count, best.state,
         best.inliers, terms, best.noise, best.freedom, hyper.mean, hyper.precision,
         assumed.rolling,
     )  # fmt: skip
-    excess, remembered = _standard(explained, best.freedom), assumed.scales
+    excess, remembered = _standard(explained, coefficients, best.freedom), assumed.scales
     near = _near_outliers(best, threshold) if assumed.rolling else 0
     most = excess[:-1].max()
     known = remembered.excess[:-1].max() > _ASKS_REMEMBERED
@@ -231,7 +228,7 @@ def _near_outliers(best: Posterior, threshold: float) -> int:
     return count if count >= max(_NEAR_OUTLIERS, _NEAR_PART * inliers) else 0
 
 
-def _standard(explained: Array, freedom: float) -> Array:
+def _standard(explained: Array, own: Array, freedom: float) -> Array:
     """How much more than chance columns explain (15,), standard normal where there is nothing.
 
     An F test, because the noise is of the same errors (Rao 1948), by Paulson's approximation
@@ -239,9 +236,10 @@ def _standard(explained: Array, freedom: float) -> Array:
 
     Args:
         explained: (15,) squares in noise variances.
+        own: (15,) how many columns explain them that the motion does not mimic.
         freedom: of the errors.
     """
-    own, rest = _COEFFICIENTS, freedom - _COEFFICIENTS
+    rest = freedom - own
     enough = rest >= 1.0
     rest = np.maximum(rest, 1.0)
     left = np.maximum(freedom - explained, 1e-3 * max(freedom, 1.0))
@@ -445,52 +443,51 @@ def _either(
 def _look(
     data: Array, count: int, state: Array, inliers: BoolArray, prior: PriorTerms,
     noise: float, freedom: float, means: Array, precisions: Array, turns: bool,
-) -> tuple[Array, float, Undetected]:  # fmt: skip
+) -> tuple[Array, Array, float, Undetected]:  # fmt: skip
     """What each frequency of an in-frame turn, and a smooth error, would explain of the errors.
 
-    Score statistics at the best motion without them, chi-squared of 6 and 20 degrees of freedom
-    where there is nothing (Rao 1948).
+    Score statistics at the best motion without them, chi-squared where there is nothing (Rao 1948).
 
     Returns:
-        (15,) of the 14 frequencies and the smooth error; how much neighbouring rows agree; and what
-        one frequency may do, whose scales have these ``means`` and ``precisions`` (15,).
+        (15,) of the 14 frequencies and the smooth error; their degrees of freedom (15,): 6, and 20
+        or, where the motion mimics some of its columns, fewer; how much neighbouring rows agree;
+        and what one frequency may do, whose scales have these ``means`` and ``precisions`` (15,).
     """
-    statistic = np.zeros(SCALES)
+    statistic, counts = np.zeros(SCALES), np.full(SCALES, 6.0)
     variance, frequencies = noise * noise, len(CYCLES)
     products, agreement = score_products(data, count, state, inliers, prior, variance, turns)
     own, crossed, along, within, across, beside, inverse = products
     pull = np.zeros((frequencies if turns else 0, 6, PARAMETERS))
     for f in range(len(pull)):
-        pull[f] = _beside_motion(own[f], crossed[f], inverse)
-        statistic[f] = _explained(own[f], along[f]) / variance
-    _beside_motion(within, across, inverse)
-    statistic[frequencies] = _explained(within, beside) / variance
+        pull[f], _ = _beside_motion(own[f], crossed[f], inverse)
+        statistic[f] = _explained(inverted(own[f]), along[f]) / variance
+    _, ridge = _beside_motion(within, across, inverse)
+    left = inverted(within)
+    statistic[frequencies] = _explained(left, beside) / variance
+    counts[frequencies] = max(len(ridge) - np.sum(np.diag(left) * ridge), 1.0)
     vibration = undetected_vibration(own, pull, along, variance, freedom, means, precisions)
-    return statistic, agreement, vibration
+    return statistic, counts, agreement, vibration
 
 
 @kernel
-def _beside_motion(own: Array, crossed: Array, inverse: Array) -> Array:
-    """Take the motion out of products of columns, ``N - X M^-1 X^T``; by how much they move it."""
-    pulled = crossed @ inverse
+def _beside_motion(own: Array, crossed: Array, inverse: Array) -> tuple[Array, Array]:
+    """Take the motion out of products of columns, ``N - X M^-1 X^T``; by how much they move it, and
+    what stands on the diagonal so that columns that the motion mimics wholly explain nothing.
+    """
+    pulled, ridge = crossed @ inverse, 1e-6 * np.diag(own) + 1e-12
     for i in range(len(own)):
-        # What the motion mimics wholly explains nothing.
-        own[i, i] *= 1.0 + 1e-6
-        own[i, i] += 1e-12
+        own[i, i] += ridge[i]
         for j in range(i + 1):
             taken = 0.0
             for k in range(PARAMETERS):
                 taken += pulled[i, k] * crossed[j, k]
             own[i, j] -= taken
             own[j, i] = own[i, j]
-    return pulled
+    return pulled, ridge
 
 
 @kernel
-def _explained(left: Array, along: Array) -> float:
+def _explained(inverse: Array, along: Array) -> float:
     """Squares that columns explain beside the motion."""
-    inverse_left, explained = inverted(left), 0.0
-    for i in range(len(along)):
-        for j in range(len(along)):
-            explained += along[i] * inverse_left[i, j] * along[j]
+    explained = float(np.sum(along * (inverse @ along)))
     return explained if np.isfinite(explained) else 0.0

@@ -31,12 +31,25 @@ from rs_localizer.core.scales import SPEEDS
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import MOVE, PARAMETERS, STATE_SIZE, TURN, step_between
-from rs_localizer.estimation.frame_fit import fit_frame, log_determinant_of_inverse
+from rs_localizer.estimation.frame_fit import (
+    fit_frame,
+    log_determinant_of_inverse,
+    products_of,
+    smooth_at,
+)
 from rs_localizer.estimation.mirror import leaning_less, plane_of
 from rs_localizer.estimation.observations import weighted
 from rs_localizer.estimation.posterior import WIDEST_GATE
-from rs_localizer.estimation.prior import PriorTerms, terms_at
-from rs_localizer.estimation.refine import apply_step, inverted, refine
+from rs_localizer.estimation.prior import PriorTerms, add_prior, terms_at
+from rs_localizer.estimation.refine import (
+    apply_step,
+    half_inverse,
+    inverted,
+    refine,
+    solve_positive,
+    squared,
+)
+from rs_localizer.estimation.residuals import linearized, normal_equations
 
 # More steps of Gauss-Newton than any fit needs that ends.
 STEPS = 25
@@ -64,9 +77,16 @@ _FITS, _FINE = 4, 1e-6
 _NO_SCALE, _ITERATIONS = 1e6, 50
 # Deviation of a lean (rad, 2 deg) up to which one Gaussian will do.
 _KNOWN_LEAN = 0.035
-# Logarithm of the odds of the best part of the leans against those that are left out (of a Gaussian
-# what is beyond 3.7 deviations), how far they reach in deviations, and the most of them.
-_LEAST_PART, _REACH, _MOST_PARTS = 7.0, 8, 100
+# Steps of the grid of leans in deviations: the trapezoid rule is right to 3e-4 of a Gaussian, and
+# leans pinned to this part of a step are wider by 1e-3.
+_SPACING, _PIN = 1.5, 0.03
+# A last step beside a pinned lean gains less than this (noise variances): evidence to half of it.
+_PINNED_STEPS, _PINNED_GAIN = 6, 1e-2
+# Neighbours are looked at of all parts up to these odds (logarithm) against the best: of a Gaussian
+# they reach beyond three deviations.
+_LEAST_PART, _MOST_PARTS = 4.0, 100
+# Where the evidence falls faster than that of the mode's Gaussian, steps shrink to this at least.
+_LEAST_SHARE, _TINY = 0.25, 1e-300
 # Probabilities that have no part in the covariance.
 _NO_PART = 1e-5
 
@@ -183,6 +203,17 @@ def averaged(
     return apply_step(states[best], mean), covariance, steps
 
 
+class _Held(NamedTuple):
+    """What does not change with the lean of a mode."""
+
+    chosen: BoolArray  # (n,) inliers
+    noise: float  # px
+    cost: float  # noise variances, the least; NaN: that of the mode
+    freedom: float
+    field: Array  # (n,2,q) px, columns of the smooth error; their products leave the motion's
+    pulls: Array  # (q,18) by how much it moves the motion, over the covariance
+
+
 class Mode(NamedTuple):
     """A Gaussian about an optimum, and its evidence."""
 
@@ -191,6 +222,7 @@ class Mode(NamedTuple):
     evidence: float  # logarithm; minus infinity: nothing was found
     cost: float  # noise variances
     smooth: float  # px, scale of the smooth error
+    held: _Held
 
 
 class _Modes(NamedTuple):
@@ -327,9 +359,7 @@ def _modes(
             other, twin = leaning_less(inliers.points, inliers.chosen, near, 2.0)
         whole, open_ = mode, False
         if planar:
-            whole, open_ = _over_leans(
-                data, inliers, mode, twin if other else near, prior, odds[speed], smooth
-            )
+            whole, open_ = _over_leans(inliers, mode, twin if other else near, prior, smooth)
         count, here = _keep(modes, count, speed, whole), whole.evidence
         if other and not open_:
             second = _mode(data, inliers, twin, prior, odds[speed], smooth)
@@ -383,15 +413,15 @@ def _mode(
         )
         if converged:
             break
-    covariance, cost = variance * inverted(information), cost / variance
-    # Of unknown noise (Student): what it leaves beyond the best motion tells the less, the fewer
-    # the points.
-    freedom = max(inliers.freedom, 6.0)
-    beyond = max((cost - inliers.cost) / freedom, _MOST_BETTER - 1.0)
-    left = inliers.cost + freedom * math.log1p(beyond)
-    volume = log_determinant_of_inverse(covariance)
-    evidence = log_evidence(volume, left, terms, inliers, inliers.chosen, noise)
-    scale = 0.0
+    covariance, cost, scale = variance * inverted(information), cost / variance, 0.0
+    held = _Held(
+        inliers.chosen, noise, inliers.cost, inliers.freedom, np.zeros((0, 2, 0)),
+        np.zeros((0, PARAMETERS)),
+    )  # fmt: skip
+    evidence = log_evidence(
+        log_determinant_of_inverse(covariance), _of_unknown_noise(cost, held), terms, inliers,
+        inliers.chosen, noise,
+    )  # fmt: skip
     if smooth.fitted and np.isfinite(evidence):
         fit = fit_frame(
             inliers.data, len(inliers.chosen), state, terms, inliers.threshold,
@@ -404,21 +434,109 @@ def _mode(
             evidence = log_evidence(
                 fit.log_determinant, cost, terms, inliers, fit.inliers, fit.noise
             )
+            held = _Held(fit.inliers, fit.noise, np.nan, fit.freedom, held.field, held.pulls)
     if not (np.isfinite(evidence) and np.all(np.isfinite(covariance))):
-        return Mode(start, np.zeros((PARAMETERS, PARAMETERS)), -np.inf, np.inf, 0.0)
+        return Mode(start, np.zeros((PARAMETERS, PARAMETERS)), -np.inf, np.inf, 0.0, held)
     covariance = along_arcs(inliers.inflation * covariance, state[9:12])
-    return Mode(state, covariance, evidence + odds, cost, scale)
+    return Mode(state, covariance, evidence + odds, cost, scale, held)
+
+
+@inlined
+def _of_unknown_noise(cost: float, held: _Held) -> float:
+    """A cost, noise variances, where the noise is of the errors that the least cost leaves.
+
+    Student's: what a motion leaves beyond the best one tells the less, the fewer the points.
+    """
+    freedom = max(held.freedom, 6.0)
+    beyond = max((cost - held.cost) / freedom, _MOST_BETTER - 1.0)
+    return held.cost + freedom * math.log1p(beyond)
+
+
+@inlined
+def _marginal(inliers: Inliers, mode: Mode, smooth: SmoothError) -> _Held:
+    """What is held of a mode, and its smooth error, of which the scale is held, too.
+
+    With columns ``F`` of the smooth error and ``L L^T = F^T F + (sigma/s)^2``: ``F L^-T`` and
+    ``(L L^T)^-1 F^T A / s``.
+    """
+    held, count = mode.held, len(inliers.chosen)
+    lines = linearized(inliers.data, count, mode.state, np.zeros((count, 6)))
+    products = products_of(lines, held.chosen, lines.errors, False, True, smooth.bend).products
+    own = products[PARAMETERS:, PARAMETERS:].copy()
+    size = len(own)
+    for k in range(size):
+        own[k, k] += (held.noise / mode.smooth) ** 2
+    half, scale, _ = half_inverse(own)
+    field, column = np.zeros((count, 2, size)), np.zeros(size)
+    for k in range(size):
+        for j in range(k + 1):
+            column[j] = half[k, j] * scale[j]
+        field[:, :, k] = smooth_at(lines, held.chosen, column, smooth.bend)
+    pulls = squared(half, scale) @ products[PARAMETERS:, :PARAMETERS].copy() / mode.smooth
+    return _Held(held.chosen, held.noise, held.cost, held.freedom, field, pulls)
+
+
+@kernel
+def _equations(
+    data: Array, state: Array, terms: PriorTerms, held: _Held, information: Array, slope: Array
+) -> float:
+    """Fill in the normal equations, the smooth error marginalized; the cost, noise variances."""
+    variance, size = held.noise * held.noise, held.field.shape[2]
+    cost = normal_equations(data, state, _NO_SCALE, 0.0, 2, information, slope)
+    if size > 0:
+        count = len(held.field)
+        lines = linearized(data, count, state, np.zeros((count, 6)))
+        shared, along = np.zeros((size, PARAMETERS)), np.zeros(size)
+        for i in range(count):
+            if not held.chosen[i]:
+                continue
+            for side in range(2):
+                row, error = lines.by_motion[i, side], lines.errors[i, side]
+                for k in range(size):
+                    factor, products = held.field[i, side, k], shared[k]
+                    along[k] += factor * error
+                    for a in range(PARAMETERS):
+                        products[a] += factor * row[a]
+        cost -= np.sum(along * along)
+        slope -= shared.T @ along
+        information -= shared.T @ shared
+    cost += add_prior(
+        terms.informations, terms.references, terms.gravity, state, variance, information, slope
+    )
+    return cost / variance
+
+
+@kernel
+def _at_lean(
+    data: Array, start: Array, terms: PriorTerms, held: _Held
+) -> tuple[Array, Array, float]:
+    """State (24,) and covariance (18,18) beside a lean, and logarithm of their probability."""
+    variance = held.noise * held.noise
+    information, slope = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
+    state = start
+    for _ in range(_PINNED_STEPS):
+        cost = _equations(data, state, terms, held, information, slope)
+        step, solved = solve_positive(information, -slope)
+        if not solved:
+            break
+        state, gain = apply_step(state, step), -np.sum(step * slope) / variance
+        if gain < _PINNED_GAIN:
+            covariance = variance * inverted(information)
+            evidence = 0.5 * log_determinant_of_inverse(covariance)
+            evidence -= 0.5 * _of_unknown_noise(cost - gain, held)
+            pulled = held.pulls @ covariance
+            return state, covariance - pulled.T @ pulled, evidence
+    return state, information, -np.inf
 
 
 @kernel
 def _over_leans(
-    data: Array, inliers: Inliers, mode: Mode, twin: Array, terms: PriorTerms, odds: float,
-    smooth: SmoothError,
-) -> tuple[Mode, bool]:  # fmt: skip
+    inliers: Inliers, mode: Mode, twin: Array, terms: PriorTerms, smooth: SmoothError
+) -> tuple[Mode, bool]:
     """The mode of a plane, integrated over its leans where they are hardly known; whether they are.
 
-    Nested Laplace approximation: the posterior times Gaussians of the lean that add up to one (two
-    of their deviations apart, to 1.5 %), each part a Gaussian about an optimum of its own.
+    Nested Laplace approximation: a Gaussian about the optimum beside each lean of a grid, along the
+    one or two axes about which it is hardly known. Noise, inliers and scale are those of the mode.
 
     Args:
         twin: state (24,) of the mirrored lean, where the parts may be others; or that of the mode.
@@ -429,65 +547,84 @@ def _over_leans(
     sizes, axes = np.linalg.eigh(flat @ mode.covariance[TURN, TURN].copy() @ flat)
     if not (plane and sizes[2] > _KNOWN_LEAN**2):
         return mode, False
-    step = math.sqrt(sizes[2])
+    away = axes.T @ step_between(mode.state, twin)[TURN]
+    used = 2 if max(sizes[1], away[1] ** 2) > _KNOWN_LEAN**2 else 1
+    axes, away = axes.T[::-1][:used].copy(), away[::-1][:used].copy()
+    steps = _SPACING * np.sqrt(np.maximum(sizes[::-1][:used], _TINY))
+    held, data = mode.held, weighted(inliers.data, mode.held.chosen)
+    if mode.smooth > 0.0:
+        held = _marginal(inliers, mode, smooth)
+    information, slope = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
+    cost = _equations(data, mode.state, terms, held, information, slope)
+    least = cost if np.isnan(held.cost) else held.cost
+    held = _Held(held.chosen, held.noise, least, held.freedom, held.field, held.pulls)
+    volume = log_determinant_of_inverse(held.noise * held.noise * inverted(information))
+    whole = 0.5 * (volume - _of_unknown_noise(cost, held))
     informations = np.zeros((count + 1, PARAMETERS, PARAMETERS))
     references = np.empty((count + 1, STATE_SIZE))
     informations[:count], references[:count] = terms.informations, terms.references
-    places, starts = np.zeros((_MOST_PARTS, 2), np.int64), np.empty((_MOST_PARTS, STATE_SIZE))
+    pinned = PriorTerms(informations, references, terms.gravity)
+    places, starts = np.zeros((_MOST_PARTS, used), np.int64), np.empty((_MOST_PARTS, STATE_SIZE))
     states, evidences = np.empty((_MOST_PARTS, STATE_SIZE)), np.empty(_MOST_PARTS)
     covariances = np.empty((_MOST_PARTS, PARAMETERS, PARAMETERS))
-    queued = np.zeros((2 * _REACH + 1, 2 * _REACH + 1), np.bool_)
-    queued[_REACH, _REACH], starts[0], first, last = True, mode.state, 0, 1
-    away = np.round(axes.T @ step_between(mode.state, twin)[TURN] / step)
-    i, j = int(away[2]), int(away[1])
-    if max(abs(i), abs(j)) <= _REACH and not queued[_REACH + i, _REACH + j]:
-        queued[_REACH + i, _REACH + j], starts[1], last = True, twin, 2
-        places[1, 0], places[1, 1] = i, j
-    kept, best = 0, -np.inf
+    starts[0], first, last, best, measured = mode.state, 0, 1, -np.inf, False
     while first < last:
-        i, j = places[first, 0], places[first, 1]
-        turn = exp(-step * (i * axes[:, 2] + j * axes[:, 1]))
-        references[count] = starts[first]
-        references[count, :9] = (turn @ rotation).ravel()
-        across = turn @ rotation @ normal
-        informations[count, TURN, TURN] = 4.0 / sizes[2] * (np.eye(3) - np.outer(across, across))
-        part = _mode(
-            data, inliers, starts[first], PriorTerms(informations, references, terms.gravity),
-            odds, smooth,
-        )  # fmt: skip
-        first += 1
-        if not part.evidence > best - _LEAST_PART:
-            continue
-        best = max(best, part.evidence)
-        states[kept], covariances[kept] = part.state, part.covariance
-        evidences[kept], kept = part.evidence, kept + 1
-        old = part.state[:9].copy().reshape(3, 3)
-        for k in range(4):
-            m, n = i + (k == 0) - (k == 1), j + (k == 2) - (k == 3)
-            if (
-                max(abs(m), abs(n)) > _REACH
-                or queued[_REACH + m, _REACH + n]
-                or last == _MOST_PARTS
-            ):
+        turn = exp(-(places[first] * steps) @ axes)
+        references[count], references[count, :9] = starts[first], (turn @ rotation).ravel()
+        across = axes @ turn.T / (_PIN * steps[used - 1])
+        informations[count, TURN, TURN] = across.T @ across
+        states[first], covariances[first], evidences[first] = _at_lean(
+            data, starts[first], pinned, held
+        )
+        best, first = max(best, evidences[first]), first + 1
+        if first == 2 * used + 1:  # the lean of the mode, and those beside it
+            shrunk = False
+            for axis in range(used):
+                beside = evidences[2 * axis + 1] + evidences[2 * axis + 2]
+                falls = evidences[0] - 0.5 * beside
+                if falls > _SPACING**2 and not measured:
+                    steps[axis] *= max(_SPACING / math.sqrt(2.0 * falls), _LEAST_SHARE)
+                    shrunk = True
+            measured = True
+            if shrunk:
+                first, last, best = 0, 1, -np.inf
                 continue
-            queued[_REACH + m, _REACH + n] = True
-            places[last, 0], places[last, 1] = m, n
-            # About the middle of the plane, from the nearest part.
-            new = exp(-step * (m * axes[:, 2] + n * axes[:, 1])) @ turn.T @ old
-            starts[last] = part.state
-            starts[last, :9] = new.ravel()
-            starts[last, 9:12] += old @ centre - new @ centre
-            last += 1
-    if kept == 0:
+            last = _queue(places, starts, last, np.rint(away / steps).astype(np.int64), twin)
+        if not evidences[first - 1] > best - _LEAST_PART:
+            continue
+        near = states[first - 1]
+        old = near[:9].copy().reshape(3, 3)
+        for k in range(2 * used):
+            place, begin = places[first - 1].copy(), near.copy()
+            place[k // 2] += 1 - k % 2 * 2
+            # About the middle of the plane.
+            new = exp(-(place * steps) @ axes) @ turn.T @ old
+            begin[:9] = new.ravel()
+            begin[9:12] += old @ centre - new @ centre
+            last = _queue(places, starts, last, place, begin)
+    if not (best > -np.inf and np.isfinite(whole)):
         return mode, False
-    probable = np.exp(evidences[:kept] - best)
+    probable = np.exp(evidences[:last] - best)
     total = np.sum(probable)
     state, covariance, _ = averaged(
-        states[:kept], covariances[:kept], int(np.argmax(probable)), probable / total,
-        probable / total,
+        states[:last], inliers.inflation * covariances[:last], int(np.argmax(probable)),
+        probable / total, probable / total,
     )  # fmt: skip
-    evidence = best + math.log(2.0 / math.pi * total)
-    return Mode(state, covariance, evidence, mode.cost, mode.smooth), True
+    area = np.prod(steps / (_PIN * steps[used - 1] * math.sqrt(2.0 * math.pi)))
+    evidence = mode.evidence - whole + best + math.log(area * total)
+    return Mode(state, covariance, evidence, mode.cost, mode.smooth, held), True
+
+
+@inlined
+def _queue(places: IntArray, starts: Array, last: int, place: IntArray, start: Array) -> int:
+    """Put a place of a grid behind the others, if it is new and there is room; their number."""
+    for k in range(last):
+        if np.all(places[k] == place):
+            return last
+    if last < len(places):
+        places[last], starts[last] = place, start
+        last += 1
+    return last
 
 
 @kernel

@@ -34,8 +34,9 @@ IMU_TYPE = "sensor_msgs/msg/Imu"
 
 
 Results = Union["Localized", Refusal, Iterator[Union["Localized", Refusal]], None]
-"""None: the message was no frame. Of a rig an image may complete no frame, or several, each of
-which is worked on when it is asked for.
+"""None: the message was no frame.
+
+Of a rig an image may complete no frame, or several; each is worked on when it is asked for.
 """
 
 
@@ -89,9 +90,7 @@ class Input:
         return f"--{self.topic.replace('_', '-')}"
 
     def take(self, localizer: FrameLocalizer, message: Any) -> Results:
-        """Read and use a message at once; of a frame, its result, or the results of all frames that
-        are complete with it.
-        """
+        """Read and use a message at once; the results of frames that are complete with it."""
         frames = self.role is Role.FRAMES
         try:
             return self.use(localizer, self.read(message))

@@ -213,9 +213,7 @@ class RigLocalizer(FrameLocalizer):
         self._use(calibration, self._config)
 
     def add(self, name: str, kind: str, message: Any) -> Iterator[Localized | Refusal]:
-        """Take an image of a camera; the results of the frames that are complete with it, before
-        cameras are compared.
-        """
+        """Take an image; the results of frames that are complete, before cameras are compared."""
         if name not in self.calibrations:
             text = f"no usable camera_info of {name} has come yet"
             self._notice(Notice.NO_IMAGES, f"{name} is left out: {text}")
@@ -293,9 +291,7 @@ class RigLocalizer(FrameLocalizer):
         return self.mounted(self._localized(images, result, origin_ns))
 
     def _mount(self, images: Sequence[Image]) -> Refusal | None:
-        """Look up where the cameras are, of each that has not been or that moves; why one that has
-        a part in this frame is not known.
-        """
+        """Look up where cameras are that move; why one of this frame is not known."""
         frame, stamp_ns = self.camera_frame, images[0].cloud.stamp_ns or None
         mounts, refusal = dict(self._mounts), None
         for image in images:

@@ -341,7 +341,7 @@ def test_scores_are_chi_squared_where_there_is_nothing():
     for seed in range(200):
         observations, state = frame(seed, 0.02, 0.5, 60)
         best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
-        statistic, _, _ = _look(
+        statistic, *_ = _look(
             observations.packed, len(observations), best.state,
             best.inliers, PRIOR, 0.5, best.freedom, np.full(SCALES, -8.0), np.ones(SCALES), True,
         )  # fmt: skip
@@ -358,7 +358,7 @@ def test_scores_tell_the_frequency():
     for cycles in (2.0, 5.5):
         observations, state = shaken(1, cycles, 0.3 * SWING, 0.2)
         best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
-        statistic, _, _ = _look(
+        statistic, *_ = _look(
             observations.packed, len(observations), best.state,
             best.inliers, PRIOR, best.noise, best.freedom, np.full(SCALES, -8.0),
             np.ones(SCALES), True,

@@ -90,9 +90,7 @@ class Mailbox(Generic[State, Item]):
             self._changed.notify()
 
     def drop_frames(self) -> int:
-        """Forget the frames that wait, how many there are, and end the session of the one that is
-        worked on.
-        """
+        """Forget the frames that wait (how many?), and end the session of the current one."""
         with self._changed:
             dropped = len(self._frames)
             self._frames.clear()
