@@ -383,7 +383,9 @@ def pivot_of(covariance: Array) -> Array:
         for m in range(3):
             turned[i, m] -= covariance[i, m]
             turned[i, i] += (1.0 + _RIDGE) * covariance[m, m]
-    pivot: Array = np.linalg.solve(turned, along) if np.all(np.isfinite(covariance[:6, :6])) else along
+    pivot = np.zeros(3)
+    if np.all(np.isfinite(covariance[:6, :6])):
+        pivot[:] = np.linalg.solve(turned, along)
     return pivot if np.all(np.isfinite(pivot)) else np.zeros(3)
 
 
