@@ -15,9 +15,9 @@ VENV ?= .venv
 OUT ?= out
 
 # The first interpreter that will do; without any, python3 is refused below with the reason.
-supported = import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+supported = import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 ifndef PYTHON
-PYTHON := $(shell for p in python3 python3.13 python3.12 python3.11; do \
+PYTHON := $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; do \
     $$p -c '$(supported)' 2>/dev/null && echo $$p && exit; done; echo python3)
 endif
 
@@ -77,7 +77,7 @@ lint: $(ready)
 
 $(ready): setup.py pyproject.toml Makefile
 	@$(PYTHON) -c '$(supported)' 2>/dev/null || { \
-	    echo "rs_localizer needs Python 3.11, 3.12 or 3.13, but $(PYTHON) is" \
+	    echo "rs_localizer needs Python 3.11, 3.12, 3.13 or 3.14, but $(PYTHON) is" \
 	        "$$($(PYTHON) -V 2>/dev/null || echo 'not there')." \
 	        "Choose another with: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \

@@ -79,8 +79,9 @@ setup(
         "mapping": ["pycolmap", "matplotlib"],
         "plots": ["matplotlib", "Pillow>=9.1"],
         "table": ["fsspec", "pyarrow"],
-        # There is no wheel for 3.13, and a build needs Rust.
-        "video": ["telemetry-parser; python_version < '3.13'"],
+        # Of telemetry-parser there is no wheel for 3.13, and a build needs Rust. PyAV reads the
+        # second stream of files of two lenses, which OpenCV does not.
+        "video": ["av", "telemetry-parser; python_version < '3.13'"],
         "view": ["rerun-sdk"],
         "zarr": ["fsspec", "pyarrow", "zarr>=3"],
         "test": [
@@ -89,7 +90,7 @@ setup(
             "codespell==2.4.*",
             "hypothesis",
             # AprilRobotics' detector, for what it publishes; elsewhere its build needs CMake.
-            "pupil-apriltags; platform_machine == 'x86_64'",
+            "pupil-apriltags; platform_machine == 'x86_64' and python_version < '3.14'",
             "mypy==2.4.*",  # pinned, as is Ruff: what passes today passes with the next release
             "pytest",
             "pytest-timeout",

@@ -36,12 +36,7 @@ from benchmarks.experiments import (
     tracking,
     translation,
 )
-from benchmarks.experiments.report import (
-    SUMMARY,
-    count_verdicts,
-    write_result,
-    write_summary,
-)
+from benchmarks.experiments.report import SUMMARY, count_verdicts, write_result, write_summary
 from benchmarks.experiments.results import Context, Result, Verdict
 from benchmarks.honesty import experiment as honesty
 from benchmarks.inertial import experiment as inertial

@@ -36,7 +36,7 @@ class HandHeld:
 
     def simulate(self, seed: int = 0) -> Iterator[SimulatedFrame]:
         """The frames; the camera is :data:`CAMERA`."""
-        motion = _motion()
+        motion = hand_motion()
         world = room(sampled_states(motion).positions, np.random.default_rng(0), count=_LANDMARKS)
         settings = FrameSettings(self.points, _NOISE, self.outliers, self.rate)
         start = motion.intervals_ns[0][0]
@@ -45,7 +45,7 @@ class HandHeld:
 
     def readings(self, imu_rate: float, frame: str) -> Iterator[tuple[int, Any]]:
         """Stamps and sensor_msgs/Imu, in the axes of the camera, whose frame has this name."""
-        motion = _motion()
+        motion = hand_motion()
         settings = ImuSettings(rate=imu_rate)
         lever = Lever(np.eye(3), np.zeros(3))
         track = simulate_imu(motion, settings, lever, np.random.default_rng(0))
@@ -56,5 +56,6 @@ class HandHeld:
             yield stamp_ns, make_imu(stamp_ns, rate, force, settings, frame)
 
 
-def _motion() -> RecordedMotion:
+def hand_motion() -> RecordedMotion:
+    """Recorded, of a camera in its own axes."""
     return RecordedMotion(read_tum(data.path(data.HAND_MOTION)))

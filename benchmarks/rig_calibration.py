@@ -152,13 +152,10 @@ def run(seconds: float, noise: float, outliers: float, seed: int) -> tuple[Array
         camera = _camera(mounted.camera)
         recordings[name] = Recording(camera, calibrate(camera, images))
     found, truth = calibrate_rig(recordings)["rear"], _RIG["rear"]
-    centre, true_centre = -found.rotation.T @ found.translation, -_BACK.T @ truth.translation
-    turn = logarithm((found.rotation @ _BACK.T)[None])[0]
-    errors = np.concatenate([[found.time_offset - _OFFSET], turn, centre - true_centre])
-    deviations = np.concatenate([
-        [found.time_offset_deviation], found.rotation_deviations, found.centre_deviations
-    ])  # fmt: skip
-    return errors, deviations, bounds(motions, begin, seen, noise)
+    own, true_centre = found.extrinsics, -_BACK.T @ truth.translation
+    turn = logarithm((own.axes @ _BACK.T)[None])[0]
+    errors = np.r_[own.offset - _OFFSET, turn, own.centre - true_centre]
+    return errors, np.roll(found.deviations, 1), bounds(motions, begin, seen, noise)
 
 
 def _by_kind(squares: Array) -> Array:

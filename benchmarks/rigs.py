@@ -5,7 +5,8 @@
 Single frames of the independent simulator. The bound is the inverse of the Fisher information of
 the same points at the true motion, by differences of the simulator's own pixels: of pose and
 velocities alone, and of accelerations, too, with the priors that a localizer has by default. Errors
-are compared with the latter.
+are compared with the latter. Lenses are exact, and the localizer knows it; with ``--lens-errors``
+each camera is off by what a localizer expects of a calibration by default.
 """
 
 from __future__ import annotations
@@ -27,9 +28,11 @@ from benchmarks.independent.cameras import Camera
 from benchmarks.independent.motions import IntArray, Moving, hand, steady
 from benchmarks.independent.rigs import Mounted, Scene, Views, middle_of, views
 from benchmarks.independent.rotations import Array, exponential, logarithm
+from rs_localizer.config import CalibrationErrors
 
 _CAMERA = Camera(focal=450.0)
 _POINTS = 152  # of all cameras
+_EXACT = CalibrationErrors(0.0, 0.0, 0.0)
 _UPRIGHT, _TURNED = np.eye(3), np.diag([-1.0, -1.0, 1.0])
 _ASIDE = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _REGION = float(chi2.ppf(0.95, 6))
@@ -136,18 +139,31 @@ def _spreads(covariances: Array) -> Array:
     return roots
 
 
-def _rig(mounted: Mapping[str, Mounted]) -> rsl.Rig:
-    camera = rsl.Camera(
-        _CAMERA.width, _CAMERA.height, _CAMERA.matrix, _CAMERA.distortion,
-        readout_time=_CAMERA.readout_time, scan_direction=str(_CAMERA.scan),
-    )  # fmt: skip
+def _rig(
+    mounted: Mapping[str, Mounted], calibration: CalibrationErrors, rng: np.random.Generator
+) -> rsl.Rig:
+    """The rig as a calibration has it that is off by this."""
+    corner = math.hypot(_CAMERA.width, _CAMERA.height) / (2.0 * _CAMERA.focal)
+    cameras = {}
+    for name in mounted:
+        off = rng.normal(size=4)
+        matrix, distortion = _CAMERA.matrix.copy(), np.zeros(5)
+        matrix[:2, 2] += calibration.principal_point * off[:2]
+        matrix[[0, 1], [0, 1]] *= 1.0 + calibration.focal_length * off[2]
+        distortion[: len(_CAMERA.distortion)] = _CAMERA.distortion
+        distortion[0] += calibration.distortion * off[3] / (_CAMERA.focal * corner**3)
+        cameras[name] = rsl.Camera(
+            _CAMERA.width, _CAMERA.height, matrix, distortion,
+            readout_time=_CAMERA.readout_time, scan_direction=str(_CAMERA.scan),
+        )  # fmt: skip
     places = {name: (each.rotation, each.translation) for name, each in mounted.items()}
-    return rsl.Rig(dict.fromkeys(mounted, camera), places)
+    return rsl.Rig(cameras, places)
 
 
 def run(
-    name: str, scene: Scene, noise: float, outliers: float, motion: str, frames: int, seed: int
-) -> str:
+    name: str, scene: Scene, noise: float, outliers: float, motion: str, frames: int, seed: int,
+    calibration: CalibrationErrors = _EXACT,
+) -> str:  # fmt: skip
     """A line of the table."""
     mounted, rng = RIGS[name], np.random.default_rng(seed)
     motions = hand(frames, rng) if motion == "hand" else steady(frames, rng, 1.2, 0.5)
@@ -156,7 +172,7 @@ def run(
     info = information(mounted, motions, seen, noise, 1.0 - outliers)
     plain = _spreads(np.asarray(np.linalg.pinv(info[:, :12, :12], rcond=1e-14, hermitian=True)))
     bound = _spreads(np.asarray(np.linalg.inv(info + _prior())))
-    localizer, middle = rsl.Localizer(_rig(mounted)), middle_of(mounted)
+    middle, config = middle_of(mounted), rsl.LocalizerConfig(calibration=calibration)
     states = motions.states(np.arange(frames), np.full(frames, middle))
     ratios, inside, reasons, seconds = [], [], Counter[str](), 0.0
     for frame in range(frames):
@@ -168,6 +184,7 @@ def run(
             wrong = rng.uniform(size=len(pixels)) < outliers
             pixels[wrong] = rng.uniform([0, 0], [639, 479], (wrong.sum(), 2))
             parts[camera] = view.points[frame, shown], pixels
+        localizer = rsl.Localizer(_rig(mounted, calibration, rng), config)
         start = time.thread_time()
         result = localizer.localize(parts)
         seconds += time.thread_time() - start
@@ -210,6 +227,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--outliers", type=float, nargs="+", default=[0.0, 0.2, 0.4])
     parser.add_argument("--motion", nargs="+", default=["steady"], choices=["steady", "hand"])
     parser.add_argument("--scene", nargs="+", default=["rich", "wall"], choices=[*Scene])
+    parser.add_argument("--lens-errors", action="store_true", help="see above")
+    parser.add_argument("--rigs", nargs="+", default=[*RIGS], choices=[*RIGS], metavar="NAME")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--save", type=Path, metavar="FILE", help="the table, too")
     options = parser.parse_args(arguments)
@@ -220,11 +239,13 @@ def main(arguments: list[str] | None = None) -> None:
     )
     lines = [head, "|---|---|---|---|---|---|---|---|---|---|---|"]
     print("\n".join(lines), flush=True)
-    cases = product(options.motion, options.noise, options.outliers, options.scene, RIGS)
+    calibration = CalibrationErrors() if options.lens_errors else _EXACT
+    cases = product(options.motion, options.noise, options.outliers, options.scene, options.rigs)
     for motion, noise, outliers, scene, name in cases:
         if scene != Scene.RICH and name not in _BEFORE_WALLS:
             continue
-        lines.append(run(name, Scene(scene), noise, outliers, motion, options.frames, options.seed))
+        of = (options.frames, options.seed, calibration)
+        lines.append(run(name, Scene(scene), noise, outliers, motion, *of))
         print(lines[-1], flush=True)
     if options.save is not None:
         options.save.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -5,7 +5,7 @@
     python packaging/compile_kernels.py [--cpu x86-64-v3] ... [--solver r6p_vcwt] ...
 
 Run it in an environment that has the libraries of the package, in the versions for which the wheel
-is: the code is Python's (3.11 to 3.13) and Numba's (to the last digit), and setup.py then says so.
+is: the code is Python's (3.11 to 3.14) and Numba's (to the last digit), and setup.py then says so.
 The package itself is taken from this tree. Without --cpu: for all kinds that this machine can be.
 With --solver: only what nodes with it need; all else is compiled by who uses it.
 """

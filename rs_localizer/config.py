@@ -185,16 +185,10 @@ class CalibrationErrors:
     """
 
     principal_point: float = setting(
-        1.0,
-        "Standard deviation of the principal point, in pixels",
-        minimum=0.0,
-        maximum=1000.0,
+        1.0, "Standard deviation of the principal point, in pixels", minimum=0.0, maximum=1000.0
     )
     focal_length: float = setting(
-        0.002,
-        "Standard deviation of the focal length, as a share of it",
-        minimum=0.0,
-        maximum=1.0,
+        0.002, "Standard deviation of the focal length, as a share of it", minimum=0.0, maximum=1.0
     )
     distortion: float = setting(
         0.5,
@@ -212,9 +206,7 @@ class LocalizerConfig:
     """Settings of one pose estimate (keyword arguments of :class:`rs_localizer.Localizer`)."""
 
     solver: str = setting(
-        "r6p_vcwt",
-        "Minimal solver that generates the hypotheses",
-        choices=tuple(SOLVERS),
+        "r6p_vcwt", "Minimal solver that generates the hypotheses", choices=tuple(SOLVERS)
     )
     solver_iterations: int = setting(
         5, "Iterations of the iterative linear solvers", minimum=1, maximum=100
@@ -399,20 +391,13 @@ class Imu:
         True, "Estimate what is left of the time offset, from the camera's motion"
     )
     gyroscope_noise: float = setting(
-        2e-4,
-        "Noise density of the gyroscope, in rad/s/sqrt(Hz)",
-        minimum=1e-7,
-        maximum=1.0,
+        2e-4, "Noise density of the gyroscope, in rad/s/sqrt(Hz)", minimum=1e-7, maximum=1.0
     )
     gyroscope_bias_walk: float = setting(
-        1e-4,
-        "Random walk of the gyroscope's bias, in rad/s^2/sqrt(Hz)",
-        minimum=0.0,
-        maximum=1.0,
+        1e-4, "Random walk of the gyroscope's bias, in rad/s^2/sqrt(Hz)", minimum=0.0, maximum=1.0
     )
     gravity: bool = setting(
-        False,
-        "Use the direction of gravity that the accelerometer shows; needs gravity_in_map",
+        False, "Use the direction of gravity that the accelerometer shows; needs gravity_in_map"
     )
     wait: float = setting(
         0.02,

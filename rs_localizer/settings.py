@@ -17,13 +17,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
-from rs_localizer.config import (
-    NO_NAMES,
-    CameraSettings,
-    DetectorConfig,
-    FeatureConfig,
-    NodeConfig,
-)
+from rs_localizer.config import NO_NAMES, CameraSettings, DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.io.yaml_text import YamlError, load_yaml
 
 NODE_NAME = "rs_localizer"
@@ -65,9 +59,7 @@ _OF_CAMERA = tuple(item.name for item in fields(CameraSettings))
 
 
 def camera_settings(values: Mapping[str, Any]) -> dict[str, Setting]:
-    """The settings that the cameras of ``values`` have of their own, by ``NAME.setting``; the
-    default is the one of all.
-    """
+    """The settings that the cameras of ``values`` have of their own, by ``NAME.setting``."""
     shared = settings()
     return {
         f"{camera}.{name}": replace(shared[name], default=values.get(name, shared[name].default))

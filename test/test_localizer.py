@@ -190,15 +190,6 @@ def test_binning_and_roi_give_the_same_pose():
         np.testing.assert_allclose(estimate.angular_velocity, READOUT * path.rate, atol=1e-5)
 
 
-@pytest.mark.parametrize("right", [True, False])
-def test_scores_help_when_right_and_do_not_harm_when_wrong(right):
-    cam, path = camera(), Path(8)
-    points, pixels, inliers = frame(cam, path, 150, 0.5, 0.6)
-    scores = inliers + 0.1 * np.random.default_rng(0).normal(size=150)
-    result = rsl.Localizer(cam).localize(points, pixels, scores if right else -scores)
-    assert (result.inliers == inliers).mean() > 0.97
-
-
 @pytest.mark.bench
 def test_covariance_covers_the_error():
     """Mahalanobis distances against the chi-squared distribution with 12 degrees of freedom."""
@@ -303,20 +294,6 @@ def test_normalized_coordinates_are_not_taken_for_pixels():
     assert not failure
     assert failure.reason == rsl.Reason.DEGENERATE
     assert "normalized coordinates" in failure.detail
-
-
-def test_pixels_outside_the_image_are_not_used():
-    rng = np.random.default_rng(0)
-    K = np.array([[500.0, 0.0, 479.5], [0.0, 500.0, 639.5], [0.0, 0.0, 1.0]])
-    points = rng.uniform((-1.0, -1.0, 1.5), (1.0, 1.0, 3.5), (200, 3))
-    upright = points @ K.T
-    pixels = upright[:, :2] / upright[:, 2:]
-    far = pixels[(pixels[:, 1] > 800.0)]  # of an image of 960 x 1280 called 1280 x 960
-    assert len(far) > 20
-    turned = rsl.Camera(width=1280, height=600, K=K)
-    failure = rsl.Localizer(turned).localize(points[pixels[:, 1] > 800.0], far)
-    assert failure.reason == rsl.Reason.TOO_FEW_POINTS
-    assert f"{len(far)} lie outside the image of 1280 x 600 pixels" in failure.detail
 
 
 def test_pixels_beyond_the_lens_are_left_out_and_marked():

@@ -62,8 +62,7 @@ def test_the_detectors_files_hold_exactly_their_defaults_and_choices(file, kind)
 
 
 @pytest.mark.parametrize(
-    "heading",
-    ["rs_localizer", "/robot/rs_localizer", "/**/rs_localizer", "/*"],
+    "heading", ["rs_localizer", "/robot/rs_localizer", "/**/rs_localizer", "/*"]
 )
 def test_headings_that_mean_the_node(tmp_path, heading):
     path = params(tmp_path, f"{heading}:\n  ros__parameters:\n    seed: 5\n")

@@ -91,11 +91,7 @@ def _plain(found: Frames) -> Claim:
         _PAPER,
         "The best minimal model of every rolling-shutter solver fits the markers better than P3P's",
         "under P3P in every quantile from the median to 99 % (100 samples, two walls or more)",
-    ).judged_by(
-        f"{_ratio(ratio)}; {_medians(errors)}",
-        [ratio],
-        (0.0, 1.0),
-    )
+    ).judged_by(f"{_ratio(ratio)}; {_medians(errors)}", [ratio], (0.0, 1.0))
 
 
 def _r9p(found: Frames) -> Claim:
@@ -122,11 +118,7 @@ def _product(found: Frames) -> Claim:
         _OURS,
         "With every rolling-shutter solver the Localizer fits the markers better than with P3P",
         "under P3P in every quantile from the median to 99 %, 100 samples, all frames",
-    ).judged_by(
-        f"{_ratio(ratio)}; {_medians(found.products)}",
-        [ratio],
-        (0.0, 1.0),
-    )
+    ).judged_by(f"{_ratio(ratio)}; {_medians(found.products)}", [ratio], (0.0, 1.0))
 
 
 def _localized(found: Frames) -> Claim:

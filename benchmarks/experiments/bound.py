@@ -168,11 +168,7 @@ def claims(found: Found) -> list[Claim]:
             "this project",
             f"the covariance is honest: {case.label}{block}",
             f"the {_REGION:.0%} region covers {low:.0%} to {high:.0%} of the truths",
-        ).judged_by(
-            found.coverage.share(),
-            [found.coverage],
-            _COVERED,
-        ),
+        ).judged_by(found.coverage.share(), [found.coverage], _COVERED),
         Statement(
             f"bound.{case.name}_gross",
             "this project",
@@ -192,11 +188,7 @@ def claims(found: Found) -> list[Claim]:
                 "this project",
                 f"at the Cramér-Rao bound: {case.label}",
                 f"median at most {case.at_most:g} of the bound's, as standard deviations",
-            ).judged_by(
-                f"{found.ratio.value:.3f}",
-                [found.ratio],
-                (-np.inf, case.at_most),
-            ),
+            ).judged_by(f"{found.ratio.value:.3f}", [found.ratio], (-np.inf, case.at_most)),
         )
     return listed
 
@@ -210,10 +202,7 @@ def _overconfident(found: Sequence[Found]) -> Claim:
         "this project",
         "no gross error is published with a small covariance",
         "none outside the 99.99 % region of its own covariance",
-    ).judged(
-        f"{hidden} of {gross} gross errors in {total} frames",
-        hidden == 0,
-    )
+    ).judged(f"{hidden} of {gross} gross errors in {total} frames", hidden == 0)
 
 
 def _row(found: Found) -> tuple[str | float | int, ...]:

@@ -125,10 +125,7 @@ def _once_is_enough(after: Mapping[int, Curves]) -> Claim:
         f"{m.VCWT.label} is done after one iteration",
         f"all medians after one iteration at most 5 % above those after {_SHOWN[-1]}, wherever it "
         "moves",
-    ).judged(
-        f"at most {excess:+.1%}",
-        excess <= 0.05,
-    )
+    ).judged(f"at most {excess:+.1%}", excess <= 0.05)
 
 
 def _others_slow(after: Mapping[int, Curves]) -> Claim:

@@ -78,8 +78,4 @@ def _relinearised(curves: Curves) -> Claim:
         "this project",
         "relinearized, it does not matter how far off the initial orientation is",
         f"all medians up to {_OFFSETS[-1]:g} degrees within 5 % of those from the truth",
-    ).judged_by(
-        f"at most {found.value:+.1%}",
-        [found],
-        (-np.inf, 0.05),
-    )
+    ).judged_by(f"at most {found.value:+.1%}", [found], (-np.inf, 0.05))

@@ -33,10 +33,7 @@ from rs_localizer.mapping.report import rows
 from rs_localizer.simulation.marker_frames import CAMERA, SENSOR
 
 _WALK = Piece(28.0, 11.8, 15.0)
-_FLIGHTS = {
-    "another walk": Piece(40.0, 8.0),
-    "quick turns": Piece(54.8, 6.0),
-}
+_FLIGHTS = {"another walk": Piece(40.0, 8.0), "quick turns": Piece(54.8, 6.0)}
 _KEYPOINTS = 1000
 _OURS, _P3P = "r6p_vcwt", "p3p"
 # What issue and README promise.

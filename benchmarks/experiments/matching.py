@@ -165,8 +165,7 @@ def _fast_enough(run: Run) -> Claim:
         f"at {run.at_least:g} Hz or more: {run.label}",
         f"median of the CPU time of a frame at most {1e3 / run.at_least:.3g} ms",
     ).judged(
-        f"{cpu:.3g} ms, {1e3 / cpu:.0f} Hz ({clock:.3g} ms by the clock)",
-        cpu <= 1e3 / run.at_least,
+        f"{cpu:.3g} ms, {1e3 / cpu:.0f} Hz ({clock:.3g} ms by the clock)", cpu <= 1e3 / run.at_least
     )
 
 

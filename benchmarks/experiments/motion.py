@@ -125,11 +125,7 @@ def joint_is_best(experiment: str, curves: Curves) -> Claim:
         "joint, by the robust score over the 50 noisy points of the frame, is never worse than "
         "the better of its two solvers",
         f"all medians of the four errors at most {_EQUAL:.0%} above those of the better one",
-    ).judged_by(
-        f"at most {found.value:+.1%}",
-        [found],
-        (-np.inf, _EQUAL),
-    )
+    ).judged_by(f"at most {found.value:+.1%}", [found], (-np.inf, _EQUAL))
 
 
 def _moving(curves: Curves, method: Method, metric: int) -> Array:
@@ -151,11 +147,7 @@ def _two_step_poor(sweeps: Sequence[Curves]) -> Claim:
         _PAPER,
         "the three solvers in two steps are poor",
         f"all their medians at least {_POOR:g} times those of {m.VCWT.label}, wherever it moves",
-    ).judged_by(
-        f"at least {found.value:.1f} times",
-        [found],
-        (_POOR, np.inf),
-    )
+    ).judged_by(f"at least {found.value:.1f} times", [found], (_POOR, np.inf))
 
 
 def _r9p_ahead(name: str, when: str, method: Method, sweeps: Sequence[Curves]) -> Claim:

@@ -107,9 +107,7 @@ def _six_points(curves: Curves, bound: Array) -> Claim:
         "a six-point pose is limited by the noise, not by the solver",
         "median orientation error at 1 px at most 1.5 times the bound of six points",
     ).judged_by(
-        f"{listed} deg; bound {bound[0]:.2f}",
-        list(found.values()),
-        (-np.inf, 1.5 * bound[0]),
+        f"{listed} deg; bound {bound[0]:.2f}", list(found.values()), (-np.inf, 1.5 * bound[0])
     )
 
 

@@ -70,8 +70,4 @@ def _as_from_truth(plausible: Curves, context: Context) -> Claim:
         "relinearized, P3P's orientation is as good a start as the truth",
         "medians of orientation and position, from the triplet that fits best, at most 10 % above "
         "those from the true orientation",
-    ).judged_by(
-        f"at most {found.value:+.1%}",
-        [found],
-        (-np.inf, 0.10),
-    )
+    ).judged_by(f"at most {found.value:+.1%}", [found], (-np.inf, 0.10))

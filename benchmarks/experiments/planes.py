@@ -119,9 +119,7 @@ def _claim(case: Case, errors: Mapping[str, Array]) -> Claim:
         f"the velocity prior makes a plane usable: {case.label}",
         f"median orientation error at most {case.at_most:g} deg",
     ).judged_by(
-        f"{medians[_OURS]:.2f} deg ({others})",
-        [quantile(errors[_OURS])],
-        (-np.inf, case.at_most),
+        f"{medians[_OURS]:.2f} deg ({others})", [quantile(errors[_OURS])], (-np.inf, case.at_most)
     )
 
 

@@ -146,12 +146,7 @@ def _covered(trials: list[Trial]) -> Claim:
         _SPECIFICATION,
         "Its deviation is honest.",
         "95 % intervals hold at least 90 %",
-    ).judged_by(
-        f"{inside.value:.0%} of {len(trials)}",
-        [inside],
-        (0.9, 1.0),
-        "intervals too short",
-    )
+    ).judged_by(f"{inside.value:.0%} of {len(trials)}", [inside], (0.9, 1.0), "intervals too short")
 
 
 def _directed(trials: list[Trial]) -> Claim:
@@ -162,10 +157,7 @@ def _directed(trials: list[Trial]) -> Claim:
         _SPECIFICATION,
         "The direction is always right.",
         "no recording with the wrong sign",
-    ).judged(
-        f"{wrong} of {len(trials)}, odds of 10^{least:.0f} and more",
-        wrong == 0,
-    )
+    ).judged(f"{wrong} of {len(trials)}, odds of 10^{least:.0f} and more", wrong == 0)
 
 
 def _global(trials: list[Trial]) -> Claim:

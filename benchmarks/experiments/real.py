@@ -13,14 +13,7 @@ from benchmarks.experiments.methods import available
 from benchmarks.experiments.plain_ransac import PlainRansac
 from benchmarks.experiments.real_claims import METHODS, OURS, Inliers, claims, notes
 from benchmarks.experiments.results import Context, Result, Table
-from benchmarks.experiments.sequences import (
-    Frame,
-    Sequence,
-    action_camera,
-    hard,
-    phone,
-    webcam,
-)
+from benchmarks.experiments.sequences import Frame, Sequence, action_camera, hard, phone, webcam
 from rs_localizer.localizer import Localizer
 
 _SAMPLES = 1000

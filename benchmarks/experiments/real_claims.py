@@ -11,12 +11,7 @@ import numpy as np
 from benchmarks.experiments import methods as m
 from benchmarks.experiments.methods import Method, available
 from benchmarks.experiments.results import Claim, Statement
-from benchmarks.experiments.uncertainty import (
-    Interval,
-    bootstrap,
-    share,
-    together,
-)
+from benchmarks.experiments.uncertainty import Interval, bootstrap, share, together
 from rs_localizer.core.arrays import Array, IntArray
 
 METHODS = (*m.PAPERS, m.VCWT_OURS, m.R9P_OURS)

@@ -27,11 +27,7 @@ from benchmarks.experiments.robustness_cases import (
     view_of,
 )
 from benchmarks.experiments.uncertainty import CONFIDENCE, Interval, share, together
-from benchmarks.experiments.views import (
-    GROSS,
-    Outcome,
-    outcome,
-)
+from benchmarks.experiments.views import GROSS, Outcome, outcome
 from rs_localizer.core.arrays import Array
 from rs_localizer.localizer import Localizer
 
@@ -176,11 +172,7 @@ def _none_wrong(found: Sequence[Found]) -> Claim:
         "this project",
         "where there is no good pose, none is published",
         f"at most {_MOST_WRONG:.0%} of the frames of each kind have a wrong one",
-    ).judged_by(
-        listed or "none at all",
-        list(wrong.values()),
-        (0.0, _MOST_WRONG),
-    )
+    ).judged_by(listed or "none at all", list(wrong.values()), (0.0, _MOST_WRONG))
 
 
 def _row(found: Found) -> tuple[str | float | int, ...]:

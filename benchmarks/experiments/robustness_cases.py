@@ -9,12 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.experiments.views import (
-    View,
-    direction,
-    seen_at,
-    uniform_pixels,
-)
+from benchmarks.experiments.views import View, direction, seen_at, uniform_pixels
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera

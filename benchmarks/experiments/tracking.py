@@ -175,9 +175,7 @@ def _improves(case: Case, found: Run) -> Claim:
         f"tracking makes weak frames much better: {case.label}",
         "median errors of position and linear velocity at most 0.6 of the untracked ones",
     ).judged_by(
-        f"{ratios[_POSITION].value:.2f} and {ratios[_VELOCITY].value:.2f}",
-        ratios,
-        (-np.inf, 0.6),
+        f"{ratios[_POSITION].value:.2f} and {ratios[_VELOCITY].value:.2f}", ratios, (-np.inf, 0.6)
     )
 
 
@@ -225,10 +223,7 @@ def _after_a_gap(camera: Camera, frames: Sequence[SimulatedFrame]) -> Claim:
         "this project",
         "after a gap of 2 s the first frame is localized",
         f"every one, to {100 * _LOST:g} cm",
-    ).judged(
-        f"{sum(found)} of {len(found)}",
-        all(found),
-    )
+    ).judged(f"{sum(found)} of {len(found)}", all(found))
 
 
 def _rows(runs: Mapping[str, Run]) -> list[tuple[str | float, ...]]:

@@ -68,8 +68,4 @@ def _ahead(curves: Curves) -> Claim:
         "R6P v,C,t | w and v,C,t | w,t are ahead of all others",
         f"from {_FROM:g} per frame on, medians of orientation, position and t of both below those "
         "of every other solver of the paper",
-    ).judged_by(
-        f"at most {found.value:.2f} times the best of the others",
-        [found],
-        (-np.inf, 1.0),
-    )
+    ).judged_by(f"at most {found.value:.2f} times the best of the others", [found], (-np.inf, 1.0))

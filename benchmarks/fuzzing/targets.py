@@ -21,7 +21,6 @@ from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.calibration import CalibrationError, read_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.io.hloc import HlocError, open_h5, read_pairs, read_queries
 from rs_localizer.io.images import read_compressed_image, read_image
 from rs_localizer.io.imu import ImuFileError, read_imu, read_imu_csv
 from rs_localizer.io.keypoints import read_keypoints, read_map
@@ -34,6 +33,7 @@ from rs_localizer.io.video import VideoError, read_video
 from rs_localizer.markers.formats import Unsaid, read_any
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
+from rs_localizer.offline.hloc import HlocError, open_h5, read_pairs, read_queries
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import build, load_params_file, parse_assignment
 
@@ -124,11 +124,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "camera_info": Target(_messages((seeds.camera_info(),)), _read_camera, message),
         "imu": Target(_messages((seeds.imu(),)), read_imu, message),
         "image": Target(_messages(pictures), read_image, message),
-        "image/compressed": Target(
-            _pictures,
-            _compressed,
-            message,
-        ),
+        "image/compressed": Target(_pictures, _compressed, message),
         "map .npz": Target(_bytes(maps[".npz"]), _file(folder / "a.npz", _map), map_error),
         "map .npz, arrays": Target(_archives, _file(folder / "b.npz", _map), map_error),
         "map .ply": Target(_bytes(maps[".ply"]), _file(folder / "a.ply", _map), map_error),

@@ -49,10 +49,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         recordings = Recordings(
             GLOBAL_SHUTTER_TAGS,
-            {
-                "tum_vi_room5": data.path(data.HAND_MOTION),
-                "tum_rgbd_fr1_xyz": SLOW_HAND_MOTION,
-            },
+            {"tum_vi_room5": data.path(data.HAND_MOTION), "tum_rgbd_fr1_xyz": SLOW_HAND_MOTION},
             options.cache or Path(folder),
         )
         found = benches(recordings)

@@ -15,12 +15,7 @@ import numpy as np
 
 from benchmarks.experiments.uncertainty import IntArray, Interval, bootstrap
 from benchmarks.frames.judged import REGION
-from benchmarks.honesty.estimating import (
-    believed,
-    estimate,
-    frames_of,
-    scored,
-)
+from benchmarks.honesty.estimating import believed, estimate, frames_of, scored
 from benchmarks.honesty.scores import Scores, percent
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.motions import hand

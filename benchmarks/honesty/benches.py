@@ -10,11 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from benchmarks.honesty import (
-    against_p3p,
-    rendered,
-    tags,
-)
+from benchmarks.honesty import against_p3p, rendered, tags
 from benchmarks.honesty.estimating import Found
 
 _FULL = 100  # frames of a condition at which recordings are replayed in full

@@ -46,11 +46,7 @@ def p3p_claims(found: Mapping[str, Pair]) -> list[Claim]:
             _SOURCE,
             "the default refuses no more frames than P3P",
             "of the frames that one of them refuses, at most half are the default's",
-        ).judged_by(
-            f"{ours} and {theirs} refused",
-            [_refused_by_us(found.values())],
-            (0.0, 0.5),
-        )
+        ).judged_by(f"{ours} and {theirs} refused", [_refused_by_us(found.values())], (0.0, 0.5))
     )
     still = {
         name: (pair.insignificant, pair.ours.groups())

@@ -86,11 +86,7 @@ def estimate(
     return found
 
 
-def scored(
-    frames: Frames,
-    results: dict[int, Estimate | Failure],
-    camera: core.Camera,
-) -> Found:
+def scored(frames: Frames, results: dict[int, Estimate | Failure], camera: core.Camera) -> Found:
     """Results against the truth, at the first row and at the middle one."""
 
     def at(tau: float, states: States) -> Scores:

@@ -319,11 +319,7 @@ def _no_waves(count: int) -> tuple[Array, Array]:
 
 
 def _waves(
-    count: int,
-    rng: np.random.Generator,
-    hertz: tuple[float, float],
-    rate: float,
-    speed: float,
+    count: int, rng: np.random.Generator, hertz: tuple[float, float], rate: float, speed: float
 ) -> tuple[Array, Array]:
     """Amplitudes and frequencies whose velocities have these rms values, all sines the same."""
     low, high = np.log(hertz)

@@ -17,21 +17,8 @@ from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, shaken_hand
 from benchmarks.independent.scenes import Rich
 from benchmarks.inertial.minimal import minimal
-from benchmarks.inertial.recordings import (
-    follow,
-    follow_both,
-    record,
-)
-from benchmarks.inertial.single import (
-    COLUMNS,
-    FEW,
-    US,
-    Step,
-    figures,
-    right,
-    single,
-    who,
-)
+from benchmarks.inertial.recordings import follow, follow_both, record
+from benchmarks.inertial.single import COLUMNS, FEW, US, Step, figures, right, single, who
 
 _SHAKING = ((0.3, 60.0), (0.1, 120.0))  # degrees, hertz
 _NOISES = (0.3, 1.0)  # px
@@ -94,10 +81,7 @@ def _judge_vibration(noise: float, found: dict[str, Scores]) -> list[Claim]:
             US,
             f"Vibration leaves the frames localized ({noise:g} px)",
             "at least 97 %",
-        ).judged(
-            f"{localized:.1f} % (alone {percent(alone.localized):.1f} %)",
-            localized >= 97.0,
-        ),
+        ).judged(f"{localized:.1f} % (alone {percent(alone.localized):.1f} %)", localized >= 97.0),
         Statement(
             f"inertial.vibration-{noise:g}px-orientation",
             US,
@@ -152,8 +136,7 @@ def _offsets(context: Context) -> Step:
         "Stamps that are 5 ms early are found out within 10 s, in no other period of a vibration",
         "to 0.5 ms in every recording, with and without vibration",
     ).judged(
-        ", ".join(f"{name} {off:.3f} ms" for name, off in worst.items()),
-        max(worst.values()) <= 0.5,
+        ", ".join(f"{name} {off:.3f} ms" for name, off in worst.items()), max(worst.values()) <= 0.5
     )
     return "offset", Table(("motion", "ms off", *COLUMNS), rows), [claim]
 

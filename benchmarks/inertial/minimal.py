@@ -32,12 +32,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera as Believed
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rig import Rig
-from rs_localizer.estimation.assumptions import (
-    assumptions,
-    known_terms,
-    turn_seen,
-    with_experience,
-)
+from rs_localizer.estimation.assumptions import assumptions, known_terms, turn_seen, with_experience
 from rs_localizer.estimation.observations import Observed, Sighted, find_usable, packed
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import Prior

@@ -16,10 +16,7 @@ from benchmarks.independent.cameras import Camera
 from benchmarks.independent.frames import MakeMotions
 from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.scenes import Scene
-from benchmarks.inertial.recordings import (
-    alone_and_aided,
-    record,
-)
+from benchmarks.inertial.recordings import alone_and_aided, record
 from rs_localizer.core.arrays import BoolArray
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ _REST_TIME = 1.5
 # Closed loop: frames that are under way at any time. With one, the node would wait for us.
 _UNDER_WAY = 2
 _LOST_AFTER = 0.5  # s
+_SHUTTER = ("-p", f"readout_time:={READOUT_TIME}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +110,11 @@ class Ear:
 
 
 @contextlib.contextmanager
-def running(count: int) -> Iterator[tuple[Node, list[tuple[str, int]]]]:
+def running(count: int, *settings: str) -> Iterator[tuple[Node, list[tuple[str, int]]]]:
     """That many live nodes: our own node, and their namespaces and process ids.
+
+    Args:
+        settings: arguments for ROS; none: the readout time of the simulated camera.
 
     Raises:
         ChildProcessError: when a node ends at its start, with its log.
@@ -125,7 +129,7 @@ def running(count: int) -> Iterator[tuple[Node, list[tuple[str, int]]]]:
             for index in range(count):
                 namespace = f"/load_{os.getpid()}/camera{index}"
                 log = Path(directory) / f"node{index}.log"
-                processes.append(_start_node(namespace, log))
+                processes.append(_start_node(namespace, log, settings or _SHUTTER))
                 _wait_until_active(processes[-1], log)
                 nodes.append((namespace, processes[-1].pid))
             yield peer, nodes
@@ -157,7 +161,7 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
             time.sleep(1.0)
             if sents[0][0] > 0.0:
                 memory.append([_memory(pid) for _, pid in nodes])
-                used.append([time.monotonic(), *(_cpu_time(pid) for _, pid in nodes)])
+                used.append([time.monotonic(), *(cpu_time(pid) for _, pid in nodes)])
         spent = np.subtract(used[-1], used[0])
         time.sleep(_REST_TIME)
         for ear in ears:
@@ -206,11 +210,11 @@ def fastest(frames: Frames, seconds: float) -> float:
                 return (ear.answered - first) / (now - start)
 
 
-def _start_node(namespace: str, log: Path) -> subprocess.Popen[bytes]:
-    settings = ("-r", f"__ns:={namespace}", "-p", f"readout_time:={READOUT_TIME}")
+def _start_node(namespace: str, log: Path, settings: Sequence[str]) -> subprocess.Popen[bytes]:
+    arguments = ("--ros-args", "-r", f"__ns:={namespace}", *settings)
     with log.open("wb") as file:
         return subprocess.Popen(
-            [sys.executable, "-c", NODE_PROGRAM, "--ros-args", *settings], stdout=file, stderr=file
+            [sys.executable, "-c", NODE_PROGRAM, *arguments], stdout=file, stderr=file
         )
 
 
@@ -230,7 +234,7 @@ def _memory(pid: int) -> float:
     return float("nan")
 
 
-def _cpu_time(pid: int) -> float:
+def cpu_time(pid: int) -> float:
     """Seconds of all cores that a process has used."""
     values = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK")

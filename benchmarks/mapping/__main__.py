@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The figures of ``docs/mapping.md`` and of an IMU in ``docs/map_build.md``:
 
-python -m benchmarks.mapping bend bound large surveys rendered coverage weighing
+python -m benchmarks.mapping bend bound large surveys rendered coverage rigs weighing
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import sys
 from collections.abc import Callable, Iterator
 
 from benchmarks.mapping.refining import bend, bound, large
-from benchmarks.mapping.surveying import coverage, rendered, surveys
+from benchmarks.mapping.surveying import coverage, rendered, rigs, surveys
 from benchmarks.mapping.weighing import weighing
 from rs_localizer.process.arguments import integer
 
 _PARTS: dict[str, Callable[[int], Iterator[str]]] = {
     "bend": bend, "bound": bound, "large": large, "surveys": surveys,
-    "rendered": rendered, "coverage": coverage, "weighing": weighing,
+    "rendered": rendered, "coverage": coverage, "rigs": rigs, "weighing": weighing,
 }  # fmt: skip
 
 

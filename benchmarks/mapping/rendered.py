@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.mapping.rooms import Film, Walk, estimators_camera
+from benchmarks.mapping.rooms import Carried, Film, Walk, estimators_camera
 from rs_localizer.core.arrays import Array
 from rs_localizer.mapping.unknown_markers import Spotted, Spotter, every_marker
 from rs_localizer.markers.dictionaries import pattern
@@ -36,7 +36,7 @@ class Lighting:
 class _Walking:
     """A walk as the renderer asks for it."""
 
-    def __init__(self, walk: Walk, seconds: float) -> None:
+    def __init__(self, walk: Walk | Carried, seconds: float) -> None:
         self._walk = walk
         self.intervals_ns = [(0, round(1e9 * seconds))]
 

@@ -28,6 +28,7 @@ class Walk:
     phases: Array  # (12,)
     turning: float  # rad/s
     wide: float = 1.2  # m
+    sway: float = 0.0  # rad, how far it turns to and fro beside that
 
     def poses(self, times: Array) -> tuple[Array, Array]:
         """map_from_camera (n,3,3), (n,3) at times (n,), s; y of the map points down."""
@@ -39,10 +40,25 @@ class Walk:
         ])  # fmt: skip
         about = np.zeros((3, len(t), 3))
         about[0, :, 1] = self.turning * t + 0.06 * np.sin(5.0 * t + p[6])
+        about[0, :, 1] += self.sway * np.sin(0.8 * t + p[11])
         about[1, :, 0] = 0.25 * np.sin(0.7 * t + p[7]) + 0.05 * np.sin(8.0 * t + p[8])
         about[2, :, 2] = 0.1 * np.sin(0.9 * t + p[9]) + 0.04 * np.sin(6.0 * t + p[10])
         turn = exponential(about[0]) @ exponential(about[1]) @ exponential(about[2])
         return turn, place
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Carried:
+    """A camera on what walks: ``X_camera = rotation (X_body - centre)``."""
+
+    body: Walk
+    rotation: Array  # (3,3)
+    centre: Array  # (3,) m
+
+    def poses(self, times: Array) -> tuple[Array, Array]:
+        """map_from_camera, as of a walk."""
+        turn, place = self.body.poses(times)
+        return turn @ self.rotation.T, place + turn @ self.centre
 
 
 def a_walk(rng: np.random.Generator, turning: float, wide: float = 1.2) -> Walk:
@@ -54,7 +70,7 @@ def estimators_camera(camera: cameras.Camera, readout_time: float) -> Camera:
     """The same camera for the estimator."""
     return Camera(
         width=camera.width, height=camera.height, K=camera.matrix, D=np.array(camera.distortion),
-        readout_time=readout_time,
+        readout_time=readout_time, scan_direction=camera.scan,
     )  # fmt: skip
 
 
@@ -70,7 +86,7 @@ class Film:
     """Images of a walk."""
 
     camera: cameras.Camera
-    walk: Walk
+    walk: Walk | Carried
     stamps: Array  # (g,) s, of the first rows
 
     def see(

@@ -1,30 +1,34 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Markers surveyed: a printed wall, and twelve around a room."""
+"""Markers surveyed: a printed wall, and twelve around a room, by one camera and by a rig."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.independent.cameras import Camera
+from benchmarks.independent.cameras import Camera, Scan
+from benchmarks.independent.rotations import exponential
 from benchmarks.mapping.rendered import Lighting, rendered_spots
 from benchmarks.mapping.rooms import (
     SQUARE,
+    Carried,
     Film,
+    Walk,
     a_walk,
     estimators_camera,
     grid,
     ring,
 )
 from rs_localizer.core.arrays import Array
-from rs_localizer.mapping.survey import Survey, survey
-from rs_localizer.mapping.unknown_markers import Spotted, every_marker
+from rs_localizer.mapping.survey import Survey, survey, survey_rig
+from rs_localizer.mapping.unknown_markers import Filmed, Spotted, every_marker
 from rs_localizer.markers.families import family
 from rs_localizer.trajectory.fit import Fit
+from rs_localizer.trajectory.model import Extrinsics, Mounting
 from rs_localizer.trajectory.problem import LIMIT
 
 FAMILY = "4x4_50"
@@ -98,6 +102,103 @@ def coverage(seed: int, trials: int = 40) -> Iterator[str]:
         )
 
 
+# How the second camera of a rig is mounted: it looks back, 10 cm beside the first, against whose
+# shutter its own runs; its images begin 7 ms after those of the first.
+_BACK = exponential(np.array([[0.1, 3.0, 0.05]]))[0]
+_CENTRE, _LATER = np.array([0.1, -0.02, -0.05]), 0.0071
+# What its extrinsics are known to: deviations of turn (rad), place (m) and clock (s).
+_MOUNTED = np.repeat([1.7e-3, 5e-3, 1.5e-3], [3, 3, 1])
+_RIGS = ("one camera", "one camera, twice as many images", "two, back to back")
+
+
+def rigs(seed: int, trials: int = 12) -> Iterator[str]:
+    """A room surveyed by one camera, by one with twice as many images, and by two back to back
+    whose extrinsics and clocks are known to 0.1 deg, 5 mm and 1.5 ms.
+    """
+    scene = _Scene("12 of 0.15 m around a room", seconds=12.0, rate=15.0)
+    for walls in (False, True):
+        yield "the rig goes round" if not walls else "the rig looks to one side: +-30 deg"
+        yield (
+            "camera(s)                          rooms markers  mm, deg  shape: mm, deg (medians)  "
+            "inside 95 %: frame, shape  mount: off by (mm, deg, ms), inside"
+        )
+        for name in _RIGS:
+            found = [
+                one for trial in range(trials) if (one := _rig(scene, name, walls, [seed, trial]))
+            ]
+            yield _rig_line(name, found) if found else f"{name:36} none"
+
+
+def _rig(
+    scene: _Scene, name: str, aside: bool, seeds: list[int]
+) -> tuple[_Errors, Array, Array] | None:
+    """Errors of the markers, and those of the mounting with their deviations (7,)."""
+    rng = np.random.default_rng(seeds)
+    walk = a_walk(rng, 0.0 if aside else 0.6, scene.wide)
+    if aside:
+        walk = replace(walk, sway=0.5)
+    poses, size = ring(rng, 12), 0.15
+    rate = scene.rate * (2.0 if "twice" in name else 1.0)
+    stamps = np.arange(0.0, scene.seconds, 1.0 / rate)
+    markers = every_marker([family(FAMILY)], size, {})
+    first, second = scene.camera, replace(scene.camera, readout_time=0.025, scan=Scan.UP)
+    filmed = [_filmed(first, walk, stamps, poses, size, rng)]
+    true = Extrinsics(_BACK, _CENTRE, 0.0)
+    if "two" in name:
+        carried = Carried(walk, _BACK, _CENTRE)
+        given = true.moved(_MOUNTED * rng.normal(size=7))
+        rear = _filmed(second, carried, stamps + _LATER, poses, size, rng)
+        filmed.append(
+            replace(
+                rear,
+                stamp_offset=given.offset,
+                mounting=Mounting(replace(given, offset=0.0), _MOUNTED),
+            )
+        )
+    try:
+        found = survey_rig(filmed, markers)
+    except ValueError as error:
+        print(f"{name}: {error}")
+        return None
+    errors = _errors(found, poses, size)
+    mount = found.cameras[-1]
+    if len(filmed) == 1:
+        return errors, np.zeros(0), np.zeros(0)
+    off = mount.extrinsics.beside(replace(true, offset=-filmed[1].stamp_offset))
+    return errors, off, mount.deviations
+
+
+def _filmed(
+    camera: Camera, walk: Walk | Carried, stamps: Array, poses: list[tuple[Array, Array]],
+    size: float, rng: np.random.Generator,
+) -> Filmed:  # fmt: skip
+    spotted = Film(camera, walk, stamps).spot(poses, size, _NOISE, rng)
+    return Filmed(estimators_camera(camera, camera.readout_time), spotted)
+
+
+def _rig_line(name: str, found: Sequence[tuple[_Errors, Array, Array]]) -> str:
+    def every(of: str) -> Array:
+        return np.concatenate([np.ravel(getattr(errors, of)) for errors, _, _ in found])
+
+    frame, shape = (
+        f"{np.median(every(f'places{of}')):6.2f} {np.median(every(f'turns{of}')):6.3f}"
+        for of in ("", "_of_shape")
+    )
+    inside = [_inside(every(f"normalised{of}"), 1.96) for of in ("", "_of_shape")]
+    text = (
+        f"{name:36} {len(found):3} {len(every('places')) / len(found) + 1:6.1f}  {frame}  {shape}  "
+        f"{inside[0]:8.1f} {inside[1]:6.1f}"
+    )
+    off, deviations = (np.array([one[k] for one in found]) for k in (1, 2))
+    if off.size:
+        turn, place, clock = (
+            unit * np.sqrt(np.mean(part**2))
+            for unit, part in zip((180.0 / np.pi, 1e3, 1e3), np.split(off, [3, 6], 1), strict=True)
+        )
+        text += f"  {place:6.2f} {turn:.3f} {clock:.3f}, {_inside(off / deviations, 1.96):.0f} %"
+    return text
+
+
 def _inside(normalised: Array, deviations: float) -> float:
     """Percent of errors within so many of their own deviations."""
     return 100.0 * float(np.mean(np.abs(normalised) < deviations))
@@ -162,7 +263,7 @@ def _errors(found: Survey, poses: list[tuple[Array, Array]], size: float) -> _Er
     shape = _off(found, true, over, squares.mean(axis=0) - over @ ours.mean(axis=0))
     own, free = off[1:].ravel(), found.covariance[6:, 6:]
     squared = float(own @ np.linalg.solve(free, own)) / len(own)
-    asked = found.readout_check
+    asked = found.cameras[0].readout_check
     return _Errors(
         *_sizes(off[1:]),
         *_sizes(shape),

@@ -68,8 +68,7 @@ def add_overwrite(parser: argparse._ActionsContainer) -> None:
 
 
 def replaced(args: argparse.Namespace, mark: str) -> Callable[[Path], None] | None:
-    """What removes an earlier result from ``--out``, where that is wanted; every result has a file
-    of the name ``mark``.
+    """What removes an earlier result (it has a file ``mark``) from ``--out``, where wanted.
 
     Raises:
         ValueError: when what is there is something else.
@@ -91,10 +90,14 @@ def _clear(directory: Path) -> None:
             path.unlink()
 
 
-def refuse_existing(args: argparse.Namespace) -> None:
-    """Raise ``ValueError`` if ``args.out`` exists and is not to be replaced."""
-    if args.out.exists() and not args.overwrite:
-        raise ValueError(f"{args.out} exists; choose another OUT, or --overwrite")
+def refuse_existing(args: argparse.Namespace, *beside: str) -> None:
+    """Raise ``ValueError`` if ``args.out`` exists and is not to be replaced, or a file beside it.
+
+    Beside ``OUT.yaml``, ``lens.yaml`` stands for ``OUT_lens.yaml``.
+    """
+    for path in (args.out, *(args.out.with_name(f"{args.out.stem}_{name}") for name in beside)):
+        if path.exists() and not args.overwrite:
+            raise ValueError(f"{path} exists; choose another OUT, or --overwrite")
 
 
 def import_ros(name: str, what: str) -> Any:

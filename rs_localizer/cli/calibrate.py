@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,14 +24,17 @@ from rs_localizer.cli.batch import (
 from rs_localizer.cli.image_input import (
     add_telemetry,
     clock_of,
+    clock_of_lens,
     of_bag,
     of_files,
+    replay_command,
     telemetry_of,
     tell_telemetry,
     tell_times,
     video_imu,
 )
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
+from rs_localizer.cli.rig_input import cameras_of, mounting_lines, numbers
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.io.topics import IMU
 from rs_localizer.process.arguments import number
@@ -43,7 +45,6 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer.config import DetectorConfig, NodeConfig
-    from rs_localizer.core.arrays import Array
     from rs_localizer.core.camera import Camera, DistortionModel
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
@@ -66,7 +67,6 @@ if WORKING:
         Shot,
     )
     from rs_localizer.offline.recordings import (
-        camera_topics,
         optical_frame,
         read_imu_recording,
         read_recording,
@@ -114,12 +114,12 @@ def imu_lines(found: Calibration, imu: ImuRecording | None, config: NodeConfig) 
         ("imu.time_offset", offset, mount.time_offset_determined),
         (
             "rotation camera <- imu",
-            f"{_numbers(turn, 5)} (x y z w) +- {_numbers(turn_deviations, 3)} deg",
+            f"{numbers(turn, 5)} (x y z w) +- {numbers(turn_deviations, 3)} deg",
             mount.rotation_determined,
         ),
         (
             "gyroscope bias",
-            f"{_numbers(bias, 3)} +- {_numbers(bias_deviations, 3)} deg/s",
+            f"{numbers(bias, 3)} +- {numbers(bias_deviations, 3)} deg/s",
             mount.bias_determined,
         ),
         ("gyroscope noise", f"{np.degrees(mount.noise):.3f} deg/s, {mount.samples} samples", True),
@@ -128,10 +128,6 @@ def imu_lines(found: Calibration, imu: ImuRecording | None, config: NodeConfig) 
         f"{name:26} {text if known else f'not observable: {text}'}" for name, text, known in rows
     ]
     return said + _remarks(mount, imu)
-
-
-def _numbers(values: Array, digits: int) -> str:
-    return " ".join(f"{value:.{digits}f}" for value in values)
 
 
 def _remarks(found: MountFound, imu: ImuRecording) -> list[str]:
@@ -164,6 +160,9 @@ def imu_parameters(found: Calibration, config: NodeConfig) -> str:
     return f"    imu.time_offset: {time_offset(found.mount, config)!r}\n"
 
 
+# Beside FILE.yaml, as FILE_...
+_LENS, _MAP = "camera_info.yaml", "map.yaml"
+_TRANSFORMS, _CAMCHAIN = "transforms.launch.xml", "camchain.yaml"
 # Of each result of many.
 _SHUTTER = "shutter.yaml"
 
@@ -182,8 +181,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rig",
         action="store_true",
         help="the recordings are those of cameras on one body, one each, or one bag has topics of "
-        "several: find where the cameras are, and their clocks, too; the first one's axes and "
-        "clock are the rig's. Cameras are named as their files, or as their topics begin; "
+        "several, or one video several lenses (.insv): find where the cameras are, and their "
+        "clocks, too; the first one's axes and clock are the rig's. "
+        "Cameras are named as their files, or as their topics begin; "
         "--calibration is a camchain, or FILE of all as FILE#NAME",
     )
     parser.add_argument(
@@ -228,7 +228,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--force",
         action="store_true",
-        help="write the files although the result is refused (the exit code stays 1)",
+        help="write the readout time although it is refused (the exit code stays 1)",
     )
     parser.add_argument(
         "--share",
@@ -267,14 +267,22 @@ def run(args: argparse.Namespace) -> Figures | None:
 def calibrate_one(args: argparse.Namespace) -> Calibration:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
-        refuse_existing(args)
+        lens = args.intrinsics or (args.calibration is None and not is_bag(args.recording))
+        beside = {_LENS: lens, _MAP: args.map or args.board, "share.csv": args.share}
+        refuse_existing(args, *(name for name, written in beside.items() if written))
     config = _config(args)
     source = _read(args, config)
     intrinsics = args.intrinsics or source.camera is None
     found = _calibrated(args, source, _first_camera(source, config), config)
     refusal = verdict.refusal(found)
-    if args.out is not None and (args.force or not refusal):
-        _write(args, found, source.map, intrinsics, config)
+    if args.out is not None and (args.force or not verdict.lens_refusal(found)):
+        refused = "" if args.force else refusal
+        written = _write(args, found, source.map, intrinsics, config, refused)
+        if refused and written:
+            refusal += (
+                f". Written to {args.out} and beside it: lens, map. Not written: readout time and "
+                "scan direction, which stay unknown: no twists (--force writes them, too)"
+            )
     if refusal:
         raise ValueError(refusal)
     if args.share:
@@ -303,6 +311,7 @@ def _calibrated(
     tell_telemetry(
         argparse.Namespace(images=args.recording, no_telemetry=args.no_telemetry),
         verdict.readout_time(found),
+        found.fit.camera,
         lens=False,
     )
     if intrinsics:
@@ -343,7 +352,9 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
         imu = _imu_of_video(args, path)
         known = args.calibration is not None
         camera = read_calibration(args.calibration) if known else _unknown((2, 2))
-        source = of_files(path, camera, clock_of(path, args.rate))
+        lens: int | None = getattr(args, "lens", None)
+        clock = clock_of(path, args.rate) if lens is None else clock_of_lens()
+        source = of_files(path, camera, clock, lens)
         found = _detected(args, source.shots)
         tell_times(source.clock)
         return replace(found, own_stamps=path.is_dir() and args.rate is None, imu=imu)
@@ -473,14 +484,22 @@ def _write(
     marker_map: MarkerMap | None,
     intrinsics: bool,
     config: NodeConfig,
-) -> None:
-    """FILE.yaml, and beside it the lens and the map as they were found; and what comes next."""
+    refused: str,
+) -> bool:
+    """FILE.yaml, and beside it the lens and the map as they were found; and what comes next.
+
+    Args:
+        refused: why the shutter is not known, then it is left out; or ''.
+
+    Returns:
+        Whether there was anything to write.
+    """
     path: Path = args.out
-    path.parent.mkdir(parents=True, exist_ok=True)
     lens, shape = args.calibration, args.map
-    text = (
-        "/**:\n  ros__parameters:\n"
-        f"    readout_time: {verdict.readout_time(found)!r}\n"
+    text = "/**:\n  ros__parameters:\n" + (
+        f"    # readout_time {refused}\n    scan_direction: {config.scan_direction}\n"
+        if refused
+        else f"    readout_time: {verdict.readout_time(found)!r}\n"
         f"    readout_time_deviation: {found.deviation!r}\n"
         f"    scan_direction: {verdict.scan_direction(found)}\n" + imu_parameters(found, config)
     )
@@ -488,47 +507,41 @@ def _write(
     if intrinsics:
         values = found.lens._asdict().items()
         text += "".join(f"    calibration.{name}: {value:.4g}\n" for name, value in values)
-        lens = path.with_name(f"{path.stem}_camera_info.yaml")
+        lens = path.with_name(f"{path.stem}_{_LENS}")
         writers[lens] = lambda part: write_calibration(part, found.fit.camera)
     if marker_map is not None and verdict.shape_is_free(found):
-        shape = path.with_name(f"{path.stem}_map.yaml")
+        shape = path.with_name(f"{path.stem}_{_MAP}")
         places = verdict.moved(found, marker_map.points)
         marker_map = marker_map.with_points(places, found.shape_deviation)
         writers[shape] = partial(write_marker_map, marker_map=marker_map)
     if marker_map is not None:
         declared = config.map_deviation or marker_map.settings.get("map_deviation", 0.0)
         text += f"    map_deviation: {declared:.3g}\n" if declared else ""
+    if refused and not writers:
+        return False
     writers[path] = lambda part: part.write_text(text, encoding="utf-8")
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_files(*writers) as parts:
         for part, write in zip(parts, writers.values(), strict=True):
             write(part)
     for file in writers:
         print(f"written: {file}")
     print(f"next: {_next(args, path, lens, shape)}")
+    return True
 
 
 def _next(args: argparse.Namespace, out: Path, lens: Path | None, shape: Path | None) -> str:
     """The commands that make poses of this recording with what was found."""
-    recording: Path = args.recording
-    seen, poses = (out.with_name(f"{out.stem}_{what}") for what in ("seen", "poses"))
+    recording, seen = str(args.recording), out.with_name(f"{out.stem}_seen")
+    params, poses = ["--params", str(out)], str(out.with_name(f"{out.stem}_poses"))
+    if shape is None:  # a recording of correspondences
+        return shlex.join(["rs_localizer", "replay", recording, *params, "--out", poses])
     options = {"--map": shape, "--calibration": lens, "--rate": args.rate, "--image": args.image}
     given = [
         word for name, value in options.items() if value is not None for word in (name, str(value))
     ]
-    replay = ["replay", str(recording), "--params", str(out), "--out", str(poses)]
-    if shape is None:  # a recording of correspondences
-        return shlex.join(["rs_localizer", *replay])
-    replay[1] = str(seen)
-    detect = ["rs_localizer", "detect", str(recording), *given, "--out", str(seen)]
-    return f"{shlex.join(detect)} && {shlex.join(['rs_localizer', *replay])}"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _OfRig:
-    """What goes into a rig's calibration of one camera."""
-
-    args: argparse.Namespace  # as of a recording of this camera alone
-    frame: str  # of its optical axes
+    detect = ["rs_localizer", "detect", recording, *given, *params, "--out", str(seen)]
+    return f"{shlex.join(detect)} && {replay_command(seen)}"
 
 
 def _calibrate_rig(args: argparse.Namespace) -> None:
@@ -537,21 +550,23 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
         if getattr(args, name) is not None:
             raise UsageError(f"--{name} is for one camera: leave it out with --rig")
     if args.out is not None:
-        refuse_existing(args)
+        refuse_existing(args, _TRANSFORMS, _CAMCHAIN)
     # Cameras by name need a readout time; what it is does not matter where it is estimated.
     args.assignments = ["readout_time:=0.03", *args.assignments]
     config, recordings, maps = _config(args), dict[str, Recording](), list[MarkerMap]()
-    cameras = _cameras_of(args, config)
+    cameras = cameras_of(args, config)
     intrinsics = args.intrinsics
     for name, own in cameras.items():
         print(f"{name}:")
         axis = config.of_cameras.get(name, config).scan_direction
         of_camera = replace(config, scan_direction=axis)
-        source = _read(own.args, of_camera)
+        plots = None if args.plots is None else args.plots / name
+        of_args = argparse.Namespace(**vars(own.args) | {"plots": plots})
+        source = _read(of_args, of_camera)
         intrinsics |= source.camera is None
         maps += [] if source.map is None else [source.map]
         camera = _without_k3(_first_camera(source, of_camera))
-        recordings[name] = Recording(camera, _calibrated(own.args, source, camera, config))
+        recordings[name] = Recording(camera, _calibrated(of_args, source, camera, config))
     refusals = {name: verdict.refusal(each.calibration) for name, each in recordings.items()}
     refusals = {name: text for name, text in refusals.items() if text}
     if refusals and not args.force:
@@ -559,60 +574,25 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
     rig = calibrate_rig(recordings)
     first, comments = next(iter(rig)), list[str]()
     for name, mounted in list(rig.items())[1:]:
-        comments += _mounted_lines(name, first, mounted)
+        comments += mounting_lines(name, first, mounted.extrinsics, mounted.deviations)
         print("\n".join(comments[-3:]))
         if np.any(mounted.inflations > 1.0):
             print(
                 "parts of the recording differ by more than their noise: the deviations of "
-                f"rotation, place and offset are {_numbers(mounted.inflations, 1)} times that"
+                f"rotation, place and offset are {numbers(mounted.inflations, 1)} times that"
             )
-        if len(args.recordings) == 1:
+        if len(args.recordings) == 1 and is_bag(args.recordings[0]):
             _tell_tf(args.recordings[0], mounted, cameras[name].frame, cameras[first].frame)
     refusals |= {name: text for name, one in rig.items() if (text := one.undetermined)}
     if args.out is not None and (args.force or not refusals):
         frames = {name: own.frame for name, own in cameras.items()}
         values = _of_maps(config, maps) | (_of_lenses(recordings) if intrinsics else {})
         _write_rig(args.out, _parts(rig, recordings, config), frames, values, comments, intrinsics)
+        print(f"next: {_next_of_rig(args)}")
     if refusals:
         raise ValueError(
             "not observable: " + "; ".join(f"{name}: {text}" for name, text in refusals.items())
         )
-
-
-def _cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, _OfRig]:
-    """The cameras of the recordings, by name."""
-    plots = args.plots
-    if len(args.recordings) > 1:
-        names = [re.sub(r"\W", "_", path.stem, flags=re.ASCII) for path in args.recordings]
-        topics = [{"recording": path} for path in args.recordings]
-        frames = [f"{name}_optical_frame" for name in names]
-    else:
-        (path,) = args.recordings
-        if not is_bag(path):
-            raise UsageError(f"--rig needs the recordings of several cameras, or one bag; {path}")
-        given = config.cameras if config.is_rig else None
-        with open_bag(path) as bag:
-            by_name = camera_topics(bag, given)
-            frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
-        names = list(by_name)
-        topics = [{"recording": path, **own} for own in by_name.values()]
-    if len(set(names)) < max(len(names), 2) or not all(name[:1].isalpha() for name in names):
-        raise UsageError(
-            f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
-        )
-    if len(set(frames)) < len(frames):  # as of single recordings put together
-        frames = [""] * len(frames)
-    lens = args.calibration
-    return {
-        name: _OfRig(
-            argparse.Namespace(**vars(args) | own | {
-                "calibration": None if lens is None else lens.with_name(f"{lens.name}#{name}"),
-                "plots": None if plots is None else plots / name,
-            }),
-            frame or f"{name}_optical_frame",
-        )
-        for name, own, frame in zip(names, topics, frames, strict=True)
-    }  # fmt: skip
 
 
 def _without_k3(camera: Camera) -> Camera:
@@ -622,26 +602,14 @@ def _without_k3(camera: Camera) -> Camera:
     return replace(camera, D=np.r_[camera.D, np.zeros(4)][:4])
 
 
-def _mounted_lines(name: str, first: str, found: Mounted) -> list[str]:
-    """Where a camera is beside the first one, and its clock."""
-    turn = Rotation.from_matrix(found.rotation).as_quat(canonical=True)
-    turned, moved = np.degrees(found.rotation_deviations), 1e3 * found.centre_deviations
-    centre = -1e3 * found.rotation.T @ found.translation
-    offset, deviation = 1e3 * found.time_offset, 1e3 * found.time_offset_deviation
-    return [
-        f"{f'{name} <- {first}':26} {_numbers(turn, 5)} (x y z w) +- {_numbers(turned, 3)} deg",
-        f"{f'place in {first}':26} {_numbers(centre, 2)} +- {_numbers(moved, 2)} mm",
-        f"{'offset of its stamps':26} {offset:+.3f} +- {deviation:.3f} ms",
-    ]
-
-
 def _tell_tf(path: Path, found: Mounted, own: str, first: str) -> None:
     """What TF of a bag says of a camera's frame in that of the first one."""
     with open_bag(path) as bag:
         given = transform_between(bag, own, first)
     if given is not None:
-        off = np.degrees(Rotation.from_matrix(given.rotation.T @ found.rotation).magnitude())
-        away = given.rotation.T @ given.translation - found.rotation.T @ found.translation
+        mounted = found.extrinsics
+        off = np.degrees(Rotation.from_matrix(given.rotation.T @ mounted.axes).magnitude())
+        away = given.rotation.T @ given.translation + mounted.centre
         print(f"TF has it {off:.2f} deg and {1e3 * np.linalg.norm(away):.1f} mm off")
 
 
@@ -657,9 +625,10 @@ def _parts(
             readout_time=0.0 if own.global_shutter else abs(one.readout_time),
             scan_direction=verdict.scan_direction(own),
         )
-    poses = {name: (one.rotation, one.translation) for name, one in rig.items()}
+    mounts = {name: one.extrinsics for name, one in rig.items()}
+    poses = {name: (own.axes, -own.axes @ own.centre) for name, own in mounts.items()}
     base = config.of_cameras.get(next(iter(rig)), config).stamp_offset
-    offsets = {name: base + one.time_offset for name, one in rig.items()}
+    offsets = {name: base + own.offset for name, own in mounts.items()}
     return RigParts(cameras, poses, offsets)
 
 
@@ -681,9 +650,7 @@ def _write_rig(
 ) -> None:  # fmt: skip
     """FILE.yaml, and beside it the transforms, the camchain, and lenses that were found."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    transforms, chain = (
-        path.with_name(f"{path.stem}_{what}") for what in ("transforms.launch.xml", "camchain.yaml")
-    )
+    transforms, chain = (path.with_name(f"{path.stem}_{what}") for what in (_TRANSFORMS, _CAMCHAIN))
     writers: dict[Path, Callable[[Path], object]] = {
         transforms: partial(write_static_transforms, parts=parts, frames=frames),
         chain: partial(write_camchain, parts=parts),
@@ -708,7 +675,17 @@ def _write_rig(
             write(file)
     for file in writers:
         print(f"written: {file}")
-    print(f"next: ros2 launch {shlex.quote(str(transforms))}")
+
+
+def _next_of_rig(args: argparse.Namespace) -> str:
+    """The command that goes on: poses of a video of several lenses, or TF for a live rig."""
+    path, stem, recording = args.out, args.out.stem, args.recordings[0]
+    if len(args.recordings) > 1 or is_bag(recording) or args.map is None:
+        return shlex.join(["ros2", "launch", str(path.with_name(f"{stem}_transforms.launch.xml"))])
+    chain, poses = path.with_name(f"{stem}_camchain.yaml"), path.with_name(f"{stem}_poses")
+    files = {"--map": args.map, "--calibration": chain, "--params": path, "--out": poses}
+    words = [word for name, value in files.items() for word in (name, str(value))]
+    return shlex.join(["rs_localizer", "replay", str(recording), *words])
 
 
 def _calibrate_batch(args: argparse.Namespace) -> None:

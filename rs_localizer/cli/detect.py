@@ -7,6 +7,8 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced
@@ -23,8 +25,10 @@ from rs_localizer.cli.image_input import (
     write_shutter,
 )
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
+from rs_localizer.cli.rig_input import cameras_of
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
-from rs_localizer.io.bags import STORAGES
+from rs_localizer.io.bags import STORAGES, BagWriter, is_bag
+from rs_localizer.io.image_clock import DEFAULT_START_NS
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import build, settings
 
@@ -33,8 +37,11 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer.io.atomic_files import atomic_directory
+    from rs_localizer.io.rigs import make_mounts, read_camchain
+    from rs_localizer.io.topics import TF_STATIC
     from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
     from rs_localizer.offline.fleet.task import Figures, Kind
+    from rs_localizer.offline.image_sources import Carried, Shot
     from rs_localizer.pipeline.images import FrameDetector
     from rs_localizer.pipeline.keypoints import FrameExtractor
 
@@ -84,7 +91,7 @@ def run(args: argparse.Namespace) -> Figures | None:
         if args.features is None:
             recorded = detect_one(alone)
             tell_next(alone)
-            return _figures(recorded)
+            return _figures(*recorded)
         detect_features(alone)
         tell_next(alone, " --map MAP")
         return None
@@ -95,25 +102,48 @@ def run(args: argparse.Namespace) -> Figures | None:
     return None
 
 
-def detect_one(args: argparse.Namespace) -> Recorded:
-    """Detect in the images of one recording, and say what came of it."""
+def detect_one(args: argparse.Namespace) -> list[Recorded]:
+    """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
     marker_map = find_map(args)
-    notices: Counter[str] = Counter()
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
-    detector = FrameDetector(config, lambda _, text: notices.update((text,)), marker_map)
-    detector.warm_up()
-    with (
-        opened(args, args.images, args.start) as source,
-        atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
-    ):
-        recorded = _record(args, source, detector, out)
+    told = []
+    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
+        with BagWriter(out, args.storage) as bag:
+            for name, own in _cameras(args, bag).items():
+                notices: Counter[str] = Counter()
+                detector = FrameDetector(config, partial(_count, notices), marker_map)
+                detector.warm_up()
+                with opened(own, args.images, args.start) as source:
+                    recorded = _record(own, name, source, detector, bag)
+                told.append((name, recorded, notices, detector.seconds, source.clock))
         write_shutter(args, out, marker_map.settings)
-    _tell(args, recorded, notices)
-    for fault in (*recorded.faults, *time_faults(args, source.clock, recorded.period)):
-        print(f"warning: {fault}")
-    if args.timing:
-        _tell_times(recorded.images, *detector.seconds)
-    return recorded
+    for name, recorded, notices, seconds, clock in told:
+        _tell(f"{args.out}{f', {name}' if name else ''}", recorded, notices)
+        for fault in (*recorded.faults, *time_faults(args, clock, recorded.period, name)):
+            print(f"warning: {fault}")
+        if args.timing:
+            _tell_times(recorded.images, *seconds)
+    tell_telemetry(args)
+    return [recorded for _, recorded, *_ in told]
+
+
+def _cameras(args: argparse.Namespace, bag: BagWriter) -> dict[str, argparse.Namespace]:
+    """The arguments of each camera of a rig by its name, or of one that is alone, by "".
+
+    Where the lenses of one video are goes into the bag.
+    """
+    settings = build(shutter_values(args))
+    if not settings.is_rig:
+        return {"": args}
+    rig = cameras_of(argparse.Namespace(**vars(args) | {"recordings": [args.images]}), settings)
+    if args.calibration is not None and not is_bag(args.images):
+        start = DEFAULT_START_NS if args.start is None else round(1e9 * args.start)
+        bag.write(TF_STATIC, make_mounts(read_camchain(args.calibration)), start)
+    return {name: own.args for name, own in rig.items()}
+
+
+def _count(notices: Counter[str], _: str, text: str) -> None:
+    notices[text] += 1
 
 
 def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
@@ -124,38 +154,45 @@ def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
 
 
 def _record(
-    args: argparse.Namespace, source: Source, detector: FrameDetector, out: Path
+    args: argparse.Namespace, name: str, source: Source, detector: FrameDetector, bag: BagWriter
 ) -> Recorded:
     with tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress:
         return record(
-            source.shots,
+            _shots(args, name, source),
             detector,
-            out,
-            _options(args),
+            bag,
+            _options(args, name),
             done=progress.update,
             tell=lambda text: progress.write(f"note: {text}", file=sys.stderr),
         )
 
 
-def _tell(args: argparse.Namespace, recorded: Recorded, notices: Counter[str]) -> None:
+def _shots(args: argparse.Namespace, name: str, source: Source) -> Iterator[Shot | Carried]:
+    """The images of a camera; what goes along comes with the first of a rig only."""
+    if name in ("", build(shutter_values(args)).cameras[0]):
+        return iter(source.shots)
+    return (shot for shot in source.shots if not isinstance(shot, Carried))
+
+
+def _tell(what: str, recorded: Recorded, notices: Counter[str]) -> None:
     fit = ""
     if np.isfinite(recorded.residual):
         fit = f", within {recorded.residual:.3f} px rms of a global-shutter pose (median)"
     print(
-        f"{args.out}: {recorded.with_corners} of {recorded.images} images, "
+        f"{what}: {recorded.with_corners} of {recorded.images} images, "
         f"{recorded.corners:.0f} corners each (median){fit}"
     )
     if recorded.with_corners < recorded.images:
         print(f"{recorded.images - recorded.with_corners} images show no part of the map")
-    tell_telemetry(args)
     tell_left_out(recorded.refused, recorded.carried)
     for text, count in notices.most_common(3):
         print(f"note ({count} images): {text}")
 
 
-def _options(args: argparse.Namespace) -> Options:
-    direction = build(shutter_values(args)).scan_direction
-    return Options(args.storage, args.with_images, direction)
+def _options(args: argparse.Namespace, name: str = "") -> Options:
+    settings = build(shutter_values(args))
+    own = settings.of_cameras.get(name, settings)
+    return Options(args.with_images, own.scan_direction, name)
 
 
 def _add_feature_arguments(parser: argparse._ActionsContainer) -> None:
@@ -183,31 +220,37 @@ def detect_features(args: argparse.Namespace) -> None:
     if args.max_keypoints is not None:
         config = FeatureConfig(features=args.features, max_keypoints=args.max_keypoints)
     extractor = FrameExtractor(config)
-    options = _options(args)
-    with (
-        opened(args, args.images, args.start) as source,
-        atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
-        tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress,
-    ):
-        extraction = record_features(source.shots, extractor, out, options, progress.update)
+    of_cameras = []
+    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
+        with BagWriter(out, args.storage) as bag:
+            for name, own in _cameras(args, bag).items():
+                with (
+                    opened(own, args.images, args.start) as source,
+                    tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress,
+                ):
+                    shots, options = _shots(args, name, source), _options(args, name)
+                    extraction = record_features(shots, extractor, bag, options, progress.update)
+                of_cameras.append((name, extraction, source.clock))
         write_shutter(args, out)
-    _tell_features(args, extraction)
-    for fault in time_faults(args, source.clock, extraction.period):
-        print(f"warning: {fault}")
+    for name, extraction, clock in of_cameras:
+        _tell_features(args, f"{args.out}{f', {name}' if name else ''}", extraction)
+        for fault in time_faults(args, clock, extraction.period, name):
+            print(f"warning: {fault}")
+    tell_telemetry(args)
     if args.timing:
-        milliseconds = 1e3 * extractor.seconds / len(extraction.stamps_ns)
+        images = sum(len(extraction.stamps_ns) for _, extraction, _ in of_cameras)
+        milliseconds = 1e3 * extractor.seconds / images
         print(f"time per image: {milliseconds:.1f} ms, {1e3 / milliseconds:.0f} images/s")
 
 
-def _tell_features(args: argparse.Namespace, extraction: Extraction) -> None:
+def _tell_features(args: argparse.Namespace, what: str, extraction: Extraction) -> None:
     with_any = len(extraction.counts)
     print(
-        f"{args.out}: {with_any} of {extraction.images} images, "
+        f"{what}: {with_any} of {extraction.images} images, "
         f"{np.median(extraction.counts):.0f} keypoints ({args.features}) each (median)"
     )
     if bare := len(extraction.stamps_ns) - with_any:
         print(f"{bare} images have no keypoint")
-    tell_telemetry(args)
     tell_left_out(extraction.refused, extraction.carried)
 
 
@@ -230,15 +273,15 @@ def _detect_warm(_: argparse.Namespace) -> None:
 def _detect_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
     """One of them: its result in ``out``, and figures for the summary."""
     return _figures(
-        detect_one(argparse.Namespace(**vars(args), images=recording, out=out, overwrite=False))
+        *detect_one(argparse.Namespace(**vars(args), images=recording, out=out, overwrite=False))
     )
 
 
-def _figures(recorded: Recorded) -> Figures:
+def _figures(*recorded: Recorded) -> Figures:
     return {
-        "images": recorded.images,
-        "with corners": recorded.with_corners,
-        "corners": recorded.corners,
-        "residual of a still pose (px)": recorded.residual,
-        "warnings": "; ".join(recorded.faults),
+        "images": sum(one.images for one in recorded),
+        "with corners": sum(one.with_corners for one in recorded),
+        "corners": min(one.corners for one in recorded),
+        "residual of a still pose (px)": max(one.residual for one in recorded),
+        "warnings": "; ".join(fault for one in recorded for fault in one.faults),
     }

@@ -33,7 +33,7 @@ if WORKING:
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import BagError, open_bag
     from rs_localizer.io.estimates import Motions, read_motions
-    from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
+    from rs_localizer.io.recording import CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC
     from rs_localizer.io.trajectories import Trajectory, Twists, read_twists
     from rs_localizer.offline.fleet.task import Figures, Kind
 
@@ -248,8 +248,9 @@ def _coverage(path: Path, estimate: Trajectory, truth: Trajectory, tolerance_ns:
     rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns, tolerance_ns)
     try:
         with open_bag(path) as bag:
-            clouds = {CORRESPONDENCES_TOPIC} & set(bag.topics)
-            frames = bag.count(clouds) if clouds else 0
+            topics = (CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC)
+            of_frames = next((topic for topic in topics if topic in bag.topics), None)
+            frames = bag.count({of_frames}) if of_frames else 0
     except BagError:  # a text file, or a directory of them
         frames = 0
     if frames > 0:  # their truth may stand there for several instants of each

@@ -28,10 +28,11 @@ if WORKING:
     from rs_localizer.core.camera import Camera
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
     from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_log, read_telemetry
-    from rs_localizer.io.video import has_times
+    from rs_localizer.io.video import count_lenses, has_times
     from rs_localizer.offline.image_sources import (
         IMAGE_TYPES,
         INFO_TYPE,
+        LENSES,
         Carried,
         Shot,
         find_topic,
@@ -44,8 +45,9 @@ if WORKING:
     )
     from rs_localizer.trajectory.imu import ImuRecording
 
-# Readout times that differ by less are called the same: what a file says counts rows its own way.
-_SAME_READOUT = 0.05
+# Readout times and focal lengths that differ by less are called the same: what a file says counts
+# rows its own way, and is of no single camera.
+_SAME = 0.05
 
 
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
@@ -113,8 +115,7 @@ def shutter_values(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def telemetry_of(path: Path, args: argparse.Namespace) -> Telemetry | None:
-    """What a video, or a log of a phone beside it, says of its camera; None: nothing, or it is not
-    to be used.
+    """What a video, or a log beside it, says of its camera; None: nothing, or it is not to be used.
 
     Raises:
         ValueError: for telemetry that cannot be read.
@@ -146,17 +147,26 @@ def add_telemetry(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def tell_telemetry(args: argparse.Namespace, used: float | None = None, lens: bool = True) -> None:
+def tell_telemetry(
+    args: argparse.Namespace, used: float | None = None, measured: Camera | None = None,
+    lens: bool = True,
+) -> None:  # fmt: skip
     """Say what a video knows of its camera, and what is not used of it.
 
     Args:
         args: with ``images`` and ``no_telemetry``.
         used: the readout time that was measured, s; None: that of the settings is used.
+        measured: the camera, if it was measured.
         lens: whether a lens profile takes the place of a calibration.
     """
     path = args.images
     if args.no_telemetry:
         return
+    is_rig = measured is None and build(shutter_values(args)).is_rig
+    if path.suffix == ".insv" and importlib.util.find_spec("av") is not None:
+        names = lenses_of(path)
+        if len(names) > 1 and measured is None and not is_rig:
+            print(f"note: of {', '.join(names)} the first one is used; calibrate --rig takes all")
     found = _telemetry(path)
     if found is None:
         missing = importlib.util.find_spec("telemetry_parser") is None
@@ -170,18 +180,27 @@ def tell_telemetry(args: argparse.Namespace, used: float | None = None, lens: bo
             "readout time are not used"
         )
         return
-    said = [f"gyroscope at {found.rate:.0f} Hz"]
+    said = [f"gyroscope at {found.rate:.0f} Hz" + (" (not used of a rig)" if is_rig else "")]
     if found.readout_time is not None:
         said.append(f"readout time {1e3 * found.readout_time:.2f} ms")
         how = "given" if used is None else "measured"
         used = build(shutter_values(args)).readout_time if used is None else used
-        if abs(used / found.readout_time - 1.0) > _SAME_READOUT:
+        if abs(used / found.readout_time - 1.0) > _SAME:
             said[-1] += f" (not used: {1e3 * used:.2f} ms was {how})"
     if found.exposure is not None:
         said.append(f"exposure {1e3 * found.exposure:.2f} ms (median)")
     if found.lens:
-        how = "used" if lens and args.calibration is None else "not used"
-        said.append(found.lens + (f", {how}" if found.profile is not None else ""))
+        said.append(found.lens)
+        if (profile := found.profile) is not None:
+            used_one = lens and args.calibration is None
+            said[-1] += ", used" if used_one else ", not used"
+            if measured is not None:
+                focal = measured.K[0, 0] * profile.width / measured.width
+                if abs(focal / profile.K[0, 0] - 1.0) > _SAME:
+                    said[-1] += (
+                        f" (its focal length is {profile.K[0, 0]:.0f} px, {focal:.0f} px was "
+                        "measured: of another mode?)"
+                    )
     print(f"{found.camera}: {', '.join(said)}; --no-telemetry ignores them")
 
 
@@ -202,28 +221,40 @@ def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> Non
         print(f"kept for replay: {kept}")
 
 
-def time_faults(args: argparse.Namespace, clock: ImageClock | None, period: float) -> list[str]:
+def time_faults(
+    args: argparse.Namespace, clock: ImageClock | None, period: float, camera: str = ""
+) -> list[str]:
     """Say where the times are from; what speaks against them, and against the readout time.
 
     Args:
         period: s from one image to the next.
+        camera: of a rig, whose images these are.
     """
-    faults = []
+    faults, settings = [], build(shutter_values(args))
     if clock is not None:
         print(clock.description())
         faults.append(clock.fault())
-    faults.append(readout_fault(build(shutter_values(args)).readout_time, period))
+    own = settings.of_cameras.get(camera, settings)
+    faults.append(readout_fault(own.readout_time, period))
     return [fault for fault in faults if fault]
 
 
 def tell_next(args: argparse.Namespace, more: str = "") -> None:
     """The command that makes poses of the recording, with further options."""
-    out = shlex.quote(str(args.out))
-    settings = f" --params {out}/{PARAMETERS}" if (args.out / PARAMETERS).exists() else ""
-    if "readout_time" not in shutter_values(args):
-        settings += " -p readout_time:=SECONDS"
-    poses = shlex.quote(f"{args.out}_poses")
-    print(f"next: rs_localizer replay {out}{settings}{more} --out {poses}")
+    if not {"readout_time", "cameras"} & set(shutter_values(args)):
+        print(
+            "the readout time is not known: poses come without twists; calibrate measures it, and "
+            "-p readout_time:=SECONDS gives it to the next command"
+        )
+    known = (args.out / PARAMETERS).exists()
+    print(f"next: {replay_command(args.out, known=known)}{more}")
+
+
+def replay_command(recording: Path, *, known: bool = True) -> str:
+    """The command that makes poses of what ``detect`` wrote, with the parameters beside it."""
+    params = ["--params", str(recording / PARAMETERS)] if known else []
+    words = ["replay", str(recording), *params, "--out", f"{recording}_poses"]
+    return shlex.join(["rs_localizer", *words])
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,8 +268,8 @@ class Source:
 
 @contextlib.contextmanager
 def opened(
-    args: argparse.Namespace, path: Path, start: float | None = None, calibrated: bool = True
-) -> Iterator[Source]:
+    args: argparse.Namespace, path: Path, start: float | None = None, calibrated: bool = True,
+) -> Iterator[Source]:  # fmt: skip
     """Images with the lens of ``args.calibration`` or, of a bag, its camera_info.
 
     Args:
@@ -254,6 +285,16 @@ def opened(
         for name in ("image", "camera_info"):
             if getattr(args, name) is not None:
                 raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
+        lens: int | None = getattr(args, "lens", None)  # one of several that filmed into one file
+        if lens is not None:
+            if args.rate is not None:
+                raise UsageError("--rate is for one camera: leave it out with cameras")
+            if args.calibration is None:
+                raise UsageError(
+                    "cameras in one file: --calibration FILE_camchain.yaml of calibrate --rig"
+                )
+            yield of_files(path, read_calibration(args.calibration), clock_of_lens(start), lens)
+            return
         telemetry = telemetry_of(path, args)
         camera = None if args.calibration is None else read_calibration(args.calibration)
         if camera is None and calibrated:
@@ -272,6 +313,16 @@ def opened(
     with open_bag(path) as bag:
         camera = None if args.calibration is None else read_calibration(args.calibration)
         yield of_bag(bag, camera, args, calibrated)
+
+
+def lenses_of(path: Path) -> tuple[str, ...]:
+    """The names of the cameras that filmed into one file."""
+    return LENSES[: count_lenses(path)]
+
+
+def clock_of_lens(start: float | None = None) -> ImageClock:
+    """One of several: their common zero is the first image of the first one."""
+    return ImageClock(None, None if start is None else round(start * 1e9), zero_ns=0)
 
 
 def of_bag(
@@ -299,10 +350,12 @@ def clock_of(path: Path, rate: float | None, start: float | None = None) -> Imag
     return ImageClock(rate, None if start is None else round(start * 1e9))
 
 
-def of_files(path: Path, camera: Camera | None, clock: ImageClock) -> Source:
-    """The images of a video or folder."""
+def of_files(
+    path: Path, camera: Camera | None, clock: ImageClock, lens: int | None = None
+) -> Source:
+    """The images of a video, of one of its lenses, or of a folder."""
     if not path.is_dir():
-        return Source(from_video(path, camera, clock), None, clock)
+        return Source(from_video(path, camera, clock, lens), None, clock)
     files = image_files(path)
     return Source(from_files(files, camera, clock), len(files), clock)
 

@@ -20,15 +20,17 @@ if WORKING:
     from rs_localizer.core import so3
     from rs_localizer.core.types import Estimate
     from rs_localizer.io.atomic_files import OutputError, atomic_files
-    from rs_localizer.io.hloc import (
+    from rs_localizer.offline.hloc import (
+        Answer,
         HlocError,
+        Reference,
+        localize_queries,
         open_h5,
         read_pairs,
         read_queries,
         result_line,
         result_name,
     )
-    from rs_localizer.offline.hloc import Answer, Reference, localize_queries
     from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
     from rs_localizer.solvers.table import find_solver
 

@@ -26,6 +26,7 @@ from typing import Any
 import rs_localizer
 from rs_localizer.cli import COMMON, LateParser, UsageError, add_common
 from rs_localizer.io.atomic_files import remove_unfinished
+from rs_localizer.io.remote import is_url, placed_beside
 from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import INTERRUPTED, StopRequest
 
@@ -138,6 +139,40 @@ def main(
     """
     words = list(sys.argv[1:] if argv is None else argv)
     common, words = _common_options(words)
+    if (url := _url_of_out(words)) is None:
+        return _run(words, common, importing)
+    try:
+        if "--scheduler" in words:
+            raise UsageError("--out: workers need a folder that all of them see, not a URL")
+        with placed_beside(url) as place:
+            code = _run(
+                [str(place) if word == url else word for word in words], common, importing,
+                lambda text: text.replace(str(place), url.rstrip("/")),
+            )  # fmt: skip
+            if code:
+                raise SystemExit(code)  # nothing of it is placed
+    except SystemExit as end:
+        return int(end.code or 0)
+    except Exception as error:
+        if (fault := _said(words[0], error)) is not None:
+            return fault
+        raise
+    return code
+
+
+def _url_of_out(words: Sequence[str]) -> str | None:
+    """Where the result is to be, if that is no place of this machine."""
+    at = words.index("--out") + 1 if "--out" in words else 0
+    return words[at] if 0 < at < len(words) and is_url(words[at]) else None
+
+
+def _run(
+    words: Sequence[str],
+    common: set[str],
+    importing: Callable[[str], AbstractContextManager[object]],
+    shown: Callable[[str], str] = str,
+) -> int:
+    """Run one command; ``shown`` changes what it prints."""
     try:
         name = _parser().parse_args(words[:1]).command
         command = COMMANDS[name]
@@ -152,11 +187,11 @@ def main(
         return _fail(name, explain(error), 1)
     StopRequest.clean_up.append(remove_unfinished)
     try:
-        with _output(name, common):
+        with _output(name, common, shown):
             result = module.run(arguments)
             printed = sys.stdout
         if "--json" in common and isinstance(printed, io.StringIO):
-            _print_json(name, result, printed.getvalue())
+            print(shown(_json(name, result, printed.getvalue())))
         sys.stdout.flush()
     except Exception as error:
         if "--verbose" in common:
@@ -210,7 +245,7 @@ def _command_parser(name: str) -> argparse.ArgumentParser:
 
 
 @contextlib.contextmanager
-def _output(name: str, common: Collection[str]) -> Iterator[None]:
+def _output(name: str, common: Collection[str], shown: Callable[[str], str]) -> Iterator[None]:
     """Within ``with``, what is printed cannot steer the terminal, and goes where options say."""
     if name == "watch":
         yield
@@ -220,14 +255,21 @@ def _output(name: str, common: Collection[str]) -> Iterator[None]:
         with contextlib.redirect_stdout(io.StringIO()):
             yield
     else:
-        with _plain_output():
+        with _plain_output(shown):
             yield
 
 
-def _print_json(name: str, result: Any, printed: str) -> None:
-    """The figures of a command, or the lines that it has printed."""
-    content = {"text": printed.splitlines()} if result is None else {"result": result}
-    print(json.dumps({"command": name, **_as_json(content)}, indent=1))
+_NEXT = "next: "
+
+
+def _json(name: str, result: Any, printed: str) -> str:
+    """The figures of a command and what comes next, or the lines that it has printed."""
+    lines = printed.splitlines()
+    content: dict[str, Any] = {"text": lines} if result is None else {"result": result}
+    following = [line.removeprefix(_NEXT) for line in lines if line.startswith(_NEXT)]
+    if following and result is not None:
+        content["next"] = following[-1]
+    return json.dumps({"command": name, **_as_json(content)}, indent=1)
 
 
 def _as_json(value: Any) -> Any:
@@ -262,11 +304,11 @@ def _fail(name: str, text: str, code: int) -> int:
 
 
 @contextlib.contextmanager
-def _plain_output() -> Iterator[None]:
+def _plain_output(shown: Callable[[str], str]) -> Iterator[None]:
     """Within ``with``, what is printed cannot steer the terminal."""
     write = sys.stdout.write
     output = sys.stdout
-    output.write = lambda text: write(text.translate(_STEERING))  # type: ignore[method-assign]
+    output.write = lambda text: write(shown(text).translate(_STEERING))  # type: ignore[method-assign]
     try:
         yield
     finally:

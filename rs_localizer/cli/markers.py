@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``rs_localizer markers make|check``: prints with their map file; is a map file consistent?"""
+"""``rs_localizer markers make|check``: prints with their map file, and checks of map files."""
 
 from __future__ import annotations
 
@@ -131,11 +131,7 @@ def _map(args: argparse.Namespace) -> MarkerMap:
         size = args.size or _SIZE
         gap = _GAP * size / _SIZE if args.gap is None else args.gap
         markers = wall(
-            args.family or _FAMILY,
-            grid,
-            *(size, gap),
-            first_id=args.first_id or 0,
-            pose=pose,
+            args.family or _FAMILY, grid, *(size, gap), first_id=args.first_id or 0, pose=pose
         )
         return MarkerMap(markers, map_frame=args.map_frame)
     _refuse(args, "a grid", "size", "gap")

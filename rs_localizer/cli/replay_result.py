@@ -145,9 +145,7 @@ class Track:
         return stamps, np.array(self._rows).reshape(-1, 13)[first]
 
     def write(self, out: Path, pose_time: str) -> tuple[int, bool]:
-        """Write :data:`POSES` and :data:`TWISTS`; how many stamps came repeatedly, and whether
-        there are twists.
-        """
+        """Write poses and twists; how many stamps were repeated, and if there are twists."""
         bodies = " or ".join(sorted(self._bodies)) or "the camera"
         maps = " or ".join(sorted(self._maps)) or "the map"
         when = {

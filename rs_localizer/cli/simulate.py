@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced
@@ -25,7 +25,7 @@ from rs_localizer.simulation.settings import (
     ImageSettings,
     ImuSettings,
 )
-from rs_localizer.simulation.walls import SCENES
+from rs_localizer.simulation.walls import SCENES, Scene
 
 if WORKING:
     import numpy as np
@@ -35,19 +35,20 @@ if WORKING:
     from rs_localizer.core.arrays import Array
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.maps.files import write_map_file
-    from rs_localizer.io.rigs import RigParts, read_camchain
+    from rs_localizer.io.rigs import RigParts, make_mounts, read_camchain
+    from rs_localizer.io.topics import TF_STATIC
     from rs_localizer.io.trajectories import read_tum
     from rs_localizer.markers.map_files import write_marker_map
-    from rs_localizer.simulation.frames import frame_stamps, simulate_frames
+    from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
     from rs_localizer.simulation.image_sequence import rendered_frames
     from rs_localizer.simulation.imu import ImuBagWriter, Lever, simulate_imu
     from rs_localizer.simulation.recording import write_rendered, write_simulated
     from rs_localizer.simulation.renderer import Renderer
     from rs_localizer.simulation.rig import (
+        Frame,
         camera_stamps,
         rig_parameters,
         simulate_rig,
-        write_mounts,
         write_rig_frame,
     )
     from rs_localizer.simulation.scene import described, keypoint_rows, room
@@ -193,8 +194,8 @@ def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
 
 def rig_of(args: argparse.Namespace) -> RigParts:
     """The rig of ``--rig``; UsageError for what it does not go with."""
-    if args.images or args.imu:
-        raise UsageError("--rig is for points: leave --images and --imu out")
+    if args.imu:
+        raise UsageError("--imu is for one camera: leave it out with --rig")
     parts = read_camchain(args.rig)
     if unknown := [name for name, camera in parts.cameras.items() if camera.readout_time == 0.0]:
         raise UsageError(f"--rig: {args.rig} has no readout_time of {', '.join(unknown)}")
@@ -396,35 +397,59 @@ def run(args: argparse.Namespace) -> dict[str, object]:
 
 def _write_rig(args: argparse.Namespace) -> dict[str, object]:
     parts, motion = rig_of(args), motion_of(args)
-    seen = FrameSettings(args.points, args.noise, args.outliers, args.rate)
     first = next(iter(parts.cameras.values()))
     some = set(stamps_of(args, first, motion))
     stamps = {
         name: [stamp for stamp in all_ if min(some) <= stamp <= max(some)]
         for name, all_ in camera_stamps(parts, motion, args.rate, args.seed, args.triggered).items()
     }
-    rng = np.random.default_rng(args.seed)
-    landmarks = described(room(_positions(motion), rng), MAP_FRAME, rng)
+    scene, rng = None, np.random.default_rng(args.seed)
+    see: Callable[[str, TrueMotion, int], Iterator[Frame]]
+    if args.images:
+        scene, encoding = SCENES[args.walls](sampled_states(motion)), _encoding(args)
+        renderers = {
+            name: Renderer(camera, scene.planes, _pictures(args))
+            for name, camera in parts.cameras.items()
+        }
+
+        def see(name: str, mounted: TrueMotion, place: int) -> Iterator[Frame]:
+            seed = args.seed + place
+            return rendered_frames(renderers[name], mounted, stamps[name], encoding, seed)
+    else:
+        landmarks = described(room(_positions(motion), rng), MAP_FRAME, rng)
+        seen = FrameSettings(args.points, args.noise, args.outliers, args.rate)
+
+        def see(name: str, mounted: TrueMotion, place: int) -> Iterator[Frame]:
+            return simulate_frames(
+                parts.cameras[name], mounted, landmarks.points, seen, stamps_ns=stamps[name],
+                seed=args.seed + place,
+            )  # fmt: skip
+
     total, counts = sum(map(len, stamps.values())), 0
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
         with BagWriter(built, args.storage) as bag:
-            write_mounts(bag, parts, min(some))
-            images = simulate_rig(
-                parts, motion, landmarks.points, seen, stamps_ns=stamps, seed=args.seed
-            )
+            bag.write(TF_STATIC, make_mounts(parts), min(some))
+            images = simulate_rig(parts, motion, see)
             for image in tqdm(images, total=total, unit="image", desc="simulate", disable=None):
-                rows = keypoint_rows(image.frame, landmarks, rng) if args.keypoints else None
+                rows = None
+                if isinstance(image.frame, SimulatedFrame):
+                    counts += len(image.frame.points)
+                    rows = keypoint_rows(image.frame, landmarks, rng) if args.keypoints else None
                 write_rig_frame(bag, parts, motion, image, rows)
-                counts += len(image.frame.points)
-        if not counts:
+        if scene is None and not counts:
             raise ValueError(f"no image sees any point; nothing is written to {args.out}")
         write_parameters(built / PARAMETERS, rig_parameters(parts))
         if args.keypoints:
             write_map_file(built / MAP, landmarks)
-    names = ", ".join(parts.cameras)
-    print(f"{args.out}: {total} images of {names}, {counts / total:.0f} points each")
+        if scene is not None and scene.marker_map is not None:
+            write_marker_map(built / MARKER_MAP, scene.marker_map)
+    said = f"{args.out}: {total} images of {', '.join(parts.cameras)}"
+    told: dict[str, object] = {"images": total, "cameras": list(parts.cameras)}
+    if scene is not None:
+        return told | _tell_scene(args, said, scene)
+    print(f"{said}, {counts / total:.0f} points each")
     _tell_next(args)
-    return {"images": total, "cameras": list(parts.cameras), "points_per_image": counts / total}
+    return told | {"points_per_image": counts / total}
 
 
 def _write_points(args: argparse.Namespace) -> dict[str, object]:
@@ -474,9 +499,7 @@ def _write_images(args: argparse.Namespace) -> dict[str, object]:
     camera, motion = camera_of(args), motion_of(args)
     stamps = stamps_of(args, camera, motion)
     scene = SCENES[args.walls](sampled_states(motion))
-    settings = ImageSettings(args.exposure, args.grey_noise, args.vignetting)
-    renderer = Renderer(camera, scene.planes, settings)
-    encoding = Encoding(args.format, round(args.quality))
+    renderer, encoding = Renderer(camera, scene.planes, _pictures(args)), _encoding(args)
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
         with bag_of(args, built, motion) as bag:
             frames = rendered_frames(renderer, motion, stamps, encoding, seed=args.seed)
@@ -486,14 +509,27 @@ def _write_images(args: argparse.Namespace) -> dict[str, object]:
         if scene.marker_map is not None:
             write_marker_map(built / MARKER_MAP, scene.marker_map)
     said = f"{args.out}: {len(stamps)} images in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"
+    return {"images": len(stamps)} | _tell_scene(args, said, scene)
+
+
+def _tell_scene(args: argparse.Namespace, said: str, scene: Scene) -> dict[str, object]:
+    """Say what was rendered, and what comes next."""
     if scene.marker_map is None:
         print(said)
-        return {"images": len(stamps)}
+        return {}
     print(f"{said}, {len(scene.marker_map.markers)} markers on the walls")
     out = shlex.quote(str(args.out))
     markers = shlex.quote(f"{args.out}_markers")
     print(f"next: rs_localizer detect {out} --map {out}/{MARKER_MAP} --out {markers}")
-    return {"images": len(stamps), "markers": len(scene.marker_map.markers)}
+    return {"markers": len(scene.marker_map.markers)}
+
+
+def _pictures(args: argparse.Namespace) -> ImageSettings:
+    return ImageSettings(args.exposure, args.grey_noise, args.vignetting)
+
+
+def _encoding(args: argparse.Namespace) -> Encoding:
+    return Encoding(args.format, round(args.quality))
 
 
 def _shutter(args: argparse.Namespace) -> dict[str, object]:

@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``rs_localizer warm``: compiles all kernels of the nodes, of calibration and of smoothing before
-somebody waits for them.
-"""
+"""``rs_localizer warm``: compiles all kernels before somebody waits for them."""
 
 from __future__ import annotations
 

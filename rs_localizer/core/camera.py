@@ -59,9 +59,7 @@ def choice(name: str, kind: type[E], value: Any) -> E:
 
 
 class DistortionModel(StrEnum):
-    """THE list of lenses: names in sensor_msgs/CameraInfo (the last two: Kalibr's), and their
-    laws.
-    """
+    """THE list of lenses: names in CameraInfo (the last two: Kalibr's), and their laws."""
 
     law: LensLaw
 
@@ -270,9 +268,7 @@ class Camera:
         return self.rays_and_jacobian(pixels)[0]
 
     def rays_and_jacobian(self, pixels: Array) -> tuple[Array, Array]:
-        """Bearings (n,2) of raw pixels (n,2), see :meth:`rays`, and the derivatives (n,2,2) of the
-        pixel by the bearing there.
-        """
+        """Bearings (n,2) of :meth:`rays`, and the derivatives (n,2,2) of the pixels by them."""
         pixels = np.ascontiguousarray(pixels, dtype=np.float64)
         sensor = pixels * self.binning + self._offset()
         if len(self.D) == 0 or len(sensor) == 0:

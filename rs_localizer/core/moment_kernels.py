@@ -1,7 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose and twist at one row time, with their covariances: the formulas of
-:mod:`rs_localizer.pipeline.pose_at_time`, all in one call."""
+"""Pose and twist at one row time, with covariances: :mod:`rs_localizer.pipeline.pose_at_time`."""
 
 from __future__ import annotations
 

@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike
 from rs_localizer.core.arrays import Array, BoolArray, IntArray, Random
 from rs_localizer.core.bearings import bearings
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.gyro_compensated import gyro_compensated
-from rs_localizer.core.gyro_rotation import GyroRotation
+from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Mounts, Rig

@@ -59,8 +59,8 @@ def _blocks(axes: Axes, calibration: Calibration) -> None:
 
 
 def _coverage(axes: Axes, camera: Camera, calibration: Calibration) -> None:
-    seen = calibration.posed.observations
-    axes.plot(*seen.pixels[seen.trusted].T, ",", color=_BLUE)
+    observations = calibration.posed.observations
+    axes.plot(*observations.pixels[observations.trusted].T, ",", color=_BLUE)
     axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal",
              title="Where the map was shown")  # fmt: skip
 

@@ -233,12 +233,7 @@ def cube_errors(
     return errors
 
 
-def _picture(
-    image: Image,
-    cube: Cube,
-    motions: Motions,
-    off: Mapping[str, float],
-) -> Image:
+def _picture(image: Image, cube: Cube, motions: Motions, off: Mapping[str, float]) -> Image:
     """The image once for each method, with its cube and what it is off by."""
     pictures: list[Image] = []
     captions: list[Sequence[str]] = []

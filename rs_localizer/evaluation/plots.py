@@ -151,9 +151,7 @@ def trajectories(truth: Trajectory | None, estimates: Mapping[str, Trajectory]) 
 
 
 def _range(parts: Sequence[Array], room: float) -> tuple[float, float]:
-    """What nearly all values of all series are within, with some room beyond (as a share): a
-    single one far off must not shrink all others.
-    """
+    """What nearly all values of all series are within, with some room beyond (as a share)."""
     values = np.concatenate([np.asarray(part, np.float64) for part in parts])
     values = values[np.isfinite(values)]
     if len(values) == 0:

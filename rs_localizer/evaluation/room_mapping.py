@@ -97,9 +97,7 @@ class Room:
         done: Callable[[], object] = lambda: None,
         markers: bool = True,
     ) -> list[View]:
-        """The views of a piece, with the markers or without looking for them; their images go to a
-        folder.
-        """
+        """The views of a piece, with the markers or without; their images go to a folder."""
         looker = Looker(self._most, images, self.marker_map if markers else None)
         views = []
         for image in self.images(piece):
@@ -135,9 +133,7 @@ class Room:
     ) -> dict[int, Localized | Refusal]:
         """The poses of the middle rows by the stamps of the images, as ``replay`` gives them."""
         config = NodeConfig(
-            solver=solver,
-            readout_time=self.camera.readout_time,
-            pose_time=PoseTime.MID_FRAME,
+            solver=solver, readout_time=self.camera.readout_time, pose_time=PoseTime.MID_FRAME
         )
         localizer = FrameLocalizer(config)
         localizer.use_map(landmarks)

@@ -104,6 +104,11 @@ class OffsetSearch:
         self._squares = np.zeros(len(_OFFSETS))
         self._first = None if sight is None else sight.rotation
 
+    @property
+    def hopes(self) -> bool:
+        """Whether it has not looked at frames for long in vain."""
+        return self._seen < _PATIENCE
+
     def wants(self) -> bool:
         """Whether the next frame is to be looked at."""
         self._seen += 1
@@ -340,6 +345,7 @@ class GyroscopeAid:
         self._status: InertialStatus | None = None  # until it is asked for
         self._search = OffsetSearch() if settings.estimate_time_offset else None
         self._shaken = False  # in this frame, by the gyroscope
+        self._stepped = False  # whether the search is one after a doubt
 
     def warm_up(self) -> None:
         """Compile every kernel that frames may need, or load it from the cache."""
@@ -372,7 +378,7 @@ class GyroscopeAid:
         self._status = None
         self.filter.reset()
         self._watch.reset()
-        self._last_ns = None
+        self._last_ns, self._stepped = None, False
         self._search = OffsetSearch() if self._settings.estimate_time_offset else None
 
     @property
@@ -391,7 +397,7 @@ class GyroscopeAid:
         self._search.add(sight)
         found = self._search.look(*self._watch.heard)
         if found is not None:
-            self._search, self._status = None, None
+            self._search, self._status, self._stepped = None, None, False
             if self.filter.contradicts(found.time_offset, found.deviation):
                 self.filter.reset(found.time_offset, _WIDER * found.deviation)
                 self._watch.take_up()
@@ -424,8 +430,11 @@ class GyroscopeAid:
         found = localized(foreseen)
         step = _step(foreseen, found[0])
         if step is not None and not (_contradicts(foreseen, step) or self.filter.strange):
-            self._learn(foreseen, found[0], step)
-            return found
+            if self._learn(foreseen, found[0], step):
+                return found
+            self._state = Alone.DOUBTED
+            self.filter.forget_motion()
+            return localized(None)
         alone = localized(None)
         better = _better(found[0], alone[0])
         self._contradicted(middle_ns, None if better else alone[0])
@@ -478,11 +487,13 @@ class GyroscopeAid:
         )
         return GyroPrediction(middle_ns, within, prior, predicted)
 
-    def _learn(self, foreseen: GyroPrediction, found: Estimate | Failure, step: Array) -> None:
-        """Take in a frame that agrees with the gyroscope."""
+    def _learn(self, foreseen: GyroPrediction, found: Estimate | Failure, step: Array) -> bool:
+        """Take in a frame that agrees with the gyroscope; whether the time offset does, too."""
         assert found
         self._state = Alone.NONE
         self._watch.judge(False, None)
+        if self._shaken and self._stepped and self._search is not None and self._search.hopes:
+            return False  # of a vibration whose phase nobody knows, turns say nothing
         posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
         possible = True
         if foreseen.predicted is not None:
@@ -490,16 +501,21 @@ class GyroscopeAid:
         else:
             self.filter.begin(foreseen.within, step[RATE], posterior)
         (delay, variance), unit = found.delay, self._readout_time
-        if not (self.filter.hear_delay(unit * delay, unit**2 * variance) and possible):
-            self._doubt()
+        if self.filter.hear_delay(unit * delay, unit**2 * variance) and possible:
+            return True
+        self._doubt()
+        return False
 
     def _doubt(self) -> None:
-        """Take the time offset for less well known, and look for it again: of all that a gyroscope
-        is off by, only its stamps change at once, with the clock of one of the two.
+        """Take the time offset for less well known, and look for it again.
+
+        Of all that a gyroscope is off by, only its stamps change at once, with the clock of one of
+        the two.
         """
         if self._settings.estimate_time_offset:
             self.filter.doubt_offset()
             self._search = self._search or OffsetSearch(self.filter.errors.time_offset)
+            self._stepped = True
 
     def _contradicted(self, middle_ns: int, alone: Estimate | Failure | None) -> None:
         """Take in a frame that does not agree, with the result of the camera alone if it counts."""

@@ -189,12 +189,12 @@ class ReadingBuffer:
         if span.period > LONGEST_PERIOD_NS:
             return Lacking(
                 Lack.TOO_SLOW,
-                f"a reading comes every {_span(span.period)}; at most {_span(LONGEST_PERIOD_NS)} "
-                "tell how a camera shakes",
+                f"readings come every {_span(span.period)}; vibration needs one every "
+                f"{_span(LONGEST_PERIOD_NS)} at least",
             )
         if span.gap:
             step = _span(span.gap)
-            return Lacking(Lack.GAP, f"for {step} within the exposure there is no reading")
+            return Lacking(Lack.GAP, f"no reading for {step} within the exposure")
         begin, end = span.begin, span.end
         greatest = values[-1, 6:]
         if greatest.max() >= _SATURATED_RATE:
@@ -203,7 +203,7 @@ class ReadingBuffer:
                 most = float(np.abs(values[span.first : span.last, :3]).max())
                 return Lacking(
                     Lack.SATURATED,
-                    f"the gyroscope shows {most:.2f} rad/s and no more: the end of its range",
+                    f"the gyroscope is saturated at {most:.2f} rad/s",
                 )
             # Cut on both sides of what it could not tell.
             stops = np.concatenate([np.flatnonzero(ends), np.flatnonzero(ends) + 1])
@@ -220,14 +220,14 @@ def _outside(stamps: IntArray, start_ns: int, end_ns: int) -> Lacking | None:
     if start_ns < oldest:
         return Lacking(
             Lack.TOO_LATE,
-            f"the first reading is {_span(oldest - start_ns)} younger than the first row (did it "
-            "begin later, or has it another clock?)",
+            f"the first reading is {_span(oldest - start_ns)} younger than the first row: a late "
+            "start, or another clock",
         )
     if newest < start_ns - _SET_BACK_NS:
         return Lacking(
             Lack.STOPPED,
-            f"the last reading is {_span(start_ns - newest)} older than the first row (has it "
-            "stopped, or has it another clock?)",
+            f"the last reading is {_span(start_ns - newest)} older than the first row: the IMU "
+            "stopped, or has another clock",
         )
     if newest < end_ns:
         return Lacking(

@@ -205,9 +205,10 @@ _MOST_DELAY = 16.0
 # Nor is the offset that the motion says, when it moves by so much (squared) more than the frame's
 # information lets it.
 _MOST_MOVED, _ROUNDING = 16.0, 1e-12  # s^2
-# A doubt makes the variance of the time offset so many times as large: one by chance costs little,
-# four in a row make of a tenth of a millisecond all that is assumed of an IMU nobody knows.
-_DOUBT = 16.0
+# After a doubt the time offset is known to so many times what is assumed of an IMU nobody knows: a
+# clock that is set steps by some 20 ms. Doubts by chance are one in 16,000 frames (four standard
+# deviations).
+_DOUBT = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -336,8 +337,7 @@ class GyroscopeFilter:
     def doubt_offset(self) -> None:
         """Frames contradict the time offset: it is not known as well as it seemed to be."""
         covariance = self.errors.covariance.copy()
-        known = float(covariance[OFFSET, OFFSET])
-        covariance[OFFSET, OFFSET] = min(_DOUBT * known, max(known, OFFSET_DEVIATION**2))
+        covariance[OFFSET, OFFSET] = (_DOUBT * OFFSET_DEVIATION) ** 2
         self._set(np.append(self.errors.bias, self.errors.time_offset), covariance)
 
     def hear_delay(self, delay: float, variance: float) -> bool:
@@ -441,9 +441,7 @@ def _carried(
 def _learned(
     before: Array, after: Array, with_parameters: Array, of_parameters: Array, step: Array
 ) -> tuple[Array, Array, Array]:
-    """How the parameters (4,) change, their covariance (4,4) then, and what is left of the one
-    with the motion (k,4).
-    """
+    """How the parameters (4,) change, their covariance (4,4), and that with the motion (k,4)."""
     gain, gained, tied = _gain(before, after, with_parameters)
     covariance = of_parameters - gained
     for i in range(4):

@@ -222,9 +222,7 @@ def _within(
     times_ns: IntArray, rates: Array, here_ns: int, bias: Array, readout_time: float, noise: float,
     of_parameters: Array,
 ) -> tuple[_Turn, Array, Array, Array, float]:  # fmt: skip
-    """The turn of a :class:`GyroRotation`, its error, and the other fields of :class:`TurnWithin`;
-    and the period of the samples, s.
-    """
+    """The turn of a :class:`GyroRotation`, its error and so on; the samples' period (s)."""
     times, steady = _relative(times_ns, rates, here_ns, bias)
     period = (times[-1] - times[0]) / (len(times) - 1)
     dense, found = densified(times, steady)

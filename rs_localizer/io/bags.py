@@ -192,8 +192,7 @@ class BagReader:
 
 @contextlib.contextmanager
 def open_bag(path: Location) -> Iterator[BagReader]:
-    """Open a recording: a rosbag2 directory, one of its ``.mcap`` or ``.db3`` files, or a ``.bag``;
-    of a URL, a copy that is fetched before and removed after.
+    """Open a rosbag2 directory, ``.mcap``, ``.db3`` or ``.bag``; of a URL, a copy.
 
     Raises:
         BagError: when there is no such recording, or it is damaged or empty.

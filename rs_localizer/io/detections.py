@@ -60,11 +60,11 @@ def read_detections(message: Any) -> TagDetections:
     Raises:
         MessageError: for anything else, saying what was found.
     """
-    found = _field(message, "detections", "the message")
-    if len(found) > _MOST:
-        raise MessageError(f"{len(found)} detections are no tags of one image")
-    corners = np.empty((len(found), 4, 2))
-    for row, detection in zip(corners, found, strict=True):
+    items = _field(message, "detections", "the message")
+    if len(items) > _MOST:
+        raise MessageError(f"{len(items)} detections are no tags of one image")
+    corners = np.empty((len(items), 4, 2))
+    for row, detection in zip(corners, items, strict=True):
         points: Sequence[Any] = _field(detection, "corners", "a detection")
         if len(points) != 4:
             raise MessageError(f"a detection has {len(points)} corners, not 4")
@@ -73,8 +73,8 @@ def read_detections(message: Any) -> TagDetections:
         raise MessageError("corners of a detection are not finite")
     return TagDetections(
         stamp_ns(message),
-        tuple(_family(str(_field(one, "family", "a detection"))) for one in found),
-        np.array([int(_field(one, "id", "a detection")) for one in found], np.int64),
+        tuple(_family(str(_field(one, "family", "a detection"))) for one in items),
+        np.array([int(_field(one, "id", "a detection")) for one in items], np.int64),
         corners[:, ::-1] - _FIRST_PIXEL,
     )
 

@@ -25,10 +25,12 @@ class ImageClock:
         rate: images per second instead of the file's own times; None: these.
         start_ns: stamp of the first image; None: its own where the file has absolute times,
             otherwise :data:`DEFAULT_START_NS`.
+        zero_ns: own time that becomes ``start_ns``; None: that of the first image.
     """
 
     rate: float | None = None
     start_ns: int | None = None
+    zero_ns: int | None = None
     _images: int = 0
     _first_ns: int = 0  # own time of the first image
     _last_ns: int = 0  # own time of the last image that has one
@@ -62,6 +64,8 @@ class ImageClock:
         if own_ns is not None:
             if self._timed == 0:
                 self._first_ns = own_ns
+            if self.zero_ns is None:
+                self.zero_ns = own_ns
             self._last_ns = own_ns
             self._timed += 1
         if index == 0 and self.start_ns is None:
@@ -71,15 +75,13 @@ class ImageClock:
             return self.start_ns + round(index * 1e9 / self.rate)
         if own_ns is None and index <= 1:  # the first is at 0 in a file without times, too
             raise TimesError("the images have no times of their own: give --rate")
-        return None if own_ns is None else self.start_ns + own_ns - self._first_ns
+        return None if own_ns is None else self.start_ns + own_ns - (self.zero_ns or 0)
 
     def at(self, own_ns: int) -> int | None:
-        """Stamp of a moment of a video's own clock, once its first image has come; None: with a
-        rate that is not its own.
-        """
+        """Stamp of a moment of a video's clock, after its first image; None: with a rate."""
         if self.rate is not None or self.start_ns is None:
             return None
-        return self.start_ns + own_ns - self._first_ns
+        return self.start_ns + own_ns - (self.zero_ns or 0)
 
     @property
     def own_rate(self) -> float | None:

@@ -64,10 +64,7 @@ def _encodings() -> dict[str, _Encoding]:
 _ENCODINGS = _encodings()
 
 # Name, start and end of what can be decompressed.
-_FORMATS = (
-    ("JPEG", b"\xff\xd8", b"\xff\xd9"),
-    ("PNG", b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"),
-)
+_FORMATS = (("JPEG", b"\xff\xd8", b"\xff\xd9"), ("PNG", b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"))
 # Pixels per byte that nothing can be packed better than: a PNG of one bit per pixel, all alike.
 _DENSEST = 8 * 1032
 # No camera has more; decoded they take 8 bytes each at most.
@@ -130,10 +127,7 @@ def read_image(message: Any) -> Image:
         )
     pixel = encoding.channels * kind.itemsize
     raw: NDArray[Any] = np.ndarray(
-        (height, width, encoding.channels),
-        kind,
-        message.data,
-        strides=(step, pixel, kind.itemsize),
+        (height, width, encoding.channels), kind, message.data, strides=(step, pixel, kind.itemsize)
     )
     return Image(stamp_ns(message), str(message.header.frame_id), _gray(raw, encoding))
 
@@ -149,15 +143,13 @@ def read_compressed_image(message: Any) -> Image:
 
 
 def in_color(message: Any, image: Image) -> NDArray[np.uint8]:
-    """The pixels of a message that has been read: (h,w,3) where it holds colours of 8 bits, as
-    they stand in it, else the gray ones (h,w).
-    """
+    """The pixels of a message: (h,w,3) of colours of 8 bits, else gray ones (h,w)."""
     height, width = image.pixels.shape
     if hasattr(message, "format"):
         data = np.frombuffer(bytes(message.data), np.uint8)
-        found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-        usable = found is not None and found.dtype == np.uint8 and found.shape[2:] == (3,)
-        return np.asarray(found, np.uint8) if usable else image.pixels
+        decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        usable = decoded is not None and decoded.dtype == np.uint8 and decoded.shape[2:] == (3,)
+        return np.asarray(decoded, np.uint8) if usable else image.pixels
     if message.encoding not in COLORS:
         return image.pixels
     step = int(message.step) or 3 * width

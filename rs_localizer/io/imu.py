@@ -115,10 +115,7 @@ def read_imu(message: Any) -> ImuReading:
         )
         force = acceleration if any(acceleration) else None
     return ImuReading(
-        stamp_ns=stamp_ns(message),
-        frame=frame,
-        angular_velocity=turn,
-        linear_acceleration=force,
+        stamp_ns=stamp_ns(message), frame=frame, angular_velocity=turn, linear_acceleration=force
     )
 
 
@@ -141,8 +138,10 @@ def _vector(vector: Any, name: str, unit: str, most: float) -> Vector:
 def make_reading(
     stamp_ns: int, rate: Array, force: Array, frame: str, variances: tuple[float, float] = (0, 0)
 ) -> Any:
-    """A sensor_msgs/Imu of rosbags: rate (3,) in rad/s, force (3,) in m/s^2 (NaN: not measured),
-    their variances (0: not known); it knows no orientation.
+    """A sensor_msgs/Imu of rosbags, without an orientation.
+
+    Of a rate (3,) in rad/s and a force (3,) in m/s^2 (NaN: not measured), with their variances (0:
+    not known).
     """
     known = [np.eye(3).ravel() * variance for variance in variances]
     if not np.isfinite(force).all():

@@ -70,9 +70,7 @@ def middle_of_image(camera: Camera) -> float:
 
 
 def pixel_intrinsics(camera: Camera) -> tuple[Array, Array]:
-    """Focal lengths (2,) and principal point (2,) in pixels of the delivered image, the corner of
-    whose first pixel is at 0, 0.
-    """
+    """Focal lengths (2,) and centre (2,) in px of the delivered image; 0, 0 is its first corner."""
     binning = np.array(camera.binning, float)
     offset = np.zeros(2)
     if camera.roi is not None:

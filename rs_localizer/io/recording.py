@@ -59,14 +59,18 @@ def make_correspondences(
 
 
 def write_image(bag: BagWriter, topic: str, stamp_ns: int, encoding: str, data: bytes) -> None:
-    """A compressed image (``jpeg`` or ``png``) as sensor_msgs/CompressedImage."""
-    message = make_message(
+    """Write :func:`make_image` of the camera."""
+    bag.write(topic, make_image(stamp_ns, encoding, data), stamp_ns)
+
+
+def make_image(stamp_ns: int, encoding: str, data: bytes, frame: str = CAMERA_FRAME) -> Any:
+    """The sensor_msgs/CompressedImage of a ``jpeg`` or ``png``."""
+    return make_message(
         "sensor_msgs/msg/CompressedImage",
-        header=make_header(make_message, stamp_ns, CAMERA_FRAME),
+        header=make_header(make_message, stamp_ns, frame),
         format=encoding,
         data=np.frombuffer(data, np.uint8),
     )
-    bag.write(topic, message, stamp_ns)
 
 
 def make_camera_info(camera: Camera, stamp_ns: int, frame: str = CAMERA_FRAME) -> Any:

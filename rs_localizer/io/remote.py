@@ -82,6 +82,28 @@ def placed(place: Location) -> Iterator[Path]:
             files.put_file(str(part), path)
 
 
+@contextlib.contextmanager
+def placed_beside(url: str) -> Iterator[Path]:
+    """Within ``with``, make a result at the path that is yielded; at the end it goes to its place.
+
+    So does all that stands beside it. What is there already is never replaced.
+
+    Raises:
+        RemoteError: for a URL that cannot be written, or where something is.
+        ImportError: without fsspec.
+    """
+    with tempfile.TemporaryDirectory(prefix="rs_localizer-") as folder:
+        with _faults(url, "written"):
+            files, path = _filesystem(url.rstrip("/"))
+            if files.exists(path):
+                raise RemoteError("something is there already; choose another place")
+        yield Path(folder) / url_name(url)
+        with _faults(url, "written"):
+            above = path.rpartition("/")[0]
+            for part in Path(folder).iterdir():
+                files.put(str(part), f"{above}/{part.name}", recursive=part.is_dir())
+
+
 def fingerprint(url: str) -> str:
     """By what a file or a folder elsewhere is known again: fsspec's digest of name, size, time.
 
@@ -91,8 +113,8 @@ def fingerprint(url: str) -> str:
     """
     with _faults(url, "read"):
         files, path = _filesystem(url)
-        found = sorted(files.find(path)) or [path]
-        return " ".join(str(files.ukey(file)) for file in found)
+        paths = sorted(files.find(path)) or [path]
+        return " ".join(str(files.ukey(file)) for file in paths)
 
 
 def _filesystem(url: str) -> tuple[Any, str]:

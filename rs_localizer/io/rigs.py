@@ -1,7 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How cameras are mounted to each other, in files of other programs: Kalibr's camchain, COLMAP's
-``rig_config.json``.
+"""How cameras are mounted to each other, in Kalibr's camchain and COLMAP's ``rig_config.json``.
 
 A camchain has a mapping for each camera, in their order. Its names are Kalibr's, ``cam0``, or any
 other; besides what Kalibr writes, each may have ``readout_time`` (s) and ``scan_direction``.
@@ -28,15 +27,17 @@ import yaml
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import make_message
 from rs_localizer.io.calibration import (
     CalibrationError,
     colmap_parameters,
     kalibr_camera,
     kalibr_fields,
 )
-from rs_localizer.io.transforms import Transform, TransformError, from_numbers
+from rs_localizer.io.transforms import Transform, TransformError, from_numbers, make_transform
 from rs_localizer.io.yaml_text import YamlError, load_yaml
 
+RIG_FRAME = "rig"
 _CHAIN, _IMU, _SHIFT = "T_cn_cnm1", "T_cam_imu", "timeshift_cam_imu"
 _SHUTTER = ("readout_time", "scan_direction")
 # Entries of R R^T - I beyond this are no rounding of a file's digits.
@@ -52,8 +53,7 @@ class RigParts(NamedTuple):
 
 
 def read_camchain(path: Path | str) -> RigParts:
-    """The cameras of a camchain (see the module); without ``T_cam_imu`` the rig's axes are those of
-    the first camera.
+    """The cameras of a camchain; without ``T_cam_imu`` in the axes of the first camera.
 
     Raises:
         CalibrationError: for anything else, saying what was found.
@@ -90,9 +90,9 @@ def write_camchain(path: Path, parts: RigParts) -> None:
 
 
 def read_rig_config(path: Path | str) -> dict[str, tuple[Array, Array]]:
-    """Rotation (3,3) and translation (3,) camera_from_rig of each camera of COLMAP's
-    ``rig_config.json``, by the last folder of its ``image_prefix``; the rig's axes are those of
-    ``ref_sensor``.
+    """Rotation (3,3) and translation (3,) camera_from_rig by name, of COLMAP's ``rig_config.json``.
+
+    The name is the last folder of ``image_prefix``; the rig's axes are those of ``ref_sensor``.
 
     Raises:
         CalibrationError: for anything else, or several rigs.
@@ -231,6 +231,18 @@ def node_parameters(parts: RigParts) -> dict[str, Any]:
         if (offset := parts.time_offset.get(name, 0.0)) != 0.0:
             own[f"{name}.stamp_offset"] = offset
     return {"cameras": list(parts.cameras), **own}
+
+
+def make_mounts(parts: RigParts) -> Any:
+    """A tf2_msgs/TFMessage that says where the cameras are on the rig."""
+    transforms = [
+        make_transform(
+            make_message, 0, RIG_FRAME, optical_frame(name),
+            Transform(*parts.camera_from_rig[name]).inverse(),
+        )
+        for name in parts.cameras
+    ]  # fmt: skip
+    return make_message("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 
 def write_static_transforms(path: Path, parts: RigParts, frames: Mapping[str, str]) -> None:

@@ -33,6 +33,8 @@ _STABILIZED, _STABILIZER = "0x45495345", "0x45495341"  # GoPro: EISE, whether, a
 _OFF = ("", "N", "N/A", "OFF")
 # Models of gyroflow's lens profiles that OpenCV has as well; without a name it is the fisheye.
 _LENSES = {"opencv_fisheye": "equidistant", "opencv_standard": "plumb_bob"}
+_MEI = "insta360"
+_ANGLES = 200  # of a lens, to fit another model to: more change nothing
 _FIELD, _DIAGONAL = "0x56464f56", "0x5a464f56"  # GoPro: VFOV, its letter, and ZFOV, degrees
 
 
@@ -140,14 +142,46 @@ def _kept_profile(tags: list[dict[str, Any]]) -> dict[str, Any]:
 def _profile(tags: list[dict[str, Any]]) -> Camera | None:
     """The camera of a lens profile, as far as its model is one of ours."""
     kept = _kept_profile(tags)
-    model = _LENSES.get(kept.get("distortion_model") or "opencv_fisheye") if kept else None
-    if model is None:
+    name = (kept.get("distortion_model") or "opencv_fisheye") if kept else ""
+    if name not in (*_LENSES, _MEI):
         return None
     size, lens = kept["calib_dimension"], kept["fisheye_params"]
     try:
-        return Camera(size["w"], size["h"], lens["camera_matrix"], lens["distortion_coeffs"], model)
+        K, D = np.array(lens["camera_matrix"], float), lens["distortion_coeffs"]
+        if name == _MEI:
+            K, D = _equidistant(K, np.array(D, float), 0.5 * min(size["w"], size["h"]))
+        return Camera(size["w"], size["h"], K, D, _LENSES.get(name, "equidistant"))
     except ValueError:  # of a model that has grown, or numbers that are none
         return None
+
+
+def _equidistant(K: Array, D: Array, radius: float) -> tuple[Array, Array]:
+    """The equidistant lens nearest to one of Mei and Rives, over the image circle.
+
+    Mei and Rives, "Single view point omnidirectional camera calibration from planar grids" (ICRA
+    2007): a bearing on the unit sphere, seen from ``xi`` behind its centre, then a polynomial. The
+    two differ by some hundredths of a pixel; what decentres (p1, p2) is left out, a pixel at the
+    rim where they are 1e-4.
+
+    Args:
+        K: (3,3) camera matrix.
+        D: k1, k2, k3, p1, p2, xi.
+        radius: of the circle, px.
+    """
+    k1, k2, k3, _, _, xi = D
+    angles = np.linspace(0.0, np.pi, _ANGLES, endpoint=False)[1:]
+    with np.errstate(all="ignore"):
+        m = np.sin(angles) / (np.cos(angles) + xi)
+        radii = m * (1.0 + k1 * m**2 + k2 * m**4 + k3 * m**6)
+        grows = np.diff(radii, prepend=0.0) > 0.0
+    # As far as radii grow, and the image reaches.
+    inside = np.logical_and.accumulate(grows & (np.cos(angles) > -xi) & (K[0, 0] * radii < radius))
+    angles, radii = angles[inside], radii[inside]
+    powers = angles[:, None] ** np.arange(1, 10, 2)
+    focal, *rest = np.linalg.lstsq(powers, radii, rcond=None)[0]
+    scaled = K.copy()
+    scaled[[0, 1], [0, 1]] *= focal
+    return scaled, np.array(rest) / focal
 
 
 def _spread(forces: Array, times: Array) -> Array:

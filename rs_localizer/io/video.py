@@ -9,7 +9,7 @@ import itertools
 import mmap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -40,14 +40,31 @@ class VideoImage(NamedTuple):
     seconds: float | None  # presentation time since the first image; None: the file does not say
 
 
-def read_video(path: Path | str) -> Iterator[VideoImage]:
+def count_lenses(path: Path) -> int:
+    """How many cameras filmed into one file: its streams of one size, as in Insta360's .insv.
+
+    Raises:
+        VideoError: when it cannot be read.
+        ImportError: without PyAV.
+    """
+    with _container(path) as container:
+        return len(_lenses(container))
+
+
+def read_video(path: Path | str, lens: int | None = None) -> Iterator[VideoImage]:
     """The images of a video, in the order of presentation.
 
     A plain stream of JPEG images (``.mjpeg``) keeps its bytes and has no times; anything else that
     OpenCV reads is compressed anew.
 
+    Args:
+        path: of the video.
+        lens: of :func:`count_lenses`, from 0 on: its images, whose times are since the first image
+            of the first lens; None: the only stream, or the one that OpenCV takes.
+
     Raises:
         VideoError: when the file is missing or holds no image.
+        ImportError: with a lens, without PyAV.
     """
     path = Path(path)
     if not path.is_file():
@@ -55,11 +72,45 @@ def read_video(path: Path | str) -> Iterator[VideoImage]:
     with path.open("rb") as file:
         is_stream = file.read(2) == _JPEG_START
     any_image = False
-    for item in _from_stream(path) if is_stream else _from_container(path):
+    if lens is not None:
+        images = _of_lens(path, lens)
+    else:
+        images = _from_stream(path) if is_stream else _from_container(path)
+    for item in images:
         any_image = True
         yield item
     if not any_image:
         raise VideoError(f"{path} holds no image that OpenCV can read")
+
+
+@contextlib.contextmanager
+def _container(path: Path) -> Iterator[Any]:
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            yield container
+    except av.FFmpegError as error:
+        raise VideoError(f"{path} cannot be read: {error}") from error
+
+
+def _lenses(container: Any) -> list[Any]:
+    streams = container.streams.video
+    return [stream for stream in streams if stream.format.width == streams[0].format.width
+            and stream.format.height == streams[0].format.height]  # fmt: skip
+
+
+def _of_lens(path: Path, lens: int) -> Iterator[VideoImage]:
+    """By PyAV: OpenCV opens one stream of a file only."""
+    with _container(path) as container:
+        lenses = _lenses(container)
+        if lens >= len(lenses):
+            raise VideoError(f"{path} is of {len(lenses)} lenses, and has no number {lens + 1}")
+        begin = float((lenses[0].start_time or 0) * lenses[0].time_base)
+        lenses[lens].thread_type = "AUTO"
+        for frame in container.decode(lenses[lens]):
+            color = frame.to_ndarray(format="bgr24")
+            yield _compressed(color, None if frame.time is None else float(frame.time) - begin)
 
 
 def _from_stream(path: Path) -> Iterator[VideoImage]:
@@ -89,18 +140,20 @@ def _from_container(path: Path) -> Iterator[VideoImage]:
             read, color = video.read()
             if not read:
                 return
-            _, jpeg = cv2.imencode(".jpg", color, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-            grey = color if color.ndim == 2 else cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)
             # Of the image just read. OpenCV 4.6 says 0 for those last images that a decoder with
             # B frames holds back, and for all images of a raw stream.
             seconds = 1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC))
             is_new = seconds > last
             last = max(last, seconds)
-            yield VideoImage(
-                jpeg.tobytes(), np.asarray(grey, np.uint8), seconds if is_new else None
-            )
+            yield _compressed(color, seconds if is_new else None)
     finally:
         video.release()
+
+
+def _compressed(color: Any, seconds: float | None) -> VideoImage:
+    _, jpeg = cv2.imencode(".jpg", color, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    grey = color if color.ndim == 2 else cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)
+    return VideoImage(jpeg.tobytes(), np.asarray(grey, np.uint8), seconds)
 
 
 def split_jpegs(data: bytes | mmap.mmap) -> Iterator[bytes]:

@@ -141,8 +141,9 @@ def gather(rows: Rows, landmark: int, scratch: Scratch) -> int:
 
 @inlined
 def _touch(rows: Rows, landmark: int, scratch: Scratch, shared: int) -> tuple[int, int]:
-    """List the controls that see a landmark, and clear what couples it with them; returns their
-    number, and that of their runs and of the shared numbers' one.
+    """List the controls that see a landmark, and clear what couples it with them.
+
+    Returns their number, and that of their runs and of the shared numbers' one.
     """
     count = runs = 0
     starts, ends, columns = scratch.runs
@@ -168,8 +169,7 @@ def _touch(rows: Rows, landmark: int, scratch: Scratch, shared: int) -> tuple[in
 
 @kernel
 def eliminate(rows: Rows, sequence: IntArray, part: int, parts: int, system: Array) -> None:
-    """Take the landmarks out of the lower triangle of a system (N,N): every ``parts``-th control's
-    rows of it, so that threads do not meet.
+    """Take landmarks out of a lower triangle (N,N): every ``parts``-th control's rows.
 
     Args:
         sequence: (p,) the landmarks, those that the same images see behind each other: what they
@@ -220,9 +220,7 @@ def lift(rows: Rows, right: Array, out: Array) -> None:
 
 @kernel
 def lower(rows: Rows, reduced: Array, right: Array) -> None:
-    """Turn right sides (p,3,m) into the landmarks' part of the solution, ``V^-1 (r - W^T x)``,
-    where ``x`` (N,m) solves the reduced system.
-    """
+    """Turn right sides (p,3,m) into ``V^-1 (r - W^T x)``; ``x`` (N,m) solves the reduced system."""
     scratch = make_scratch(rows)
     starts, ends, columns = scratch.runs
     left = np.empty(3)
@@ -253,9 +251,7 @@ def slopes(rows: Rows, out: Array) -> None:
 
 @inlined
 def _within(scratch: Scratch, runs: int, inverse: Array, out: Array) -> None:
-    """``W^T S^-1 W`` (3,3), by the lower triangle of ``S^-1``: what lies beside its diagonal
-    counts twice.
-    """
+    """``W^T S^-1 W`` (3,3), by the lower triangle of ``S^-1``."""
     coupled = scratch.coupled
     starts, ends, columns = scratch.runs
     half = np.zeros((3, 3))
@@ -283,8 +279,9 @@ def _within(scratch: Scratch, runs: int, inverse: Array, out: Array) -> None:
 
 @kernel
 def covariances(rows: Rows, sequence: IntArray, inverse: Array, out: Array) -> None:
-    """Fill the covariances (p,3,3) of some landmarks, ``V^-1 + V^-1 W^T S^-1 W V^-1``, from the
-    lower triangle of ``S^-1`` (N,N); ``sequence`` as for :func:`eliminate`.
+    """Fill the covariances (p,3,3) of some landmarks, ``V^-1 + V^-1 W^T S^-1 W V^-1``.
+
+    From the lower triangle of ``S^-1`` (N,N); ``sequence`` as for :func:`eliminate`.
     """
     scratch = make_scratch(rows)
     middle, own = np.empty((3, 3)), scratch.inverse

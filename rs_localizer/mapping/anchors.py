@@ -120,7 +120,7 @@ def placement(
     turn = upright(_down(rotations))
     if not anchors.distances:
         return Placement(
-            Similarity(1.0, turn, -turn @ positions[0]), False, False, "nothing tells the scale"
+            Similarity(1.0, turn, -turn @ positions[0]), False, False, "the scale is undetermined"
         )
     factors = []
     for distance in anchors.distances:
@@ -149,9 +149,7 @@ def placement(
 
 def _row(anchors: Anchors, name: str) -> int:
     if name not in anchors.names:
-        raise MappingError(
-            f"no point is called {name}; there are {', '.join(anchors.names) or 'none'}"
-        )
+        raise MappingError(f"unknown point {name}; points are {', '.join(anchors.names) or 'none'}")
     return anchors.corners + anchors.names.index(name)
 
 
@@ -188,8 +186,9 @@ def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
 
 
 def _down(rotations: Array) -> Array:
-    """The direction that is most often at right angles to the images' rows: people hold cameras
-    level. Its sign is that of the images' mean downward direction.
+    """The direction most often at right angles to the images' rows: people hold cameras level.
+
+    Its sign is that of the images' mean downward direction.
     """
     across = rotations[:, :, 0]
     _, vectors = np.linalg.eigh(across.T @ across)
@@ -220,11 +219,13 @@ def marker_constraints(
     """
     at = corners.images
     rough = Sights(start.rotations[at], start.positions[at], corners.pixels, corners.landmarks)
-    found = triangulate(camera, rough, len(places))
-    known = np.isfinite(found.points).all(axis=1) & (found.counts >= _LEAST_OBSERVATIONS)
+    triangulated = triangulate(camera, rough, len(places))
+    known = np.isfinite(triangulated.points).all(axis=1) & (
+        triangulated.counts >= _LEAST_OBSERVATIONS
+    )
     if np.count_nonzero(known) < _LEAST_CORNERS:
         return seen, start, MapFreedom()
-    to_markers = through(found.points[known], places[known])
+    to_markers = through(triangulated.points[known], places[known])
     kept = known[corners.landmarks]
     count = len(start.points)
     images = np.concatenate([seen.images, at[kept]])

@@ -14,6 +14,7 @@ share of all information that comes from it: what was estimated fits its own err
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,19 +23,20 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.trajectory.fit import Fit, steepness
 from rs_localizer.trajectory.normal_kernels import border_of
-from rs_localizer.trajectory.problem import Problem
+from rs_localizer.trajectory.problem import RigProblem
 from rs_localizer.trajectory.sight_kernels import Curve, Sights, Terms, differentiate, make_row
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 
 
 @kernel
 def border_rows(
-    curve: Curve, sights: Sights, terms: Terms, lifted: Array, first: int, out: Array
-) -> None:
-    """Fill the rows of as many keypoints as there is room for, from one on; zeros for those that
-    do not count.
+    curve: Curve, sights: Sights, terms: Terms, places: IntArray, lifted: Array, first: int,
+    out: Array,
+) -> None:  # fmt: skip
+    """Fill the rows of as many keypoints as there is room for; zeros for those that do not count.
 
     Args:
+        places: (c,) of the camera's own columns in the border.
         lifted: (6 n, b) H^-1 C of the bordered system: how the controls follow the border.
         out: (k,2,b + 1) derivatives by the border, the controls following, and the error.
     """
@@ -54,7 +56,7 @@ def border_rows(
             mine = out[k, r]
             mine[shared] = scale * row.error[r]
             for j in range(count):
-                mine[columns[j]] += scale * border[r, j]
+                mine[places[columns[j]]] += scale * border[r, j]
             for a in range(LOCAL):
                 x = scale * row.by_controls[r, a]
                 for j in range(shared):
@@ -81,7 +83,7 @@ class Pull:
         return max(share, independent)
 
 
-def cluster_robust(problem: Problem, fitted: Fit) -> Fit:
+def cluster_robust(problem: RigProblem, fitted: Fit) -> Fit:
     """The estimate with covariances as large as its own errors show.
 
     Args:
@@ -97,23 +99,34 @@ def cluster_robust(problem: Problem, fitted: Fit) -> Fit:
     )
 
 
-def _pull(problem: Problem, fitted: Fit) -> Pull:
-    curve, parts = problem.look(fitted.state)
-    terms = problem.terms(fitted.state, fitted.deviation)
+def _pull(problem: RigProblem, fitted: Fit) -> Pull:
     lifted = fitted.factored.lifted
     whitening = np.linalg.cholesky(fitted.border_covariance / fitted.inflation)
-    total, expected, start = 0.0, 0.0, 0
-    for sights in parts:
-        times = problem.observations.times[start : start + len(sights.first)]
-        start += len(sights.first)
+    total, expected = 0.0, 0.0
+    for curve, sights, terms, places, times in _parts(problem, fitted):
         for first, end in _seconds(times):
             rows = np.empty((end - first, 2, lifted.shape[1] + 1))
-            border_rows(curve, sights, terms, lifted, first, rows)
+            border_rows(curve, sights, terms, places, lifted, first, rows)
             own = rows[..., :-1].reshape(2 * len(rows), -1) @ whitening
             total += float(np.sum((own.T @ rows[..., -1].ravel()) ** 2))
             share = own.T @ own if own.shape[0] > own.shape[1] else own @ own.T
             expected += float(np.trace(share) - np.sum(share**2))
     return Pull(total, expected)
+
+
+def _parts(
+    problem: RigProblem, fitted: Fit
+) -> Iterator[tuple[Curve, Sights, Terms, IntArray, Array]]:
+    """Parts of each camera's keypoints, and their times (n,)."""
+    states = problem.states(fitted.state)
+    for camera, state, ratio, places in zip(
+        problem.cameras, states, problem.ratios, problem.columns, strict=True
+    ):
+        curve, parts = camera.look(state)
+        terms = camera.terms(state, fitted.deviation * float(ratio))
+        ends = np.cumsum([len(sights.first) for sights in parts])[:-1]
+        for sights, times in zip(parts, np.split(camera.observations.times, ends), strict=True):
+            yield curve, sights, terms, places, times
 
 
 def _seconds(times: Array) -> list[tuple[int, int]]:

@@ -163,8 +163,9 @@ def as_held(covariances: Array, spread: Array, every: Array, of_kept: Array) -> 
 
 
 def of_the_shape(covariance: Array, corners: Array) -> Array:
-    """Covariance (6 m, 6 m) of places and turns (along the map's axes) when all corners hold the
-    whole: of all rigid motions that lay them over the truth, the best is the identity.
+    """Covariance (6 m, 6 m) of places and turns (along the map's axes) when all corners hold it.
+
+    Of all rigid motions that lay them over the truth, the best is the identity.
 
     Args:
         covariance: (6 m, 6 m) in any frame.

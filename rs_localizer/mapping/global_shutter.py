@@ -90,12 +90,12 @@ def undo_shutter(
     given = _Given.of(camera, model, [images[name] for name in names])
     refined, shutter, used = _refined(given, camera, stamps, known, done)
     motion = Motion(used, refined.times, refined)
-    seen = motion.sights(given.images, given.rows, given.pixels)
+    projected = motion.sights(given.images, given.rows, given.pixels)
     posed = np.isin(given.images, used)
     at, rows, pixels = given.images[posed], given.rows[posed], given.pixels[posed]
-    points = triangulate(refined.camera, seen, len(given.points)).points
-    rotations = np.swapaxes(seen.rotations, 1, 2)
-    own = rotations, -np.einsum("nij,nj->ni", rotations, seen.positions)
+    points = triangulate(refined.camera, projected, len(given.points)).points
+    rotations = np.swapaxes(projected.rotations, 1, 2)
+    own = rotations, -np.einsum("nij,nj->ni", rotations, projected.positions)
     in_camera = _moved(own, points[rows])
     errors = np.sum((refined.camera.project(in_camera) - pixels) ** 2, axis=1)
     fits: BoolArray = (errors < (LIMIT * refined.deviation) ** 2) & (in_camera[:, 2] > 0.0)

@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scale and gravity of a refined map, from the IMU that went along with the camera: scale where
-nothing else tells it, z up, and a check of others.
-"""
+"""Scale and gravity of a refined map, from the IMU that went along, and a check of others."""
 
 from __future__ import annotations
 
@@ -82,13 +80,13 @@ class InertialMetres:
         deviation = self.mount.turn_deviation
         if self.turned is not None and self.turned > max(_DOUBTED, _SIGMAS * deviation):
             doubts.append(
-                f"TF has another rotation between camera and IMU than their turns, "
-                f"{np.degrees(self.turned):.1f} deg off; that of the turns is used"
+                f"the IMU's rotation in TF is {np.degrees(self.turned):.1f} deg off that of the "
+                "motion, which is used"
             )
         if self.covered < _LEAST_COVERED:
             doubts.append(
-                f"the accelerometer's readings without a gap are {100.0 * self.covered:.0f} % of "
-                "the motion only"
+                f"accelerometer readings without a gap cover {100.0 * self.covered:.0f} % of the "
+                "motion only"
             )
         return tuple(doubts)
 
@@ -122,22 +120,22 @@ def _mount(refined: RefinedMap, imu: ImuRecording) -> tuple[ImuExtrinsics, float
     """How the IMU hangs on the camera, and by how much (rad) TF has it otherwise."""
     given = imu.camera_from_imu
     try:
-        found = imu_extrinsics(imu.samples(refined.start_ns), refined.spline, given)
+        mount = imu_extrinsics(imu.samples(refined.start_ns), refined.spline, given)
     except NoMount as error:
         ends = refined.start_ns * 1e-9 + refined.times[[0, -1]]
         raise NoMetres(elsewhen(imu, *ends.tolist()) or str(error)) from error
-    if found.turn_deviation > _MOST_TURN:
+    if mount.turn_deviation > _MOST_TURN:
         if given is None:
             raise NoMetres(
                 f"the rotation between IMU and camera is known to "
-                f"{np.degrees(found.turn_deviation):.0f} deg only: turn the camera about all axes, "
+                f"{np.degrees(mount.turn_deviation):.0f} deg only: turn the camera about all axes, "
                 "or give the rotation by TF"
             )
-        return replace(found, mount=replace(found.mount, camera_from_imu=given)), None
+        return replace(mount, mount=replace(mount.mount, camera_from_imu=given)), None
     if given is None:
-        return found, None
-    between = np.ascontiguousarray(given.T @ found.mount.camera_from_imu)
-    return found, float(np.linalg.norm(so3.log(between)))
+        return mount, None
+    between = np.ascontiguousarray(given.T @ mount.mount.camera_from_imu)
+    return mount, float(np.linalg.norm(so3.log(between)))
 
 
 def elsewhen(imu: ImuRecording, first: float, last: float) -> str:

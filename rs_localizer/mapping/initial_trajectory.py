@@ -56,9 +56,7 @@ def usual_accelerations(times: Array, rotations: Array, positions: Array) -> tup
 
 
 def acceleration_prior(state: State, freedom: Freedom) -> Freedom | None:
-    """With a prior of the accelerations as large as the motion's own, where stretches are long
-    enough to tell them.
-    """
+    """With a prior of the accelerations as large as the motion's own, where stretches suffice."""
     layout = state.spline.layout
     counts = np.diff(layout.firsts)
     long = np.repeat(counts >= _LEAST_IMAGES, counts)

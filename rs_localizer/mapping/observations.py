@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a map is refined from: keypoints of known landmarks and a first guess of all, as views or a
-recording of correspondences have them.
-"""
+"""What a map is refined from: keypoints of known landmarks and a first guess of all."""
 
 from __future__ import annotations
 
@@ -121,8 +119,7 @@ def _parts(observations: MapObservations, usable: BoolArray) -> list[int]:
 
 
 def most_observed(landmarks: IntArray, images: IntArray, wanted: int) -> BoolArray:
-    """Which landmarks (up to the last one) to adjust: those that are observed most often, each if
-    half of its images need more.
+    """Which landmarks to adjust: the most observed, more if half of an image needs them.
 
     Args:
         landmarks, images: (n,) of each keypoint.
@@ -182,8 +179,8 @@ def from_recording(
     posed = [k for k, result in enumerate(results) if isinstance(result, Estimate)]
     if not posed:
         raise ValueError(f"none of {len(images)} images has a pose; of the last one, {results[-1]}")
-    found = [result for result in results if isinstance(result, Estimate)]
-    near = [estimate.residuals < _MOST_RESIDUAL for estimate in found]
+    estimates = [result for result in results if isinstance(result, Estimate)]
+    near = [estimate.residuals < _MOST_RESIDUAL for estimate in estimates]
     counts = [int(np.count_nonzero(of)) for of in near]
     seen = MapObservations(
         np.array([images[k].stamp_ns for k in posed], np.int64),
@@ -193,8 +190,8 @@ def from_recording(
     )
     start = Start(
         landmarks.points,
-        np.array([estimate.rotation.T for estimate in found]),
-        np.array([estimate.position for estimate in found]),
+        np.array([estimate.rotation.T for estimate in estimates]),
+        np.array([estimate.position for estimate in estimates]),
     )
     return RecordedMap(landmarks, seen, start, len(images))
 

@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The readout time that the images show, beside one that was given: a wrong one bends a map that
-still fits them.
-"""
+"""The readout time that the images show: a wrong one bends a map that still fits them."""
 
 from __future__ import annotations
 

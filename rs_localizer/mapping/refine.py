@@ -87,8 +87,8 @@ class Preparation:
         anchors = np.count_nonzero(np.isfinite(given))
         if 0 < anchors < _LEAST_ANCHORS:
             raise ValueError(
-                f"{anchors} landmarks of known place do not hold a map: none, or at least "
-                f"{_LEAST_ANCHORS}, can be given"
+                f"{anchors} landmarks of known place do not fix a map: give none, or at least "
+                f"{_LEAST_ANCHORS}"
             )
         return np.minimum(given, _LOOSE * self.size), anchors == 0
 
@@ -115,9 +115,9 @@ class Preparation:
         """Raise ValueError when the readout time cannot be found."""
         if not self.tells_readout:
             raise ValueError(
-                f"the readout time is found from at least {_LEAST_STRETCH} images that follow each "
-                f"other within {LONGEST_GAP} s, found {self._longest()}: give it, or more "
-                "of the recording"
+                f"estimating the readout time needs {_LEAST_STRETCH} images in a row, at most "
+                f"{LONGEST_GAP} s apart; there are {self._longest()}: give it, or more of the "
+                "recording"
             )
 
     @property

@@ -123,16 +123,16 @@ def _of_imu(place: InertialPlace) -> list[tuple[str, str]]:
     metres = place.metres
     if metres is None:
         return []
-    mount, found = metres.mount, metres.metric
+    mount, metric = metres.mount, metres.metric
     rows = []
     if place.checked:
         more = "larger" if place.larger > 0.0 else "smaller"
         share = 100.0 * np.array([abs(place.larger), metres.share])
-        tilts = np.degrees([place.tilt, found.gravity_deviation])
+        tilts = np.degrees([place.tilt, metric.gravity_deviation])
         rows = [
             ("scale by the IMU", f"{share[0]:.2f} % {more}, +- {share[1]:.2f} %"),
             ("gravity by the IMU", f"{tilts[0]:.2f} deg from -z, +- {tilts[1]:.2f} deg"),
         ]
     offset = f"{1e3 * mount.mount.delay:+.2f} +- {1e3 * mount.delay_deviation:.2f} ms"
-    bias = " ".join(f"{value:.2f}" for value in found.bias)
+    bias = " ".join(f"{value:.2f}" for value in metric.bias)
     return [*rows, ("imu.time_offset", offset), ("bias of the accelerometer", f"{bias} m/s^2")]

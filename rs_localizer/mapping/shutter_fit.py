@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A map refined with the shutter that its images show: rolling along one axis or the other, or
-global, where nobody knows it.
-"""
+"""A map refined with the shutter that its images show, where nobody knows it."""
 
 from __future__ import annotations
 
@@ -59,8 +57,10 @@ class ShutterFit:
 
 
 def likely_axes(size: tuple[int, int]) -> list[ScanDirection]:
-    """Scan directions to try, their reverses included, the likelier first: the rows of sensors lie
-    along their longer side, also where a driver or a phone has turned the images.
+    """Scan directions to try, their reverses included, the likelier first.
+
+    The rows of sensors lie along their longer side, also where a driver or a phone has turned the
+    images.
     """
     axes = [ScanDirection.TOP_TO_BOTTOM, ScanDirection.LEFT_TO_RIGHT]
     return axes if size[0] >= size[1] else axes[::-1]
@@ -130,8 +130,9 @@ def _costs(fit: RefinedMap, still: RefinedMap, observations: MapObservations) ->
 
 
 def _chance(gains: Array) -> float:
-    """Probability that the images' gains (g,) are so large by chance (Wilcoxon's signed-rank test:
-    images at rest gain nothing, those of a quick turn much).
+    """Probability that gains (g,) of images are so large by chance (Wilcoxon's signed-rank test).
+
+    Images at rest gain nothing, those of a quick turn much.
     """
     from scipy.stats import wilcoxon  # takes a second
 

@@ -1,8 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where markers are, from one recording that shows them: continuous-time adjustment with the poses
-of the markers free, each a rigid square of known size. The first marker is the origin; whatever
-shows several of them closes loops.
+"""Where markers are, from recordings that show them, by one camera or by those of a rig.
+
+Continuous-time adjustment with the poses of the markers free, each a rigid square of known size.
+The first marker is the origin; whatever shows several of them closes loops.
 
 A square that is seen from one side fits two poses. From few directions the wrong one is a minimum,
 too, which no adjustment leaves (Collins and Bartoli, *Infinitesimal plane-based pose estimation*,
@@ -13,7 +14,7 @@ its own, and compared.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,15 +30,24 @@ from rs_localizer.mapping.initial_trajectory import (
     initial_trajectory,
 )
 from rs_localizer.mapping.readout_check import ReadoutCheck
-from rs_localizer.mapping.unknown_markers import Chained, Spotted, chain
+from rs_localizer.mapping.unknown_markers import (
+    Chained,
+    Filmed,
+    Frame,
+    Spotted,
+    chain,
+    frames_of,
+)
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.bodies import BODY, PLACE
-from rs_localizer.trajectory.fit import Fit, fit
-from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
+from rs_localizer.trajectory.fit import Fit, solve
+from rs_localizer.trajectory.model import Extrinsics, Freedom, Observations, State, start_state
 from rs_localizer.trajectory.normal_kernels import Normal
-from rs_localizer.trajectory.problem import LIMIT, Problem
+from rs_localizer.trajectory.problem import LIMIT, Problem, RigProblem
+from rs_localizer.trajectory.sight_kernels import EXTRINSICS
+from rs_localizer.trajectory.spline import Spline
 
 # Steps of Gauss and Newton, and the noise of each by what it is.
 _NOISES = (10.0,) * 6 + (1.0,) * 4
@@ -54,22 +64,68 @@ class Mirrored:
     state: State  # with those mirrored that fit better so
 
 
-def mirrored(camera: Camera, observations: Observations, fitted: Fit) -> Mirrored:
-    """Compare each marker with its mirror image, the motion held.
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjustable:
+    """What the cameras saw: four corners of each marker; the first, the origin, is known."""
 
-    Args:
-        observations: corners, four of each marker; those of the first, the origin, are known.
-        fitted: the adjustment of these.
-    """
+    filmed: Sequence[Filmed]
+    seen: Sequence[Observations]  # of the landmarks that all see
+
+    def start(self, spline: Spline) -> State:
+        """A first guess."""
+        first, *others = (
+            replace(
+                start_state(one.camera, seen, spline, one.camera.readout_time),
+                extrinsics=one.extrinsics,
+            )
+            for one, seen in zip(self.filmed, self.seen, strict=True)
+        )
+        return replace(first, others=tuple(others))
+
+    def problem(
+        self,
+        start: State,
+        freedom: Freedom,
+        readout_times: bool = False,
+        markers_only: bool = False,
+    ) -> RigProblem:
+        """Of all cameras.
+
+        Args:
+            freedom: of the motion.
+            readout_times: those that are given are estimated, too.
+            markers_only: nothing but the markers is free, the origin as well.
+        """
+        bodies = None
+        if markers_only:
+            bodies = np.repeat(np.arange(len(start.landmarks) // 4), 4)
+        cameras = []
+        for one, seen, state in zip(self.filmed, self.seen, (start, *start.others), strict=True):
+            own = replace(
+                freedom,
+                readout_time=not markers_only
+                and (readout_times or not one.camera.readout_time > 0.0),
+                mounting=None if markers_only else one.mounting,
+            )
+            seen = seen if bodies is None else replace(seen, bodies=bodies)
+            cameras.append(Problem(one.camera, seen, state, own))
+        return RigProblem(cameras, np.ones(len(cameras)), one_map=True)
+
+    def fit(self, start: State, freedom: Freedom, deviation: float, *free: bool) -> Fit:
+        """The minimum of a problem."""
+        return solve(self.problem(start, freedom, *free), start, deviation)
+
+
+def mirrored(given: Adjustable, fitted: Fit) -> Mirrored:
+    """Compare each marker with its mirror image, the motion held."""
     count = len(fitted.state.landmarks) // 4
     # The origin, too, may lie the other way among all others.
-    free = replace(observations, bodies=np.repeat(np.arange(count), 4))
-    problem = Problem(camera, free, fitted.state, replace(fitted.freedom, readout_time=False))
-    other = replace(fitted.state, landmarks=_turned_over(observations, fitted.state))
+    problem = given.problem(fitted.state, fitted.freedom, markers_only=True)
+    other = _with_landmarks(fitted.state, _turned_over(given.seen, fitted.state))
     for noise in _NOISES:
         normal = problem.normal(other, noise * fitted.deviation)[1]
-        still = np.zeros(len(normal.slope))
-        other = problem.moved(other, normal, (still, _steps(normal, count)))
+        still = np.zeros(len(normal.whole.slope))
+        other = problem.moved(other, normal, (still, _steps(normal.whole, count)))
     own, theirs = (_costs(problem, state, fitted.deviation) for state in (fitted.state, other))
     better = theirs < own
     doubtful = np.abs(theirs - own) < _LEAST_DIFFERENCE * fitted.inflation
@@ -82,15 +138,23 @@ def mirrored(camera: Camera, observations: Observations, fitted: Fit) -> Mirrore
     return Mirrored(better & ~same, doubtful & ~same, _at_the_origin(fitted.state, chosen))
 
 
-def _turned_over(observations: Observations, state: State) -> Array:
+def _with_landmarks(state: State, landmarks: Array) -> State:
+    """With the same landmarks (p,3) for all cameras."""
+    others = tuple(replace(one, landmarks=landmarks) for one in state.others)
+    return replace(state, landmarks=landmarks, others=others)
+
+
+def _turned_over(every: Sequence[Observations], state: State) -> Array:
     """Corners (p,3) of each marker mirrored in depth as its images see it."""
     layout, corners = state.spline.layout, state.landmarks.reshape(-1, 4, 3)
-    times = np.clip(observations.times, layout.starts.min(), layout.ends.max())
-    markers, middles = observations.points // 4, corners.mean(axis=1)
-    toward: Array = state.spline.states(times).positions - middles[markers]
-    toward /= np.linalg.norm(toward, axis=1)[:, None]
-    sums = [np.bincount(markers, of, len(corners)) for of in toward.T]
-    sight: Array = np.column_stack(sums)
+    middles, sight = corners.mean(axis=1), np.zeros((len(corners), 3))
+    for seen, own in zip(every, (state, *state.others), strict=True):
+        times = np.clip(seen.times, layout.starts.min(), layout.ends.max())
+        states, markers = state.spline.states(times), seen.points // 4
+        centres = states.positions + states.rotations @ own.extrinsics.centre
+        toward: Array = centres - middles[markers]
+        toward /= np.linalg.norm(toward, axis=1)[:, None]
+        sight += np.column_stack([np.bincount(markers, of, len(corners)) for of in toward.T])
     sight /= np.maximum(np.linalg.norm(sight, axis=1), 1e-12)[:, None]
     depth = np.einsum("mci,mi->mc", corners - middles[:, None], sight)
     return np.asarray(corners - 2.0 * depth[..., None] * sight[:, None]).reshape(-1, 3)
@@ -105,12 +169,12 @@ def _steps(normal: Normal, count: int) -> Array:
     return steps
 
 
-def _costs(problem: Problem, state: State, deviation: float) -> Array:
+def _costs(problem: RigProblem, state: State, deviation: float) -> Array:
     """Of the corners of each marker (m,), Tukey's."""
     limit = (LIMIT * deviation) ** 2
     rest = np.maximum(1.0 - problem.errors(state) / limit, 0.0)
     costs = (1.0 - rest**3) * limit / (3.0 * deviation**2)
-    points = problem.observations.points
+    points = np.concatenate([camera.observations.points for camera in problem.cameras])
     return np.asarray(np.bincount(points // 4, costs, len(state.landmarks) // 4), np.float64)
 
 
@@ -126,7 +190,7 @@ def _at_the_origin(state: State, landmarks: Array) -> State:
     back = through(landmarks[:4], state.landmarks[:4])
     moved = back(landmarks)
     moved[:4] = state.landmarks[:4]
-    return replace(state, spline=back.moved(state.spline), landmarks=moved)
+    return _with_landmarks(replace(state, spline=back.moved(state.spline)), moved)
 
 
 _LEAST_IMAGES = 5
@@ -145,6 +209,18 @@ _MOST_TURNS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SurveyCamera:
+    """A camera as the survey saw it."""
+
+    readout_time: float  # s
+    readout_time_deviation: float  # s; NaN where it was given
+    readout_check: ReadoutCheck | None  # where it was given
+    extrinsics: Extrinsics
+    deviations: Array  # (7,) of a step of the extrinsics: rad, m, s; zeros: they are the rig's axes
+    images: int  # that show markers of the map
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Survey:
     """Markers and what is known of their errors."""
 
@@ -157,9 +233,8 @@ class Survey:
     apart: tuple[tuple[Marker, ...], ...]  # not connected with these, part by part
     # Connected, but too few images show them, or do not tell which of two ways they are turned.
     rare: tuple[Marker, ...]
-    images: int  # with a pose
     fit: Fit
-    readout_check: ReadoutCheck | None = None  # where it was given
+    cameras: tuple[SurveyCamera, ...]
 
     @property
     def deviations(self) -> Array:
@@ -182,28 +257,46 @@ def survey(
     camera: Camera, spotted: Sequence[Spotted], markers: Sequence[Marker],
     *, origin: int | None = None, stamp_offset: float = 0.0,
 ) -> Survey:  # fmt: skip
-    """Poses of the markers of a recording.
+    """Poses of the markers of a recording, as of :func:`survey_rig`.
 
     Args:
         camera: its lens, scan direction and readout time (0: it is to be found).
         spotted: images in the order of their stamps.
+        stamp_offset: s from a stamp to the first row's exposure.
+    """
+    return survey_rig([Filmed(camera, spotted, stamp_offset)], markers, origin=origin)
+
+
+def survey_rig(
+    filmed: Sequence[Filmed], markers: Sequence[Marker], *, origin: int | None = None
+) -> Survey:
+    """Poses of the markers that the cameras of a rig show, which need not see the same.
+
+    Args:
+        filmed: by each camera; the motion is that of the rig's axes.
         markers: all that may be there, by their sizes; where they are does not matter.
         origin: place of the marker whose frame is the map's; None: the first one.
-        stamp_offset: s from a stamp to the first row's exposure.
 
     Raises:
         ValueError: when the images say too little, with what was found.
     """
-    images = [one for one in spotted if len(one.markers)]
+    filmed = [
+        replace(one, spotted=[image for image in one.spotted if len(image.markers)])
+        for one in filmed
+    ]
+    images = [image for one in filmed for image in one.spotted]
     _check(images, markers, origin)
-    chained = chain(camera, images, markers, origin)
+    start_ns = min(image.stamp_ns for image in images)
+    times = [one.times(start_ns) for one in filmed]
+    frames = frames_of(times)
+    chained = chain(filmed, frames, markers, origin)
     if len(chained.markers) < 2:
         raise ValueError(
             f"no image shows {markers[next(iter(chained.markers))].name} together with another "
             "marker: there is nothing to survey"
         )
     try:
-        return _adjusted(camera, images, markers, chained, stamp_offset)
+        return _adjusted(filmed, times, frames, markers, chained)
     except Undetermined as error:
         raise ValueError(f"the images do not determine the markers' poses: {error}") from error
 
@@ -218,39 +311,41 @@ def _check(images: list[Spotted], markers: Sequence[Marker], origin: int | None)
 
 
 def _adjusted(
-    camera: Camera, images: list[Spotted], markers: Sequence[Marker], chained: Chained,
-    stamp_offset: float,
+    filmed: Sequence[Filmed], times: Sequence[Array], frames: Sequence[Frame],
+    markers: Sequence[Marker], chained: Chained,
 ) -> Survey:  # fmt: skip
-    own = _often(images, chained)
-    observations, times = _observations(camera, images, markers, chained, own, stamp_offset)
-    rotations = np.array([pose.rotation for pose in chained.poses])
-    positions = np.array([pose.translation for pose in chained.poses])
-    spline = initial_trajectory(times[chained.images], rotations, positions, camera.readout_time)
-    observations = observations.subset(spline.layout.inside(observations.times))
+    posed = [frames[k] for k in chained.frames]
+    shown = [sorted(image for frame in posed for camera, image in frame.images if camera == place)
+             for place in range(len(filmed))]  # fmt: skip
+    own = _often(filmed, shown, chained)
+    spline = _first_motion(filmed, times, posed, chained)
+    seen = []
+    for one, images, own_times in zip(filmed, shown, times, strict=True):
+        found = _observations(one, images, own_times, markers, chained, own)
+        seen.append(found.subset(spline.layout.inside(found.times)))
+    given = Adjustable(filmed, seen)
     freedom = Freedom(
-        readout_time=not camera.readout_time > 0.0,
         angular_velocity=ANGULAR_VELOCITY,
         linear_velocity=LINEAR_VELOCITY,
         least_noise=_LEAST_NOISE,
     )
-    start = start_state(camera, observations, spline, camera.readout_time)
+    start = given.start(spline)
     # Where a chain ends far off, its errors are large and no outliers.
-    errors = np.sqrt(Problem(camera, observations, start, freedom).errors(start))
-    fitted = fit(
-        camera, observations, start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE))
-    )
+    errors = np.sqrt(given.problem(start, freedom).errors(start))
+    fitted = given.fit(start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE)))
     calmer = acceleration_prior(fitted.state, freedom)
     if calmer is not None:
-        fitted = fit(camera, observations, fitted.state, calmer, fitted.deviation)
-    fitted, doubtful = _right_side_up(camera, observations, fitted)
-    fitted = _less_noise(camera, observations, fitted)
+        fitted = given.fit(fitted.state, calmer, fitted.deviation)
+    fitted, doubtful = _right_side_up(given, fitted)
+    fitted = _less_noise(given, fitted)
     _check_fit(fitted)
-    fitted = _believable(camera, observations, fitted)
+    fitted = cluster_robust(given.problem(fitted.state, fitted.freedom), fitted)
     corners = fitted.state.landmarks.reshape(-1, 4, 3)
     placed = [
         Marker(markers[m].family, markers[m].id, of) for m, of in zip(own, corners, strict=True)
     ]
-    counts = np.bincount(observations.points[fitted.inliers] // 4, minlength=len(own)) // 4
+    points = np.concatenate([each.points for each in seen])[fitted.inliers]
+    counts = np.bincount(points // 4, minlength=len(own)) // 4
     known = [k for k in range(1, len(own)) if counts[k] >= _LEAST_SIGHTS and not doubtful[k]]
     order = [0, *sorted(known, key=lambda k: own[k])]
     covariance = _covariance(fitted, order)
@@ -261,45 +356,53 @@ def _adjusted(
         tuple(int(counts[k]) for k in order),
         tuple(tuple(markers[m] for m in part) for part in chained.apart),
         tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}),
-        len(chained.images),
         fitted,
-        None if fitted.freedom.readout_time else _asked(camera, observations, fitted),
+        tuple(_cameras(given, fitted, list(map(len, shown)))),
     )
     _check_places(done)
     return done
 
 
-def _right_side_up(
-    camera: Camera, observations: Observations, fitted: Fit
-) -> tuple[Fit, BoolArray]:
+def _first_motion(
+    filmed: Sequence[Filmed], times: Sequence[Array], posed: Sequence[Frame], chained: Chained
+) -> Spline:
+    """Through the frames with a pose."""
+    rotations = np.array([pose.rotation for pose in chained.poses])
+    positions = np.array([pose.translation for pose in chained.poses])
+    # Images of a frame reach beyond its middle.
+    beyond = max(
+        abs(times[camera][image] - frame.time) for frame in posed for camera, image in frame.images
+    )
+    longest = max(one.camera.readout_time for one in filmed) + 2.0 * float(beyond)
+    return initial_trajectory(
+        np.array([frame.time for frame in posed]), rotations, positions, longest
+    )
+
+
+def _right_side_up(given: Adjustable, fitted: Fit) -> tuple[Fit, BoolArray]:
     """With all markers turned as they fit best, and for which (m,) that cannot be told."""
     for _ in range(_MOST_TURNS):
-        other = mirrored(camera, observations, fitted)
+        other = mirrored(given, fitted)
         if not other.better.any():
             break
-        turned = fit(camera, observations, other.state, fitted.freedom, fitted.deviation)
-        problem = Problem(camera, observations, fitted.state, fitted.freedom)
+        turned = given.fit(other.state, fitted.freedom, fitted.deviation)
+        problem = given.problem(fitted.state, fitted.freedom)
         if problem.normal(turned.state, fitted.deviation)[0] > fitted.cost:
             break
         fitted = turned
     return fitted, other.doubtful
 
 
-def _less_noise(camera: Camera, observations: Observations, fitted: Fit) -> Fit:
-    """With corners that are better than was taken for granted: weighed too little, they lose to
-    what is known of accelerations beforehand, and the readout time with them.
+def _less_noise(given: Adjustable, fitted: Fit) -> Fit:
+    """With corners that are better than was taken for granted.
+
+    Weighed too little, they lose to what is known of accelerations beforehand, and the readout time
+    with them.
     """
     noise = fitted.deviation * math.sqrt(fitted.inflation)
     if fitted.deviation > _LEAST_NOISE or noise > _LEAST_NOISE:
         return fitted
-    return fit(
-        camera, observations, fitted.state, replace(fitted.freedom, least_noise=noise), noise
-    )
-
-
-def _believable(camera: Camera, observations: Observations, fitted: Fit) -> Fit:
-    """With covariances as large as the corners' errors show."""
-    return cluster_robust(Problem(camera, observations, fitted.state, fitted.freedom), fitted)
+    return given.fit(fitted.state, replace(fitted.freedom, least_noise=noise), noise)
 
 
 def _covariance(fitted: Fit, order: list[int]) -> Array:
@@ -316,7 +419,7 @@ def _check_fit(fitted: Fit) -> None:
     if share < _LEAST_FIT:
         raise ValueError(
             f"{100 * share:.0f} % of the corners fit the survey, {100 * _LEAST_FIT:.0f} % should: "
-            "check the readout time, the calibration, and that no id hangs twice"
+            "check the readout time, the calibration, and that each id is used once"
         )
 
 
@@ -330,60 +433,75 @@ def _check_places(survey: Survey) -> None:
         )
 
 
-def _asked(camera: Camera, observations: Observations, fitted: Fit) -> ReadoutCheck:
-    """The readout time that the corners ask for where one was given."""
-    free = fit(
-        camera,
-        observations,
-        fitted.state,
-        replace(fitted.freedom, readout_time=True),
-        fitted.deviation,
-    )
-    free = _believable(camera, observations, free)
-    given = float(fitted.state.readout_time)
-    return ReadoutCheck(given, float(free.state.readout_time), free.readout_time_deviation)
+def _cameras(given: Adjustable, fitted: Fit, images: list[int]) -> Iterator[SurveyCamera]:
+    """The cameras, with the readout times that the corners ask for where one was given."""
+    problem, asked = given.problem(fitted.state, fitted.freedom), fitted
+    if any(one.camera.readout_time > 0.0 for one in given.filmed):
+        asked = given.fit(fitted.state, fitted.freedom, fitted.deviation, True)
+        asked = cluster_robust(given.problem(asked.state, asked.freedom, True), asked)
+    free = given.problem(asked.state, asked.freedom, True)
+    for place, one in enumerate(given.filmed):
+        state, wanted = ((fit.state, *fit.state.others)[place] for fit in (fitted, asked))
+        known = one.camera.readout_time > 0.0
+        deviation = math.sqrt(asked.border_covariance[(free.columns[place][0],) * 2])
+        deviations = np.zeros(EXTRINSICS)
+        if one.mounting is not None:
+            at = problem.columns[place][problem.cameras[place].mount_column :][:EXTRINSICS]
+            deviations = np.sqrt(np.diag(fitted.border_covariance)[at])
+        yield SurveyCamera(
+            state.readout_time,
+            math.nan if known else deviation,
+            ReadoutCheck(one.camera.readout_time, wanted.readout_time, deviation)
+            if known
+            else None,
+            state.extrinsics,
+            deviations,
+            images[place],
+        )
 
 
-def _often(images: list[Spotted], chained: Chained) -> list[int]:
+def _often(filmed: Sequence[Filmed], shown: Sequence[list[int]], chained: Chained) -> list[int]:
     """The origin first, then the other markers that enough images show."""
     counts: dict[int, int] = dict.fromkeys(chained.markers, 0)
-    for k in chained.images:
-        for marker in images[k].markers.tolist():
-            if marker in counts:
-                counts[marker] += 1
+    for one, images in zip(filmed, shown, strict=True):
+        for k in images:
+            for marker in one.spotted[k].markers.tolist():
+                if marker in counts:
+                    counts[marker] += 1
     origin, *others = chained.markers
     return [origin, *(marker for marker in others if counts[marker] >= _LEAST_SIGHTS)]
 
 
 def _observations(
-    camera: Camera, images: list[Spotted], markers: Sequence[Marker], chained: Chained,
-    own: list[int], stamp_offset: float,
-) -> tuple[Observations, Array]:  # fmt: skip
-    """All corners, and the times (g,) of the images' middle rows since the first stamp."""
-    start_ns = images[0].stamp_ns
-    delay = stamp_offset - camera.readout_time * camera.first_row_time
-    times = np.array([(image.stamp_ns - start_ns) * 1e-9 for image in images]) + delay
+    filmed: Filmed, images: list[int], times: Array, markers: Sequence[Marker], chained: Chained,
+    own: list[int],
+) -> Observations:  # fmt: skip
+    """All corners of some images of a camera.
+
+    Args:
+        times: (g,) s, of all images.
+    """
     place = {marker: k for k, marker in enumerate(own)}
-    frames, points, pixels = [], [], []
-    for k in chained.images:
-        for marker, quad in zip(images[k].markers.tolist(), images[k].quads, strict=True):
+    frames, points, pixels = [], [], [np.zeros((0, 2))]
+    for k in images:
+        spotted = filmed.spotted[k]
+        for marker, quad in zip(spotted.markers.tolist(), spotted.quads, strict=True):
             if marker in place:
-                frames.append(np.full(4, k))
-                points.append(4 * place[marker] + np.arange(4))
+                frames += [k] * 4
+                points += (4 * place[marker] + np.arange(4)).tolist()
                 pixels.append(quad)
     landmarks = np.concatenate([
         Pose(chained.markers[m].translation, chained.markers[m].rotation)(markers[m].corners)
         for m in own
     ])  # fmt: skip
-    all_pixels, all_frames = np.concatenate(pixels), np.concatenate(frames)
-    observations = Observations(
+    all_pixels, all_frames = np.concatenate(pixels), np.array(frames, np.int64)
+    return Observations(
         times=times[all_frames],
-        row_times=camera.row_time(all_pixels),
+        row_times=filmed.camera.row_time(all_pixels),
         pixels=all_pixels,
         landmarks=landmarks,
-        points=np.concatenate(points),
+        points=np.array(points, np.int64),
         frames=all_frames,
         trusted=np.ones(len(all_frames), np.bool_),
         bodies=np.repeat(np.arange(len(own)) - 1, 4),
     )
-    return observations, times

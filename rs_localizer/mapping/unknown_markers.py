@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -28,6 +29,7 @@ from rs_localizer.markers.map_check import whole_markers
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
+from rs_localizer.trajectory.model import Extrinsics, Mounting
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,59 +89,127 @@ _GROSS = 0.02
 _SHUTTER = 0.5
 # Until then (s) an image is near the one before.
 _NEAR = 0.25
+# Images of several cameras are taken together if they begin within this time (s): at 1 rad/s, a
+# degree; what two images say of two markers may differ by eight.
+_ONE_FRAME = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Filmed:
+    """The images of one camera of a rig, or of a camera alone, in the order of their stamps."""
+
+    camera: Camera  # its readout time: 0: it is to be found
+    spotted: Sequence[Spotted]
+    stamp_offset: float = 0.0  # s from a stamp to the first row's exposure, by the rig's clock
+    mounting: Mounting | None = None  # None: its axes are those of the rig
+
+    @property
+    def extrinsics(self) -> Extrinsics:
+        """As they are given."""
+        if self.mounting is None:
+            return Extrinsics(np.eye(3), np.zeros(3), 0.0)
+        return self.mounting.given
+
+    def times(self, start_ns: int) -> Array:
+        """When the images' middle rows were exposed (g,), s."""
+        camera = self.camera
+        delay = self.stamp_offset - camera.readout_time * camera.first_row_time
+        return np.array([(image.stamp_ns - start_ns) * 1e-9 for image in self.spotted]) + delay
 
 
 @dataclass(frozen=True, slots=True)
 class Chained:
-    """Markers that hang together, and the images that show them."""
+    """Markers that hang together, and the frames that show them."""
 
     markers: dict[int, Transform]  # origin_from_marker, by place in the list
-    images: list[int]  # places of those with a pose
-    poses: list[Transform]  # origin_from_camera
+    frames: list[int]  # places of those with a pose
+    poses: list[Transform]  # origin_from_rig
     apart: list[list[int]]  # markers that do not hang together with these, part by part
+
+
+class _Sight(NamedTuple):
+    """A marker in an image of one of the cameras."""
+
+    marker: int
+    camera: int
+    rays: Array  # (4,2)
+    poses: list[tuple[Transform, float]]  # rig_from_marker, and how far it fits, of 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
-    """One image: each marker's rays and both of its poses."""
+    """One frame: the markers of the images of all cameras that were taken at about one time."""
 
-    stamp_ns: int
-    rays: dict[int, Array]  # (4,2)
-    # camera_from_marker, and how far it fits, of 1.
-    poses: dict[int, list[tuple[Transform, float]]]
+    time: float  # s
+    sights: list[_Sight]
 
 
 def chain(
-    camera: Camera, spotted: Sequence[Spotted], markers: Sequence[Marker], origin: int | None
-) -> Chained:
+    filmed: Sequence[Filmed], frames: Sequence[Frame], markers: Sequence[Marker],
+    origin: int | None,
+) -> Chained:  # fmt: skip
     """Place the markers that hang together with one of them.
 
     Args:
-        camera: its lens.
-        spotted: images in the order of their stamps.
+        filmed: by each camera.
+        frames: the images that belong together, in the order of their times.
         markers: all there may be; only their sizes count.
         origin: place of the one whose frame is that of the others; None: the first of the most
             that hang together.
     """
-    views = [_view(camera, one, markers) for one in spotted]
-    seen = sorted({marker for view in views for marker in view.poses})
+    mounts = [Transform(m.axes, -m.axes @ m.centre) for m in (one.extrinsics for one in filmed)]
+    views = [_view(filmed, mounts, frame, markers) for frame in frames]
+    seen = sorted({sight.marker for view in views for sight in view.sights})
     between, scores = _between(views, markers)
     parts = _parts(seen, scores)
     first = parts[0][0] if origin is None else origin
     own = next(part for part in parts if first in part)
     placed = _placed(first, own, between, scores)
-    images, poses = _image_poses(views, placed, markers)
-    return Chained(placed, images, poses, [part for part in parts if part is not own])
+    own_frames, poses = _frame_poses(views, mounts, placed, markers)
+    return Chained(placed, own_frames, poses, [part for part in parts if part is not own])
 
 
-def _view(camera: Camera, spotted: Spotted, markers: Sequence[Marker]) -> _View:
-    rays, poses = {}, {}
-    for marker, quad in zip(spotted.markers.tolist(), spotted.quads, strict=True):
-        own = camera.rays(quad)
-        found = _square_poses(markers[marker].corners, own, _SHUTTER / camera.focal_length)
-        if np.isfinite(own).all() and found:
-            rays[marker], poses[marker] = own, found
-    return _View(spotted.stamp_ns, rays, poses)
+class Frame(NamedTuple):
+    """Images of several cameras, one of each at most, that were taken at about one time."""
+
+    time: float  # s, mean of the images' middle rows
+    images: list[tuple[int, int]]  # the camera, and its image
+
+
+def frames_of(times: Sequence[Array]) -> list[Frame]:
+    """Which images belong together, by the times (g,), s, of each camera's."""
+    every = sorted(
+        (float(time), camera, image)
+        for camera, own in enumerate(times)
+        for image, time in enumerate(own)
+    )
+    groups: list[list[tuple[float, int, int]]] = []
+    for one in every:
+        last = groups[-1] if groups else []
+        if last and one[0] - last[0][0] < _ONE_FRAME and one[1] not in {of[1] for of in last}:
+            last.append(one)
+        else:
+            groups.append([one])
+    return [
+        Frame(sum(of[0] for of in group) / len(group), [of[1:] for of in group])
+        for group in groups
+    ]  # fmt: skip
+
+
+def _view(
+    filmed: Sequence[Filmed], mounts: list[Transform], frame: Frame, markers: Sequence[Marker]
+) -> _View:
+    sights = []
+    for place, image in frame.images:
+        camera, spotted = filmed[place].camera, filmed[place].spotted[image]
+        back = mounts[place].inverse()
+        for marker, quad in zip(spotted.markers.tolist(), spotted.quads, strict=True):
+            own = camera.rays(quad)
+            found = _square_poses(markers[marker].corners, own, _SHUTTER / camera.focal_length)
+            if np.isfinite(own).all() and found:
+                found = [(back @ pose, fit) for pose, fit in found]
+                sights.append(_Sight(marker, place, own, found))
+    return _View(frame.time, sights)
 
 
 def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Transform, float]]:
@@ -168,18 +238,20 @@ def _between(
     views: list[_View], markers: Sequence[Marker]
 ) -> tuple[dict[tuple[int, int], Transform], dict[tuple[int, int], float]]:
     """Of each pair a < b, a_from_b, and by how many images it is said."""
-    images: dict[tuple[int, int], list[_View]] = {}
+    images: dict[tuple[int, int], list[tuple[_Sight, _Sight]]] = {}
     for view in views:
-        for pair in combinations(sorted(view.poses), 2):
-            images.setdefault(pair, []).append(view)
+        by_marker = sorted(view.sights, key=lambda sight: sight.marker)
+        for one, other in combinations(by_marker, 2):
+            if one.marker != other.marker:
+                images.setdefault((one.marker, other.marker), []).append((one, other))
     between, scores = {}, {}
     for (a, b), among in images.items():
         step = -(-len(among) // _MOST_IMAGES)
         said = [
             (k, first.inverse() @ second, fit * other)
-            for k, view in enumerate(among[::step])
-            for first, fit in view.poses[a]
-            for second, other in view.poses[b]
+            for k, (one, two) in enumerate(among[::step])
+            for first, fit in one.poses
+            for second, other in two.poses
         ]
         size = max(markers[a].size, markers[b].size)
         between[a, b], scores[a, b] = _agreed(said, size)
@@ -187,9 +259,7 @@ def _between(
 
 
 def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Transform, float]:
-    """What most images say, each of which says several things that fit more or less; and by how
-    many it is said.
-    """
+    """What most images say, each of several things that fit more or less; and by how many."""
     image = np.array([k for k, _, _ in said])
     turns = np.array([of.rotation for _, of, _ in said])
     places = np.array([of.translation for _, of, _ in said])
@@ -247,32 +317,41 @@ def _placed(
     return placed
 
 
-def _image_poses(
-    views: list[_View], placed: dict[int, Transform], markers: Sequence[Marker]
-) -> tuple[list[int], list[Transform]]:
-    """Images with a pose, and origin_from_camera of each."""
-    images: list[int] = []
+def _frame_poses(
+    views: list[_View], mounts: list[Transform], placed: dict[int, Transform],
+    markers: Sequence[Marker],
+) -> tuple[list[int], list[Transform]]:  # fmt: skip
+    """Frames with a pose, and origin_from_rig of each."""
+    frames: list[int] = []
     poses: list[Transform] = []
     for k, view in enumerate(views):
-        own = [marker for marker in view.poses if marker in placed]
+        own = [sight for sight in view.sights if sight.marker in placed]
         if not own:
             continue
-        points = np.concatenate([_corners(markers[marker], placed[marker]) for marker in own])
-        rays = np.concatenate([view.rays[marker] for marker in own])
-        options = [
-            pose @ placed[marker].inverse() for marker in own for pose, _ in view.poses[marker]
+        by_camera = [
+            (
+                mounts[place],
+                np.concatenate([_corners(markers[of.marker], placed[of.marker]) for of in seen]),
+                np.concatenate([of.rays for of in seen]),
+            )
+            for place in sorted({sight.camera for sight in own})
+            for seen in [[sight for sight in own if sight.camera == place]]
         ]
-        costs = np.array([_cost(option, points, rays) for option in options])
+        options = [pose @ placed[of.marker].inverse() for of in own for pose, _ in of.poses]
+        costs = np.array([
+            sum(_cost(mount @ option, points, rays) for mount, points, rays in by_camera)
+            for option in options
+        ])  # fmt: skip
         alike = [option for option, cost in zip(options, costs, strict=True)
                  if cost <= _ALIKE * costs.min()]  # fmt: skip
         best = options[int(np.argmin(costs))]
-        near = images and (view.stamp_ns - views[images[-1]].stamp_ns) * 1e-9 < _NEAR
+        near = frames and view.time - views[frames[-1]].time < _NEAR
         if near and len(alike) > 1:
             before = poses[-1].rotation
             best = max(alike, key=lambda option: float(np.sum(option.rotation.T * before)))
-        images.append(k)
+        frames.append(k)
         poses.append(best.inverse())
-    return images, poses
+    return frames, poses
 
 
 def _corners(marker: Marker, placed: Transform) -> Array:

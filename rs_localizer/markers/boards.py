@@ -166,14 +166,14 @@ def _around(board: Charuco, index: int, quad: Array) -> list[tuple[int, Array, f
     unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
     square = np.array([[-rim, -rim], [1 + rim, -rim], [1 + rim, 1 + rim], [-rim, 1 + rim]])
     to_image = cv2.getPerspectiveTransform(unit, quad.astype(np.float32))
-    seen = cv2.perspectiveTransform(square[None], to_image)[0]
+    corners = cv2.perspectiveTransform(square[None], to_image)[0]
     side = float(np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1).min())
     # The window must not reach the marker's own corner, nor the next corner of the board.
     limit = side * min(rim, _WINDOW_SHARE)
     places = ((column - 1, row - 1), (column, row - 1), (column, row), (column - 1, row))
     return [
         (y * (board.columns - 1) + x, pixel, limit)
-        for (x, y), pixel in zip(places, seen, strict=True)
+        for (x, y), pixel in zip(places, corners, strict=True)
         if 0 <= x < board.columns - 1 and 0 <= y < board.rows - 1
     ]
 

@@ -271,8 +271,7 @@ _MOST_IDS = 6
 
 
 def recognized(image: Gray) -> list[str]:
-    """The markers, by family, and the chessboard that an image shows; most certain first: for
-    those whose map is wrong.
+    """The markers, by family, and the chessboard that an image shows; most certain first.
 
     Takes seconds in a large image: all families are tried. Of several that read the same
     quadrilateral, that with the most bits counts, for it is the least likely to be chance.

@@ -77,8 +77,8 @@ class MarkerFinder:
         if ids is None or len(ids) == 0:
             return np.empty(0, np.int64), np.empty((0, 4, 2))
         quads = np.concatenate(corners).reshape(-1, 4, 2).astype(np.float64)
-        found = self._ids[np.asarray(ids, np.int64).ravel()]
-        return found, np.roll(quads, -self._turns, axis=1)
+        own_ids = self._ids[np.asarray(ids, np.int64).ravel()]
+        return own_ids, np.roll(quads, -self._turns, axis=1)
 
 
 def _configured(parameters: Any) -> Any:
@@ -104,9 +104,7 @@ def _dictionary(family: Family) -> Any:
 
 
 def _part(family: Family, ids: NDArray[np.int64]) -> Any:
-    """A dictionary of some ids: those that differ by as many bits as the family's are kept apart,
-    and as many wrong bits are corrected.
-    """
+    """A dictionary of some ids, that are told apart by as many bits as the family's."""
     whole = _dictionary(family)
     part = _aruco.getPredefinedDictionary(getattr(_aruco, family.constant))  # a copy
     part.bytesList = np.ascontiguousarray(whole.bytesList[ids])

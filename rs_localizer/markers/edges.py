@@ -70,9 +70,9 @@ def edge_points(
         if _sample(image, x - reach * nx, y - reach * ny, step * nx, step * ny, profile):
             e[k] = step * _edge(profile, levels, step, rises) - reach
     if rises[SEEN] > 0.0:
-        seen = rises[SEEN]
+        count = rises[SEEN]
         for i in range(1, len(rises)):
-            rises[i] /= seen
+            rises[i] /= count
     return rises
 
 
@@ -223,8 +223,9 @@ def _width(rises: Array) -> float:
 
 @inlined
 def _levels(rises: Array, at: int, cell: float) -> tuple[float, float]:
-    """The level half way up the edge of a side, and how far around it to go, where its rises
-    (4,5) of the round before are not whole; else NaN.
+    """The level half way up the edge of a side, and how far around it to go; else NaN.
+
+    Where its rises (4,5) of the round before are whole.
     """
     none = (math.nan, math.nan)
     for k in range(4):
@@ -252,8 +253,10 @@ def _side(
     rises: Array,
     c: Array,
 ) -> bool:
-    """Fit the edge near the side that corner ``at`` begins: offsets c0 + c1 s + c2 s^2 outward, s
-    in -1..1. ``before`` (4,5) are the rises of the last round, ``rises`` (5,) those of this one.
+    """Fit the edge near the side that corner ``at`` begins.
+
+    Offsets c0 + c1 s + c2 s^2 outward, s in -1..1. ``before`` (4,5) are the rises of the last
+    round, ``rises`` (5,) those of this one.
     """
     a, b, last = q[at], q[(at + 1) % 4], (at + 3) % 4
     length = math.hypot(b[0] - a[0], b[1] - a[1])
@@ -331,15 +334,15 @@ def refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> 
     """
     # Whether an image may be written depends on where it came from. Numba would compile a kernel
     # for either kind, and the two might round differently.
-    seen = image.view()
-    seen.flags.writeable = False
-    found: NDArray[np.bool_] = _refine(seen, quads, cells)
-    return found
+    pixels = image.view()
+    pixels.flags.writeable = False
+    refined: NDArray[np.bool_] = _refine(pixels, quads, cells)
+    return refined
 
 
 @kernel
 def _refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-    found = np.zeros((len(quads), 4), np.bool_)
+    refined = np.zeros((len(quads), 4), np.bool_)
     curves = np.empty((4, 3))
     good = np.empty(4, np.bool_)
     moved = np.empty((4, 2))
@@ -350,9 +353,9 @@ def _refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) ->
             for s in range(4):
                 good[s] = _side(image, q, s, cells[m], most_points, before, rises[s], curves[s])
             for k in range(4):
-                found[m, k] = good[k] and good[(k + 3) % 4]
+                refined[m, k] = good[k] and good[(k + 3) % 4]
                 moved[k] = q[k]
-                if found[m, k]:
+                if refined[m, k]:
                     x, y = _corner(q, k, curves[(k + 3) % 4], curves[k])
                     moved[k, 0], moved[k, 1] = x, y
             q[:] = moved
@@ -362,7 +365,7 @@ def _refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) ->
         for k in range(4):
             dx, dy = q[k, 0] - quads[m, k, 0], q[k, 1] - quads[m, k, 1]
             # Comparison with NaN is false.
-            found[m, k] = found[m, k] and dx * dx + dy * dy <= most * most
-            if found[m, k]:
+            refined[m, k] = refined[m, k] and dx * dx + dy * dy <= most * most
+            if refined[m, k]:
                 quads[m, k] = q[k]
-    return found
+    return refined

@@ -29,7 +29,7 @@ _NEIGHBOURS, _AROUND = 3, 8
 # What is farther away than this (in sides) is none: there a fisheye lens counts.
 _FAR = 6.0
 _MISFIT_TEXT = (
-    "the map does not fit the image: {} do not lie as it says; a position, a size or an id is wrong"
+    "the map contradicts the image: {} are misplaced; a position, a size or an id is wrong"
 )
 
 
@@ -353,7 +353,7 @@ class LeaveOneOut:
         away = _shift(views)
         x, y, z = (f"{value:+.4f}" for value in away)
         return (
-            f"{self._names[worst]} is not where the map has it: against the others, which fit to "
+            f"{self._names[worst]} is misplaced in the map: relative to the others, which fit to "
             f"{fit:.2f} px without it, it is off by {off:.1f} px, about "
             f"{100.0 * np.linalg.norm(away):.1f} cm ({x}, {y}, {z} m in the map)"
         )

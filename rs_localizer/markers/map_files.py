@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of marker maps: YAML, for instance
+"""Files of marker maps, in YAML.
 
     map_frame: map                 # frame of all that follows; lengths in metres
     markers:

@@ -74,8 +74,9 @@ class MarkerMap:
 
     @property
     def settings(self) -> dict[str, float]:
-        """What the localizer is to be told of it: ``map_deviation`` (m), rms over the points of the
-        boards. Markers are exact: what their places are worth is their survey's to say.
+        """What the localizer is to be told: ``map_deviation`` (m), rms over the boards.
+
+        Markers are exact: what their places are worth is their survey's to say.
         """
         boards = [(len(board.points), deviation_of(board)) for board in self.boards]
         if not boards:
@@ -84,9 +85,7 @@ class MarkerMap:
         return {"map_deviation": float(np.sqrt(counts @ deviations**2 / counts.sum()))}
 
     def with_points(self, points: Array, deviation: float | None = None) -> MarkerMap:
-        """The same map with its corners (n,3) elsewhere, in the order of :attr:`points`, those of
-        boards known to a deviation (m).
-        """
+        """The same map with its corners (n,3) elsewhere, of boards to a deviation (m)."""
         sizes = [len(item.points) for item in (*self.markers, *self.boards)]
         parts = np.split(points, np.cumsum(sizes)[:-1])
         own = len(self.markers)

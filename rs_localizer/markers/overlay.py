@@ -65,9 +65,7 @@ class CameraPath:
 
 
 def draw_detections(image: Gray, detections: Detections) -> Picture:
-    """The image with outlines: blue what is used, orange and crossed what is not in the map or
-    seen twice.
-    """
+    """The image with outlines: blue what is used, orange and crossed what is not."""
     picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
     for item in detections.markers:
         for quad, id_, mapped in zip(item.quads, item.ids.tolist(), item.mapped, strict=True):

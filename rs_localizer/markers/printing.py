@@ -112,8 +112,8 @@ def _axes(pose: Pose, middle: tuple[float, float], size: tuple[float, float]) ->
     right, up, out = (_direction(pose.rotation[:, k]) for k in range(3))
     x, y, z = -pose.position @ pose.rotation * _MM
     origin = (middle[0] + x, middle[1] + y)
-    told = ", ".join(f"{value:g}" for value in np.round(pose.position, 4) + 0.0)
-    where = f"the middle of the first print is at ({told}) m"
+    text = ", ".join(f"{value:g}" for value in np.round(pose.position, 4) + 0.0)
+    where = f"the middle of the first print is at ({text}) m"
     if abs(z) > _FLAT * _MM or not (0 <= origin[0] <= size[0] and 0 <= origin[1] <= size[1]):
         return Axes(right, up, out, None, f"{where}; the origin is not on this page")
     if np.hypot(x, y) < _FLAT * _MM:
@@ -214,12 +214,12 @@ def _white_cells(board: Chessboard | Charuco, columns: int, rows: int) -> list[t
 def _rectangles(white: NDArray[np.bool_], cell: float) -> Array:
     """The black cells as rectangles (n,4), as few as runs along the rows make them."""
     rows = len(white)
-    found = []
+    rectangles = []
     for row in range(rows):
         edges = np.flatnonzero(np.diff(np.concatenate([[True], white[row], [True]]).astype(int)))
         for start, end in edges.reshape(-1, 2).tolist():
-            found.append([start * cell, (rows - 1 - row) * cell, (end - start) * cell, cell])
-    return np.array(found, np.float64).reshape(-1, 4)
+            rectangles.append([start * cell, (rows - 1 - row) * cell, (end - start) * cell, cell])
+    return np.array(rectangles, np.float64).reshape(-1, 4)
 
 
 MARGIN = 10.0
@@ -343,12 +343,12 @@ def _add_rim(axes: Any, x: float, y: float, item: Figure) -> None:
 
 def _frame(axes: Any, page: Page, frame: Axes) -> None:
     """Axes of the map in words, and at its origin, where they cover nothing that is black."""
-    told = f"map: {frame.right} to the right, {frame.up} up, {frame.out} out of the paper; "
+    text = f"map: {frame.right} to the right, {frame.up} up, {frame.out} out of the paper; "
     free = frame.origin is not None and not any(
         _covers(frame.origin, x, y, item) for x, y, item in page.figures
     )
     arrows = ", the origin where the arrows start" if free else ""
-    axes.text(MARGIN, MARGIN + 12.0, told + frame.where + arrows, fontsize=0.8 * _FONT)
+    axes.text(MARGIN, MARGIN + 12.0, text + frame.where + arrows, fontsize=0.8 * _FONT)
     if frame.origin is None or not free:
         return
     x, y = frame.origin

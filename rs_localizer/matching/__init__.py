@@ -247,7 +247,6 @@ def _project(camera: Camera, motion: Motion, points: Array) -> Array:
     One step of what :func:`rs_localizer.core.shutter.project_rolling` does until no digit changes:
     to a small part of a pixel, in a fifth of the time.
     """
-
     state, moved = state_in(motion, np.zeros(3)), np.empty(points.shape)
 
     def view(tau: Array) -> Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from rs_localizer.markers.map_check import LeaveOneOut, Predict, rms, still_erro
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
+from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.refusal import Refusal
 
 # Fewer corners than this say nothing about how well a pose fits.
@@ -71,15 +71,15 @@ class Recorded:
 class Options:
     """How images are recorded."""
 
-    storage: str = "mcap"  # or sqlite3
     with_images: bool = False  # write these, too, as far as they are compressed
     scan_direction: str = ScanDirection.TOP_TO_BOTTOM  # for the check of the markers' places
+    camera: str = ""  # of a rig, whose topics these are
 
 
 def record(
     shots: Iterable[Shot | Carried],
     detector: FrameDetector,
-    out: Path,
+    bag: BagWriter,
     options: Options,
     *,
     done: Callable[[], object] = lambda: None,
@@ -90,7 +90,7 @@ def record(
     Args:
         shots: the images, and what else of their recording is to be kept.
         detector: looks for markers.
-        out: bag directory to create.
+        bag: where they are written.
         options: what is written, and how it was seen.
         done: called after each image.
         tell: called when many images in the beginning show nothing, with what they show instead.
@@ -100,25 +100,26 @@ def record(
     """
     tally = _Tally(detector.map)
     cameras = Cameras(options.scan_direction)
-    with BagWriter(out, options.storage) as bag:
-        for shot in shots:
-            if isinstance(shot, Carried):
-                tally.carried[shot.topic] += 1
-                bag.write(shot.topic, shot.message, shot.recorded_ns)
-                continue
-            if isinstance(shot.image, Refusal):
-                tally.refuse(shot.image)
-            else:
-                detected = detector.detect(shot.image)
-                tally.add(cameras.of(shot, shot.image), detected)
-                if len(detected.detections.ids):
-                    _write(bag, shot, detected, options.with_images)
-                if tally.images == _PATIENCE and tally.are_few:
-                    count = len(tally.counts) or "none"
-                    tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
-            done()
-        if not tally.counts:
-            raise DetectError(f"none of the {tally.images} images {tally.nothing()}")
+    for shot in shots:
+        if isinstance(shot, Carried):
+            tally.carried[shot.topic] += 1
+            bag.write(shot.topic, shot.message, shot.recorded_ns)
+            continue
+        if isinstance(shot.image, Refusal):
+            tally.refuse(shot.image)
+        else:
+            detected = detector.detect(shot.image)
+            tally.add(cameras.of(shot, shot.image), detected)
+            if len(detected.detections.ids):
+                corners = correspondences(detected, make_message)
+                _write(bag, shot, CORRESPONDENCES_TOPIC, corners, options)
+            if tally.images == _PATIENCE and tally.are_few:
+                count = len(tally.counts) or "none"
+                tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
+        done()
+    if not tally.counts:
+        of = f" of {options.camera}" if options.camera else ""
+        raise DetectError(f"none of the {tally.images} images{of} {tally.nothing()}")
     return tally.recorded()
 
 
@@ -145,12 +146,12 @@ class _Tally:
     def add(self, camera: Camera, detected: Detected) -> None:
         self.images += 1
         self._stamps.append(detected.image.stamp_ns)
-        found = detected.detections
-        self._others.update(found.unknown)
-        if len(found.ids):
-            self.counts.append(len(found.ids))
+        detections = detected.detections
+        self._others.update(detections.unknown)
+        if len(detections.ids):
+            self.counts.append(len(detections.ids))
             self._residuals.append(static_residual(camera, detected))
-            self._markers.add(camera, found)
+            self._markers.add(camera, detections)
             return
         self._empties += 1
         if self._empties.bit_count() == 1:  # the 1st, 2nd, 4th, 8th ...
@@ -180,9 +181,9 @@ class _Tally:
 
     def instead(self) -> list[str]:
         """What images that show nothing of the map show otherwise."""
-        seen = Counter(name for image in self._empty for name in recognized(image.pixels))
+        names = Counter(name for image in self._empty for name in recognized(image.pixels))
         # What one of several shows may be chance.
-        return [name for name, count in seen.most_common(4) if 2 * count >= len(self._empty)]
+        return [name for name, count in names.most_common(4) if 2 * count >= len(self._empty)]
 
     def recorded(self) -> Recorded:
         known = [value for value in self._residuals if np.isfinite(value)]
@@ -192,8 +193,8 @@ class _Tally:
                 f"even the stillest images leave {least:.1f} px rms: the calibration can hardly be "
                 "of this camera in this mode, or the map (sizes, positions) is wrong"
             )
-        if self.are_few and (seen := self.instead()):
-            faults.append(f"images that show nothing of the map show {'; '.join(seen)}")
+        if self.are_few and (names := self.instead()):
+            faults.append(f"images that show nothing of the map show {'; '.join(names)}")
         period = np.diff(np.array(self._stamps, np.int64))
         return Recorded(
             self.images,
@@ -216,10 +217,10 @@ class _RollingFit:
     def __call__(self, camera: Camera, points: Array, pixels: Array) -> Predict | None:
         if self._last is None or self._last[0] is not camera:
             self._last = camera, Localizer(camera, min_inliers=_LEAST_INLIERS)
-        found = self._last[1].localize(points, pixels)
-        if not found:
+        estimate = self._last[1].localize(points, pixels)
+        if not estimate:
             return None
-        return lambda some: project_rolling(camera, found.at_rows, some)[0]
+        return lambda some: project_rolling(camera, estimate.at_rows, some)[0]
 
 
 class Cameras:
@@ -251,34 +252,36 @@ class Cameras:
         return camera
 
 
-def _why(found: tuple[int, int], calibrated: tuple[int, int]) -> str:
+def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
     """What two sizes of images have to do with each other."""
-    if found == calibrated[::-1]:
+    if size == calibrated[::-1]:
         return (
             ": they are turned by a quarter; calibrate with images as they are recorded (the scan "
             "direction turns with them)"
         )
-    if abs(found[0] * calibrated[1] - found[1] * calibrated[0]) <= max(calibrated):
+    if abs(size[0] * calibrated[1] - size[1] * calibrated[0]) <= max(calibrated):
         return ": another resolution of the same shape; calibrate in the mode that is used"
     return ": another mode or camera; calibrate in the mode that is used"
 
 
-def _write(bag: BagWriter, shot: Shot, detected: Detected, with_images: bool) -> None:
-    bag.write(CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
-    bag.write(CORRESPONDENCES_TOPIC, correspondences(detected, make_message), shot.recorded_ns)
-    if with_images and shot.compressed is not None:
-        bag.write(IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
+def _write(bag: BagWriter, shot: Shot, topic: str, message: Any, options: Options) -> None:
+    """What the image shows, its camera, and the image itself."""
+    own = f"/{options.camera}" if options.camera else ""
+    bag.write(own + CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
+    bag.write(own + topic, message, shot.recorded_ns)
+    if options.with_images and shot.compressed is not None:
+        bag.write(own + IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
 
 
 def static_residual(camera: Camera, detected: Detected) -> float:
     """Reprojection error (px rms) of the best global-shutter pose; NaN: there is none."""
-    found = detected.detections
-    if len(found.ids) < _LEAST_CORNERS:
+    detections = detected.detections
+    if len(detections.ids) < _LEAST_CORNERS:
         return np.nan
-    pose = still_pose(found.points, camera.rays(found.pixels))
+    pose = still_pose(detections.points, camera.rays(detections.pixels))
     if pose is None:
         return np.nan
-    return rms(still_errors(camera, pose, found.points, found.pixels))
+    return rms(still_errors(camera, pose, detections.points, detections.pixels))
 
 
 @dataclass(slots=True)
@@ -301,7 +304,7 @@ class Extraction:
 def record_features(
     shots: Iterable[Shot | Carried],
     extractor: FrameExtractor,
-    out: Path,
+    bag: BagWriter,
     options: Options,
     done: Callable[[], object] = lambda: None,
 ) -> Extraction:
@@ -310,40 +313,32 @@ def record_features(
     Args:
         shots: the images, and what else of their recording is to be kept.
         extractor: looks for keypoints.
-        out: bag directory to create.
+        bag: where they are written.
         options: what is written.
         done: called after each image.
 
     Raises:
         DetectError: when no image has keypoints, or images and calibration differ in size.
     """
-    told = Extraction()
+    extraction = Extraction()
     cameras = Cameras(options.scan_direction)
-    with BagWriter(out, options.storage) as bag:
-        for shot in shots:
-            if isinstance(shot, Carried):
-                told.carried[shot.topic] += 1
-                bag.write(shot.topic, shot.message, shot.recorded_ns)
-                continue
-            told.images += 1
-            if isinstance(shot.image, Refusal):
-                told.refused.setdefault(shot.image.reason, shot.image.detail)
-            else:
-                cameras.of(shot, shot.image)
-                told.stamps_ns.append(shot.image.stamp_ns)
-                extracted = extractor.extract(shot.image)
-                if len(extracted.features):
-                    told.counts.append(len(extracted.features))
-                    _write_keypoints(bag, shot, extracted, options.with_images)
-            done()
-        if not told.counts:
-            reasons = "".join(f"; {detail}" for detail in told.refused.values())
-            raise DetectError(f"none of the {told.images} images has any keypoint{reasons}")
-    return told
-
-
-def _write_keypoints(bag: BagWriter, shot: Shot, extracted: Extracted, with_images: bool) -> None:
-    bag.write(CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
-    bag.write(KEYPOINTS_TOPIC, keypoints(extracted, make_message), shot.recorded_ns)
-    if with_images and shot.compressed is not None:
-        bag.write(IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
+    for shot in shots:
+        if isinstance(shot, Carried):
+            extraction.carried[shot.topic] += 1
+            bag.write(shot.topic, shot.message, shot.recorded_ns)
+            continue
+        extraction.images += 1
+        if isinstance(shot.image, Refusal):
+            extraction.refused.setdefault(shot.image.reason, shot.image.detail)
+        else:
+            cameras.of(shot, shot.image)
+            extraction.stamps_ns.append(shot.image.stamp_ns)
+            extracted = extractor.extract(shot.image)
+            if len(extracted.features):
+                extraction.counts.append(len(extracted.features))
+                _write(bag, shot, KEYPOINTS_TOPIC, keypoints(extracted, make_message), options)
+        done()
+    if not extraction.counts:
+        reasons = "".join(f"; {detail}" for detail in extraction.refused.values())
+        raise DetectError(f"none of the {extraction.images} images has any keypoint{reasons}")
+    return extraction

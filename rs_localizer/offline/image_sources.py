@@ -20,6 +20,7 @@ from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.imu import make_reading
 from rs_localizer.io.messages import make_header, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
+from rs_localizer.io.rigs import optical_frame
 from rs_localizer.io.telemetry import Telemetry
 from rs_localizer.io.topics import IMU
 from rs_localizer.io.video import read_video
@@ -29,7 +30,11 @@ from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 SUFFIXES = (".jpg", ".jpeg", ".png")
-_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".mjpeg", ".mjpg", ".m4v", ".h264", ".ts")
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".mjpeg", ".mjpg", ".m4v", ".h264", ".ts",
+           ".insv")  # fmt: skip
+
+LENSES = tuple(f"lens{k}" for k in range(1, 10))
+"""Names of the cameras that filmed into one file, in the order of their streams."""
 
 # Names of image files that are a time in ns, as EuRoC's and TUM-VI's: from 1973 (before, a name
 # may be a time of today in us) to what a stamp of ROS can hold.
@@ -59,27 +64,28 @@ class Carried:
     message: Any
 
 
-def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator[Shot]:
-    """The images of a video.
+def from_video(
+    path: Path, camera: Camera | None, clock: ImageClock, lens: int | None = None
+) -> Iterator[Shot]:
+    """The images of a video, or of one of its lenses.
 
     Raises:
         ValueError: when it cannot be read, or has no times and the clock no rate.
     """
-    for jpeg, gray, seconds in read_video(path):
+    frame = CAMERA_FRAME if lens is None else optical_frame(LENSES[lens])
+    for jpeg, gray, seconds in read_video(path, lens):
         now = clock.relative(None if seconds is None else round(1e9 * seconds))
         if now is None:
-            lost = Refusal(Reason.NO_TIME, "OpenCV gives no presentation time")
-            yield Shot(lost, _info(camera, 0), None, 0)
+            lost = Refusal(Reason.NO_TIME, "it has no presentation time")
+            yield Shot(lost, _info(camera, 0, frame), None, 0)
         else:
-            yield _shot(Image(now, CAMERA_FRAME, gray), camera, jpeg, "jpeg")
+            yield _shot(Image(now, frame, gray), camera, jpeg, "jpeg")
 
 
 def with_telemetry(
     shots: Iterable[Shot | Carried], telemetry: Telemetry, clock: ImageClock
 ) -> Iterator[Shot | Carried]:
-    """The images of a video, and its gyroscope as ``imu``, in the axes and by the clock of the
-    camera; without a clock of its own, none.
-    """
+    """The images of a video, and its gyroscope as ``imu``, in the camera's axes and clock."""
     times_ns = np.round(1e9 * telemetry.times).astype(np.int64)
     sent = 0
     for shot in shots:
@@ -108,10 +114,10 @@ def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> I
         stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
         header = SimpleNamespace(stamp=stamp, frame_id=CAMERA_FRAME)
         message = SimpleNamespace(header=header, format=name, data=data)
-        found = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
-        if isinstance(found, Refusal):
-            found = Refusal(found.reason, f"{file.name}: {found.detail}")
-        yield _shot(found, camera, data, name, now)
+        image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
+        if isinstance(image, Refusal):
+            image = Refusal(image.reason, f"{file.name}: {image.detail}")
+        yield _shot(image, camera, data, name, now)
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -131,8 +137,8 @@ def image_files(folder: Path) -> list[Path]:
 def holds_images(path: Path) -> str:
     """What a path that is not a recording holds of images, as ``is a video``; empty: nothing."""
     if path.is_dir():
-        found = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
-        return f"is a folder of {found} images" if found else ""
+        count = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
+        return f"is a folder of {count} images" if count else ""
     if path.suffix.lower() in SUFFIXES:
         return "is an image"
     return "is a video" if path.is_file() and path.suffix.lower() in _VIDEOS else ""
@@ -202,16 +208,17 @@ def _shot(
     image: Image | Refusal, camera: Camera | None, data: bytes, format_: str, stamp: int = 0
 ) -> Shot:
     """An image of a file."""
+    frame = CAMERA_FRAME
     if isinstance(image, Image):
-        stamp = image.stamp_ns
+        stamp, frame = image.stamp_ns, image.frame
     compressed = make_message(
         IMAGE_TYPES[1],
-        header=make_header(make_message, stamp, CAMERA_FRAME),
+        header=make_header(make_message, stamp, frame),
         format=format_,
         data=np.frombuffer(data, np.uint8),
     )
-    return Shot(image, _info(camera, stamp), compressed, stamp)
+    return Shot(image, _info(camera, stamp, frame), compressed, stamp)
 
 
-def _info(camera: Camera | None, stamp: int) -> Any:
-    return None if camera is None else make_camera_info(camera, stamp)
+def _info(camera: Camera | None, stamp: int, frame: str) -> Any:
+    return None if camera is None else make_camera_info(camera, stamp, frame)

@@ -135,10 +135,10 @@ def optical_frame(bag: BagReader, info: str | None = None, image: str | None = N
     """
     for types, topic in (((INFO_TYPE,), info), (IMAGE_TYPES, image)):
         try:
-            found = find_topic(bag, types, topic, "")
+            source = find_topic(bag, types, topic, "")
         except SourceError:
             continue
-        for _, _, message in bag.messages([found]):
+        for _, _, message in bag.messages([source]):
             return str(message.header.frame_id)
     return ""
 
@@ -146,8 +146,7 @@ def optical_frame(bag: BagReader, info: str | None = None, image: str | None = N
 def camera_topics(
     bag: BagReader, cameras: Sequence[str] | None = None
 ) -> dict[str, dict[str, str]]:
-    """The topics of each camera of a rig by the names of their inputs: camera_info, and one of
-    correspondences, keypoints and image.
+    """The topics of each camera of a rig by the names of their inputs.
 
     Args:
         cameras: their names, which stand before those of the topics; None: all that there are.
@@ -159,11 +158,11 @@ def camera_topics(
     for info in sorted(topic for topic, kind in bag.topics.items() if kind == INFO_TYPE):
         prefix = info.rpartition("/")[0]
         own = {topic: kind for topic, kind in bag.topics.items() if topic.startswith(f"{prefix}/")}
-        found = [(name, f"{prefix}/{name}") for name in (CORRESPONDENCES, KEYPOINTS)]
-        found = [pair for pair in found if pair[1] in own]
-        found += [("image", topic) for topic in sorted(own) if own[topic] in IMAGE_TYPES]
-        if prefix and found:
-            there[prefix.rpartition("/")[2]] = {CAMERA_INFO: info, **dict(found[:1])}
+        topics = [(name, f"{prefix}/{name}") for name in (CORRESPONDENCES, KEYPOINTS)]
+        topics = [pair for pair in topics if pair[1] in own]
+        topics += [("image", topic) for topic in sorted(own) if own[topic] in IMAGE_TYPES]
+        if prefix and topics:
+            there[prefix.rpartition("/")[2]] = {CAMERA_INFO: info, **dict(topics[:1])}
     names = list(there) if cameras is None else list(cameras)
     if missing := [name for name in names if name not in there] or (len(names) < 2 and ["another"]):
         raise RecordingError(

@@ -72,22 +72,24 @@ def plane_depths(points: Array) -> Depths:
 
 
 def map_depths(points: Array) -> Depths:
-    """Depths between the points (n,3) of a map that the camera has before it, their inverses
-    interpolated in the image; around them, those of the nearest. Who hides whom is not known.
+    """Depths between the points (n,3) of a map before the camera: who hides whom is not known.
+
+    Their inverses are interpolated in the image; around them are those of the nearest.
     """
     from scipy.interpolate import griddata  # 20 MB, which a node without this output does not need
 
     def depths(rotation: Array, translation: Array, rays: Array) -> Array:
-        seen = points @ rotation.T + translation
-        seen = seen[seen[:, 2] > 0.0]
-        places, inverse = seen[:, :2] / seen[:, 2:], 1.0 / seen[:, 2]
+        in_camera = points @ rotation.T + translation
+        in_camera = in_camera[in_camera[:, 2] > 0.0]
+        places, inverse = in_camera[:, :2] / in_camera[:, 2:], 1.0 / in_camera[:, 2]
         near = np.abs(places).max(axis=1) < 2.0 * np.abs(rays[:, :2]).max()
         if np.count_nonzero(near) < 4:
             return np.full(len(rays), np.nan)
         given = places[near], inverse[near], rays[:, :2]
-        found = griddata(*given, method="linear")
+        interpolated = griddata(*given, method="linear")
         return np.asarray(
-            1.0 / np.where(np.isfinite(found), found, griddata(*given, method="nearest"))
+            1.0
+            / np.where(np.isfinite(interpolated), interpolated, griddata(*given, method="nearest"))
         )
 
     return depths

@@ -126,7 +126,7 @@ def find_topics(bag: BagReader, given: Mapping[str, str | None] | None = None) -
     """
     wanted = {name: topic for name, topic in (given or {}).items() if topic is not None}
     frames = _choose_frames(bag, wanted)
-    found = {}
+    chosen = {}
     for name, item in INPUTS.items():
         if item.role == Role.FRAMES:
             needed = item is frames
@@ -137,8 +137,8 @@ def find_topics(bag: BagReader, given: Mapping[str, str | None] | None = None) -
             used = name == frames.needs or all(name != other.needs for other in INPUTS.values())
             needed = used and (item.necessary or name in wanted or bool(_named(bag, item)))
         if needed:
-            found[name] = _find(bag, item, wanted.get(name))
-    return Topics(found)
+            chosen[name] = _find(bag, item, wanted.get(name))
+    return Topics(chosen)
 
 
 def find_rig_topics(
@@ -159,20 +159,20 @@ def find_rig_topics(
         for item in (INPUTS[CORRESPONDENCES], INPUTS[KEYPOINTS])
     }
     kind = max(there, key=lambda name: len(there[name]))
-    found = _of_cameras(bag, INPUTS[CAMERA_INFO], cameras) | there[kind]
+    chosen = _of_cameras(bag, INPUTS[CAMERA_INFO], cameras) | there[kind]
     for name in cameras:
         for own in (f"{name}/{CAMERA_INFO}", f"{name}/{kind}"):
-            if own not in found:
+            if own not in chosen:
                 raise BagError(f"{bag.path} has no topic {own}; it has {_describe(bag.topics)}")
     map_topic = (given or {}).get(MAP_POINTS)
     if kind == KEYPOINTS and (map_topic or _named(bag, INPUTS[MAP_POINTS])):
-        found[MAP_POINTS] = _find(bag, INPUTS[MAP_POINTS], map_topic)
-    return Topics(found)
+        chosen[MAP_POINTS] = _find(bag, INPUTS[MAP_POINTS], map_topic)
+    return Topics(chosen)
 
 
 def _of_cameras(bag: BagReader, item: Input, cameras: Sequence[str]) -> dict[str, str]:
     """The topics of an input of each camera, by ``NAME/input``."""
-    found: dict[str, str] = {}
+    chosen: dict[str, str] = {}
     for name in cameras:
         own = f"{name}/{item.topic}"
         topics = sorted(
@@ -183,8 +183,8 @@ def _of_cameras(bag: BagReader, item: Input, cameras: Sequence[str]) -> dict[str
         if len(topics) > 1:
             raise BagError(f"{bag.path}: several topics may be {own}: {_list(topics)}")
         for topic in topics:
-            found[own] = topic
-    return found
+            chosen[own] = topic
+    return chosen
 
 
 def _choose_frames(bag: BagReader, wanted: Mapping[str, str]) -> Input:
@@ -193,13 +193,13 @@ def _choose_frames(bag: BagReader, wanted: Mapping[str, str]) -> Input:
     given = [item for item in kinds if item.topic in wanted]
     if given:
         return given[-1]
-    found = [item for item in kinds if _named(bag, item)]
-    if len(found) > 1:
+    candidates = [item for item in kinds if _named(bag, item)]
+    if len(candidates) > 1:
         raise BagError(
-            f"{bag.path} has {' and '.join(item.topic for item in found)}; choose with "
-            f"{' or '.join(item.option for item in found)}"
+            f"{bag.path} has {' and '.join(item.topic for item in candidates)}; choose with "
+            f"{' or '.join(item.option for item in candidates)}"
         )
-    return found[0] if found else kinds[0]
+    return candidates[0] if candidates else kinds[0]
 
 
 def imu_topics(bag: BagReader) -> list[str]:
@@ -226,9 +226,9 @@ def _find(bag: BagReader, item: Input, given: str | None) -> str:
     if given is not None:
         if given in of_type:
             return given
-        found = f"is of type {bag.topics[given]}" if given in bag.topics else "does not exist"
+        fault = f"is of type {bag.topics[given]}" if given in bag.topics else "does not exist"
         raise BagError(
-            f"{bag.path}: topic {given} {found}; topics of type {item.type}: {_list(of_type)}"
+            f"{bag.path}: topic {given} {fault}; topics of type {item.type}: {_list(of_type)}"
         )
     for candidates in (_named(bag, item), of_type):
         if len(candidates) == 1:
@@ -376,10 +376,10 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
         yield Answer(last[1], stamp_ns(last[2]), result)
 
 
-def _each(results: Results) -> Sequence[Localized | Refusal]:
+def _each(results: Results) -> Iterable[Localized | Refusal]:
     if results is None:
         return []
-    return results if isinstance(results, Sequence) else [results]
+    return results if isinstance(results, Iterator) else [results]
 
 
 def _list(topics: list[str]) -> str:

@@ -102,8 +102,10 @@ def reproject(frame: Localized, camera: Camera) -> Reprojection:
     """Project the inliers through the shutter that the frame was localized with."""
     points, pixels = columns(frame, "xyz"), columns(frame, "uv")
     predicted, tau = project_rolling(camera, frame.estimate.at_rows, points)
-    seen = np.isfinite(tau)
-    return Reprojection(points[seen], pixels[seen], predicted[seen], row_colours(tau[seen]))
+    visible = np.isfinite(tau)
+    return Reprojection(
+        points[visible], pixels[visible], predicted[visible], row_colours(tau[visible])
+    )
 
 
 def enlargement(frames: Sequence[Localized]) -> int:
@@ -205,9 +207,9 @@ def shown(bag: BagReader, topics: Topics) -> Iterator[Picture | Cloud]:
 
 def _picture_topic(bag: BagReader) -> str | None:
     """The only one, or that of the name that ``detect --images`` gives; else none can be meant."""
-    found = image_topics(bag)
-    named = [topic for topic in found if topic.strip("/") == COMPRESSED_IMAGE]
-    chosen = found if len(found) == 1 else named
+    topics = image_topics(bag)
+    named = [topic for topic in topics if topic.strip("/") == COMPRESSED_IMAGE]
+    chosen = topics if len(topics) == 1 else named
     return chosen[0] if len(chosen) == 1 else None
 
 
@@ -223,8 +225,8 @@ def _picture(message: Any) -> Picture:
 
 def _cloud(message: Any, matched: bool) -> Cloud:
     if matched:
-        found = read_correspondences(message)
-        return Cloud(found.stamp_ns, found.pixels, found.points)
+        correspondences = read_correspondences(message)
+        return Cloud(correspondences.stamp_ns, correspondences.pixels, correspondences.points)
     keypoints = read_keypoints(message)
     return Cloud(keypoints.stamp_ns, keypoints.pixels, np.zeros((0, 3)))
 
@@ -236,7 +238,7 @@ _UNKNOWN = np.full(3, np.nan)
 
 def series(frames: Sequence[Localized]) -> Series:
     """By path: the names of k curves, and their values (n,k), NaN where there is none."""
-    found = [frame.estimate for frame in frames]
+    estimates = [frame.estimate for frame in frames]
     spread = [np.sqrt(np.diag(frame.pose.covariance)) for frame in frames]
     twists = [frame.twist for frame in frames]
     return {
@@ -248,7 +250,7 @@ def series(frames: Sequence[Localized]) -> Series:
         ),
         COUNTS: (
             ["points", "inliers, rolling shutter", "inliers, global shutter"],
-            _rows([[len(e.inliers), e.inliers.sum(), e.global_shutter_inliers] for e in found]),
+            _rows([[len(e.inliers), e.inliers.sum(), e.global_shutter_inliers] for e in estimates]),
         ),
         DEVIATION: (
             ["position", "orientation"],
@@ -414,9 +416,9 @@ class _Scene:
         clouds = [item.points for item in items if isinstance(item, Cloud)]
         points = np.unique(np.concatenate([landmarks, *clouds]), axis=0)
         points = points[:: 1 + len(points) // _MOST_LANDMARKS]
-        way = [frame.pose.position for frame in self._frames.values()]
+        path = [frame.pose.position for frame in self._frames.values()]
         self._stream.log(LANDMARKS, rr.Points3D(points, colors=_GRAY, radii=-1.5), static=True)
-        self._stream.log(PATH, rr.LineStrips3D([way], colors=_BLUE, radii=-1.0), static=True)
+        self._stream.log(PATH, rr.LineStrips3D([path], colors=_BLUE, radii=-1.0), static=True)
         camera = self._camera
         self._stream.log(
             IMAGE,
@@ -450,22 +452,21 @@ class _Scene:
                 self._stream.log(path, rr.Clear(recursive=False))
             self._stream.log(REFUSED, rr.TextLog("no pose", level=rr.TextLogLevel.WARN))
             return
-        found = reproject(frame, self._camera)
-        ends = found.pixels + self._sizes.longer * (found.predicted - found.pixels)
-        strips = np.stack([_centred(found.pixels), _centred(ends)], axis=1)
+        pairs = reproject(frame, self._camera)
+        ends = pairs.pixels + self._sizes.longer * (pairs.predicted - pairs.pixels)
+        strips = np.stack([_centred(pairs.pixels), _centred(ends)], axis=1)
         self._stream.log(
-            MATCHES, rr.Points2D(_centred(found.predicted), colors=found.colours, radii=-3.0)
+            MATCHES, rr.Points2D(_centred(pairs.predicted), colors=pairs.colours, radii=-3.0)
         )
         self._stream.log(self._residuals, rr.LineStrips2D(list(strips), colors=_ORANGE))
-        self._stream.log(INLIERS, rr.Points3D(found.points, colors=found.colours, radii=-3.0))
+        self._stream.log(INLIERS, rr.Points3D(pairs.points, colors=pairs.colours, radii=-3.0))
 
     def _log_pose(self, frame: Localized) -> None:
         import rerun as rr
 
         rotation, translation = frame.estimate.at(0.0)
         self._stream.log(
-            CAMERA,
-            rr.Transform3D(translation=-rotation.T @ translation, mat3x3=rotation.T),
+            CAMERA, rr.Transform3D(translation=-rotation.T @ translation, mat3x3=rotation.T)
         )
         self._stream.log(
             BODY,

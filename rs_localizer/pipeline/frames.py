@@ -365,9 +365,7 @@ class FrameLocalizer:
             )
 
     def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
-        """Whether readings of the frame with this stamp are missing that may come within so many
-        seconds.
-        """
+        """Whether readings of the frame with this stamp may yet come within so many s."""
         time_ns = self._middle_row_ns(stamp_ns)
         return self.imu.awaits(self._tracker, self._config, time_ns, patience)
 
@@ -465,7 +463,9 @@ class FrameLocalizer:
             return Refusal(result.reason, result.detail)
         if result.lens is not None and not watch.axis_in_doubt:
             self._notice(Notice.LENS, lens_is_off(result.lens))
-        readout = ReadoutKnown(deviation, watch.may_be_reversed, watch.surely_global)
+        readout = ReadoutKnown(
+            deviation, watch.may_be_reversed, watch.surely_global, watch.other_axis
+        )
         return self.mounted(of_camera(cloud, result, config, camera, frame, readout))
 
     def _thinned(self, cloud: Correspondences) -> Correspondences:

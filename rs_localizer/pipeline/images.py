@@ -75,10 +75,7 @@ class FrameDetector:
     """
 
     def __init__(
-        self,
-        config: DetectorConfig,
-        notice: Notify = unheard,
-        marker_map: MarkerMap | None = None,
+        self, config: DetectorConfig, notice: Notify = unheard, marker_map: MarkerMap | None = None
     ) -> None:
         if marker_map is None:
             if not config.marker_map:

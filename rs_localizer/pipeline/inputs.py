@@ -9,7 +9,7 @@ reader. Launch files read this list: it imports no kernels.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Any, Union
@@ -33,8 +33,11 @@ CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 
 
-Results = Union["Localized", Refusal, Sequence[Union["Localized", Refusal]], None]
-"""None: the message was no frame. Of a rig an image may complete no frame, or several."""
+Results = Union["Localized", Refusal, Iterator[Union["Localized", Refusal]], None]
+"""None: the message was no frame.
+
+Of a rig an image may complete no frame, or several; each is worked on when it is asked for.
+"""
 
 
 class Role(Enum):
@@ -87,9 +90,7 @@ class Input:
         return f"--{self.topic.replace('_', '-')}"
 
     def take(self, localizer: FrameLocalizer, message: Any) -> Results:
-        """Read and use a message at once; of a frame, its result, or the results of all frames that
-        are complete with it.
-        """
+        """Read and use a message at once; the results of frames that are complete with it."""
         frames = self.role is Role.FRAMES
         try:
             return self.use(localizer, self.read(message))

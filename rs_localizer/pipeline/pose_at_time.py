@@ -106,10 +106,15 @@ def either(pose: Pose, other: Pose) -> Pose:
     return replace(pose, covariance=pose.covariance + np.outer(step, step))
 
 
-def backwards(twist: Twist) -> Twist:
-    """A twist with room for the opposite."""
-    step = 2.0 * np.concatenate([twist.linear, twist.angular])
+def either_twist(twist: Twist, other: Twist) -> Twist:
+    """A twist with room for another that it may be as well."""
+    step = np.concatenate([other.linear - twist.linear, other.angular - twist.angular])
     return replace(twist, covariance=twist.covariance + np.outer(step, step))
+
+
+def backwards(twist: Twist) -> Twist:
+    """The opposite."""
+    return replace(twist, linear=-twist.linear, angular=-twist.angular)
 
 
 def _beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:

@@ -34,6 +34,7 @@ from rs_localizer.io.transforms import NotYetError, Transform, TransformError, T
 from rs_localizer.pipeline.pose_at_time import (
     backwards,
     either,
+    either_twist,
     pose_at,
     published_moment,
     twist_at,
@@ -150,6 +151,7 @@ class ReadoutKnown:
     deviation: float  # s
     may_be_reversed: bool  # rows may run the other way
     global_shutter: bool  # all rows are exposed at once, whatever is set
+    other_axis: Estimate | None = None  # the same frame, if its rows may be its columns
 
 
 def of_camera(
@@ -175,7 +177,12 @@ def of_camera(
     deviation = readout.deviation
     if twist is not None and readout.may_be_reversed:
         other = pose_at(estimate, -tau)
-        pose, twist = either(pose, other), backwards(twist)
+        pose, twist = either(pose, other), either_twist(twist, backwards(twist))
+    if twist is not None and readout.other_axis is not None:
+        for row in (tau, -tau):  # in either direction
+            pose = either(pose, pose_at(readout.other_axis, row))
+        columns = twist_at(readout.other_axis, tau, readout_time)
+        twist = either_twist(either_twist(twist, columns), backwards(columns))
     if twist is not None and deviation > 0.0:
         # The middle row comes later where the readout takes longer; the first one does not.
         delay = deviation * camera.first_row_time if tau == 0.0 else 0.0

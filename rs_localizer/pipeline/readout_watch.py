@@ -11,9 +11,11 @@ from enum import Enum, auto
 import numpy as np
 
 from rs_localizer.config import LONGEST_READOUT_TIME, NodeConfig
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice
 from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.core.shake import FUNCTIONS, shake_at
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.localizer import Localizer
@@ -52,6 +54,14 @@ _KNOWN, _LEAST_SHARE = 0.08, 0.5
 # Residuals count up to this multiple of the inlier threshold.
 _TRUNCATED = 2.0
 _LEAST_NOISE = 0.1  # px
+# What an in-frame turn fits of noise at most, as a logarithm of a likelihood ratio: half a unit for
+# each of its functions, about both axes of the image; and no more than it moves the points.
+# Without it the wrong axis, which always needs one, won by 4 to 22 for half a second of a hand's
+# motion (frames 617 to 631 of the bundled one).
+_OF_TURNS = float(FUNCTIONS)
+# A lens other than the calibration's has to explain points better than a motion alone by as much
+# (rs_localizer.estimation.lens): the wrong axis bends images.
+_OF_LENS = 20.0
 
 
 class ScanAxis:
@@ -73,7 +83,9 @@ class ScanAxis:
         self._evidence = 0.0  # logarithm of the odds of the other axis
         self._dense = _TRIED_FIRST  # frames that are still to be tried, each
         self._skipped = 0  # since the last one that was
-        self._suspected = self._confirmed = False
+        self._suspected = self._confirmed = self._certain = False
+        # What the last frame is by the other axis, if that may be the right one.
+        self.other: Estimate | None = None
         # Along the other axis: how long the readout takes (positive), and its direction.
         self.measured: MeasuredReadout | None = None
         self.direction: ScanDirection | None = None
@@ -91,10 +103,11 @@ class ScanAxis:
 
     @property
     def wrong(self) -> bool:
-        """Whether it must be the other axis: its motions also agree from frame to frame, which
-        errors of map and lens do not.
+        """Whether it must be the other axis.
+
+        Its motions also agree from frame to frame, which errors of map and lens do not.
         """
-        return self._evidence > _CERTAIN and self.direction is not None
+        return self.direction is not None and (self._certain or self._evidence > _CERTAIN)
 
     @property
     def undecided(self) -> bool:
@@ -128,7 +141,11 @@ class ScanAxis:
             result: and what came of it.
         """
         self._skipped += 1
+        self.other = None
+        # The wrong axis makes in-frame turns, and refusals.
+        odd = not result or len(result.shake) > 0
         due = self._leans or self._dense > 0 or self._skipped >= _EVERY
+        due |= odd and self._evidence > _LEAST
         if self._confirmed or not due:
             return
         self._skipped, self._dense = 0, self._dense - 1
@@ -138,11 +155,17 @@ class ScanAxis:
             other = _OTHER_AXIS[ScanDirection(config.scan_direction)]
             self._localizer = Localizer(replace(camera, scan_direction=other), config)
         other_result = self._localizer.find(cloud.points, cloud.pixels, cloud.scores)
-        ratio = _log_ratio(result, other_result, _TRUNCATED * config.inlier_threshold)
+        results = [(camera, result), (self._localizer.camera, other_result)]
+        ours, others = _costs(results, cloud.pixels, _TRUNCATED * config.inlier_threshold)
+        ratio = ours - others
         ratio = min(max(ratio, -_MOST_OF_A_FRAME), _MOST_OF_A_FRAME)
         self._evidence = max(_MEMORY * self._evidence + ratio, _LEAST)
         if other_result and self._leans:
             self._measure(time_ns, other_result, cloud)
+        self._certain = self.wrong and self._evidence > 0.0  # stays until as much speaks against it
+        contradicted = self.direction is None and self._monitor.odds.rolling < -_CONTRADICTS
+        if other_result and self._evidence > 0.0 and not contradicted:
+            self.other = other_result
 
     def _measure(self, time_ns: int, estimate: Estimate, cloud: Correspondences) -> None:
         assert self._localizer is not None
@@ -167,25 +190,29 @@ class ScanAxis:
         self.direction = direction if measured.readout_time > 0.0 else REVERSED[direction]
 
 
-def _log_ratio(ours: Estimate | Failure, other: Estimate | Failure, most: float) -> float:
-    """Logarithm of the likelihood ratio of two results for the same points; positive: the other.
+def _costs(
+    results: list[tuple[Camera, Estimate | Failure]], pixels: Array, most: float
+) -> list[float]:
+    """What results for the same points (n,2) leave: negative logarithms of likelihoods.
 
     Args:
         most: px, where residuals are cut off.
     """
-    if not (ours or other):
-        return 0.0
-    of_both = [result for result in (ours, other) if result]
-    count = len(of_both[0].inliers)
-    noise = max(min(result.residual_rms for result in of_both) / np.sqrt(2.0), _LEAST_NOISE)
+    estimates = [result for _, result in results if result]
+    if not estimates:
+        return [0.0] * len(results)
+    noise = max(min(one.residual_rms for one in estimates) / math.sqrt(2.0), _LEAST_NOISE)
 
-    def cost(result: Estimate | Failure) -> float:
+    def cost(camera: Camera, result: Estimate | Failure) -> float:
         if not result:
-            return count * most**2
+            return len(pixels) * most**2 / (2.0 * noise**2)
         cut = np.fmin(result.residuals, most)  # NaN: unusable by either
-        return float(cut @ cut)
+        turns = shake_at(camera.row_time(pixels[result.inliers]), result.shake)[:, :2]
+        moved = float(np.sum((camera.focal_length * turns) ** 2)) / (2.0 * noise**2)
+        of_lens = 0.0 if result.lens is None else _OF_LENS
+        return float(cut @ cut) / (2.0 * noise**2) + min(moved, _OF_TURNS) + of_lens
 
-    return float((cost(ours) - cost(other)) / (2.0 * noise**2))
+    return [cost(*pair) for pair in results]
 
 
 # Frames from one measurement to the next: few at first, more when there is more to compute.
@@ -248,7 +275,12 @@ class ReadoutWatch:
     @property
     def trusted(self) -> bool:
         """Whether what the camera does from frame to frame tells what it does within them."""
-        return not (self.far_off or self.doubtful)
+        return not (self.far_off or self.doubtful or self.other_axis)
+
+    @property
+    def other_axis(self) -> Estimate | None:
+        """What the last frame is along the other axis, if the shutter may move along that."""
+        return self._axis.other
 
     @property
     def axis_in_doubt(self) -> bool:

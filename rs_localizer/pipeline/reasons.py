@@ -158,12 +158,9 @@ IMU_REASONS: dict[str, Meaning] = {
         "readout_time is 0 (unknown), and with it which message belongs to which row",
         "set readout_time; rs_localizer calibrate finds it",
     ),
-    ImuReason.NOT_TRACKING: Meaning(
-        "the solver is for global shutters",
-        "another solver",
-    ),
+    ImuReason.NOT_TRACKING: Meaning("the solver is for global shutters", "another solver"),
     ImuReason.DOUBTED: Meaning(
-        "the points of this image fit better without the gyroscope",
+        "the points of this image fit better without the gyroscope, or its stamps have stepped",
         "nothing, if it is rare; otherwise imu.gyroscope_noise, imu.time_offset",
     ),
     ImuReason.DISAGREES: Meaning(

@@ -1,7 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Images of several cameras become frames: by their stamps alone, so that it does not matter how
-fast they come.
+"""Images of several cameras become frames: by their stamps, however fast they come.
 
 A frame holds one image of each camera whose exposures have their middles within ``rig.window``. It
 is complete when all cameras that are awaited have come, or when one comes that belongs to the next

@@ -9,7 +9,7 @@ says, at the time of the frame. Poses are those of ``base_frame``, as of one cam
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -100,7 +100,7 @@ def _calibration(name: str, localizer: FrameLocalizer) -> Calibration | None:
 
 def _localize(
     name: str, kind: str, localizer: FrameLocalizer, message: Any
-) -> list[Localized | Refusal]:
+) -> Iterator[Localized | Refusal]:
     return _rig(localizer).add(name, kind, message)
 
 
@@ -212,17 +212,19 @@ class RigLocalizer(FrameLocalizer):
             )
         self._use(calibration, self._config)
 
-    def add(self, name: str, kind: str, message: Any) -> list[Localized | Refusal]:
-        """Take an image of a camera; the results of the frames that are complete with it."""
+    def add(self, name: str, kind: str, message: Any) -> Iterator[Localized | Refusal]:
+        """Take an image; the results of frames that are complete, before cameras are compared."""
         if name not in self.calibrations:
             text = f"no usable camera_info of {name} has come yet"
             self._notice(Notice.NO_IMAGES, f"{name} is left out: {text}")
-            return [Refusal(Reason.NO_CAMERA_INFO, text)]
+            yield Refusal(Reason.NO_CAMERA_INFO, text)
+            return
         own = self._config.of_cameras[name]
         camera = self.calibrations[name].camera(own.readout_time, own.scan_direction)
         cloud = self._read(name, kind, message, camera)
         if isinstance(cloud, Refusal):
-            return [cloud]
+            yield cloud
+            return
         for notice, text in oddities(cloud, camera, self.calibrations[name].frame).items():
             self._notice(notice, f"{name}: {text}")
         cloud = thinned(cloud, self._config.max_points // len(self._config.cameras), camera.size)
@@ -230,7 +232,8 @@ class RigLocalizer(FrameLocalizer):
         middle_ns = start_ns - round(camera.first_row_time * own.readout_time * 1e9)
         image = Image(name, start_ns, middle_ns, cloud)
         frames = self._assembler.add(image) if self.watch.is_usable(name) else []
-        answers = [self._localize_frame(frame) for frame in frames]
+        for images in frames:
+            yield self._localize_frame(images)
         frame = self.camera_frame
         fixed = {
             each: mount
@@ -238,7 +241,6 @@ class RigLocalizer(FrameLocalizer):
             if not self.transforms.moves(self.calibrations[each].frame, frame)
         }
         self.watch.add(image, camera, fixed)
-        return answers
 
     def flush(self) -> list[Localized | Refusal]:
         """The results of what still waits for other images: none will come."""
@@ -289,9 +291,7 @@ class RigLocalizer(FrameLocalizer):
         return self.mounted(self._localized(images, result, origin_ns))
 
     def _mount(self, images: Sequence[Image]) -> Refusal | None:
-        """Look up where the cameras are, of each that has not been or that moves; why one that has
-        a part in this frame is not known.
-        """
+        """Look up where cameras are that move; why one of this frame is not known."""
         frame, stamp_ns = self.camera_frame, images[0].cloud.stamp_ns or None
         mounts, refusal = dict(self._mounts), None
         for image in images:

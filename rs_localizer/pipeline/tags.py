@@ -57,26 +57,26 @@ class Tags:
     def match(self, message: Any) -> Correspondences | Refusal:
         """Correspondences of an AprilTagDetectionArray; never raises for a bad one."""
         try:
-            found = read_detections(message)
+            detections = read_detections(message)
         except MessageError as error:
             return Refusal(Reason.BAD_DETECTIONS, str(error))
-        if len(found.ids) == 0:
+        if len(detections.ids) == 0:
             return Refusal(Reason.EMPTY_CLOUD, "the detector has found no tag")
-        rows = self._known(found)
+        rows = self._known(detections)
         if not (rows >= 0).any():
-            names = _listed(found, np.arange(len(rows)))
+            names = _listed(detections, np.arange(len(rows)))
             return Refusal(Reason.NO_MATCHES, f"the marker map has none of {names}")
-        found = replace(found, ids=rows[rows >= 0], corners=found.corners[rows >= 0])
-        order = self._other_order(found)
+        detections = replace(detections, ids=rows[rows >= 0], corners=detections.corners[rows >= 0])
+        order = self._other_order(detections)
         if order is not None:
             return Refusal(Reason.BAD_DETECTIONS, order)
-        return self._correspondences(found)
+        return self._correspondences(detections)
 
-    def _known(self, found: TagDetections) -> IntArray:
+    def _known(self, detections: TagDetections) -> IntArray:
         """The first row of each tag (m,) in the map's points; -1: it is not used."""
         keys = [
             (self._kinds.get(name, name), number)
-            for name, number in zip(found.families, found.ids.tolist(), strict=True)
+            for name, number in zip(detections.families, detections.ids.tolist(), strict=True)
         ]
         rows = np.array([self._rows.get(key, -1) for key in keys], np.int64)
         repeated = np.array([keys.count(key) > 1 for key in keys], bool)
@@ -85,22 +85,25 @@ class Tags:
             (Notice.REPEATED_MARKERS, repeated, "more than once: not used"),
         ):
             if some.any():
-                listed = _listed(found, np.flatnonzero(some))
+                listed = _listed(detections, np.flatnonzero(some))
                 self._notice(name, f"the detector has found {listed}, {text}")
         rows[repeated] = -1
         return rows
 
-    def _other_order(self, found: TagDetections) -> str | None:
+    def _other_order(self, detections: TagDetections) -> str | None:
         """What is wrong with the order of the corners, if another one fits the map."""
         self._images += 1
-        if len(found.ids) < 2 or (self._agreed >= _AGREED and self._images % _ONE_IN):
+        if len(detections.ids) < 2 or (self._agreed >= _AGREED and self._images % _ONE_IN):
             return None
-        fault = self._check.fault(self._detections(found, found.corners))
+        fault = self._check.fault(self._detections(detections, detections.corners))
         if fault is None:
             self._agreed += 1
             return None
         for order in _ORDERS:
-            if self._check.fault(self._detections(found, found.corners[:, order])) is None:
+            if (
+                self._check.fault(self._detections(detections, detections.corners[:, order]))
+                is None
+            ):
                 # A message has ours backwards.
                 names = [_CORNERS[order.index(k)] for k in (3, 2, 1, 0)]
                 return (
@@ -110,17 +113,17 @@ class Tags:
         self._notice(Notice.WRONG_MAP, fault)
         return None
 
-    def _detections(self, found: TagDetections, corners: Array) -> Detections:
-        rows = (found.ids[:, None] + np.arange(4)).ravel()
+    def _detections(self, detections: TagDetections, corners: Array) -> Detections:
+        rows = (detections.ids[:, None] + np.arange(4)).ravel()
         return Detections(
             rows, self._points[rows], corners.reshape(-1, 2), np.ones(len(rows)), (), (), (), ()
         )
 
-    def _correspondences(self, found: TagDetections) -> Correspondences:
-        rows = (found.ids[:, None] + np.arange(4)).ravel()
-        sides = np.linalg.norm(np.roll(found.corners, -1, axis=1) - found.corners, axis=2)
+    def _correspondences(self, detections: TagDetections) -> Correspondences:
+        rows = (detections.ids[:, None] + np.arange(4)).ravel()
+        sides = np.linalg.norm(np.roll(detections.corners, -1, axis=1) - detections.corners, axis=2)
         scores = np.repeat(sides.min(axis=1), 4)
-        points, pixels = self._points[rows], found.corners.reshape(-1, 2)
+        points, pixels = self._points[rows], detections.corners.reshape(-1, 2)
         names = [(name, "<f8") for name in "xyz"]
         fields = [*names, ("u", "<f4"), ("v", "<f4"), ("score", "<f4"), ("id", "<u4")]
         table = np.empty(len(rows), fields)
@@ -128,7 +131,7 @@ class Tags:
             table[name] = column
         table["score"], table["id"] = scores, rows
         return Correspondences(
-            found.stamp_ns, self._map.map_frame, points, pixels, scores, 0, table
+            detections.stamp_ns, self._map.map_frame, points, pixels, scores, 0, table
         )
 
 
@@ -141,6 +144,6 @@ def read_tags(file: str, notice: Notify) -> Tags:
     return Tags(read_marker_map(Path(file).expanduser()), notice)
 
 
-def _listed(found: TagDetections, some: IntArray) -> str:
-    names = [f"{found.families[k]} {found.ids[k]}" for k in some.tolist()]
+def _listed(detections: TagDetections, some: IntArray) -> str:
+    names = [f"{detections.families[k]} {detections.ids[k]}" for k in some.tolist()]
     return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")

@@ -17,6 +17,7 @@ _UBUNTU = {
 _ONLY_PIP = ("numba", "rosbags")
 # Of what only some commands need: the extra that brings it.
 _EXTRAS = {
+    "av": "video",
     "dask": "fleet",
     "distributed": "fleet",
     "fsspec": "table",

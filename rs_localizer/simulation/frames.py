@@ -158,7 +158,6 @@ def _visible(
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], Array]:
     """A random choice of the points that some row sees: their ids (n,) and true pixels (n,2)."""
-
     poses_at = true_poses_at(camera, motion, middle_ns)
     size = np.array(camera.size)
     rotations, translations = poses_at(np.zeros(1))

@@ -67,9 +67,7 @@ def write_truth(
     body: str = CAMERA_FRAME,
     recorded_ns: int | None = None,
 ) -> None:
-    """Pose of the camera, or of another body, in the map, and its twist in its axes, of a state of
-    one instant; recorded then, unless another time is given.
-    """
+    """Pose and twist of a body in the map, of one instant; recorded then, or at another time."""
     x, y, z = state.positions[0].tolist()
     qx, qy, qz, qw = so3.quaternion(np.ascontiguousarray(state.rotations[0])).tolist()
     pose = make_message(

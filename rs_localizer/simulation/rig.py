@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,26 +17,29 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io import topics
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.recording import make_camera_info, make_correspondences
-from rs_localizer.io.rigs import RigParts, node_parameters, optical_frame
-from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
+from rs_localizer.io.recording import (
+    RAW_IMAGE_TOPIC,
+    make_camera_info,
+    make_correspondences,
+    make_image,
+)
+from rs_localizer.io.rigs import RIG_FRAME, RigParts, node_parameters, optical_frame
+from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps
+from rs_localizer.simulation.image_sequence import RenderedFrame
 from rs_localizer.simulation.recording import write_truth
-from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import TrueMotion, TrueState
 
-RIG_FRAME = "rig"
 # How far the rates of cameras' oscillators are off, as a part of themselves: common quartz.
 _RATE_ERROR = 5e-5
 # The random numbers of clocks are their own.
 _CLOCK_STREAM = 28
 
+Frame = SimulatedFrame | RenderedFrame
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountedMotion:
-    """The motion of a camera that is mounted to a moving rig: ``X_camera = rotation X_rig +
-    translation``.
-    """
+    """The motion of a camera on a moving rig: ``X_camera = rotation X_rig + translation``."""
 
     rig: TrueMotion
     rotation: Array  # (3,3)
@@ -59,11 +62,11 @@ class MountedMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigFrame:
-    """An image of one of the cameras."""
+    """What one of the cameras saw at once."""
 
     name: str
     stamp_ns: int  # by the camera's own clock
-    frame: SimulatedFrame
+    frame: Frame
 
 
 def camera_stamps(
@@ -94,30 +97,20 @@ def camera_stamps(
 
 
 def simulate_rig(
-    parts: RigParts,
-    motion: TrueMotion,
-    map_points: Array,
-    settings: FrameSettings,
-    *,
-    stamps_ns: dict[str, list[int]],
-    seed: int = 0,
+    parts: RigParts, motion: TrueMotion, see: Callable[[str, TrueMotion, int], Iterable[Frame]]
 ) -> Iterator[RigFrame]:
-    """The images of all cameras of a map (m,3), in the order in which they have been read.
+    """The frames of all cameras, in the order in which they have been read.
 
     Args:
         parts: the rig; its stamps are those of true time without ``time_offset``.
         motion: of the rig's axes.
-        stamps_ns: of :func:`camera_stamps`.
-        seed: of the noise.
+        see: the frames of a camera by its name, its motion, and its place among the random numbers.
     """
 
     def images(place: int, name: str, camera: Camera) -> Iterator[tuple[int, int, RigFrame]]:
         mounted = MountedMotion(motion, *parts.camera_from_rig[name])
         offset_ns = round(parts.time_offset.get(name, 0.0) * 1e9)
-        for frame in simulate_frames(
-            camera, mounted, map_points, settings, stamps_ns=stamps_ns[name],
-            seed=seed + 1000 * place,
-        ):  # fmt: skip
+        for frame in see(name, mounted, 1000 * place):
             read_ns = frame.stamp_ns + round(camera.readout_time * 1e9)
             yield read_ns, place, RigFrame(name, frame.stamp_ns - offset_ns, frame)
 
@@ -131,20 +124,6 @@ def rig_parameters(parts: RigParts) -> dict[str, Any]:
     return {**node_parameters(parts), "base_frame": RIG_FRAME}
 
 
-def write_mounts(bag: BagWriter, parts: RigParts, stamp_ns: int) -> None:
-    """Where the cameras are on the rig, on /tf_static."""
-    transforms = [
-        make_transform(
-            make_message, 0, RIG_FRAME, optical_frame(name),
-            Transform(*parts.camera_from_rig[name]).inverse(),
-        )
-        for name in parts.cameras
-    ]  # fmt: skip
-    bag.write(
-        topics.TF_STATIC, make_message("tf2_msgs/msg/TFMessage", transforms=transforms), stamp_ns
-    )
-
-
 def write_rig_frame(
     bag: BagWriter,
     parts: RigParts,
@@ -152,18 +131,23 @@ def write_rig_frame(
     image: RigFrame,
     keypoints: NDArray[Any] | None = None,
 ) -> None:
-    """Camera info and correspondences (or keypoints) of a camera, and the truth of the rig when its
-    first and its middle row were exposed.
+    """Camera info and image, correspondences or keypoints of a camera, and the rig's truth.
+
+    The truth is of when its first and its middle row were exposed.
     """
     camera, frame, stamp_ns = parts.cameras[image.name], image.frame, image.stamp_ns
     recorded_ns = frame.stamp_ns + round(camera.readout_time * 1e9)
     for time_ns in sorted({frame.stamp_ns, frame.middle_ns}):
         write_truth(bag, time_ns, motion.state(time_ns, np.zeros(1)), RIG_FRAME, recorded_ns)
-    info = make_camera_info(camera, stamp_ns, optical_frame(image.name))
+    optical = optical_frame(image.name)
+    info = make_camera_info(camera, stamp_ns, optical)
     bag.write(f"/{image.name}/{topics.CAMERA_INFO}", info, recorded_ns)
-    if keypoints is None:
+    if isinstance(frame, RenderedFrame):
+        picture = make_image(stamp_ns, frame.format, frame.data, optical)
+        bag.write(f"/{image.name}{RAW_IMAGE_TOPIC}", picture, recorded_ns)
+    elif keypoints is None:
         cloud = make_correspondences(stamp_ns, frame.points, frame.pixels, frame.ids)
         bag.write(f"/{image.name}/{topics.CORRESPONDENCES}", cloud, recorded_ns)
     else:
-        cloud = make_cloud(make_message, stamp_ns, optical_frame(image.name), keypoints)
+        cloud = make_cloud(make_message, stamp_ns, optical, keypoints)
         bag.write(f"/{image.name}/{topics.KEYPOINTS}", cloud, recorded_ns)

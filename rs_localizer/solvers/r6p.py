@@ -25,7 +25,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.simd.algebra import cross, dot, least_squares, triangularize
@@ -192,42 +191,3 @@ def solve_batch(
     """
     # Not a kernel itself: Numba would optimize all of the code once more.
     _solve(points, rays, tau, samples, rotations, BOUND, models, np.empty((0, 3, 1)))
-
-
-def find_solutions(
-    points: ArrayLike, rays: ArrayLike, tau: ArrayLike, bound: float = BOUND
-) -> tuple[Array, Array, Array, Array]:
-    """The solutions themselves, before I + [v]x is replaced by the nearest rotation.
-
-    Args:
-        points: (h,6,3) points in the frame of the initial rotation.
-        rays: (h,6,2) undistorted bearings ``x/z, y/z``.
-        tau: (h,6) row times.
-        bound: largest norm of v.
-
-    Returns:
-        v, C, w, t, each (h,20,3), by the length of v; NaN beyond a sample's last solution.
-
-    Raises:
-        ValueError: wrong shapes.
-    """
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    rays = np.ascontiguousarray(rays, dtype=np.float64)
-    tau = np.ascontiguousarray(tau, dtype=np.float64)
-    h = len(points)
-    n = SAMPLE_SIZE
-    if points.shape != (h, n, 3) or rays.shape != (h, n, 2) or tau.shape != (h, n):
-        raise ValueError(
-            f"r6p takes points (h,{n},3), rays (h,{n},2) and tau (h,{n}); "
-            f"got {points.shape}, {rays.shape} and {tau.shape}"
-        )
-    models = np.empty((SOLUTIONS, MODEL_SIZE, h))
-    turns = np.full((SOLUTIONS, 3, h), np.nan)
-    samples = np.arange(h * n, dtype=np.int64).reshape(h, n)
-    _solve(
-        points.reshape(-1, 3), rays.reshape(-1, 2), tau.ravel(), samples, np.eye(3)[None],
-        float(bound), models, turns,
-    )  # fmt: skip
-    found = np.moveaxis(models, (2, 0), (0, 1))
-    v = np.where(np.isnan(found[..., :1]), np.nan, np.moveaxis(turns, (2, 0), (0, 1)))
-    return v, found[..., 9:12], found[..., 12:15], found[..., 15:]

@@ -161,8 +161,9 @@ def solve_free(
     points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, as_published: bool,
     models: Array,
 ) -> None:  # fmt: skip
-    """The unknowns themselves: models (18,h) are v, C, t and R_RS (row-major), all of them in the
-    frame of the initial rotation. Arguments otherwise as :func:`solve_batch`.
+    """The unknowns themselves: models (18,h) are v, C, t and R_RS, in the initial rotation's frame.
+
+    Row-major. Arguments otherwise as :func:`solve_batch`.
     """
     work = np.empty(_INPUTS * LANES)
     model = np.empty(MODEL_SIZE * LANES)

@@ -29,12 +29,12 @@ from rs_localizer.trajectory.observe import Observed, Posed, collect, in_order, 
 from rs_localizer.trajectory.spline import LONGEST_SPACING, Spline, first_spline, refined
 
 
-def likelihood(camera: Camera, found: Calibration, count: int = 9) -> tuple[Array, Array]:
+def likelihood(camera: Camera, result: Calibration, count: int = 9) -> tuple[Array, Array]:
     """Readout times (count,) within four deviations, and what they cost more than the best."""
-    seen = within(found.posed.observations, found.fit.state.spline)
-    values = found.readout_time + np.linspace(-4.0, 4.0, count) * found.formal_deviation
-    costs = np.array([cost_at(camera, seen, found.fit, float(value)) for value in values])
-    return values, costs - found.fit.cost
+    observations = within(result.posed.observations, result.fit.state.spline)
+    values = result.readout_time + np.linspace(-4.0, 4.0, count) * result.formal_deviation
+    costs = np.array([cost_at(camera, observations, result.fit, float(value)) for value in values])
+    return values, costs - result.fit.cost
 
 
 class Residuals(NamedTuple):
@@ -45,17 +45,19 @@ class Residuals(NamedTuple):
     squared_errors: Array  # (n,) px^2
 
 
-def without_readout(camera: Camera, found: Calibration) -> tuple[Residuals, Residuals]:
+def without_readout(camera: Camera, result: Calibration) -> tuple[Residuals, Residuals]:
     """What a global shutter would leave, and what the readout time leaves."""
-    seen = within(found.posed.observations, found.fit.state.spline).subset(found.fit.inliers)
-    seen = replace(seen, trusted=np.ones_like(seen.trusted))
-    held = replace(found.fit.freedom, readout_time=False)
+    observations = within(result.posed.observations, result.fit.state.spline).subset(
+        result.fit.inliers
+    )
+    observations = replace(observations, trusted=np.ones_like(observations.trusted))
+    held = replace(result.fit.freedom, readout_time=False)
     both = []
-    for value in (0.0, found.readout_time):
-        start = replace(found.fit.state, readout_time=value)
-        both.append(fit(camera, seen, start, held).squared_errors)
-    speeds = image_speeds(camera, seen, found.fit.state)
-    before, after = (Residuals(seen.row_times, speeds, errors) for errors in both)
+    for value in (0.0, result.readout_time):
+        start = replace(result.fit.state, readout_time=value)
+        both.append(fit(camera, observations, start, held).squared_errors)
+    speeds = image_speeds(camera, observations, result.fit.state)
+    before, after = (Residuals(observations.row_times, speeds, errors) for errors in both)
     return before, after
 
 
@@ -166,9 +168,7 @@ def cut(state: State, start: float, end: float) -> State | None:
 
 
 def disagreement(values: Array, deviations: Array) -> float:
-    """By how much deviations (b,) are too small for the scatter of values (b,) (Birge's ratio),
-    1 if that may be chance.
-    """
+    """By how much deviations (b,) are too small (Birge's ratio), at least 1."""
     if len(values) < 2:
         return 1.0
     weights = deviations**-2.0
@@ -184,8 +184,7 @@ def disagreement(values: Array, deviations: Array) -> float:
 
 
 def discrepancy(value: float, values: Array, deviations: Array) -> float:
-    """By how much the value of the whole differs from the mean of its parts (b,), beyond the noise
-    of that mean.
+    """By how much the whole's value differs from the mean of its parts (b,), beyond its noise.
 
     Corners that are off in all images of a part alike bend its lens and shape. The shorter it is,
     the more of the shutter is taken for those: then the whole lies beside all of its parts.
@@ -198,6 +197,9 @@ def discrepancy(value: float, values: Array, deviations: Array) -> float:
 
 
 _LEAST_IMAGES = 20
+# Keypoints of all images together: each image keeps its part. A fisheye of 285 images with 352
+# corners each took minutes longer, for a lens and a readout time that errors of the corners limit.
+_MOST_SIGHTS = 40_000
 # A board: few landmarks, seen often. Each is where it should be to about this part of its size (a
 # quarter of a millimetre of an A4 sheet), beside what bends all of it.
 _MOST_BOARD_POINTS, _LEAST_SIGHTS, _BOARD_SHARE = 400, 30, 1e-3
@@ -302,15 +304,13 @@ class Calibration:
     @property
     def held(self) -> int:
         """Landmarks that are seen often enough to have a shape estimated, but are too many."""
-        seen = self.posed.observations
-        often = len(seen.points) >= _LEAST_SIGHTS * len(seen.landmarks)
-        return len(seen.landmarks) if often and self.fit.freedom.landmarks == 0.0 else 0
+        observations = self.posed.observations
+        often = len(observations.points) >= _LEAST_SIGHTS * len(observations.landmarks)
+        return len(observations.landmarks) if often and self.fit.freedom.landmarks == 0.0 else 0
 
     @property
     def shape_deviation(self) -> float:
-        """Of the landmarks that were estimated (m, rms): by the noise, and by half of what the
-        halves differ by but for a rigid motion.
-        """
+        """Of the estimated landmarks (m, rms): by the noise, and half of the halves' difference."""
         count = 3 * len(np.unique(self.posed.observations.points))
         first = 1 + len(self.fit.state.lens)
         variances = np.diag(self.fit.border_covariance)[first : first + count]
@@ -370,7 +370,7 @@ def calibrate(
         ValueError: when the recording determines nothing, saying what was found.
     """
     taken = np.unique([image.stamp_ns for image in images])
-    images = in_order(images)
+    images = _thinned(in_order(images))
     if len(images) < _LEAST_IMAGES:
         raise ValueError(f"{len(images)} images show the map, at least {_LEAST_IMAGES} are needed")
     results = localize_each(camera, images, done)
@@ -385,18 +385,33 @@ def calibrate(
     stamps = examine((taken - taken[0]) * 1e-9)
     freedom = _freedom(posed.observations, intrinsics)
     try:
-        found = _best(camera, posed, stamps.interval, freedom)
+        fitted = _best(camera, posed, stamps.interval, freedom)
     except Undetermined as error:
         raise ValueError(str(error)) from error
-    seen, no_mount = within(posed.observations, found.state.spline), ""
+    observations, no_mount = within(posed.observations, fitted.state.spline), ""
     if imu is not None:
         try:
             samples = imu.samples(posed.start_ns)
-            seen, found = with_gyro(camera, seen, found, samples, imu.camera_from_imu)
+            observations, fitted = with_gyro(
+                camera, observations, fitted, samples, imu.camera_from_imu
+            )
         except (NoMount, Undetermined) as error:
             no_mount = str(error)
-    judged = _judged(camera, posed, seen, stamps, found, len(images))
+    judged = _judged(camera, posed, observations, stamps, fitted, len(images))
     return replace(judged, no_mount=no_mount, own_stamps=own_stamps or stamps.irregular)
+
+
+def _thinned(images: list[Observed]) -> list[Observed]:
+    """Images with no more keypoints in all than are worth their time, others in each image."""
+    every = sum(len(image.points) for image in images) / _MOST_SIGHTS
+    if every <= 1.0:
+        return images
+    kept = (np.floor(np.arange(k / len(images), len(image.points), every)).astype(np.int64)
+            for k, image in enumerate(images))  # fmt: skip
+    return [
+        replace(image, points=image.points[rows], pixels=image.pixels[rows])
+        for image, rows in zip(images, kept, strict=True)
+    ]
 
 
 def _freedom(observations: Observations, intrinsics: bool) -> Freedom:
@@ -412,48 +427,48 @@ def _freedom(observations: Observations, intrinsics: bool) -> Freedom:
 
 
 def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fit:
-    """Readout time first, then all that is free; then times of the images' own, and finer knots,
-    if the residuals ask for them.
-    """
+    """Readout time first, then all that is free, then the images' times and finer knots."""
     spacing = min(LONGEST_SPACING, interval)
     spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, 0.5 * interval)
-    seen = within(posed.observations, spline)
-    plain = fit(camera, seen, start_state(camera, seen, spline), Freedom())
-    found = fit(camera, seen, plain.state, _calm(plain.state, freedom), plain.deviation)
+    observations = within(posed.observations, spline)
+    plain = fit(camera, observations, start_state(camera, observations, spline), Freedom())
+    fitted = fit(camera, observations, plain.state, _calm(plain.state, freedom), plain.deviation)
     with suppress(Undetermined):  # a richer model that cannot be determined is no candidate
-        other = _unsteady(camera, seen, found, interval, freedom)
+        other = _unsteady(camera, observations, fitted, interval, freedom)
         unsteady = other.freedom.stamps > _LEAST_JITTER * interval
-        if unsteady and cheaper(other, found, len(other.state.delays)):
-            found = other
+        if unsteady and cheaper(other, fitted, len(other.state.delays)):
+            fitted = other
     with suppress(Undetermined):
-        state = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
-        finer = fit(camera, seen, state, found.freedom, found.deviation)
-        added = 6 * (len(finer.state.spline.positions) - len(found.state.spline.positions))
-        if cheaper(finer, found, added):
-            found = finer
-    return found
+        state = replace(fitted.state, spline=refined(fitted.state.spline, 0.5 * spacing))
+        finer = fit(camera, observations, state, fitted.freedom, fitted.deviation)
+        added = 6 * (len(finer.state.spline.positions) - len(fitted.state.spline.positions))
+        if cheaper(finer, fitted, added):
+            fitted = finer
+    return fitted
 
 
 def _unsteady(
-    camera: Camera, seen: Observations, found: Fit, interval: float, freedom: Freedom
+    camera: Camera, observations: Observations, fitted: Fit, interval: float, freedom: Freedom
 ) -> Fit:
     """With a time of its own for each image, from tight to loose to what they turn out to be."""
-    own, other = _calm(found.state, freedom), found
+    own, other = _calm(fitted.state, freedom), fitted
     for share in _FIRST_JITTERS:
         own = replace(own, stamps=share * interval)
-        other = fit(camera, seen, other.state, own)
-    own = replace(own, stamps=max(_jitter(camera, seen, other.state), _LEAST_STAMPS))
-    return fit(camera, seen, other.state, own, other.deviation)
+        other = fit(camera, observations, other.state, own)
+    own = replace(own, stamps=max(_jitter(camera, observations, other.state), _LEAST_STAMPS))
+    return fit(camera, observations, other.state, own, other.deviation)
 
 
-def _jitter(camera: Camera, seen: Observations, state: State) -> float:
+def _jitter(camera: Camera, observations: Observations, state: State) -> float:
     """What the images' own times are off their stamps, s rms.
 
     By how one image differs from the mean of its neighbours: times that drift are nearly a motion
     that drifts. And by the fast images: in slow ones a hundredth of a pixel, which may be the
     detector's error, is worth a millisecond.
     """
-    weights = np.bincount(seen.frames, image_speeds(camera, seen, state) ** 2, len(state.delays))
+    weights = np.bincount(
+        observations.frames, image_speeds(camera, observations, state) ** 2, len(state.delays)
+    )
     weights = np.minimum(weights[1:-1], np.minimum(weights[:-2], weights[2:]))
     beside = np.diff(state.delays, 2)
     return float(np.sqrt(weights @ beside**2 / (6.0 * np.sum(weights))))
@@ -480,27 +495,35 @@ def within(observations: Observations, spline: Spline) -> Observations:
 
 
 def _judged(
-    camera: Camera, posed: Posed, seen: Observations, stamps: Stamps, found: Fit, images: int
+    camera: Camera,
+    posed: Posed,
+    observations: Observations,
+    stamps: Stamps,
+    fitted: Fit,
+    images: int,
 ) -> Calibration:
-    opposite = cost_at(camera, seen, found, -found.state.readout_time)
-    blocks, halves = blocks_of(camera, seen, found), blocks_of(camera, seen, found, 2)
-    formal = found.readout_time_deviation
+    opposite = cost_at(camera, observations, fitted, -fitted.state.readout_time)
+    blocks, halves = (
+        blocks_of(camera, observations, fitted),
+        blocks_of(camera, observations, fitted, 2),
+    )
+    formal = fitted.readout_time_deviation
     values, deviations = _of(blocks, "readout_time"), _of(blocks, "deviation")
     inflation, mount = disagreement(values, deviations), None
-    if seen.gyro is not None:
+    if observations.gyro is not None:
         doubt = disagreement(_of(blocks, "delay"), _of(blocks, "delay_deviation"))
-        mount = mount_of(camera, found, seen.gyro, doubt)
-    at = slice(1, 1 + len(found.state.lens))
-    lens = lens_errors(found.camera, inflation**2 * found.border_covariance[at, at])
+        mount = mount_of(camera, fitted, observations.gyro, doubt)
+    at = slice(1, 1 + len(fitted.state.lens))
+    lens = lens_errors(fitted.camera, inflation**2 * fitted.border_covariance[at, at])
     if len(halves) == 2:
         lens = lens.or_half(lens_difference(halves[0].camera, halves[1].camera))
     return Calibration(
-        readout_time=found.state.readout_time,
+        readout_time=fitted.state.readout_time,
         deviation=math.hypot(
             formal * inflation,
-            _interval_deviation(found, stamps),
+            _interval_deviation(fitted, stamps),
             0.5 * _apart(halves)[0],
-            discrepancy(found.state.readout_time, values, inflation * deviations),
+            discrepancy(fitted.state.readout_time, values, inflation * deviations),
         ),
         formal_deviation=formal,
         blocks=blocks,
@@ -508,9 +531,9 @@ def _judged(
         own_stamps=True,
         lens=lens,
         inflation=inflation,
-        reversed_cost=opposite - found.cost,
+        reversed_cost=opposite - fitted.cost,
         stamps=stamps,
-        fit=found,
+        fit=fitted,
         posed=posed,
         images=images,
         mount=mount,
@@ -521,10 +544,10 @@ def _of(blocks: tuple[Block, ...], name: str) -> Array:
     return np.array([getattr(block, name) for block in blocks])
 
 
-def _interval_deviation(found: Fit, stamps: Stamps) -> float:
+def _interval_deviation(fitted: Fit, stamps: Stamps) -> float:
     """Of the readout time (s), where stamps are even and the images were not."""
     # So many images know a variance no better than that.
-    chance = 1.0 + 2.0 * math.sqrt(2.0 / len(found.state.delays))
-    unsaid = found.freedom.stamps**2 - chance * stamps.jitter**2
+    chance = 1.0 + 2.0 * math.sqrt(2.0 / len(fitted.state.delays))
+    unsaid = fitted.freedom.stamps**2 - chance * stamps.jitter**2
     share = math.sqrt(max(unsaid, 0.0)) / stamps.interval
-    return _INTERVAL_SHARE * share * abs(found.state.readout_time)
+    return _INTERVAL_SHARE * share * abs(fitted.state.readout_time)

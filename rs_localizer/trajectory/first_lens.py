@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A first lens, and its distortion model, from images in which the camera hardly moves (Zhang
-2000, by OpenCV).
-"""
+"""A first lens, and its model, from images in which the camera hardly moves (Zhang 2000)."""
 
 from __future__ import annotations
 
@@ -47,13 +45,11 @@ _CANDIDATES = (
     _Candidate(DistortionModel.RATIONAL_POLYNOMIAL, 8, cv2.CALIB_RATIONAL_MODEL),
 )
 _RICHER = 0.9
-# OpenCV 5 has one set of flags, earlier ones had another for fisheyes.
-_FLAGS: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2
-_FISHEYE = (
-    _FLAGS.CALIB_RECOMPUTE_EXTRINSIC | _FLAGS.CALIB_FIX_SKEW | _FLAGS.CALIB_USE_INTRINSIC_GUESS
-)
 _POSE_STEPS = 4  # of Gauss and Newton from a pose in rays: they double the digits
 _LEAST_POINTS = 8
+# Of Levenberg and Marquardt for a fisheye: steps at most, and by what part of the cost the last one
+# changed it.
+_LENS_STEPS, _SETTLED = 60, 1e-7
 _FLAT = 1e-6  # thickness of a plane by its size
 
 
@@ -87,9 +83,7 @@ def first_lens(size: tuple[int, int], images: list[Observed]) -> Camera:
 
 
 def _unseen_error(lens: Camera, images: list[Observed], candidate: _Candidate) -> float:
-    """Error (px rms) of each half of the images under a lens that the other half finds near this
-    one.
-    """
+    """Error (px rms) of each half of the images under a lens of the other half."""
     halves = images[::2], images[1::2]
     squared, count = 0.0, 0
     for known, unseen in (halves, halves[::-1]):
@@ -103,39 +97,130 @@ def _unseen_error(lens: Camera, images: list[Observed], candidate: _Candidate) -
 
 
 def reprojection_error(camera: Camera, image: Observed) -> float:
-    """Error (px rms, of u and v together) of the best global-shutter pose of an image; where the
-    lens has no ray for a pixel, or there is no pose, infinite.
-    """
-    rays = camera.rays(image.pixels)
-    if not np.isfinite(rays).all():
+    """Error (px rms of u and v together) of the best global-shutter pose; infinite without one."""
+    pose = _pose(camera, image)
+    if pose is None:
         return np.inf
-    found, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None)
-    if not found:
-        return np.inf
-    # In pixels, not in rays: far from the middle they are not the same.
-    rotation = cv2.Rodrigues(turn)[0]
-    rotation, place = np.asarray(rotation, float), np.asarray(place, float).ravel()
-    for _ in range(_POSE_STEPS):
-        local = image.points @ rotation.T + place
-        if not np.all(local[:, 2] > 0.0):
-            return np.inf
-        pixels, by_ray = camera.distort(local[:, :2] / local[:, 2:])
-        by_point = (
-            np.concatenate(
-                [by_ray, -np.einsum("nij,nj->ni", by_ray, local[:, :2] / local[:, 2:])[:, :, None]],
-                2,
-            )
-            / local[:, 2, None, None]
-        )
-        by_turn = -by_point @ so3.hat(local)
-        step = np.linalg.lstsq(
-            np.concatenate([by_turn, by_point], 2).reshape(-1, 6),
-            (image.pixels - pixels).ravel(), rcond=None,
-        )[0]  # fmt: skip
-        change = so3.exp(step[:3])
-        rotation, place = change @ rotation, change @ place + step[3:]
+    rotation, place = pose
     off = camera.project(image.points @ rotation.T + place) - image.pixels
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
+def _pose(camera: Camera, image: Observed) -> tuple[Array, Array] | None:
+    """Rotation (3,3) and translation (3,) of the best pose; None as for an infinite error."""
+    rays = camera.rays(image.pixels)
+    if not np.isfinite(rays).all():
+        return None
+    solved, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None)
+    if not solved:
+        return None
+    # In pixels, not in rays: far from the middle they are not the same.
+    pose = np.array(cv2.Rodrigues(turn)[0], np.float64), np.array(place, np.float64).ravel()
+    for _ in range(_POSE_STEPS):
+        linear = _linear(camera, image, *pose)
+        if linear is None:
+            return None
+        errors, by_pose, _ = linear
+        pose = _moved(*pose, np.linalg.lstsq(by_pose, -errors, rcond=None)[0])
+    return pose
+
+
+def _moved(rotation: Array, place: Array, step: Any) -> tuple[Array, Array]:
+    change: Array = so3.exp(np.ascontiguousarray(step[:3]))
+    return change @ rotation, change @ place + step[3:]
+
+
+def _linear(
+    camera: Camera, image: Observed, rotation: Array, place: Array
+) -> tuple[Array, Array, Array] | None:
+    """Errors (2n,) px of an image, by its pose (2n,6), and the rays (n,2); None: it looks away."""
+    local = image.points @ rotation.T + place
+    if not np.all(local[:, 2] > 0.0):
+        return None
+    rays = local[:, :2] / local[:, 2:]
+    pixels, by_ray = camera.distort(rays)
+    if not np.isfinite(pixels).all():
+        return None
+    along = -np.einsum("nij,nj->ni", by_ray, rays)[:, :, None]
+    by_point = np.concatenate([by_ray, along], 2) / local[:, 2, None, None]
+    by_pose = np.concatenate([-by_point @ so3.hat(local), by_point], 2).reshape(-1, 6)
+    return (pixels - image.pixels).ravel(), by_pose, rays
+
+
+def _fisheye(size: tuple[int, int], images: list[Observed], K: Array) -> tuple[float, Camera]:
+    """Squared errors (px^2), and the equidistant lens near ``K`` (3,3) that leaves them.
+
+    OpenCV's own asks for boards that are flat, one to an image.
+
+    Raises:
+        ValueError: when no such lens fits.
+    """
+
+    def lens(numbers: Array) -> Camera:
+        matrix = np.array([[numbers[0], 0.0, numbers[2]], [0.0, numbers[1], numbers[3]], [0, 0, 1]])
+        model = DistortionModel.EQUIDISTANT
+        width, height = size
+        return Camera(width=width, height=height, K=matrix, D=numbers[4:], distortion_model=model)
+
+    def cost(numbers: Array, poses: list[tuple[Array, Array]]) -> float:
+        camera, total = lens(numbers), 0.0
+        for image, pose in zip(posed, poses, strict=True):
+            part = _linear(camera, image, *pose)
+            total += np.inf if part is None else float(part[0] @ part[0])
+        return total
+
+    numbers = np.r_[K[0, 0], K[1, 1], K[0, 2], K[1, 2], np.zeros(4)]
+    first = [(image, _pose(lens(numbers), image)) for image in images]
+    posed = [image for image, pose in first if pose is not None]
+    poses = [pose for _, pose in first if pose is not None]
+    if len(posed) < max(_LEAST_IMAGES, len(images) // 2):
+        raise ValueError("no poses by this focal length")
+    least, damping = cost(numbers, poses), 1e-3
+    for _ in range(_LENS_STEPS):
+        camera, parts = lens(numbers), []
+        of_lens, slope = np.zeros((8, 8)), np.zeros(8)
+        for image, pose in zip(posed, poses, strict=True):
+            linear = _linear(camera, image, *pose)
+            assert linear is not None
+            errors, by_pose, rays = linear
+            by_lens = _by_fisheye(numbers, rays)
+            own = by_pose.T @ by_pose
+            own[np.diag_indices(6)] *= 1.0 + damping
+            mixed = np.linalg.solve(own, np.column_stack([by_pose.T @ by_lens, by_pose.T @ errors]))
+            parts.append(mixed)
+            of_lens += by_lens.T @ (by_lens - by_pose @ mixed[:, :8])
+            slope += by_lens.T @ (errors - by_pose @ mixed[:, 8])
+        of_lens[np.diag_indices(8)] *= 1.0 + damping
+        step = -np.linalg.solve(of_lens, slope)
+        moved = [
+            _moved(*pose, -mixed[:, 8] - mixed[:, :8] @ step)
+            for pose, mixed in zip(poses, parts, strict=True)
+        ]
+        left = cost(numbers + step, moved) if np.all(numbers[:2] + step[:2] > 0.0) else np.inf
+        if not left < least:
+            damping *= 10.0
+            if damping > 1e6:
+                break
+            continue
+        settled = least - left < _SETTLED * least
+        numbers, poses, least, damping = numbers + step, moved, left, max(0.1 * damping, 1e-9)
+        if settled:
+            break
+    return least * len(images) / len(posed), lens(numbers)
+
+
+def _by_fisheye(numbers: Array, rays: Array) -> Array:
+    """Pixels (2n,) by focal lengths, centre and distortion (8) of an equidistant lens."""
+    radius = np.hypot(*rays.T)
+    angle = np.arctan(radius)
+    powers = angle[:, None] ** np.arange(1.0, 10.0, 2.0)
+    unit = rays / np.maximum(radius, 1e-12)[:, None]
+    by_lens = np.zeros((len(rays), 2, 8))
+    for k in range(2):
+        by_lens[:, k, k] = unit[:, k] * (powers @ np.r_[1.0, numbers[4:]])
+        by_lens[:, k, 2 + k] = 1.0
+        by_lens[:, k, 4:] = numbers[k] * unit[:, k, None] * powers[:, 1:]
+    return by_lens.reshape(-1, 8)
 
 
 def _calibrated(
@@ -144,9 +229,7 @@ def _calibrated(
     candidate: _Candidate,
     start: Array | None = None,
 ) -> Camera | None:
-    """The lens of this kind that fits the images best, from ``start`` (3,3) or from anywhere;
-    None: none does.
-    """
+    """The best lens of this kind, from ``start`` (3,3) or anywhere; None: none fits."""
     points = [np.asarray(image.points, np.float32)[:, None] for image in images]
     pixels = [np.asarray(image.pixels, np.float32)[:, None] for image in images]
     best: tuple[float, Any, Any] | None = None
@@ -156,17 +239,14 @@ def _calibrated(
     for K, flags in near or _starts(size, everything):
         try:
             if model == DistortionModel.EQUIDISTANT:
-                given = [np.asarray(image.points)[None] for image in images]
-                seen = [np.asarray(image.pixels)[None] for image in images]
-                error, found, D, _, _ = cv2.fisheye.calibrate(
-                    given, seen, size, K, np.zeros(4), flags=_FISHEYE
-                )
-            else:
-                flags |= candidate.flags
-                error, found, D, _, _ = cv2.calibrateCamera(
-                    points, pixels, size, K, np.zeros(candidate.numbers), flags=flags
-                )
-        except cv2.error:
+                error, lens = _fisheye(size, images, K)
+                best = (error, lens.K, lens.D) if best is None or error < best[0] else best
+                continue
+            flags |= candidate.flags
+            error, found, D, _, _ = cv2.calibrateCamera(
+                points, pixels, size, K, np.zeros(candidate.numbers), flags=flags
+            )
+        except (cv2.error, ValueError, np.linalg.LinAlgError):
             continue
         if np.isfinite(error) and (best is None or error < best[0]):
             best = (error, found, D.ravel()[: candidate.numbers])
@@ -179,8 +259,10 @@ def _calibrated(
 
 
 def _folds(lens: Camera) -> bool:
-    """Whether pixels of the image have no ray: a series that fits the middle of the image, where
-    the board was shown, may turn back towards the rim.
+    """Whether pixels of the image have no ray.
+
+    A series that fits the middle of the image, where the board was shown, may turn back towards the
+    rim.
     """
     if lens.distortion_model == DistortionModel.EQUIDISTANT:  # looks sideways there, and has none
         return False
@@ -208,8 +290,8 @@ def _speed(before: Observed, after: Observed) -> float:
     first, second = np.nonzero(common)
     if len(first) == 0:
         return np.inf
-    way = np.linalg.norm(before.pixels[first] - after.pixels[second], axis=1)
-    return float(np.median(way)) / max((after.stamp_ns - before.stamp_ns) * 1e-9, 1e-9)
+    displacement = np.linalg.norm(before.pixels[first] - after.pixels[second], axis=1)
+    return float(np.median(displacement)) / max((after.stamp_ns - before.stamp_ns) * 1e-9, 1e-9)
 
 
 def _starts(size: tuple[int, int], everything: Array) -> list[tuple[Array, int]]:

@@ -52,9 +52,7 @@ class Fit:
         return float(np.sqrt(self.border_covariance[0, 0])) if free else np.nan
 
     def state_covariances(self, times: Array) -> Array:
-        """Covariances (m,12,12) at times (m,): turn in camera axes, position in the map, body
-        rate (rad/s), velocity in the map (m/s).
-        """
+        """Covariances (m,12,12) at times (m,): turn, position, body rate, velocity."""
         first, jacobians = self.state.spline.jacobians(times)
         inner = self.inflation * self.factored.local_covariances(first)
         covariances: Array = jacobians @ inner @ np.swapaxes(jacobians, 1, 2)
@@ -98,22 +96,23 @@ def solve(problem: AnyProblem, start: State, deviation: float | None = None) -> 
     return _finish(problem, state, deviation)
 
 
-def cost_at(camera: Camera, observations: Observations, found: Fit, readout_time: float) -> float:
-    """The least cost with this readout time (s), to be compared with ``found.cost``; less exactly
-    where it is far from the least of all.
+def cost_at(camera: Camera, observations: Observations, fitted: Fit, readout_time: float) -> float:
+    """The least cost with this readout time (s), to be compared with ``fitted.cost``.
+
+    Less exact where it is far from the least of all.
     """
-    held = replace(found.freedom, readout_time=False)
-    start = replace(found.state, readout_time=readout_time)
+    held = replace(fitted.freedom, readout_time=False)
+    start = replace(fitted.state, readout_time=readout_time)
     problem = Problem(camera, observations, start, held)
-    least = minimise(problem, start, found.deviation, _FEW_STEPS)
-    return problem.normal(least, found.deviation)[0]
+    least = minimise(problem, start, fitted.deviation, _FEW_STEPS)
+    return problem.normal(least, fitted.deviation)[0]
 
 
 def cheaper(richer: Fit, plainer: Fit, parameters: float) -> bool:
     """Whether so many more parameters are worth it, by the noise that the richer model leaves."""
     limit = (LIMIT * richer.deviation) ** 2
-    left = [float(np.sum(found.squared_errors.clip(max=limit))) for found in (plainer, richer)]
-    return (left[0] - left[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
+    costs = [float(np.sum(fitted.squared_errors.clip(max=limit))) for fitted in (plainer, richer)]
+    return (costs[0] - costs[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
 
 
 def image_speeds(camera: Camera, observations: Observations, state: State) -> Array:
@@ -169,7 +168,5 @@ def steepness(squared: Array, deviation: float) -> float:
 
 
 def left_over(keypoints: int, used: int) -> float:
-    """By how much the noise's variance is larger than the mean square of what is left of it, when
-    so many numbers were estimated.
-    """
+    """By how much the noise's variance exceeds the mean square that is left."""
     return 2.0 * keypoints / max(2.0 * keypoints - used, 1.0)

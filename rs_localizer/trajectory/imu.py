@@ -94,13 +94,17 @@ class MountFound:
 
 
 def with_gyro(
-    camera: Camera, seen: Observations, found: Fit, samples: GyroSamples, given: Array | None
+    camera: Camera,
+    observations: Observations,
+    fitted: Fit,
+    samples: GyroSamples,
+    given: Array | None,
 ) -> tuple[Observations, Fit]:
     """The motion again, with a gyroscope and its mount in it.
 
     Args:
-        seen: keypoints.
-        found: motion of the keypoints alone.
+        observations: keypoints.
+        fitted: motion of the keypoints alone.
         given: (3,3) camera_from_imu as others say; checked, not believed.
 
     Returns:
@@ -110,9 +114,9 @@ def with_gyro(
         NoMount: when the gyroscope shows other turns than the camera.
         Undetermined: when the joint system cannot be solved.
     """
-    mount = first_mount(samples, found.state.spline, given)
-    guess = replace(found, state=replace(found.state, mount=mount))
-    samples, joint = _settled(camera, seen, samples, guess)
+    mount = first_mount(samples, fitted.state.spline, given)
+    guess = replace(fitted, state=replace(fitted.state, mount=mount))
+    samples, joint = _settled(camera, observations, samples, guess)
     least = _LEAST_SAMPLES * float(np.median(np.diff(samples.times)))
     for _ in range(_MOST_HALVINGS):
         spacing = 0.5 * joint.state.spline.layout.spacing
@@ -120,31 +124,31 @@ def with_gyro(
             break
         finer = replace(joint.state, spline=refined(joint.state.spline, spacing))
         try:
-            quieter, other = _settled(camera, seen, samples, replace(joint, state=finer))
+            quieter, other = _settled(camera, observations, samples, replace(joint, state=finer))
         except Undetermined:
             break
         if not _worth_it(quieter, other, samples, joint):
             break
         samples, joint = quieter, other
-    return replace(seen, gyro=samples), joint
+    return replace(observations, gyro=samples), joint
 
 
 def _settled(
-    camera: Camera, seen: Observations, samples: GyroSamples, found: Fit
+    camera: Camera, observations: Observations, samples: GyroSamples, fitted: Fit
 ) -> tuple[GyroSamples, Fit]:
     """The joint estimate when the noise of the gyroscope does not change any more."""
-    samples = _with_noise(samples, found)
+    samples = _with_noise(samples, fitted)
     for _ in range(_ROUNDS):
-        joint = replace(seen, gyro=samples)
-        found = fit(camera, joint, found.state, found.freedom, found.deviation)
-        before, samples = samples.deviation, _with_noise(samples, found)
+        joint = replace(observations, gyro=samples)
+        fitted = fit(camera, joint, fitted.state, fitted.freedom, fitted.deviation)
+        before, samples = samples.deviation, _with_noise(samples, fitted)
         if abs(samples.deviation - before) < _SETTLED * before:
             break
-    return samples, found
+    return samples, fitted
 
 
-def _with_noise(samples: GyroSamples, found: Fit) -> GyroSamples:
-    noise = GyroTerms(samples, found.state, 0).noise(found.state)
+def _with_noise(samples: GyroSamples, fitted: Fit) -> GyroSamples:
+    noise = GyroTerms(samples, fitted.state, 0).noise(fitted.state)
     return replace(samples, deviation=max(noise, _LEAST_DEVIATION))
 
 
@@ -157,7 +161,7 @@ def _worth_it(quieter: GyroSamples, finer: Fit, samples: GyroSamples, coarser: F
     return bool(gain > _COST_PER_PARAMETER * added)
 
 
-def mount_of(camera: Camera, found: Fit, samples: GyroSamples, inflation: float) -> MountFound:
+def mount_of(camera: Camera, fitted: Fit, samples: GyroSamples, inflation: float) -> MountFound:
     """What a joint estimate says of the IMU.
 
     Args:
@@ -165,23 +169,23 @@ def mount_of(camera: Camera, found: Fit, samples: GyroSamples, inflation: float)
         samples: with the noise that they turned out to have.
         inflation: of the deviation of the delay, because parts of the recording disagree.
     """
-    mount, covariance = found.state.mount, found.border_covariance
+    mount, covariance = fitted.state.mount, fitted.border_covariance
     assert mount is not None
     deviations = np.sqrt(np.diag(covariance))[-MOUNT:]
     # The spline's time of an image is its stamp at the middle row, the camera's at the first row.
-    by_offset, later = np.zeros(len(covariance)), middle_row(camera, found.state.readout_time)
+    by_offset, later = np.zeros(len(covariance)), middle_row(camera, fitted.state.readout_time)
     by_offset[DELAY - MOUNT] = 1.0
-    if found.freedom.readout_time:
+    if fitted.freedom.readout_time:
         by_offset[0] = later
     return MountFound(
-        time_offset=mount.delay + later * found.state.readout_time,
+        time_offset=mount.delay + later * fitted.state.readout_time,
         time_offset_deviation=inflation * float(np.sqrt(by_offset @ covariance @ by_offset)),
         mount=mount,
         rotation_deviations=deviations[:3],
         bias_deviations=deviations[3:6],
         shape_deviations=deviations[DELAY + 1 :],
         noise=samples.deviation,
-        samples=len(GyroTerms(samples, found.state, 0).samples.times),
+        samples=len(GyroTerms(samples, fitted.state, 0).samples.times),
         inflation=inflation,
     )
 

@@ -86,10 +86,10 @@ def imu_extrinsics(
     if len(times) < _LEAST_PARTS * _PART:
         raise NoMount(f"{_WHILE * len(times):.1f} s of the motion have samples without a gap")
     before, after = (spline.states(ends).rotations for ends in (times, times + whiles))
-    seen = Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec()
+    turns = Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec()
     parts: IntArray = np.arange(len(times)) // _PART
     for _ in range(_ROUNDS):
-        errors, by_mount = _errors(shown, (times, whiles), seen, mount)
+        errors, by_mount = _errors(shown, (times, whiles), turns, mount)
         squared = np.sum(np.square(errors), axis=1)
         weights = np.square(np.maximum(1.0 - squared / (_LIMIT * np.median(squared)), 0.0))
         scores = weights[:, None] * np.einsum("nij,ni->nj", by_mount, errors)
@@ -126,8 +126,10 @@ class _Shown:
         return self._all.turns(times, whiles)
 
     def changes(self, times: Array, whiles: Array) -> Array:
-        """How they change with the times (m,), rad/s, without vibration: with it, an offset would
-        be found at which the tone of a motor happens to be zero at these times.
+        """How they change with the times (m,), rad/s, without vibration.
+
+        With it, an offset would be found at which the tone of a motor happens to be zero at these
+        times.
         """
         ahead, behind = (self._calm.turns(times + shift, whiles) for shift in (_STEP, -_STEP))
         return np.asarray((ahead - behind) / (2.0 * _STEP))
@@ -156,8 +158,9 @@ class _Turned:
 
 
 def _times(layout: Layout, sampled: Array) -> tuple[Array, Array]:
-    """When turns begin (m,), and how long they last (m,), s: one after the other, each within a
-    stretch and without a gap. Not evenly: a tone in step with them would be no noise.
+    """When turns begin (m,), and how long they last (m,), s: each within a stretch, without a gap.
+
+    Not evenly: a tone in step with them would be no noise.
     """
     parts = [
         _unevenly(np.arange(start + _MARGIN, end - _MARGIN - _UNEVEN, _WHILE))
@@ -179,13 +182,13 @@ def _unevenly(times: Array) -> Array:
 
 
 def _errors(
-    shown: _Shown, when: tuple[Array, Array], seen: Array, mount: GyroMount
+    shown: _Shown, when: tuple[Array, Array], turns: Array, mount: GyroMount
 ) -> tuple[Array, Array]:
     """What turns (m,3) of the gyroscope should be more, and its derivatives (m,3,13)."""
-    turned = seen @ mount.camera_from_imu
+    turned = turns @ mount.camera_from_imu
     here, whiles = when[0] - mount.delay, when[1]
-    errors = seen @ mount.matrix.T + whiles[:, None] * mount.bias - shown.turns(here, whiles)
-    by_mount = np.empty((len(seen), 3, MOUNT))
+    errors = turns @ mount.matrix.T + whiles[:, None] * mount.bias - shown.turns(here, whiles)
+    by_mount = np.empty((len(turns), 3, MOUNT))
     by_mount[:, :, :3] = mount.matrix @ mount.camera_from_imu @ so3.hat(turned)
     by_mount[:, :, 3:6] = whiles[:, None, None] * np.eye(3)
     by_mount[:, :, DELAY] = shown.changes(here, whiles)

@@ -136,8 +136,9 @@ def lens_difference(camera: Camera, other: Camera) -> LensErrors:
 
 
 def _field(camera: Camera) -> tuple[Array, Array]:
-    """Rays (n,3) through the image, the corners first, and by the three shifts and scale that an
-    error of the lens may be taken for, how it moves their pixels (2 n, 3).
+    """Rays (n,3) through the image, and how what an error may be taken for moves pixels (2 n, 3).
+
+    The corners come first; three shifts and a scale are what an error of the lens may be taken for.
     """
     width, height = camera.size
     u, v = np.meshgrid(np.linspace(0.0, width - 1.0, _GRID), np.linspace(0.0, height - 1.0, _GRID))

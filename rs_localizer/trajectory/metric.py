@@ -88,14 +88,14 @@ def mean_accelerations(
         camera_from_imu: (3,3).
         spacing: s, of the means; half the period of the quickest motion that counts.
     """
-    found = []
+    means = []
     for start, end in _covered(spline.layout, samples.times):
         count = int((end - start) / spacing - _SUPPORT + 1.0 + 1e-9)
         for first in range(0, count, _MOST):
             numbers = np.arange(first, min(first + _MOST, count))
             times = np.asarray(start + spacing * (0.5 * _SUPPORT + numbers), np.float64)
-            found.append(_means(spline, samples, camera_from_imu, spacing, times))
-    return found
+            means.append(_means(spline, samples, camera_from_imu, spacing, times))
+    return means
 
 
 def _covered(layout: Layout, times: Array) -> list[tuple[float, float]]:
@@ -218,9 +218,7 @@ def _noises(count: int, spacing: float) -> tuple[Array, Array]:
 
 
 def _overlaps(degree: int, count: int) -> Array:
-    """Integrals (n,n) of the products of B-splines a spacing apart, by it: one of twice the degree
-    and one more.
-    """
+    """Integrals (n,n) of the products of B-splines a spacing apart, by it."""
     order = 2 * degree + 1
     knots = np.arange(order + 2) - 0.5 * (order + 1)
     values = BSpline.basis_element(knots, extrapolate=False)(np.arange(count, dtype=float))
@@ -375,15 +373,15 @@ def _fit(whitened: Whitened, ratio: float, first: Array, lever: Lever) -> _Fitte
         right = rows.T @ values
         right[:INVERSE] += whitened.right / variance
         found = np.asarray(np.linalg.solve(normal, right), np.float64)
-        left = max(whitened.left(found), _EXACT * whitened.squared, _NOTHING)
-        variance = left / (whitened.count - INVERSE)
+        squared = max(whitened.left(found), _EXACT * whitened.squared, _NOTHING)
+        variance = squared / (whitened.count - INVERSE)
         inverse, down = float(found[INVERSE]), found[GRAVITY] / np.linalg.norm(found[GRAVITY])
     likelihood = -0.5 * (
         whitened.count * (1.0 + np.log(variance))
         + whitened.log_determinant
         + np.linalg.slogdet(normal)[1]
     )
-    explained = 1.0 - left / max(whitened.squared, _NOTHING)
+    explained = 1.0 - squared / max(whitened.squared, _NOTHING)
     covariance = np.asarray(np.linalg.inv(normal), np.float64)
     return _Fitted(found, covariance, ratio, variance, float(likelihood), explained)
 
@@ -427,8 +425,7 @@ def _part(part: Means, kept: BoolArray, fit: _Fitted) -> tuple[float, float]:
 
 
 def excess(values: Array, deviations: Array) -> float:
-    """By how much the deviation of the weighted mean of values (b,) is too small, as they scatter
-    more than by their deviations (b,); 1 if that may be chance.
+    """By how much a weighted mean's deviation is too small, as values (b,) scatter; at least 1.
 
     Blocks may be known very differently well; all are taken to differ by the same on top
     (DerSimonian and Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 1986).

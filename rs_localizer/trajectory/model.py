@@ -52,6 +52,20 @@ class Extrinsics:
         turned = so3.exp(np.ascontiguousarray(step[:3])) @ self.axes
         return Extrinsics(turned, self.centre + step[3:6], self.offset + float(step[6]))
 
+    def beside(self, other: Extrinsics) -> Array:
+        """The step (7,) that leads here from others."""
+        turn = so3.log(np.ascontiguousarray(self.axes @ other.axes.T))
+        step: Array = np.r_[turn, self.centre - other.centre, self.offset - other.offset]
+        return step
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mounting:
+    """What is known of extrinsics beforehand."""
+
+    given: Extrinsics
+    deviations: Array  # (7,) of a step from there: rad, m, s; infinite: nothing
+
 
 @dataclass(frozen=True, slots=True)
 class Freedom:
@@ -76,7 +90,8 @@ class Freedom:
     # The noise is at least this (px). Where images have hardly more keypoints than numbers of their
     # own, a robust estimate rejects all but those it can run through, and ends at no noise at all.
     least_noise: float = 1e-4  # recordings without noise are simulated
-    mounted: bool = False  # where the camera is on the rig that the motion is of, and its clock
+    # Where the camera is on the rig that the motion is of, and its clock; None: that is known.
+    mounting: Mounting | None = None
 
     def accelerations(self, spacing: float) -> Accelerations:
         """What is expected of them at controls that are so far apart (s)."""

@@ -22,8 +22,10 @@ from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL, ORDER
 
 
 class Accelerations(NamedTuple):
-    """What is expected of the accelerations at the controls: in each stretch a stationary
-    first-order Markov process (Singer, see :mod:`rs_localizer.tracking`), or independent ones.
+    """What is expected of the accelerations at the controls.
+
+    In each stretch a stationary first-order Markov process (Singer, see
+    :mod:`rs_localizer.tracking`), or independent ones.
     """
 
     angular: float  # rad/s^2, standard deviation of each component
@@ -57,8 +59,10 @@ def eliminate_stamps(normal: Normal) -> None:
 
 
 class Change(NamedTuple):
-    """By how much the acceleration at a control is not what the one before lets expect, times the
-    square of the spacing; and its derivatives by the controls from two before to one behind it.
+    """By how much the acceleration at a control is not what the one before lets expect.
+
+    Times the square of the spacing; and its derivatives by the controls from two before to one
+    behind it.
     """
 
     turn: Array  # (3,) body axes
@@ -179,9 +183,7 @@ def changes(curve: Curve, firsts: IntArray, memory: float, covariances: Array, o
 @kernel
 def add_rest(curve: Curve, controls: IntArray, angular: float, linear: float,
              normal: Normal) -> float:  # fmt: skip
-    """Add a zero-mean prior of these deviations (rad/s, m/s) on the velocity from each of some
-    controls (k,) to the next; returns its cost.
-    """
+    """Add a zero-mean prior (rad/s, m/s) of the velocity after controls (k,); its cost."""
     by_turn = np.empty((3, 6))
     angular_precision = (curve.spacing * angular) ** -2
     linear_precision = (curve.spacing * linear) ** -2
@@ -235,9 +237,7 @@ class Normal(NamedTuple):
 @kernel
 def border_of(sights: Sights, terms: Terms, n: int, row: Row, columns: IntArray,
                border: Array) -> int:  # fmt: skip
-    """Fill the columns of the border that keypoint n touches, rising, and its derivatives
-    (2,...) by them; returns their number.
-    """
+    """Fill the border's columns that keypoint n touches, and derivatives (2,...); how many."""
     count = len(row.by_shared[0])
     for k in range(count):
         columns[k] = k

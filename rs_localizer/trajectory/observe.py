@@ -39,7 +39,6 @@ class Posed:
     times: Array  # (f,) s, of the images with a pose
     rotations: Array  # (f,3,3) map_from_camera
     positions: Array  # (f,3) m
-    image_times: Array  # (g,) s, of all images, in their order
 
 
 def in_order(images: Iterable[Observed]) -> list[Observed]:
@@ -89,7 +88,7 @@ def collect(
         for result, count in zip(results, counts, strict=True)
     ]
     posed = np.flatnonzero([bool(result) for result in results])
-    found = [result for result in results if isinstance(result, Estimate)]
+    estimates = [result for result in results if isinstance(result, Estimate)]
     return Posed(
         Observations(
             times=np.repeat(times, counts),
@@ -102,7 +101,6 @@ def collect(
         ),
         start_ns,
         times[posed],
-        np.array([estimate.rotation.T for estimate in found]).reshape(-1, 3, 3),
-        np.array([estimate.position for estimate in found]).reshape(-1, 3),
-        times,
+        np.array([estimate.rotation.T for estimate in estimates]).reshape(-1, 3, 3),
+        np.array([estimate.position for estimate in estimates]).reshape(-1, 3),
     )

@@ -70,9 +70,11 @@ def single_image_likelihood(
     tau = camera.row_time(pixels)
     omega, v = motion.angular_velocity, motion.linear_velocity
     turns, local = _seen(motion.rotation, motion.translation, omega, v, points, tau)
-    seen, by_ray = camera.distort(local[:, :2] / np.where(local[:, 2:] > 0.0, local[:, 2:], 1.0))
+    projected, by_ray = camera.distort(
+        local[:, :2] / np.where(local[:, 2:] > 0.0, local[:, 2:], 1.0)
+    )
     information, slope, squared, count = _normal(
-        turns, local, tau, omega, v, seen - pixels, by_ray, camera.row_time_gradient
+        turns, local, tau, omega, v, projected - pixels, by_ray, camera.row_time_gradient
     )
     if count <= _PARAMETERS:
         return None
@@ -246,18 +248,18 @@ class ShutterHypotheses:
             readout_time: s, that is set.
         """
         none, rolling = changed(of, 0.0), changed(of, readout_time)
-        left = np.array([none[0], rolling[0], changed(of, -readout_time)[0], rolling[1]])
-        if np.all(np.isfinite(left)):
+        costs = np.array([none[0], rolling[0], changed(of, -readout_time)[0], rolling[1]])
+        if np.all(np.isfinite(costs)):
             # Neighbouring triples share their noise: less changes than it would of others.
             usual = (np.min(self._left[0, :_APART]) + SIDE) / (self._count + 1.0)
-            most = _MOST * max(np.min(left[:_APART]), usual)
+            most = _MOST * max(np.min(costs[:_APART]), usual)
             self._count = _MEMORY * self._count + 1.0
-            self._left = _MEMORY * self._left + np.minimum(left, most)
+            self._left = _MEMORY * self._left + np.minimum(costs, most)
 
     def _odds(self, one: int, other: int, to_doubt: bool = False) -> float:
         """Logarithm of the odds for one value against another."""
-        left = self._left[int(to_doubt)]
-        return self._logarithm(float(left[one]), float(left[other]))
+        costs = self._left[int(to_doubt)]
+        return self._logarithm(float(costs[one]), float(costs[other]))
 
     def _logarithm(self, ours: float, theirs: float) -> float:
         if not min(ours, theirs) > 0.0:
@@ -266,9 +268,7 @@ class ShutterHypotheses:
 
     @property
     def logarithm(self) -> float:
-        """Logarithm of the odds for a global shutter; negative where nothing else than a rolling
-        one can be, 0 where nothing is known.
-        """
+        """Logarithm of the odds for a global shutter; 0 where nothing is known."""
         return self._odds(_NONE, _SET)
 
     @property
@@ -300,15 +300,17 @@ class ShutterHypotheses:
 
 @kernel
 def changed(of: Equations, readout_time: float) -> tuple[float, float]:
-    """Square of what changes between the last two triples at a readout time, in variances of the
-    newer one's noise; and how far that readout time is from none, beyond the noise of the way.
+    """Square of what changes between the last two triples at a readout time, in their variances.
+
+    In variances of the newer one's noise; and how far that readout time is from none, beyond the
+    noise of the way.
     """
     last = len(of.x) - 1
-    change, way, spread = np.empty(SIDE), np.empty(SIDE), np.empty((SIDE, SIDE))
+    change, displacement, spread = np.empty(SIDE), np.empty(SIDE), np.empty((SIDE, SIDE))
     for i in range(SIDE):
         change[i] = of.y[last, i] - of.y[last - 1, i]
-        way[i] = readout_time * (of.x[last, i] - of.x[last - 1, i])
-        change[i] -= way[i]
+        displacement[i] = readout_time * (of.x[last, i] - of.x[last - 1, i])
+        change[i] -= displacement[i]
         for j in range(SIDE):
             both = of.yx[last, i, j] + of.yx[last, j, i]
             spread[i, j] = of.yy[last, i, j] - readout_time * both
@@ -320,7 +322,7 @@ def changed(of: Equations, readout_time: float) -> tuple[float, float]:
             squared += change[i] * weights[i, j] * change[j]
             noise = of.xx[last, i, j] + of.xx[last - 1, i, j]
             noise *= _WAY_NOISE * readout_time * readout_time
-            apart += weights[i, j] * (way[i] * way[j] - noise)
+            apart += weights[i, j] * (displacement[i] * displacement[j] - noise)
     return squared, max(apart, 0.0)
 
 

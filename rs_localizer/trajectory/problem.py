@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cost of a trajectory and its normal equations, on the whitened errors of
-:mod:`rs_localizer.trajectory.sight_kernels`.
-"""
+"""The cost of a trajectory and its normal equations, on whitened errors."""
 
 from __future__ import annotations
 
@@ -73,18 +71,18 @@ class Problem:
         self.pieces = _pieces(observations, freedom)
         self.shape_information: Array | None = None
         if freedom.paper and self.pieces.count:
-            seen = observations.landmarks[self.pieces.slots >= 0]
-            covariance = paper_covariance(seen, freedom.landmarks)
+            landmarks = observations.landmarks[self.pieces.slots >= 0]
+            covariance = paper_covariance(landmarks, freedom.landmarks)
             self.shape_information = np.asarray(np.linalg.inv(covariance), np.float64)
         readout = 1 if freedom.readout_time else 0
-        extrinsics = EXTRINSICS if freedom.mounted else 0
+        extrinsics = 0 if freedom.mounting is None else EXTRINSICS
         self.border = readout + self.lens_count + extrinsics + self.pieces.columns
         self.gyro: GyroTerms | None = None
         if observations.gyro is not None and start.mount is not None:
             self.gyro = GyroTerms(observations.gyro, start, self.border)
             self.border += MOUNT
         self.lens_column = readout if self.lens_count else -1
-        self.mount_column = readout + self.lens_count if freedom.mounted else -1
+        self.mount_column = readout + self.lens_count if extrinsics else -1
         self.point_column = readout + self.lens_count + extrinsics if self.pieces.count else -1
 
     @property
@@ -109,10 +107,19 @@ class Problem:
         return list(self._workers.map(work, *parts))
 
     def _part(self, state: State, curve: Curve, arms: Array, part: slice) -> Sights:
-        seen = self.observations
-        tau, points, frames = seen.row_times[part], seen.points[part], seen.frames[part]
+        observations = self.observations
+        tau, points, frames = (
+            observations.row_times[part],
+            observations.points[part],
+            observations.frames[part],
+        )
         mounted = state.extrinsics
-        times = seen.times[part] + state.delays[frames] + state.readout_time * tau + mounted.offset
+        times = (
+            observations.times[part]
+            + state.delays[frames]
+            + state.readout_time * tau
+            + mounted.offset
+        )
         first, u = state.spline.layout.locate(times)
         local, velocity = np.empty((len(first), 3)), np.empty((len(first), 3))
         axes, centre = mounted.axes, mounted.centre
@@ -120,7 +127,7 @@ class Problem:
         ahead = np.where(local[:, 2:] > 0.0, local, (0.0, 0.0, 1.0))
         seen_as = project(self.camera, state.lens, ahead, self.lens_column >= 0)
         return Sights(
-            first, u, tau, local, velocity, seen_as.pixels - seen.pixels[part],
+            first, u, tau, local, velocity, seen_as.pixels - observations.pixels[part],
             seen_as.by_ray, seen_as.by_lens, self.pieces.slots[points], arms[points], frames,
             axes, centre,
         )  # fmt: skip
@@ -141,11 +148,11 @@ class Problem:
 
     def errors(self, state: State) -> Array:
         """Squared whitened errors (n,), px^2."""
-        terms, found = self.terms(state, 1.0), []
+        terms, squared = self.terms(state, 1.0), []
         for sights in self.look(state)[1]:
-            found.append(np.empty(len(sights.first)))
-            squared_errors(sights, terms, found[-1])
-        return np.concatenate(found)
+            squared.append(np.empty(len(sights.first)))
+            squared_errors(sights, terms, squared[-1])
+        return np.concatenate(squared)
 
     def noise(self, state: State, deviation: float) -> float:
         """Standard deviation of the noise, from the errors that are not far off the last one."""
@@ -216,6 +223,13 @@ class Problem:
             normal.border_slope[at] += pull
             normal.corner[at, at] += np.tril(self.lens_prior.information)
             cost += float(offset @ pull)
+        if self.freedom.mounting is not None:
+            offset = state.extrinsics.beside(self.freedom.mounting.given)
+            precisions = self.freedom.mounting.deviations**-2.0
+            at = slice(self.mount_column, self.mount_column + EXTRINSICS)
+            normal.border_slope[at] += precisions * offset
+            normal.corner[diagonal[at], diagonal[at]] += precisions
+            cost += float(precisions @ offset**2)
         if self.point_column >= 0 and not self.pieces.rigid:
             free = self.pieces.slots >= 0
             offset = (state.landmarks - self.observations.landmarks)[free].ravel()
@@ -275,8 +289,8 @@ class Problem:
 
     def trusted(self, start: State) -> Problem:
         """The same with the trusted keypoints only."""
-        seen = self.observations
-        return Problem(self.camera, seen.subset(seen.trusted), start, self.freedom)
+        observations = self.observations
+        return Problem(self.camera, observations.subset(observations.trusted), start, self.freedom)
 
     def images(self, inliers: BoolArray) -> int:
         """How many images have some of these keypoints (n,)."""
@@ -291,19 +305,23 @@ class RigNormal(NamedTuple):
 
 
 class RigProblem:
-    """The cost of one motion that several cameras see, as of :class:`Problem`; their borders stand
-    one after the other, their keypoints as well.
+    """The cost of one motion that several cameras see; borders and keypoints stand in their order.
 
     Args:
         cameras: of which the first has what is expected of the motion.
         noises: (k,) px, of each camera's keypoints; they keep their ratios.
+        one_map: the free landmarks are the same of all; they come last, once.
     """
 
-    def __init__(self, cameras: list[Problem], noises: Array) -> None:
-        self.cameras, self.ratios = cameras, noises / noises[0]
+    def __init__(self, cameras: list[Problem], noises: Array, one_map: bool = False) -> None:
+        self.cameras, self.ratios, self._one_map = cameras, noises / noises[0], one_map
         self.camera, self.freedom = cameras[0].camera, cameras[0].freedom
-        ends = np.cumsum([0, *(camera.border for camera in cameras)]).tolist()
-        self.columns, self.border = [slice(a, b) for a, b in pairwise(ends)], ends[-1]
+        points = cameras[0].pieces.columns if one_map else 0
+        ends = np.cumsum([0, *(camera.border - points for camera in cameras)])
+        self.border = int(ends[-1]) + points
+        shared = np.arange(ends[-1], self.border)
+        # Where each camera's border stands in that of all.
+        self.columns = [np.r_[np.arange(a, b), shared] for a, b in pairwise(ends.tolist())]
         self._last: tuple[State, list[State]] | None = None
 
     def states(self, state: State) -> list[State]:
@@ -331,9 +349,9 @@ class RigProblem:
         for normal, at in zip(own, self.columns, strict=True):
             whole.band[: len(normal.band)] += normal.band
             whole.slope[:] += normal.slope
-            whole.cross[:, at] = normal.cross
-            whole.corner[at, at] = normal.corner
-            whole.border_slope[at] = normal.border_slope
+            whole.cross[:, at] += normal.cross
+            whole.corner[np.ix_(at, at)] += normal.corner
+            whole.border_slope[at] += normal.border_slope
         return cost, RigNormal(whole, own)
 
     def factored(self, normal: RigNormal, damping: float = 0.0) -> Factored:
@@ -364,7 +382,8 @@ class RigProblem:
     def trusted(self, start: State) -> RigProblem:
         """The same with the trusted keypoints only."""
         pairs = zip(self.cameras, self.states(start), strict=True)
-        return RigProblem([camera.trusted(one) for camera, one in pairs], self.ratios)
+        cameras = [camera.trusted(one) for camera, one in pairs]
+        return RigProblem(cameras, self.ratios, self._one_map)
 
     def images(self, inliers: BoolArray) -> int:
         """How many images of all cameras have some of these keypoints (n,)."""
@@ -391,6 +410,6 @@ def _pieces(observations: Observations, freedom: Freedom) -> Pieces:
         return Pieces(observations.bodies, rigid=True)
     slots = np.full(len(observations.landmarks), -1)
     if freedom.landmarks > 0.0:
-        seen = np.unique(observations.points)
-        slots[seen] = np.arange(len(seen))
+        landmarks = np.unique(observations.points)
+        slots[landmarks] = np.arange(len(landmarks))
     return Pieces(slots, rigid=False)

@@ -149,9 +149,10 @@ class Score(NamedTuple):
 
 @kernel
 def score(of: Equations, value: float) -> Score:
-    """``sum of x*^T W (y - T x)``, where ``x*`` is the best estimate of the displacement: what
-    its noise shares with that of ``y - T x`` is removed, so that both are independent, and it is
-    shrunk towards rest where it is only noise.
+    """``sum of x*^T W (y - T x)``, where ``x*`` is the best estimate of the displacement.
+
+    What its noise shares with that of ``y - T x`` is removed, so that both are independent, and it
+    is shrunk towards rest where it is only noise.
 
     NaN where a covariance is none.
     """
@@ -203,9 +204,10 @@ def _decorrelate(
     displacement: Array,
     covariance: Array,
 ) -> Array:
-    """Write displacement (6,) and covariance (6,6) of ``x`` without what its noise shares with that
-    of the error (6,), whose inverse covariance is weight (6,6); return the matrix (6,6) that
-    shrinks the displacement towards rest.
+    """Write displacement (6,) and covariance (6,6) of ``x`` without the noise of the error (6,).
+
+    The error's inverse covariance is weight (6,6); return the matrix (6,6) that shrinks the
+    displacement towards rest.
     """
     shared, gain = np.empty((SIDE, SIDE)), np.empty((SIDE, SIDE))
     for i in range(SIDE):
@@ -249,10 +251,10 @@ def equation(
     onward = log(multiplied(before.rotation.T.copy(), now.rotation))
     further = log(multiplied(back, after.rotation))
     for i in range(3):
-        way = 0.0
+        displacement = 0.0
         for j in range(3):
-            way += back[i, j] * (after.position[j] - before.position[j])
-        of.x[place, i], of.x[place, 3 + i] = (onward[i] + further[i]) / span, way / span
+            displacement += back[i, j] * (after.position[j] - before.position[j])
+        of.x[place, i], of.x[place, 3 + i] = (onward[i] + further[i]) / span, displacement / span
     of.y[place], of.xx[place], of.yx[place], of.yy[place] = 0.0, 0.0, 0.0, 0.0
     views = (before, now, after)
     for k in range(3):
@@ -273,17 +275,17 @@ def equation(
 
 @kernel
 def jumps(before: View, now: View, after: View, first: float, second: float) -> bool:
-    """Whether three views cannot be of one way, whatever the shutter; arguments of
-    :func:`equation`.
-    """
+    """Whether three views are of no one way, whatever the shutter; as :func:`equation`."""
     back, on = np.ascontiguousarray(before.rotation.T), np.ascontiguousarray(now.rotation.T)
     turn = log(on @ after.rotation) / second - log(back @ now.rotation) / first
-    way = (after.position - now.position) / second - (now.position - before.position) / first
+    displacement = (after.position - now.position) / second - (
+        now.position - before.position
+    ) / first
     views, paces = (before, now, after), (1.0 / first, 1.0 / first + 1.0 / second, 1.0 / second)
     for part in range(2):
         squared, noise = 0.0, 0.0
         for i in range(3):
-            squared += way[i] * way[i] if part else turn[i] * turn[i]
+            squared += displacement[i] * displacement[i] if part else turn[i] * turn[i]
             for k in range(3):
                 noise += paces[k] * paces[k] * views[k].covariance[3 * part + i, 3 * part + i]
         if np.sqrt(squared) > 0.5 * (first + second) * _JUMP[part] + _NOISE * np.sqrt(noise):

@@ -20,7 +20,6 @@ import numpy as np
 from scipy.signal import argrelmax, correlate, correlation_lags
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Undetermined
@@ -28,7 +27,7 @@ from rs_localizer.trajectory.calibration import Calibration, cut, disagreement, 
 from rs_localizer.trajectory.fit import Fit, solve
 from rs_localizer.trajectory.imu import middle_row
 from rs_localizer.trajectory.lens import with_lens
-from rs_localizer.trajectory.model import Extrinsics, Freedom, State
+from rs_localizer.trajectory.model import Extrinsics, Freedom, Mounting, State
 from rs_localizer.trajectory.problem import Problem, RigProblem
 from rs_localizer.trajectory.sight_kernels import EXTRINSICS
 from rs_localizer.trajectory.spline import Spline, refined
@@ -41,10 +40,11 @@ _STEP, _LEAST_SECONDS, _LEAST_SHARE, _TRIED = 0.01, 2.0, 0.3, 10
 _MOST_TURNED = 0.05
 # Parts of the recording that are estimated on their own.
 _PARTS = 3
-# An offset, a turn and a place are determined to these deviations (s, rad, m): a hand's 67 deg/s
-# makes 0.1 deg of 1.5 ms, and frames of a pair notice extrinsics that are 0.2 deg or 1 cm off
-# (docs/rigs.md): by two deviations.
-_MOST_OFFSET, _MOST_TURN, _MOST_PLACE = 1.5e-3, math.radians(0.1), 5e-3
+DETERMINED = math.radians(0.1), 5e-3, 1.5e-3
+"""A turn, a place and an offset are determined to these deviations (rad, m, s): a hand's 67 deg/s
+makes 0.1 deg of 1.5 ms, and frames of a pair notice extrinsics that are 0.2 deg or 1 cm off
+(docs/rigs.md): by two deviations.
+"""
 
 
 class Recording(NamedTuple):
@@ -60,12 +60,9 @@ class Mounted:
 
     camera: Camera  # with its lens; the readout time and scan direction it was assumed to have
     readout_time: float  # s; negative: against that direction
-    rotation: Array  # (3,3) camera_from_rig
-    translation: Array  # (3,) m
-    time_offset: float  # s, to add to its stamps, of first rows, for the time of the first camera's
-    rotation_deviations: Array  # (3,) rad, of a turn about the camera's axes
-    centre_deviations: Array  # (3,) m, of its place, along the rig's axes
-    time_offset_deviation: float  # s
+    # ``offset``: s, to add to its stamps, of first rows, for the time of the first camera's.
+    extrinsics: Extrinsics
+    deviations: Array  # (7,) of a step of these: rad, m, s
     # Of the seven above one after the other: what parts of the recording say by themselves makes
     # them so much larger; 1: nothing.
     inflations: Array
@@ -73,24 +70,21 @@ class Mounted:
     @property
     def undetermined(self) -> str:
         """What the recording does not determine, with figures; empty: all is."""
-        turn, place = (
-            float(np.max(of)) for of in (self.rotation_deviations, self.centre_deviations)
+        units = (
+            ("rotation", np.degrees(1.0), "deg"),
+            ("position", 1e3, "mm"),
+            ("clock", 1e3, "ms"),
         )
-        values = (
-            ("rotation", math.degrees(turn), math.degrees(_MOST_TURN), "deg"),
-            ("position", 1e3 * place, 1e3 * _MOST_PLACE, "mm"),
-            ("clock", 1e3 * self.time_offset_deviation, 1e3 * _MOST_OFFSET, "ms"),
-        )
+        largest = (float(np.max(of)) for of in np.split(self.deviations, [3, 6]))
         return ", ".join(
-            f"{name} +- {value:.2g} {unit} (known to less than {limit:.2g} it would be)"
-            for name, value, limit, unit in values
+            f"{name} +- {unit * value:.2g} {of} (known to less than {unit * limit:.2g} it would be)"
+            for (name, unit, of), value, limit in zip(units, largest, DETERMINED, strict=True)
             if not value < limit
         )
 
 
 def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
-    """Extrinsics and clock offsets of the cameras of a rig, by their names; the first one's axes
-    and clock are those of the rig.
+    """Extrinsics and clock offsets of the cameras of a rig, in the axes and clock of the first.
 
     Raises:
         ValueError: for a single camera, or when the motions of two cameras are not one, or do not
@@ -114,7 +108,9 @@ def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
                 extrinsics = first_extrinsics(spline, state.spline, shift)
             except Undetermined as error:
                 raise ValueError(f"{name}: {error}") from error
-            state, freedom = replace(state, extrinsics=extrinsics), replace(freedom, mounted=True)
+            nothing = Mounting(extrinsics, np.full(EXTRINSICS, np.inf))
+            state = replace(state, extrinsics=extrinsics)
+            freedom = replace(freedom, mounting=nothing)
         seen = calibration.posed.observations
         seen = replace(seen, times=seen.times + shift)
         seen = seen.subset(spline.layout.inside(seen.times + state.extrinsics.offset))
@@ -183,9 +179,7 @@ def _turning(spline: Spline) -> tuple[float, Array, Array]:
 
 
 def _at_offset(rig: Spline, own: Spline, offset: float) -> tuple[Extrinsics, float]:
-    """Extrinsics if the rig's time is later by an offset (s), and how far (rad) the axes turn about
-    them in the median.
-    """
+    """Extrinsics at a later time of the rig (s), and how far (rad) the axes turn about them."""
     times = np.arange(own.layout.starts[0], own.layout.ends[-1], _STEP)
     times = times[own.layout.inside(times) & rig.layout.inside(times + offset)]
     body, camera = rig.states(times + offset), own.states(times)
@@ -206,25 +200,21 @@ class _Joint(NamedTuple):
         return self.fit.state, *self.fit.state.others
 
     def numbers(self, place: int, about: Extrinsics) -> tuple[Array, Array]:
-        """Turn and displacement of a camera beside some extrinsics, and the offset of the stamps of
-        first rows; and their deviations (7,) by the noise.
-        """
+        """Turn, displacement and stamps' offset by some extrinsics; their deviations (7,)."""
         if place == 0:
             return np.zeros(EXTRINSICS), np.zeros(EXTRINSICS)
-        camera, column = self.problem.cameras[place], self.problem.columns[place].start
+        camera, column = self.problem.cameras[place], self.problem.columns[place][0]
         own, first = self.states[place], self.states[0]
-        turn = so3.log(np.ascontiguousarray(own.extrinsics.axes @ about.axes.T))
         # A stamp is that of the first row; the estimate compares the times of middle rows.
         later = middle_row(camera.camera, own.readout_time)
         first_later = middle_row(self.problem.camera, first.readout_time)
-        offset = own.extrinsics.offset - later * own.readout_time
-        offset += first_later * first.readout_time
+        values = own.extrinsics.beside(replace(about, offset=later * own.readout_time))
+        values[6] += first_later * first.readout_time
         by_border = np.zeros((EXTRINSICS, self.problem.border))
         by_border[:, column + camera.mount_column :][:, :EXTRINSICS] = np.eye(EXTRINSICS)
         by_border[6, [column, 0]] = -later, first_later
         covariance = by_border @ self.fit.border_covariance @ by_border.T
-        moved = own.extrinsics.centre - about.centre
-        return np.r_[turn, moved, offset], np.sqrt(np.diag(covariance))
+        return values, np.sqrt(np.diag(covariance))
 
 
 def _parts(whole: _Joint) -> Iterator[_Joint]:
@@ -258,11 +248,7 @@ def _mounted(place: int, whole: _Joint, parts: list[_Joint]) -> Mounted:
     return Mounted(
         camera=with_lens(whole.problem.cameras[place].camera, state.lens),
         readout_time=state.readout_time,
-        rotation=extrinsics.axes,
-        translation=-extrinsics.axes @ extrinsics.centre,
-        time_offset=float(values[6]),
-        rotation_deviations=deviations[:3],
-        centre_deviations=deviations[3:6],
-        time_offset_deviation=float(deviations[6]),
+        extrinsics=replace(extrinsics, offset=float(values[6])),
+        deviations=deviations,
         inflations=inflations,
     )

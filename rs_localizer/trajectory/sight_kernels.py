@@ -116,8 +116,9 @@ def look(
 
 @kernel
 def _whitened(sights: Sights, terms: Terms, n: int, by_point: Array, flow: Array) -> bool:
-    """Fill the whitened derivative (2,3) of the pixel by the camera point, the inverse of A
-    (rows 2 and 3 of ``flow``) and the unwhitened flow per second (row 0); false if useless.
+    """Fill the whitened derivative (2,3) of the pixel by the camera point; false if useless.
+
+    With the inverse of A (rows 2 and 3 of ``flow``) and the unwhitened flow per second (row 0).
     """
     x, y, z = sights.local[n, 0], sights.local[n, 1], 1.0 / sights.local[n, 2]
     for i in range(2):
@@ -187,8 +188,9 @@ def make_row(sights: Sights, terms: Terms) -> Row:
 def _to_body(
     sights: Sights, terms: Terms, n: int, row: Row, r: int, gradient: Array, point: Array
 ) -> None:
-    """Fill the derivative (3,) of coordinate r and the landmark (3,) along the body's axes; and the
-    derivatives by the mount, where it is free.
+    """Fill the derivative (3,) of coordinate r and the landmark (3,) along the body's axes.
+
+    And the derivatives by the mount, where it is free.
     """
     axes, g, p = sights.axes, row.by_point[r], sights.local[n]
     for i in range(3):

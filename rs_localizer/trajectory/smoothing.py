@@ -56,16 +56,16 @@ class Told:
         )
 
 
-def told(found: Fit) -> Told:
+def told(fitted: Fit) -> Told:
     """What an estimate says of the accelerations that were expected of it."""
-    spline, firsts = found.state.spline, found.state.spline.layout.firsts
+    spline, firsts = fitted.state.spline, fitted.state.spline.layout.firsts
     about = np.concatenate([
         np.maximum(np.arange(first - 1, last - 3), first)
         for first, last in pairwise(firsts)
     ])  # fmt: skip
     curve = Curve(spline.rotations, spline.positions, *spline.steps(), spline.layout.spacing)
-    prior, sums = found.freedom.accelerations(spline.layout.spacing), np.empty((2, 2))
-    changes(curve, firsts, prior.memory, found.factored.local_covariances(about), sums)
+    prior, sums = fitted.freedom.accelerations(spline.layout.spacing), np.empty((2, 2))
+    changes(curve, firsts, prior.memory, fitted.factored.local_covariances(about), sums)
     squares, variances = sums
     numbers = 3 * len(about) - variances / np.array([prior.angular, prior.linear]) ** 2
     return Told(squares, numbers)
@@ -145,8 +145,9 @@ class FastTurn:
 
 
 def fast_turn(times: Array, estimates: list[Estimate], readout_time: float) -> FastTurn | None:
-    """The fast part of the turns that gyroscopes know of frames at times (f,), s, of their middle
-    rows; None: too few of the frames have one, or frames lie too far apart.
+    """The fast part of the turns that gyroscopes know at times (f,), s, of frames' middle rows.
+
+    None: too few of the frames have one, or frames lie too far apart.
     """
     # These take a third of a second, which programs that smooth nothing do not wait for.
     from scipy.interpolate import CubicSpline
@@ -321,26 +322,30 @@ def smooth(
     known = [_all_inliers(one, image) for one, image in zip(estimates, images, strict=True)]
     delay = stamp_offset - readout_time * camera.first_row_time
     posed = collect(camera, images, list(known), delay)
-    seen = posed.observations
+    observations = posed.observations
     spacing, fading = _knots(posed.times)
     fast = fast_turn(posed.times, estimates, readout_time)
     rotations = posed.rotations
     if fast is not None:
-        turned = _turned_pixels(camera, seen, fast, readout_time)
-        moved = float(np.median(np.hypot(*(turned - seen.pixels).T)))
+        turned = _turned_pixels(camera, observations, fast, readout_time)
+        moved = float(np.median(np.hypot(*(turned - observations.pixels).T)))
         if moved < _LEAST_SHARE * np.median([one.residual_rms for one in estimates]):
             fast = None
         else:
-            seen = replace(seen, pixels=turned)
+            observations = replace(observations, pixels=turned)
             rotations = rotations @ np.swapaxes(fast.rotations(posed.times), 1, 2)
     spline = first_spline(posed.times, rotations, posed.positions, spacing, readout_time)
-    seen = seen.subset(spline.layout.inside(seen.times) & np.isfinite(seen.pixels[:, 0]))
+    observations = observations.subset(
+        spline.layout.inside(observations.times) & np.isfinite(observations.pixels[:, 0])
+    )
     best = _best(
-        lambda state, freedom: Problem(camera, seen, state, freedom),
-        start_state(camera, seen, spline, readout_time),
+        lambda state, freedom: Problem(camera, observations, state, freedom),
+        start_state(camera, observations, spline, readout_time),
         fading,
     )
-    shaken = _shaken(best, seen.frames, estimates) | _turns_in_frame(camera.focal_length, estimates)
+    shaken = _shaken(best, observations.frames, estimates) | _turns_in_frame(
+        camera.focal_length, estimates
+    )
     counted = shaken if fast is None else shaken[fast.covered]
     if counted.mean() > _MOST_SHAKEN:
         shaken[:] = True
@@ -359,8 +364,7 @@ class RigFrame:
 
 
 def smooth_rig(rig: Rig, frames: list[RigFrame]) -> Smoothed:
-    """The motion of a rig through frames with a pose, in their order; as :func:`smooth`, per
-    ``readout_time`` of the first camera.
+    """The motion of a rig through frames in their order; as :func:`smooth`, of its first camera.
 
     Raises:
         ValueError: when the frames determine no motion.
@@ -407,9 +411,7 @@ def smooth_rig(rig: Rig, frames: list[RigFrame]) -> Smoothed:
 
 
 def _knots(times: Array) -> tuple[float, float]:
-    """Spacing of the knots, and time in which accelerations fade (0: they do not), s, of images at
-    times (f,).
-    """
+    """Spacing of the knots, and time in which accelerations fade (0: never), s, of times (f,)."""
     interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     fading = FADING if interval < 0.5 * FADING else 0.0
     return min(_NARROW_SPACING if fading else LONGEST_SPACING, interval), fading
@@ -422,36 +424,34 @@ def _all_inliers(estimate: Estimate, image: Observed) -> Estimate:
 def _best(problem: Callable[[State, Freedom], AnyProblem], start: State, fading: float) -> Fit:
     """With the accelerations that the motion shows, and finer knots if they are worth it."""
     plain = solve(problem(start, Freedom(readout_time=False, fading=fading)), start)
-    found = _lively(problem, plain)
-    spline = found.state.spline
-    halved = replace(found.state, spline=refined(spline, 0.5 * spline.layout.spacing))
-    finer = _lively(problem, solve(problem(halved, found.freedom), halved, found.deviation))
-    more = np.sum(told(finer).numbers) - np.sum(told(found).numbers)
-    return finer if cheaper(finer, found, float(more)) else found
+    fitted = _lively(problem, plain)
+    spline = fitted.state.spline
+    halved = replace(fitted.state, spline=refined(spline, 0.5 * spline.layout.spacing))
+    finer = _lively(problem, solve(problem(halved, fitted.freedom), halved, fitted.deviation))
+    more = np.sum(told(finer).numbers) - np.sum(told(fitted).numbers)
+    return finer if cheaper(finer, fitted, float(more)) else fitted
 
 
 def _turned_pixels(
-    camera: Camera, seen: Observations, fast: FastTurn, readout_time: float
+    camera: Camera, observations: Observations, fast: FastTurn, readout_time: float
 ) -> Array:
     """Where the pixels (n,2) would be without the fast turn; NaN where no image point is."""
-    rays = np.column_stack([camera.rays(seen.pixels), np.ones(len(seen.pixels))])
-    turns = fast.rotations(seen.times + readout_time * seen.row_times)
+    rays = np.column_stack([camera.rays(observations.pixels), np.ones(len(observations.pixels))])
+    turns = fast.rotations(observations.times + readout_time * observations.row_times)
     return camera.project(np.einsum("nij,nj->ni", turns, rays))
 
 
-def _shaken(found: Fit, frames: IntArray, estimates: list[Estimate]) -> BoolArray:
-    """Which images (f,) shake in a way that the motion does not follow; keypoints (n,) are of these
-    ``frames``.
-    """
-    own = np.array([max(one.residual_rms, found.freedom.least_noise) ** 2 for one in estimates])
+def _shaken(fitted: Fit, frames: IntArray, estimates: list[Estimate]) -> BoolArray:
+    """Which images (f,) shake in a way that the motion does not follow, by their keypoints (n,)."""
+    own = np.array([max(one.residual_rms, fitted.freedom.least_noise) ** 2 for one in estimates])
     count = np.bincount(frames, minlength=len(estimates))
     # Robust, as the estimates are: outliers of the motion count as its limit.
-    squared = np.minimum(found.squared_errors, (LIMIT * found.deviation) ** 2)
+    squared = np.minimum(fitted.squared_errors, (LIMIT * fitted.deviation) ** 2)
     off = np.bincount(frames, squared, len(estimates)) / np.maximum(count, 1)
     # An estimate's errors are those of two coordinates, less what it took to fit them.
-    left = np.maximum(1.0 - PARAMETERS / np.maximum(2 * count, 1), 0.1)
+    freedom = np.maximum(1.0 - PARAMETERS / np.maximum(2 * count, 1), 0.1)
     limit = np.maximum(_SHAKEN**2, 1.0 + _SHAKEN_SIGMAS / np.sqrt(np.maximum(count, 1)))
-    return np.asarray((count > 0) & (off > limit * own / left), np.bool_)
+    return np.asarray((count > 0) & (off > limit * own / freedom), np.bool_)
 
 
 def _turns_in_frame(focal_length: float, estimates: list[Estimate]) -> BoolArray:
@@ -466,15 +466,15 @@ def _turns_in_frame(focal_length: float, estimates: list[Estimate]) -> BoolArray
     return np.asarray(turning & (near > 0.5 * count))
 
 
-def _lively(problem: Callable[[State, Freedom], AnyProblem], found: Fit) -> Fit:
+def _lively(problem: Callable[[State, Freedom], AnyProblem], fitted: Fit) -> Fit:
     """With a prior of the accelerations that the motion itself shows."""
     for _ in range(_ROUNDS):
-        before, freedom = found.freedom, told(found).most_likely(found.freedom)
-        found = solve(problem(found.state, freedom), found.state, found.deviation)
+        before, freedom = fitted.freedom, told(fitted).most_likely(fitted.freedom)
+        fitted = solve(problem(fitted.state, freedom), fitted.state, fitted.deviation)
         changed = (
             freedom.angular_acceleration / before.angular_acceleration,
             freedom.linear_acceleration / before.linear_acceleration,
         )
         if np.all(np.abs(np.log(changed)) < _ALIKE):
             break
-    return found
+    return fitted

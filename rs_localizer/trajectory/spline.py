@@ -53,9 +53,7 @@ def spline_through(
     parts: list[IntArray], times: Array, rotations: Array, positions: Array, spacing: float,
     margin: float,
 ) -> Spline:  # fmt: skip
-    """A spline near poses, as :func:`first_spline`, with a stretch for each part: indices of frames
-    that follow each other, or of one that stands alone.
-    """
+    """A spline near poses, as :func:`first_spline`, with a stretch for each part (indices)."""
     intervals = np.array([[times[part[0]] - margin, times[part[-1]] + margin] for part in parts])
     layout = Layout.over(intervals, spacing)
     controls = layout.control_times()

@@ -78,8 +78,9 @@ def turn(vector: Array, scale: float, rotation: Array, jacobian: Array) -> None:
 
 @inlined
 def inverse_right_jacobian(v: Array, out: Array) -> None:
-    """Inverse of the right Jacobian of the exponential at a rotation vector; its transpose is
-    that of the left one.
+    """Inverse of the right Jacobian of the exponential at a rotation vector.
+
+    Its transpose is that of the left one.
     """
     x, y, z = v[0], v[1], v[2]
     squared = x * x + y * y + z * z
@@ -119,8 +120,9 @@ def pose(
     rotations: Array, positions: Array, vectors: Array, first: int, u: float, work: Array,
     rotation: Array, position: Array,
 ) -> None:  # fmt: skip
-    """Pose at ``u`` behind control ``first``; ``work`` (8,3,3) keeps turns and Jacobians, and
-    the basis of the positions in ``work[7, 0:2]``.
+    """Pose at ``u`` behind control ``first``; ``work`` (8,3,3) keeps turns and Jacobians.
+
+    The basis of the positions is in ``work[7, 0:2]``.
     """
     basis = work[6, 0]
     cumulative(u, 0, basis)
@@ -182,8 +184,9 @@ def rates(
 
 @kernel
 def pull_back(row: Array, inverses: Array, first: int, work: Array, out: Array) -> None:
-    """Derivative by the four controls' turns, into ``out[0:3], out[6:9], ...``, of what changes
-    by ``row`` (3,) per body-axes turn of the camera. ``work`` as :func:`pose` left it.
+    """Derivative by the four controls' turns of what changes by ``row`` (3,) per turn.
+
+    Into ``out[0:3], out[6:9], ...``, of body-axes turns. ``work`` as :func:`pose` left it.
     """
     x, y, z = row[0], row[1], row[2]
     for k in range(LOCAL):

@@ -28,8 +28,8 @@ def warm_up() -> None:
     camera = Camera(width=320, height=240, K=_K, readout_time=_READOUT_TIME)
     images = _seen_by(camera)
     calibrate(camera, images, imu=_gyroscope())
-    found = list(zip(images, localize_each(camera, images), strict=True))
-    posed = [(image, one) for image, one in found if isinstance(one, Estimate)]
+    localized = list(zip(images, localize_each(camera, images), strict=True))
+    posed = [(image, one) for image, one in localized if isinstance(one, Estimate)]
     smoothed = smooth(camera, [image for image, _ in posed], [one for _, one in posed])
     smoothed.sample(np.array([image.stamp_ns for image, _ in posed]))
 
@@ -59,9 +59,9 @@ def _seen_by(camera: Camera) -> list[Observed]:
             return _poses(middle + tau * _READOUT_TIME)
 
         pixels = project_rolling(camera, poses_at, points)[0] + rng.normal(0.0, 0.3, (_POINTS, 2))
-        seen = np.isfinite(pixels).all(axis=1) & camera.inside(pixels)
+        visible = np.isfinite(pixels).all(axis=1) & camera.inside(pixels)
         stamp_ns = _START_NS + round(k * 1e9 / _RATE)
-        images.append(Observed(stamp_ns, points[seen], pixels[seen]))
+        images.append(Observed(stamp_ns, points[visible], pixels[visible]))
     return images
 
 

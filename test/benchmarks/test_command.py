@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import benchmarks
+from benchmarks import size
 from benchmarks.__main__ import main
 
 
@@ -49,3 +50,23 @@ def test_the_help_names_every_tool_and_none_besides(capsys):
         if 'if __name__ == "__main__"' in path.read_text()
     }
     assert named == programs - {"__main__", "load.camera"}  # the latter is started by load
+
+
+SOURCE = """
+from rs_localizer.core import so3
+import rs_localizer.core.arrays
+_A, B = 1, 2
+_TERMS: tuple = ()
+name = 3
+def late():
+    from rs_localizer.core.so3 import exp
+"""
+
+
+def test_constants_are_names_in_capitals_that_a_module_assigns():
+    assert size._constants(SOURCE) == 3
+
+
+def test_imports_are_modules_of_the_package_late_ones_included():
+    modules = {"core.so3", "core.arrays", "core.shutter"}
+    assert set(size._imported("own", SOURCE, modules)) == {"core.so3", "core.arrays"}

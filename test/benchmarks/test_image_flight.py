@@ -2,8 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images of a quick hand into both nodes: the same poses and twists as offline, to the last bit."""
 
+import re
 import subprocess
 import sys
+
+import pytest
 
 from benchmarks import image_flight
 from rs_localizer.cli.main import main
@@ -16,6 +19,7 @@ def run(*words: str) -> None:
     subprocess.run(command, check=True, capture_output=True)
 
 
+@pytest.mark.bench
 def test_nodes_and_replay_agree(tmp_path, capsys):
     images, markers, poses = (str(tmp_path / name) for name in ("images", "markers", "poses"))
     assert main(["simulate", images, *FLIGHT, "--grey-noise", "2"]) == 0
@@ -30,3 +34,5 @@ def test_nodes_and_replay_agree(tmp_path, capsys):
         "/rs_localizer/pose: 5 live, 5 replayed, 5 identical\n"
         "/rs_localizer/twist: 5 live, 5 replayed, 5 identical\n"
     )
+    assert image_flight.main([images, "--rate", "5"]) == 0
+    assert re.match(r"[1-5] poses of 5 images at 5 Hz, from image", capsys.readouterr().out)

@@ -116,6 +116,10 @@ def test_faults(flight, tmp_path, capsys):
     assert main(["calibrate", str(flight), "--out", str(earlier)]) == 1
     assert f"{earlier} exists; choose another OUT, or --overwrite" in capsys.readouterr().err
     assert earlier.read_text() == "mine"
+    earlier.rename(tmp_path / "other_camera_info.yaml")
+    other = ["--out", str(tmp_path / "other.yaml")]
+    assert main(["calibrate", str(flight), "--intrinsics", *other]) == 1
+    assert "other_camera_info.yaml exists" in capsys.readouterr().err
 
 
 def test_smooth(flight, tmp_path, capsys):

@@ -4,8 +4,10 @@
 that is the test's own (rays through a distorted lens, three by three in a pixel, row by row).
 """
 
+import argparse
 import json
 import shlex
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -14,16 +16,24 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
+from rs_localizer.cli.marker_map import find_map
+from rs_localizer.core.camera import Camera
 from rs_localizer.io.calibration import read_calibration
+from rs_localizer.io.rigs import RigParts, read_camchain, write_camchain
 from rs_localizer.io.telemetry import CAMERA_FROM_SENSOR
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.markers.map_files import read_marker_map
-from rs_localizer.settings import load_params_file
+from rs_localizer.io.video import count_lenses
+from rs_localizer.markers.map_files import read_marker_map, write_marker_map
+from rs_localizer.settings import build, load_params_file
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 320, 240, 290.0, (161.5, 117.0)
 K1, K2 = -0.12, 0.05
 READOUT, RATE, SECONDS = 0.02, 30.0, 3.0
 COLUMNS, ROWS, SQUARE = 9, 6, 0.03  # inner corners, m
+AXES, ORIGIN = np.eye(3), np.zeros(3)
+# A second lens: upside down, 1 cm to the right, 7 ms later.
+TURN = Rotation.from_euler("zyx", [180.0, 2.0, -1.0], degrees=True).as_matrix()
+PLACE, LATER = np.array([0.01, 0.002, -0.004]), 0.007
 WITHIN = (np.arange(3) + 0.5) / 3.0 - 0.5  # of a pixel
 
 
@@ -56,9 +66,14 @@ def pose(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (around * Rotation.from_rotvec(pace * shake)).as_matrix(), centre
 
 
-def expose(stamp: float, through: np.ndarray) -> np.ndarray:
-    """The image (HEIGHT, WIDTH) whose first row is exposed at ``stamp``."""
+def expose(
+    stamp: float, through: np.ndarray, turn: np.ndarray = AXES, place: np.ndarray = ORIGIN
+) -> np.ndarray:
+    """The image (HEIGHT, WIDTH) whose first row is exposed at ``stamp``, of a camera that is
+    mounted to that of :func:`pose`: its axes are the columns of ``turn``, its centre is ``place``.
+    """
     rotations, centres = pose(stamp + READOUT * np.arange(HEIGHT) / (HEIGHT - 1))
+    rotations, centres = rotations @ turn, centres + rotations @ place
     image = np.empty((HEIGHT, WIDTH), np.uint8)
     for row in range(HEIGHT):
         turned = through[row].reshape(-1, 3) @ rotations[row].T.astype(np.float32)
@@ -83,6 +98,16 @@ def film(tmp_path_factory) -> Path:
     return folder
 
 
+def paste_next(said: str) -> str:
+    """Run what comes next as it is printed, and as each command says in its turn."""
+    (line,) = [row for row in said.splitlines() if row.startswith("next: ")]
+    for command in line.removeprefix("next: ").split(" && "):
+        words = shlex.split(command)
+        assert words[0] == "rs_localizer"
+        assert main(words[1:]) == 0
+    return line
+
+
 def test_a_film_gives_lens_readout_time_and_direction(film, tmp_path, capsys):
     out = tmp_path / "camera.yaml"
     board = ["--board", f"{COLUMNS}x{ROWS}", "--square", str(SQUARE)]
@@ -98,24 +123,45 @@ def test_a_film_gives_lens_readout_time_and_direction(film, tmp_path, capsys):
     r2 = np.array([0.1, 0.2])
     found = camera.D[0] * r2 + camera.D[1] * r2**2
     assert found == pytest.approx(K1 * r2 + K2 * r2**2, abs=0.005)
-    # What comes next works as it is printed: lens, shutter and map are passed on.
-    (line,) = [row for row in capsys.readouterr().out.splitlines() if row.startswith("next: ")]
-    for command in line.removeprefix("next: ").split(" && "):
-        words = shlex.split(command)
-        assert words[0] == "rs_localizer"
-        assert main(words[1:]) == 0
+    line = paste_next(capsys.readouterr().out)
     assert "camera_map.yaml" in line
     # The board's shape was measured: better known than that of any paper (0.1 m rms: 0.2 mm).
     measured = read_marker_map(tmp_path / "camera_map.yaml").settings
     assert load_params_file(out)["map_deviation"] == pytest.approx(measured["map_deviation"], 0.01)
     assert 0.0 < measured["map_deviation"] < 2e-4
     assert "camera_camera_info.yaml" in line
-    poses = read_tum(tmp_path / "camera_poses" / "poses.txt")
+    poses = read_tum(tmp_path / "camera_seen_poses" / "poses.txt")
     assert len(poses.positions) > 0.9 * SECONDS * RATE
     # A board of another size is named.
     smaller = ["--board", f"{COLUMNS - 2}x{ROWS}", "--square", str(SQUARE)]
     main(["calibrate", str(film), *smaller])
     assert f"a chessboard of {COLUMNS}x{ROWS} inner corners" in capsys.readouterr().err
+
+
+def test_lens_and_board_come_without_a_readout_time(film, tmp_path, capsys):
+    """Stamps that are not the images' own put the readout time in doubt, and nothing else."""
+    late, out = tmp_path / "late", tmp_path / "camera.yaml"
+    late.mkdir()
+    rng = np.random.default_rng(0)
+    for file in sorted(film.iterdir()):
+        (late / f"{int(file.stem) + round(4e6 * rng.normal())}.png").symlink_to(file)
+    board = ["--board", f"{COLUMNS}x{ROWS}", "--square", str(SQUARE)]
+    assert main(["calibrate", str(late), *board, "--out", str(out)]) == 1
+    said = capsys.readouterr()
+    assert "beside their stamps" in said.err
+    assert "beside it: lens, map. Not written: readout time and scan direction" in said.err
+    values = load_params_file(out)
+    assert "readout_time" not in values
+    camera = read_calibration(tmp_path / "camera_camera_info.yaml")
+    focal = values["calibration.focal_length"]
+    assert camera.K[0, 0] == pytest.approx(FOCAL, rel=4.0 * focal)
+    assert focal < 0.01
+    # Twists need it, poses do not; both commands name the same one to come next.
+    line = paste_next(said.out)
+    own = capsys.readouterr().out
+    assert f"next: {line.rpartition(' && ')[2]}" in own
+    assert "-p readout_time:=SECONDS" in own
+    assert len(read_tum(tmp_path / "camera_seen_poses" / "poses.txt").positions) > 80
 
 
 def test_a_video_with_the_log_of_a_phone(film, tmp_path, capsys):
@@ -156,3 +202,64 @@ def test_a_video_with_the_log_of_a_phone(film, tmp_path, capsys):
     assert "TF, or the axes of a video, agrees with the rotation to 0." in said
     assert main([*words, *lens, "--imu", "--no-telemetry"]) == 2
     assert "this one has none that is known" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def two_lenses(film, tmp_path_factory) -> Path:
+    """The film, and what a second lens saw of it, as two streams of one file."""
+    av = pytest.importorskip("av", reason="needs PyAV (rs_localizer[video])")
+    path, through = tmp_path_factory.mktemp("lenses") / "VID_1.insv", rays()
+    with av.open(str(path), "w", format="mp4") as container:
+        streams = [container.add_stream("mpeg4", rate=1000) for _ in range(2)]
+        for stream in streams:
+            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+            stream.bit_rate, stream.time_base = 40_000_000, Fraction(1, 1000)
+        for k, file in enumerate(sorted(film.iterdir())):
+            at = round(1000 * k / RATE)
+            other = expose(k / RATE + LATER, through, TURN, PLACE)
+            images = [(cv2.imread(str(file), 0), at), (other, at + round(1000 * LATER))]
+            for stream, (image, time) in zip(streams, images, strict=True):
+                frame = av.VideoFrame.from_ndarray(image, format="gray").reformat(format="yuv420p")
+                frame.pts, frame.time_base = time, Fraction(1, 1000)
+                container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode())
+    return path
+
+
+def test_two_lenses_in_one_file_are_a_rig(two_lenses, tmp_path, capsys):
+    assert count_lenses(two_lenses) == 2
+    board = argparse.Namespace(map=None, board=f"{COLUMNS}x{ROWS}", square=SQUARE, pattern=None)
+    write_marker_map(tmp_path / "board.yaml", find_map(board))
+    out = tmp_path / "rig.yaml"
+    lens = Camera(WIDTH, HEIGHT, [[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]],
+                  [K1, K2, 0, 0])  # fmt: skip
+    names = ("lens1", "lens2")
+    chain = RigParts(dict.fromkeys(names, lens), dict.fromkeys(names, (AXES, ORIGIN)), {})
+    write_camchain(tmp_path / "lenses.yaml", chain)
+    words = ["--map", str(tmp_path / "board.yaml"), "--calibration", str(tmp_path / "lenses.yaml")]
+    words += ["--out", str(out)]
+    assert main(["calibrate", "--rig", str(two_lenses), *words]) == 0
+    (line,) = [row for row in capsys.readouterr().out.splitlines() if row.startswith("next: ")]
+    config, parts = build(load_params_file(out)), read_camchain(tmp_path / "rig_camchain.yaml")
+    assert config.cameras == ("lens1", "lens2")
+    for own in config.of_cameras.values():
+        assert own.readout_time == pytest.approx(READOUT, abs=1e-3)
+        assert own.scan_direction == "top_to_bottom"
+    # The streams have one clock, and the second one begins later by it.
+    assert parts.time_offset["lens2"] == pytest.approx(0.0, abs=1e-3)
+    rotation, translation = parts.camera_from_rig["lens2"]
+    assert Rotation.from_matrix(rotation @ TURN).magnitude() < np.radians(1.0)
+    assert -rotation.T @ translation == pytest.approx(PLACE, abs=3e-3)
+
+    command, *words = shlex.split(line.removeprefix("next: "))
+    assert command == "rs_localizer"
+    assert main(words) == 0
+    poses = read_tum(tmp_path / "rig_poses" / "poses.txt")
+    assert len(poses.positions) > 0.9 * SECONDS * RATE
+    # The rig is the first lens; the video's images begin at 1 s.
+    times = 1e-9 * np.array(poses.stamps_ns) - 1.0
+    corner = np.array([(COLUMNS - 1) / 2, (ROWS - 1) / 2, 0.0]) * SQUARE
+    truth = pose(times)[1] + corner
+    errors = np.linalg.norm(poses.positions - truth, axis=1)
+    assert np.median(errors) < 1e-3

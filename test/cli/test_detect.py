@@ -230,6 +230,7 @@ def test_a_board_is_known_as_paper_is(files, capsys):
     found = load_params_file(files.out / "parameters.yaml")
     assert found == pytest.approx({"map_deviation": paper})
     said = capsys.readouterr().out
-    assert f"--params {files.out}/parameters.yaml -p readout_time:=SECONDS" in said
+    assert f"--params {files.out}/parameters.yaml --out" in said
+    assert "-p readout_time:=SECONDS" in said
     assert detect(files, files.video, *words, "--overwrite", "-p", "map_deviation:=0.0") == 0
     assert load_params_file(files.out / "parameters.yaml") == {"map_deviation": 0.0}

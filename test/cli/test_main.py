@@ -20,6 +20,7 @@ import pytest
 import rs_localizer
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.main import COMMANDS, main
+from rs_localizer.core.simd.jit import cache_directory
 from rs_localizer.io.atomic_files import atomic_files
 
 
@@ -122,35 +123,22 @@ def test_a_signal_while_the_workplace_is_removed(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["map.yaml"]
 
 
-def test_a_signal_while_the_workplace_is_made(tmp_path, monkeypatch):
-    make_folder = os.mkdir
-
-    def interrupted(path: str, *mode: int) -> None:
-        make_folder(path, *mode)
-        raise KeyboardInterrupt
-
-    def make(arguments: argparse.Namespace) -> None:
-        monkeypatch.setattr(os, "mkdir", interrupted)
-        with atomic_files(tmp_path / "map.yaml"):
-            pass
-
-    command = SimpleNamespace(add_arguments=lambda parser: None, run=make)
-    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
-    assert main(["replay"]) == 130
-    monkeypatch.undo()
-    assert not list(tmp_path.iterdir())
-
-
 def test_what_a_command_prints_as_json(monkeypatch, capsys):
     results: list[object] = [{"residual (px)": math.nan, "poses": 3}, None]
 
     def run(arguments: argparse.Namespace) -> object:
-        sys.stdout.write("a line\n")
+        sys.stdout.write(
+            "a line\nnext: rs_localizer evaluate\n" if len(results) > 1 else "a line\n"
+        )
         return results.pop(0)
 
     command = SimpleNamespace(add_arguments=lambda parser: None, run=run)
     monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
-    expected = {"command": "replay", "result": {"residual (px)": None, "poses": 3}}
+    expected = {
+        "command": "replay",
+        "result": {"residual (px)": None, "poses": 3},
+        "next": "rs_localizer evaluate",
+    }
     assert main(["replay", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == expected
     assert main(["replay", "--json"]) == 0
@@ -261,19 +249,6 @@ def test_ctrl_c_while_a_command_runs_leaves_nothing_in_the_way(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ctrl_c_between_two_imports_has_no_traceback():
-    code = (
-        "import os, signal, sys, rs_localizer.__main__ as m, rs_localizer.cli.main as c\n"
-        "def parser(): os.kill(os.getpid(), signal.SIGINT)\n"
-        "c._parser = parser\n"
-        "sys.exit(m.run())"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stderr) == (130, "rs_localizer: interrupted\n")
-
-
 def test_who_stops_reading_is_not_told_of_it():
     """As with ``| head -1``: more is written than the pipe holds."""
     code = (
@@ -293,3 +268,31 @@ def test_who_stops_reading_is_not_told_of_it():
     assert process.stderr.read() == ""
     process.stderr.close()
     assert process.wait(timeout=60) == 141
+
+
+def test_it_says_where_the_kernels_are(capsys):
+    assert main(["warm", "--solver", "p3p"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[:10].strip() for line in lines[:2]] == ["markers", "solver p3p"]
+    assert lines[2:] == [f"kernels are in {cache_directory()}"]
+    assert list(cache_directory().rglob("*.nbc"))
+    assert main(["warm", "--solver", "p3p", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)["result"]
+    assert list(result["seconds"]) == ["markers", "solver p3p"]
+    assert result["kernels"] == str(cache_directory())
+
+
+def test_kernels_that_cannot_be_kept_are_a_failure(tmp_path):
+    (tmp_path / "cache").write_text("a file in its place")
+    done = subprocess.run(
+        [sys.executable, "-m", "rs_localizer", "warm", "--solver", "p3p"],
+        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")},
+        text=True,
+        capture_output=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"rs_localizer warm: cache of kernels in {tmp_path}/cache/")
+    assert done.stderr.endswith(("Not a directory\n", "File exists\n"))
+    assert done.stderr.count("\n") == 1

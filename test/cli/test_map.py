@@ -3,6 +3,7 @@
 """``rs_localizer map``: what it says and writes."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,10 @@ import pytest
 from rs_localizer.cli.main import main
 from rs_localizer.io.maps.files import read_map_file, write_map_file
 from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.markers.formats import read_any
+from rs_localizer.markers.map_files import read_marker_map, write_marker_map
+from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.markers.poses import Pose
 
 COLMAP = Path(__file__).parents[1] / "io" / "maps" / "colmap"
 
@@ -48,3 +53,109 @@ def test_a_model_of_colmap_becomes_a_file(tmp_path, capsys, form):
     result = json.loads(capsys.readouterr().out)["result"]
     assert result["landmarks"] == str(len(read_map_file(out, "map")))
     assert result["written to"] == str(out)
+
+
+def refused(words: list[str], code: int, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The command ends with a code and a sentence, without a traceback."""
+    assert main(["map", *words]) == code
+    error = capsys.readouterr().err
+    assert said in error
+    assert "Traceback" not in error
+
+
+@pytest.fixture
+def marker_file(tmp_path) -> Path:
+    path = tmp_path / "wall.yaml"
+    markers = wall("apriltag_36h11", (3, 2), 0.16, 0.04, pose=Pose(np.array([1.0, 2.0, 0.5])))
+    write_marker_map(path, MarkerMap(markers))
+    return path
+
+
+def test_info_and_convert(tmp_path, marker_file, capsys):
+    assert main(["map", "info", str(marker_file)]) == 0
+    said = capsys.readouterr().out
+    assert "markers of apriltag_36h11" in said
+    assert "6, ids 0 to 5" in said
+    field, back = tmp_path / "field.json", tmp_path / "back.yaml"
+    assert main(["map", "convert", str(marker_file), str(field)]) == 0
+    assert len(json.loads(field.read_text())["tags"]) == 6
+    refused(["convert", str(field), str(back)], 1, "give --size", capsys)
+    assert not back.exists()
+    words = ["convert", str(field), str(back), "--size", "0.16", "--to", "apriltag_ros"]
+    assert main(["map", *words]) == 0
+    found, kind = read_any(back)
+    assert kind == "apriltag_ros"
+    np.testing.assert_allclose(found.points, read_marker_map(marker_file).points, atol=1e-9)
+    corners = tmp_path / "corners.npz"
+    assert main(["map", "convert", str(marker_file), str(corners)]) == 0
+    landmarks = read_map_file(corners, "map")
+    np.testing.assert_array_equal(landmarks.points, read_marker_map(marker_file).points)
+
+
+def test_refine_and_survey_what_was_simulated(tmp_path, capsys):
+    flight, out = tmp_path / "flight", tmp_path / "refined.npz"
+    simulated = ["simulate", str(flight), "--duration", "1.5", "--keypoints", "--points", "120"]
+    assert main([*simulated, "--trajectory", "tum_vi_room5", "--noise", "0.3"]) == 0
+    true = read_map_file(flight / "map.npz", "map")
+    off = np.random.default_rng(0).normal(0.0, 0.02, true.points.shape)
+    write_map_file(tmp_path / "off.npz", replace(true, points=true.points + off))
+    capsys.readouterr()
+    words = [
+        "refine", str(flight), "--params", str(flight / "parameters.yaml"),
+        "--map", str(tmp_path / "off.npz"), "--out", str(out), "-p", "map_deviation:=0.02",
+    ]  # fmt: skip
+    assert main(["map", *words]) == 0
+    said = capsys.readouterr().out
+    assert "noise after" in said
+    found = read_map_file(out, "map")
+    assert found.covariances is not None
+    known = np.isfinite(found.covariances[:, 0, 0])
+    errors = np.linalg.norm(found.points - true.points, axis=1)[known]
+    assert np.median(errors) < 0.7 * np.median(np.linalg.norm(off, axis=1)[known])
+    assert found.descriptors is not None
+    assert main(["map", "info", str(out)]) == 0
+    assert "deviations known" in capsys.readouterr().out
+    refused(words, 1, "exists; choose another OUT", capsys)
+    again = [*words, "--overwrite"]
+    refused([*again, "--hold", "1", "2", "999999"], 2, "no landmark 999999", capsys)
+    refused([*again, "-p", "readout_time:=0.0", "--shutter", "given"], 2, "needs -p", capsys)
+    refused(["refine", str(tmp_path), "--out", "a.obj"], 2, "--out must end in", capsys)
+
+
+def make(out: Path, *words: str) -> int:
+    return main(["markers", "make", str(out), *words])
+
+
+def test_make_and_check(tmp_path, capsys):
+    out = tmp_path / "wall.v2"
+    assert make(out) == 0
+    said = capsys.readouterr().out
+    assert f"{out}.pdf: 1 page of a4; print at 100 %" in said
+    assert (tmp_path / "wall.v2.pdf").read_bytes().startswith(b"%PDF")
+    made = read_marker_map(tmp_path / "wall.v2.yaml")
+    assert [marker.name for marker in made.markers] == [f"marker 4x4_50 {k}" for k in range(6)]
+    assert main(["markers", "check", f"{out}.yaml"]) == 0
+    said = capsys.readouterr().out
+    assert "6 markers and 0 boards of 4x4_50 in map; no problem found" in said
+    # Nothing is overwritten.
+    assert make(out, "--size", "0.05") == 1
+    assert "exists already" in capsys.readouterr().err
+    assert make(out, "--size", "0.05", "--overwrite", "--json") == 0
+    pages = {"pages": [f"{out}.pdf"], "map": f"{out}.yaml", "corners": 24}
+    assert json.loads(capsys.readouterr().out)["result"] == pages
+    assert read_marker_map(f"{out}.yaml").markers[0].size == pytest.approx(0.05)
+
+
+def test_problems_of_a_map_are_named(tmp_path, capsys):
+    assert make(tmp_path / "wall", "--grid", "2x1", "--size", "0.05", "--gap", "0.03") == 0
+    path = tmp_path / "wall.yaml"
+    text = path.read_text()
+    path.write_text(text.replace("[0.04, 0.0, 0.0]", "[0.0, 0.0, 0.0]"))
+    capsys.readouterr()
+    assert main(["markers", "check", str(path)]) == 1
+    said = capsys.readouterr()
+    assert said.out == "marker 4x4_50 0 and marker 4x4_50 1 overlap by 0.01 m\n"
+    assert said.err == f"rs_localizer markers: {path} has a problem\n"
+    path.write_text(text.replace("id: 1", "id: 0"))
+    assert main(["markers", "check", str(path)]) == 1
+    assert "marker 4x4_50 0 is there twice" in capsys.readouterr().err

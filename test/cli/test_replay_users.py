@@ -58,31 +58,6 @@ def test_images_are_sent_to_detect(tmp_path, capsys, name, text):
     assert "--calibration camera.yaml" in error
 
 
-def test_an_interrupted_replay_leaves_nothing_in_the_way(flight, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    out.mkdir()  # as an earlier version left it
-    words = ["replay", str(flight), "--out", str(out), *SHUTTER]
-    real = replay_command.replay
-
-    def interrupted(*arguments: Any) -> Any:
-        for index, item in enumerate(real(*arguments)):
-            if index == 3:
-                raise KeyboardInterrupt
-            yield item
-
-    monkeypatch.setattr(replay_command, "replay", interrupted)
-    assert main(words) == 130
-    assert list(tmp_path.glob("out/*")) == []
-    monkeypatch.setattr(replay_command, "replay", real)
-    assert main(words) == 0
-    # An earlier result stays until a new one is whole.
-    (out / "notes.txt").write_text("mine")
-    files = sorted(out.rglob("*"))
-    monkeypatch.setattr(replay_command, "replay", interrupted)
-    assert main([*words, "--overwrite"]) == 130
-    assert sorted(out.rglob("*")) == files
-
-
 def test_frames_are_written_as_they_come_and_let_go(flight, tmp_path, monkeypatch):
     """An hour of them would take gigabytes."""
     real = replay_command.replay

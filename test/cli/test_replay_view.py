@@ -76,6 +76,12 @@ def test_poses_and_velocities_are_those_of_the_result(shown):
     np.testing.assert_allclose(path, motions.poses.positions, atol=1e-5)
 
 
+def test_the_result_is_that_without_a_file(flight, shown, tmp_path):
+    assert main(["replay", str(flight), *SHUTTER, "--out", str(tmp_path / "plain")]) == 0
+    for name in ("poses.txt", "twists.txt"):
+        assert (tmp_path / "plain" / name).read_bytes() == (shown[0] / name).read_bytes()
+
+
 def test_matches_are_inliers_or_others(shown):
     _, found = shown
     inliers = values(found, paths.MATCHES, "Points2D:positions")

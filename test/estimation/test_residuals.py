@@ -17,9 +17,7 @@ def test_the_error_is_measured_at_the_row_where_the_model_puts_the_point(scene, 
         direction, speed=0.3, noise=0.3, acceleration=0.3
     )
     found = residuals.squared_errors(
-        scene.pack(camera, points, measured),
-        len(points),
-        scene.state_of(motion),
+        scene.pack(camera, points, measured), len(points), scene.state_of(motion)
     )
     expected = np.linalg.norm(measured - true, axis=1)
     # The naive error, with the pose of the measured row, is off by up to a third here.

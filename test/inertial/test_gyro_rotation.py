@@ -7,8 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
-from rs_localizer.core.gyro_compensated import gyro_compensated
-from rs_localizer.core.gyro_rotation import GyroRotation, late_at
+from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated, late_at
 from rs_localizer.core.so3 import hat
 from rs_localizer.inertial.turning import densified
 

@@ -18,12 +18,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rs_localizer.io import bags
 from rs_localizer.io.bags import BagError, BagWriter, make_message, open_bag
 from rs_localizer.io.calibration import CalibrationError, read_calibration
-from rs_localizer.io.hloc import HlocError, open_h5, read_queries
 from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum
 from rs_localizer.io.video import VideoError, read_video, split_jpegs
+from rs_localizer.offline.hloc import HlocError, open_h5, read_queries
 
 COLMAP = Path(__file__).parent / "maps" / "colmap"
 IMU = "sensor_msgs/msg/Imu"

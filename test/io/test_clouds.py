@@ -13,12 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rs_localizer.io.bags import make_message
-from rs_localizer.io.clouds import (
-    make_cloud,
-    read_correspondences,
-    select_inliers,
-    thinned,
-)
+from rs_localizer.io.clouds import make_cloud, read_correspondences, select_inliers, thinned
 from rs_localizer.io.messages import MessageError
 
 PLAIN = [(name, 4 * i, 7) for i, name in enumerate("xyzuv")]

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import struct
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,12 +24,7 @@ from rs_localizer.cli.map import build
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.telemetry import (
-    Telemetry,
-    TelemetryError,
-    has_telemetry,
-    read_telemetry,
-)
+from rs_localizer.io.telemetry import Telemetry, TelemetryError, has_telemetry, read_telemetry
 from rs_localizer.settings import load_params_file
 
 RATE = 200.0
@@ -81,9 +77,7 @@ PROFILE = {  # as telemetry-parser makes them of DJI's files; there they name no
 }
 
 
-@pytest.mark.parametrize(
-    ("model", "known"), [({}, True), ({"distortion_model": "insta360"}, False)]
-)
+@pytest.mark.parametrize(("model", "known"), [({}, True), ({"distortion_model": "gopro"}, False)])
 def test_lens_profiles(log: Path, monkeypatch: Any, model: dict[str, str], known: bool) -> None:
     import telemetry_parser
 
@@ -108,6 +102,70 @@ def test_lens_profiles(log: Path, monkeypatch: Any, model: dict[str, str], known
         )
         pixels, _ = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, D)
         np.testing.assert_allclose(found.profile.project(points[0]), pixels[0], atol=1e-9)
+
+
+# As a GO 3 has them: xi, fx, fy, cx, cy, three angles, three of a place, k1, k2, k3, p1, p2, size.
+MEI = {"xi": 2.0, "f": 2870.0, "centre": (1280.0, 1290.0), "k": (0.05, -0.1, 0.1), "size": 2560}
+
+
+def field(tag: int, value: int | float | str | bytes) -> bytes:
+    """A field of a message of protobuf."""
+
+    def varint(number: int) -> bytes:
+        low = number & 0x7F
+        return bytes([low | 0x80]) + varint(number >> 7) if number > 0x7F else bytes([low])
+
+    if isinstance(value, int):
+        return varint(8 * tag) + varint(value)
+    if isinstance(value, float):
+        return varint(8 * tag + 1) + struct.pack("<d", value)
+    data = value.encode() if isinstance(value, str) else value
+    return varint(8 * tag + 2) + varint(len(data)) + data
+
+
+def test_a_file_of_insta360(tmp_path: Path) -> None:
+    """Its trailer, written by hand as telemetry-parser's source describes it; the lens is that of
+    Mei and Rives, here by its own formula.
+    """
+    size, (cx, cy) = MEI["size"], MEI["centre"]
+    numbers = [1, MEI["xi"], MEI["f"], MEI["f"], cx, cy, 0, 0, 0, 0, 0, 0, *MEI["k"], 0, 0, size,
+               size, 4, 0]  # fmt: skip
+    pair = field(1, size) + field(2, size)
+    about = field(2, "Insta360 GO 3") + field(19, pair) + field(24, 1000) + field(25, 18.5)
+    about += field(27, pair + field(3, size) + field(4, size))
+    about += field(54, "_".join(map(str, numbers)))
+    readings = b"".join(
+        struct.pack("<Q6d", 1000 + 5 * k, 1.0, 0.0, 0.0, 0.5, 0.0, 0.1) for k in range(400)
+    )
+    records = b""
+    for kind, style, data in ((3, 0, readings), (1, 1, about)):
+        records += data + struct.pack("<BBI", style, kind, len(data))
+    path = tmp_path / "VID_1.insv"
+    path.write_bytes(bytes(5000) + records + bytes(32) + struct.pack("<II", len(records) + 72, 3)
+                     + b"8db42d694ccc418790edff439fe026bf")  # fmt: skip
+    assert has_telemetry(path)
+    found = read_telemetry(path)
+    assert found is not None
+    assert found.camera == "Insta360 GO 3"
+    assert found.readout_time == pytest.approx(0.0185)
+    assert (found.rate, found.times[0]) == (pytest.approx(200.0), pytest.approx(0.0))
+    # The library has x up, as in test_readings_are_in_the_axes_of_the_camera.
+    np.testing.assert_allclose(found.rates[0], [0.0, -0.5, -0.1], atol=1e-9)
+    np.testing.assert_allclose(found.forces[0], [0.0, -9.80665, 0.0], atol=1e-3)
+    assert found.profile is not None
+    assert found.profile.distortion_model == "equidistant"
+    slope, around = np.meshgrid(np.linspace(0.0, 1.4, 30), np.linspace(0.0, 6.0, 7))
+    bearings = np.stack(
+        [np.sin(slope) * np.cos(around), np.sin(slope) * np.sin(around), np.cos(slope)], axis=-1
+    ).reshape(-1, 3)
+    m = bearings[:, :2] / (bearings[:, 2:] + MEI["xi"])
+    square = np.sum(m**2, axis=1, keepdims=True)
+    grown = 1.0 + sum(k * square ** (j + 1) for j, k in enumerate(MEI["k"]))
+    pixels = MEI["f"] * m * grown + [cx, cy]
+    inside = np.linalg.norm(pixels - [cx, cy], axis=1) < size / 2
+    assert inside.sum() > 150
+    seen = found.profile.project(bearings)
+    np.testing.assert_allclose(seen[inside], pixels[inside], atol=0.1)
 
 
 @pytest.fixture
@@ -232,3 +290,18 @@ def test_maps_take_the_gyroscope_of_a_video(video: Path, telemetry: Any) -> None
     assert imu.recording.stamps_ns[0] == 10**9
     assert build.shutter_of(given).readout_time == pytest.approx(0.0205)
     assert build.imu_of(parser.parse_args([str(video), "--out", "map", "--no-telemetry"])) is None
+
+
+@pytest.mark.parametrize(("focal", "doubted"), [(280.0, False), (300.0, True)])
+def test_a_focal_length_that_disagrees_is_named(
+    video: Path, telemetry: Any, capsys: pytest.CaptureFixture[str], focal: float, doubted: bool
+) -> None:
+    """Of another resolution of the same shape: half of the measured one is to be compared."""
+    lens = Camera(160, 120, [[140.0, 0, 80], [0, 140, 60], [0, 0, 1]], np.zeros(4), "equidistant")
+    telemetry(lens="lens profile", profile=lens)
+    measured = Camera(320, 240, [[focal, 0, 160], [0, focal, 120], [0, 0, 1]])
+    args = argparse.Namespace(images=video, no_telemetry=False, calibration=None)
+    image_input.tell_telemetry(args, 0.0205, measured, lens=False)
+    said = capsys.readouterr().out
+    assert "lens profile, not used" in said
+    assert ("(its focal length is 140 px, 150 px was measured" in said) == doubted

@@ -89,11 +89,32 @@ def spot(
     stamps: np.ndarray, noise: float = 0.1,
 ) -> list[Spotted]:  # fmt: skip
     """The markers that images at stamps (g,), s, show as a whole."""
-    motion = hand(rng, 0.25)
+    return spot_along(rng, hand(rng, 0.25), poses, size, stamps, noise)
+
+
+@dataclass(frozen=True)
+class Carried:
+    """A camera on a body that moves."""
+
+    body: projector.Motion
+    axes: np.ndarray  # (3,3) camera_from_body
+    centre: np.ndarray  # (3,) m
+
+    def pose(self, t):
+        rotations, positions = self.body.pose(t)
+        return rotations @ self.axes.T, positions + rotations @ self.centre
+
+
+def spot_along(
+    rng: np.random.Generator, motion: projector.Motion | Carried,
+    poses: list[tuple[np.ndarray, np.ndarray]], size: float, stamps: np.ndarray,
+    noise: float = 0.1, readout: float = READOUT,
+) -> list[Spotted]:  # fmt: skip
+    """The same, of a camera that moves so; the stamps are those of its first rows."""
     corners = np.concatenate([size * SQUARE @ turn.T + place for turn, place in poses])
     spotted = []
     for stamp in stamps:
-        quads = projector.expose(motion, float(stamp), READOUT, corners).reshape(-1, 4, 2)
+        quads = projector.expose(motion, float(stamp), readout, corners).reshape(-1, 4, 2)
         whole = np.flatnonzero(np.isfinite(quads).all(axis=(1, 2)))
         found = quads[whole] + rng.normal(0.0, noise, (len(whole), 4, 2))
         spotted.append(Spotted(10**12 + round(1e9 * float(stamp)), whole, found))

@@ -21,13 +21,12 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.evaluation.room_mapping import Errors, Piece, Room, without_refinement
 from rs_localizer.io.maps.colmap import read_images
-from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.mapping import MappingError
 from rs_localizer.mapping.anchors import Anchors
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_fit
-from rs_localizer.mapping.colmap import DATABASE, SPARSE, Effort
+from rs_localizer.mapping.colmap import SPARSE, Effort
 from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.inertial_metres import InertialPlace, inertial_metres
 from rs_localizer.mapping.report import written
@@ -167,14 +166,6 @@ def test_without_calibration_lens_and_shutter_are_found(views, folder):
     assert not built.placement.scaled
     assert "top_to_bottom (estimated" in written(built, len(views), views)
     shutil.rmtree(alone)
-
-
-def test_the_model_of_colmap_can_be_read(built, folder):
-    """With its descriptors; nothing else is left behind."""
-    assert sorted(item.name for item in folder.iterdir()) == [DATABASE, SPARSE]
-    read = read_map_file(folder / SPARSE, "map")
-    assert len(read) == len(built.structure.points)
-    assert read.descriptors is not None
 
 
 def test_the_model_of_colmap_becomes_that_of_a_global_shutter(

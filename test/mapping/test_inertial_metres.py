@@ -13,12 +13,7 @@ from scenes import SECONDS, START_NS, camera, hand, imu_of, refined_of, walk
 from rs_localizer.mapping import MappingError
 from rs_localizer.mapping.anchors import Placement
 from rs_localizer.mapping.gauge import Similarity
-from rs_localizer.mapping.inertial_metres import (
-    GivenImu,
-    NoMetres,
-    inertial_metres,
-    place_by_imu,
-)
+from rs_localizer.mapping.inertial_metres import GivenImu, NoMetres, inertial_metres, place_by_imu
 from rs_localizer.mapping.refine import RefinedMap, refine
 from rs_localizer.trajectory.imu import ImuRecording
 

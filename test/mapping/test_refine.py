@@ -227,7 +227,7 @@ def test_what_is_no_map_is_refused(video):
         refine(camera(), few, video.start)
     one = np.full(count, np.inf)
     one[0] = 0.001
-    with pytest.raises(ValueError, match="1 landmarks of known place do not hold a map"):
+    with pytest.raises(ValueError, match="1 landmarks of known place do not fix a map"):
         refine(camera(), video.seen, video.start, MapFreedom(deviations=one))
     with pytest.raises(ValueError, match="stamps must rise"):
         replace(video.seen, stamps_ns=video.seen.stamps_ns[::-1])

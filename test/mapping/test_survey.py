@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import READOUT, camera, ring, spot
+from scenes import READOUT, Carried, camera, hand, ring, spot, spot_along
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.io.transforms import Transform
-from rs_localizer.mapping.survey import Survey, survey
-from rs_localizer.mapping.unknown_markers import Chained, Spotted, chain, every_marker
+from rs_localizer.mapping.survey import Survey, survey, survey_rig
+from rs_localizer.mapping.unknown_markers import Chained, Filmed, Spotted, chain, every_marker
 from rs_localizer.markers.consistency import problems
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.trajectory.model import Extrinsics, Mounting
 
 SIZE = 0.15
 STAMPS = np.arange(0.0, 3.0, 1.0 / 30.0)
@@ -83,14 +84,14 @@ def test_images_of_one_marker_do_not_hide_the_noise(spotted, poses):
 
 
 def test_a_wrong_readout_time_is_named(spotted):
-    right = survey(camera(), spotted, MARKERS).readout_check
+    right = survey(camera(), spotted, MARKERS).cameras[0].readout_check
     assert right is not None
     assert not right.differs
-    wrong = survey(camera(0.7 * READOUT), spotted, MARKERS).readout_check
+    wrong = survey(camera(0.7 * READOUT), spotted, MARKERS).cameras[0].readout_check
     assert wrong is not None
     assert wrong.differs
     assert wrong.estimated == pytest.approx(READOUT, abs=3e-3)
-    assert survey(camera(0.0), spotted, MARKERS).readout_check is None
+    assert survey(camera(0.0), spotted, MARKERS).cameras[0].readout_check is None
 
 
 def test_a_survey_that_few_corners_fit_is_refused(spotted):
@@ -123,3 +124,38 @@ def test_a_marker_that_was_turned_over_is_turned_back(spotted, poses, origin, mo
     found = survey(camera(), spotted[:40], MARKERS, origin=origin)
     assert found.rare == ()
     check(found, poses, 0.03)
+
+
+# The second camera looks back, 10 cm beside the first; its shutter runs up.
+BACK = Rotation.from_euler("yx", [175.0, 10.0], degrees=True).as_matrix()
+CENTRE = np.array([0.1, -0.02, -0.05])
+# What its extrinsics and its clock are known to, and how far off they are given.
+DEVIATIONS = np.repeat([1.7e-3, 5e-3, 1.5e-3], [3, 3, 1])
+OFF = DEVIATIONS * [1.0, -1.0, 0.5, 1.0, 1.0, -1.0, 1.0]
+
+
+def test_cameras_that_never_see_the_same_make_one_map():
+    rng = np.random.default_rng(5)
+    front, behind = ring(rng, 4, SIZE), ring(rng, 4, SIZE)
+    poses = [*front, *((BACK.T @ turn, BACK.T @ place + CENTRE) for turn, place in behind)]
+    motion = hand(rng, 0.25)
+    stamps = np.arange(0.0, 2.5, 1.0 / 20.0)
+    seen = spot_along(rng, motion, poses, SIZE, stamps)
+    carried = Carried(motion, BACK, CENTRE)
+    also = spot_along(rng, carried, poses, SIZE, stamps + 0.007, readout=-READOUT)
+    assert not {*np.concatenate([one.markers for one in seen])} & {
+        *np.concatenate([one.markers for one in also])
+    }
+    given = Extrinsics(BACK, CENTRE, 0.0).moved(OFF)
+    up = replace(camera(), scan_direction="bottom_to_top")
+    rear = Filmed(up, also, mounting=Mounting(given, DEVIATIONS))
+    found = survey_rig([Filmed(camera(), seen), rear], MARKERS)
+    assert [marker.id for marker in found.markers] == list(range(8))
+    check(found, poses, 0.03)
+    mounted = found.cameras[1]
+    errors = mounted.extrinsics.beside(Extrinsics(BACK, CENTRE, 0.0))
+    assert np.all(np.abs(errors) < 4.0 * mounted.deviations)
+    # The recording knows turns and the clock better than they were given.
+    assert np.all(mounted.deviations[[0, 1, 2, 6]] < 0.7 * DEVIATIONS[[0, 1, 2, 6]])
+    assert mounted.readout_check is not None
+    assert not mounted.readout_check.differs

@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.markers.consistency import problems
 from rs_localizer.markers.detection import Detections
 from rs_localizer.markers.families import family
-from rs_localizer.markers.map_check import MapCheck
+from rs_localizer.markers.map_check import Fit, LeaveOneOut, MapCheck, still_fit
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Charuco, Marker
+from rs_localizer.offline.detect import _RollingFit
 
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z of the print along -y of the map
 SIDEWAYS = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])  # z of the print along x of the map
@@ -95,7 +98,7 @@ def test_a_few_markers_of_many_at_another_place_show_in_an_image():
     )
     places = iter(range(54))
     told = changed(true, lambda corners: corners + np.array([0, 0, 0.12 * (next(places) == 20)]))
-    assert "do not lie as it says" in str(shown(told, true))
+    assert "are misplaced" in str(shown(told, true))
 
 
 def marker(id_: int, x: float, size: float = 0.1, rotation: Any = None) -> Marker:
@@ -119,3 +122,60 @@ BEHIND = np.diag([-1.0, 1.0, -1.0])
 def test_problems_of_a_map(markers, boards, text):
     (found,) = problems(MarkerMap(tuple(markers), tuple(boards)))
     assert text in found
+
+
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera(640, 480, K)
+MARKERS = MarkerMap(wall("4x4_50", (3, 2), 0.07, 0.03))
+
+
+def said(shift: Any, marker=4, spin=0.0, noise=0.1, fit: Fit = still_fit, corners=24) -> str | None:
+    """What is said when a marker was mounted elsewhere, of a camera that turns (deg/readout)."""
+    rng = np.random.default_rng(1)
+    true = MARKERS.points.copy()
+    true[4 * marker : 4 * marker + 4] += shift
+    check = LeaveOneOut(MARKERS, fit)
+    for _ in range(30):
+        angles = rng.uniform(-35.0, 35.0, 3) * [0.3, 1.0, 1.0]
+        turn = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
+        motion = Motion(
+            turn @ np.diag([1.0, -1.0, -1.0]),
+            np.array([*rng.normal(0.0, 0.02, 2), 0.5]),
+            np.radians(spin) * rng.normal(size=3),
+            np.zeros(3),
+        )
+        pixels, _ = project_rolling(CAMERA, motion.at_rows, true)
+        pixels += rng.normal(0.0, noise, pixels.shape)
+        found = np.arange(corners), MARKERS.points[:corners], pixels[:corners], np.ones(corners)
+        check.add(CAMERA, Detections(*found, (), (), (), ()))
+    return check.fault()
+
+
+def test_a_centimetre_is_named_with_its_direction():
+    text = said([0.01, 0.0, 0.0])
+    assert text is not None
+    assert text.startswith("marker 4x4_50 4 is misplaced in the map")
+    assert "about 1.0 cm (+0.01" in text
+    text = said([0.0, -0.006, 0.004], marker=0)
+    assert text is not None
+    assert text.startswith("marker 4x4_50 0 ")
+
+
+def test_a_right_map_is_not_blamed_for_noise_or_the_shutter():
+    assert said(0.0) is None
+    assert said(0.0, noise=1.0) is None
+    assert said(0.0, spin=4.0) is None
+
+
+def test_a_shaking_rolling_shutter_hides_no_marker():
+    """The fit of detect: what the shutter does is tens of times what the marker does."""
+    text = said([0.01, 0.0, 0.0], spin=4.0, fit=_RollingFit())
+    assert text is not None
+    assert text.startswith("marker 4x4_50 4 is misplaced in the map")
+    assert "about 1.0 cm (+0.0" in text
+    assert said(0.0, spin=4.0, fit=_RollingFit()) is None
+
+
+def test_with_two_markers_nobody_knows_which_is_off():
+    assert said([0.01, 0.0, 0.0], marker=0, corners=12) is not None
+    assert said([0.01, 0.0, 0.0], marker=0, corners=8) is None

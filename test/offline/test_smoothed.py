@@ -52,8 +52,7 @@ def in_windows(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
 
 
 def test_windows_say_what_one_piece_says(
-    recorded: tuple[FrameLocalizer, list[Localized], list[int]],
-    monkeypatch: pytest.MonkeyPatch,
+    recorded: tuple[FrameLocalizer, list[Localized], list[int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     localizer, frames, stamps = recorded
     (whole,) = smooth_frames(localizer, frames, stamps, None)

@@ -99,6 +99,30 @@ def test_rows_say_what_the_messages_say(flights: list[Path], tmp_path: Path) -> 
         assert (row["points"], row["map_frame"]) == (100, "map")
 
 
+def test_a_result_goes_to_a_url(
+    flights: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import fsspec
+
+    files, url = fsspec.filesystem("memory"), "memory://results/poses"
+    words = ["replay", str(flights[1]), *SHUTTER, "--out"]
+    assert main([*words, url]) == 0
+    assert f"written to {url}: " in capsys.readouterr().out
+    assert main([*words, str(tmp_path / "poses")]) == 0
+    here = {str(path.relative_to(tmp_path)): path.read_bytes()
+            for path in tmp_path.rglob("*") if path.is_file()}  # fmt: skip
+    there = {path.removeprefix("/results/"): files.cat(path) for path in files.find("/results")}
+    assert there.keys() == here.keys()
+    assert there["poses/poses.txt"] == here["poses/poses.txt"]
+    assert main([*words, url]) == 1
+    assert f"{url} cannot be written: something is there already" in capsys.readouterr().err
+    # What fails leaves nothing.
+    assert main(["replay", str(tmp_path / "none"), "--out", "memory://results/none"]) == 1
+    assert not files.exists("/results/none")
+    assert main([*words, "memory://results/more", "--scheduler", "tcp://head:8786"]) == 2
+    files.rm("/results", recursive=True)
+
+
 def test_smoothed_rows_are_those_of_the_smoothed_motion(
     flights: list[Path], tmp_path: Path
 ) -> None:

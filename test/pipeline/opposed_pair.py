@@ -12,7 +12,7 @@ import numpy as np
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
-from rs_localizer.io.rigs import RigParts
+from rs_localizer.io.rigs import RigParts, make_mounts
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import write_parameters
 from rs_localizer.simulation.rig import (
@@ -20,7 +20,6 @@ from rs_localizer.simulation.rig import (
     camera_stamps,
     rig_parameters,
     simulate_rig,
-    write_mounts,
     write_rig_frame,
 )
 from rs_localizer.simulation.scene import room
@@ -32,10 +31,7 @@ K = np.array([[450.0, 0.0, 319.5], [0.0, 450.0, 239.5], [0.0, 0.0, 1.0]])
 UPSIDE_DOWN = np.diag([-1.0, -1.0, 1.0])
 PARTS = RigParts(
     {name: Camera(640, 480, K, readout_time=0.03) for name in ("left", "right")},
-    {
-        "left": (np.eye(3), np.zeros(3)),
-        "right": (UPSIDE_DOWN, -UPSIDE_DOWN @ [0.1, 0.0, 0.0]),
-    },
+    {"left": (np.eye(3), np.zeros(3)), "right": (UPSIDE_DOWN, -UPSIDE_DOWN @ [0.1, 0.0, 0.0])},
     {"left": 0.0, "right": 0.004},
 )
 ANGULAR, LINEAR = np.array([0.3, -0.5, 0.2]), np.array([0.2, -0.3, 0.1])
@@ -96,7 +92,7 @@ def record(
     stamps = camera_stamps(parts, motion, settings.rate, seed=4, triggered=False)
     points = wall() if points is None else points
     with BagWriter(path) as bag:
-        write_mounts(bag, parts, motion.intervals_ns[0][0] - 100_000_000)
+        bag.write("/tf_static", make_mounts(parts), motion.intervals_ns[0][0] - 100_000_000)
         for image in simulate_rig(true, motion, points, settings, stamps_ns=stamps, seed=1):
             if keep(image):
                 write_rig_frame(bag, parts, motion, replace(image, stamp_ns=stamp(image)))

@@ -97,10 +97,7 @@ def measured(stamp_ns: int, rate: Array) -> SimpleNamespace:
 
 @pytest.mark.parametrize(
     "direction",
-    [
-        "right_to_left",
-        *(pytest.param(one, marks=pytest.mark.bench) for one in list(ROW_TIME)[:3]),
-    ],
+    ["right_to_left", *(pytest.param(one, marks=pytest.mark.bench) for one in list(ROW_TIME)[:3])],
 )
 def test_pose_and_twist_are_right_whatever_is_turned_or_late(direction, make_camera_info):
     tree = TransformTree()

@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+import rs_localizer
 from rs_localizer.config import NodeConfig
-from rs_localizer.core.reasons import Reason
+from rs_localizer.core.reasons import ImuReason, Reason
 from rs_localizer.io.bags import BagError
 from rs_localizer.io.clouds import Correspondences, EmptyCloudError
 from rs_localizer.offline.replay import NO_FRAMES, find_topics
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import INPUTS, Input, Role
-from rs_localizer.pipeline.reasons import REASONS
+from rs_localizer.pipeline.reasons import IMU_REASONS, REASONS, explained
 from rs_localizer.pipeline.refusal import Refusal
 
 ROOT = Path(__file__).parents[2]
@@ -106,3 +107,26 @@ def test_a_reader_of_correspondences_is_all_that_frames_of_another_kind_need():
     assert isinstance(empty, Refusal)
     assert isinstance(early, Refusal)
     assert (empty.reason, early.reason) == (Reason.EMPTY_CLOUD, Reason.NO_CAMERA_INFO)
+
+
+PACKAGE = Path(rs_localizer.__file__).parent
+
+
+def test_every_reason_is_explained_and_given_somewhere():
+    assert set(REASONS) == set(Reason)
+    others = (path for path in PACKAGE.rglob("*.py") if path.name != "reasons.py")
+    given = {name for path in others for name in re.findall(r"\bReason\.(\w+)", path.read_text())}
+    assert {reason.name for reason in Reason} == given
+
+
+def test_a_reason_says_what_it_means_and_what_to_look_at():
+    text = explained("degenerate")
+    assert "do not determine the motion" in text
+    assert "look at it from an angle" in text
+    assert explained("unheard_of") == ""
+
+
+def test_every_reason_to_go_without_the_imu_has_its_sentence():
+    assert set(IMU_REASONS) == set(ImuReason)
+    assert not set(IMU_REASONS) & set(REASONS)
+    assert "which message belongs to which row" in explained(ImuReason.NO_READOUT_TIME)

@@ -15,8 +15,6 @@ from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.types import Estimate
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at, with_timing
 
-from .plain_moments import plain_pose, plain_twist
-
 READOUT_TIME = 0.03
 TAUS = [-0.5, 0.0, 0.3, -7.0]
 # Per readout: none, nearly none, fast, and around half a turn.
@@ -222,25 +220,3 @@ def test_nothing_runs_away_beyond_the_rows(tau):
         found = twist_at(seen, tau, READOUT_TIME)
         assert np.abs(found.angular).max() < 0.5 / READOUT_TIME
         assert np.linalg.eigvalsh(found.covariance).min() > 0.0
-
-
-@pytest.mark.parametrize("rate_error", [None, 1e-9 * np.eye(3), np.eye(3)])
-@pytest.mark.parametrize("tau", [-0.5, 0.0, 0.31])
-def test_the_kernels_are_plain_arithmetic_beside_a_gyroscope(rate_error, tau):
-    samples = np.linspace(-0.6, 0.6, 25)
-    rates = 0.1 * np.sin(np.outer(samples, [20.0, 25.0, 30.0]) + 1.0)
-    known = GyroRotation.of(samples, rates, rate_noise=0.003, delay=0.02)
-    known = replace(known, rate_error=rate_error)
-    for turn in (None, known):
-        motion = estimate(0.2, acceleration=0.05, shake=0.002)
-        motion = motion if turn is None else motion.turned(turn, (0.0, np.inf))
-        pose, expected = pose_at(motion, tau), plain_pose(motion, tau)
-        for found, wanted in zip(
-            (pose.position, pose.rotation, pose.covariance), expected, strict=True
-        ):
-            np.testing.assert_allclose(found, wanted, atol=1e-14)
-        seen, expected = twist_at(motion, tau, 1.0), plain_twist(motion, tau)
-        for found, wanted in zip(
-            (seen.linear, seen.angular, seen.covariance), expected, strict=True
-        ):
-            np.testing.assert_allclose(found, wanted, atol=1e-14)

@@ -142,10 +142,7 @@ def parameters(description: list[Piece], executable: str) -> dict[str, Any]:
 
 
 WALL = __file__  # any file that exists
-MAP = {
-    "markers.launch.py": {"marker_map": WALL},
-    "rig.launch.py": {"cameras": "front, rear"},
-}
+MAP = {"markers.launch.py": {"marker_map": WALL}, "rig.launch.py": {"cameras": "front, rear"}}
 LOCALIZING = ["localizer.launch.py", "markers.launch.py", "features.launch.py"]
 DETECTORS = {"markers.launch.py": DetectorConfig, "features.launch.py": FeatureConfig}
 

@@ -138,8 +138,18 @@ def problems(h, seed, *, physical, rotation=30.0, translation=0.3, error=6.0, no
     return SimpleNamespace(**{name: x[settled] for name, x in vars(problem).items()})
 
 
-def solutions(p, **bound):
-    return r6p.find_solutions(p.points, p.rays, p.tau, **bound)
+def solutions(p, bound=BOUND):
+    """v, C, w, t, each (h,20,3), before I + [v]x is replaced by the nearest rotation."""
+    h = len(p.points)
+    models, turns = np.empty((20, 18, h)), np.full((20, 3, h), np.nan)
+    r6p._solve(
+        np.ascontiguousarray(p.points).reshape(-1, 3), np.ascontiguousarray(p.rays).reshape(-1, 2),
+        np.ascontiguousarray(p.tau).ravel(), np.arange(6 * h).reshape(h, 6), np.eye(3)[None],
+        bound, models, turns,
+    )  # fmt: skip
+    found = np.moveaxis(models, (2, 0), (0, 1))
+    v = np.where(np.isnan(found[..., :1]), np.nan, np.moveaxis(turns, (2, 0), (0, 1)))
+    return v, found[..., 9:12], found[..., 12:15], found[..., 15:]
 
 
 def check_residuals(p, v, c, w, t, limit=1e-9):

@@ -148,6 +148,7 @@ def test_images_without_the_board_are_not_missing():
     assert found.images == len(images) - 3
 
 
+@pytest.mark.bench
 def test_a_bent_board_is_found_and_its_lens_with_it():
     """A board that is bent by 1 %: shape and lens, and what the lens is off by."""
     rng = np.random.default_rng(3)
@@ -172,10 +173,16 @@ def test_a_bent_board_is_found_and_its_lens_with_it():
         assert error < 4.0 * deviation
 
 
-@pytest.mark.parametrize("model", ["equidistant", "plumb_bob"])
-def test_the_distortion_model_is_that_of_the_lens(model):
-    """A fisheye of 150 degrees that shows a board in every direction; and an ordinary lens."""
+@pytest.mark.parametrize(
+    ("model", "deep"), [("equidistant", False), ("equidistant", True), ("plumb_bob", False)]
+)
+def test_the_distortion_model_is_that_of_the_lens(model, deep):
+    """A fisheye of 150 degrees that shows a board, or a heap, in every direction; and an ordinary
+    lens.
+    """
     rng, flat = np.random.default_rng(2), projector.board(8, 6, 0.05, 0.0)
+    if deep:  # OpenCV's calibration of fisheyes takes boards only, and no lens was found
+        flat = flat + rng.uniform(-0.1, 0.1, flat.shape)
     camera = CAMERA
     if model == "equidistant":
         K, D = np.diag([240.0, 241.0, 1.0]), np.array([0.02, -0.01, 0.003, 0.0])

@@ -63,18 +63,17 @@ def pair():
 def test_a_pair_that_never_sees_the_same():
     rig = pair()
     front, rear = rig["front"], rig["rear"]
-    np.testing.assert_array_equal(front.rotation, np.eye(3))
-    assert front.time_offset == front.time_offset_deviation == 0.0
+    np.testing.assert_array_equal(front.extrinsics.axes, np.eye(3))
+    assert front.extrinsics.offset == 0.0
+    assert not front.deviations.any()
     assert front.undetermined == rear.undetermined == ""
     for mounted, readout in zip((front, rear), READOUTS, strict=True):
         assert mounted.readout_time == pytest.approx(readout, abs=2e-4)
-    turn = Rotation.from_matrix(rear.rotation @ AXES.T).as_rotvec()
-    errors = np.r_[turn, -rear.rotation.T @ rear.translation - CENTRE, rear.time_offset - OFFSET]
-    deviations = np.r_[
-        rear.rotation_deviations, rear.centre_deviations, rear.time_offset_deviation
-    ]  # fmt: skip
-    assert np.all(np.abs(errors) < 4.0 * deviations)
-    assert np.all(deviations < [2e-3, 2e-3, 2e-3, 5e-3, 5e-3, 5e-3, 2e-4])
+    mounted = rear.extrinsics
+    turn = Rotation.from_matrix(mounted.axes @ AXES.T).as_rotvec()
+    errors = np.r_[turn, mounted.centre - CENTRE, mounted.offset - OFFSET]
+    assert np.all(np.abs(errors) < 4.0 * rear.deviations)
+    assert np.all(rear.deviations < [2e-3, 2e-3, 2e-3, 5e-3, 5e-3, 5e-3, 2e-4])
 
 
 def test_motions_that_are_not_one_are_refused():
@@ -87,5 +86,5 @@ def test_motions_that_are_not_one_are_refused():
 
 def test_what_is_not_determined_is_named():
     rear = pair()["rear"]
-    vague = replace(rear, time_offset_deviation=0.003)
+    vague = replace(rear, deviations=np.r_[rear.deviations[:6], 0.003])
     assert vague.undetermined == "clock +- 3 ms (known to less than 1.5 it would be)"

@@ -132,8 +132,7 @@ def moved_markers(marker_map: MarkerMap, by: Similarity) -> MarkerMap:
         raise ValueError("a map with boards cannot be scaled: their squares have a size")
     boards = tuple(
         replace(
-            board,
-            pose=Pose(by(board.pose.position[None])[0], by.rotation @ board.pose.rotation),
+            board, pose=Pose(by(board.pose.position[None])[0], by.rotation @ board.pose.rotation)
         )
         for board in marker_map.boards
     )

@@ -22,20 +22,23 @@ def add_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check(args: argparse.Namespace, readout: ReadoutCheck | None, instead: str) -> None:
-    """Refuse a map that is made with the wrong readout time: it is bent by many times what its
-    deviations say, and fits its images nearly as well.
+def check(
+    args: argparse.Namespace, readout: ReadoutCheck | None, instead: str, camera: str = ""
+) -> None:
+    """Refuse a map that is made with the wrong readout time.
+
+    It is bent by many times what its deviations say, and fits its images nearly as well.
 
     Args:
         instead: what else the user can do.
+        camera: of a rig, whose readout time it is.
 
     Raises:
         ValueError: unless the user wants it all the same.
     """
     if readout is None or not readout.differs:
         return
+    fault = f"{camera}: {readout.message}" if camera else readout.message
     if not args.keep_readout_time:
-        raise ValueError(
-            f"{readout.message}; {instead}, and with {_KEEP} it is written all the same"
-        )
-    print(f"warning: {readout.message}")
+        raise ValueError(f"{fault}; {instead}, and with {_KEEP} it is written all the same")
+    print(f"warning: {fault}")

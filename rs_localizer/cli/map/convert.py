@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 
-from rs_localizer.cli.map import either, info
+from rs_localizer.cli.map import either
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,6 +17,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> dict[str, str]:
     either.check_output(args)
     any_map, kind = either.read(args)
-    table = info.describe(args.file, any_map, kind)
+    table = either.describe(args.file, any_map, kind)
     either.write(args, any_map)
     return {**table, "written to": str(args.out)}

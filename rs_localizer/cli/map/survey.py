@@ -5,12 +5,19 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, UsageError, refuse_existing
 from rs_localizer.cli.map import contradiction
-from rs_localizer.cli.settings_args import add_settings, given_settings, one_camera
+from rs_localizer.cli.rig_input import (
+    MapCamera,
+    add_mounting_argument,
+    map_cameras,
+    mounting_lines,
+)
+from rs_localizer.cli.settings_args import add_settings, given_settings
 from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family, family
 from rs_localizer.process.arguments import number
 
@@ -19,14 +26,12 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer.cli.image_input import opened, tell_times
-    from rs_localizer.config import NodeConfig
     from rs_localizer.core.arrays import Array
-    from rs_localizer.core.camera import Camera
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.camera_info import Calibration, read_camera_info
     from rs_localizer.io.images import Image
-    from rs_localizer.mapping.survey import Survey, survey
-    from rs_localizer.mapping.unknown_markers import Spotted, Spotter, every_marker
+    from rs_localizer.mapping.survey import Survey, survey_rig
+    from rs_localizer.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
     from rs_localizer.markers.consistency import problems
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
@@ -44,7 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "is one of all distances."
     )
     parser.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="a video, a folder of images, or a bag"
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="RECORDING",
+        help="a video, a folder of images, or a bag; several are those of cameras on one body, "
+        "named as their files",
     )
     parser.add_argument(
         "--family",
@@ -72,7 +82,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="WALL.yaml")
     parser.add_argument("--overwrite", action="store_true", help="replace WALL.yaml")
     parser.add_argument("--map-frame", default="map", help="(default: %(default)s)")
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="the lens")
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE",
+        help="the lens; of a rig, a camchain as calibrate --rig writes it",
+    )  # fmt: skip
+    add_mounting_argument(parser)
     parser.add_argument(
         "--min-side", type=number(0.0), default=LEAST_SIDE, metavar="PX",
         help="markers with a shorter side are left out (default: %(default)s)",
@@ -91,18 +105,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     if args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
-    config, markers = given_settings(args, check=one_camera), _markers(args)
+    config, markers = given_settings(args), _markers(args)
     origin = _origin(args, markers)
     refuse_existing(args)
-    if not args.recording.exists():
-        raise ValueError(f"{args.recording} does not exist")
-    camera, spotted = _spotted(args, config, Spotter(markers, args.min_side))
-    surveyed_map = survey(camera, spotted, markers, origin=origin, stamp_offset=config.stamp_offset)
+    spotter, cameras = Spotter(markers, args.min_side), map_cameras(args, config)
+    filmed = [_filmed(camera, spotter) for camera in cameras]
+    surveyed_map = survey_rig(filmed, markers, origin=origin)
     every = (
         surveyed_map.deviations_of_shape if args.deviations == _SHAPE else surveyed_map.deviations
     )
-    _tell(surveyed_map, every, len(spotted))
-    contradiction.check(args, surveyed_map.readout_check, "without one it is found")
+    _tell(surveyed_map, every, cameras, filmed)
+    for camera, found in zip(cameras, surveyed_map.cameras, strict=True):
+        instead = "calibrate --rig finds it" if camera.name else "without one it is found"
+        contradiction.check(args, found.readout_check, instead, camera.name)
     surveyed = tuple(
         replace(marker, deviations=deviations)
         for marker, deviations in zip(surveyed_map.markers, every, strict=True)
@@ -151,11 +166,9 @@ def _origin(args: argparse.Namespace, markers: tuple[Marker, ...]) -> int | None
     return places[0]
 
 
-def _spotted(
-    args: argparse.Namespace, config: NodeConfig, spotter: Spotter
-) -> tuple[Camera, list[Spotted]]:
-    """The camera, and the markers of each image."""
-    spotted: dict[int, Spotted] = {}
+def _filmed(given: MapCamera, spotter: Spotter) -> Filmed:
+    """A camera, and the markers of each image."""
+    args, config, spotted = given.args, given.config, dict[int, Spotted]()
     calibration: Calibration | None = None
     with opened(args, args.recording) as source:
         for shot in tqdm(source.shots, unit="image", desc="detect", disable=None):
@@ -177,17 +190,27 @@ def _spotted(
     tell_times(source.clock)
     if calibration is None:
         raise ValueError(f"{args.recording} has no image that can be read")
-    return camera, [spotted[stamp] for stamp in sorted(spotted)]
+    every = [spotted[stamp] for stamp in sorted(spotted)]
+    return Filmed(camera, every, config.stamp_offset, given.mounting)
 
 
-def _tell(surveyed_map: Survey, every: Array, images: int) -> None:
+def _tell(
+    surveyed_map: Survey, every: Array, cameras: Sequence[MapCamera], filmed: Sequence[Filmed]
+) -> None:
     """The table of the markers, with their deviations (m,6)."""
     fit = surveyed_map.fit
-    print(f"images with a marker     {surveyed_map.images} of {images}")
     print(f"noise of the corners     {fit.deviation:.3f} px, {np.mean(fit.inliers):.1%} fit")
-    deviation = fit.readout_time_deviation
-    spread = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
-    print(f"readout time             {1e3 * fit.state.readout_time:.3f}{spread} ms")
+    for given, images, found in zip(cameras, filmed, surveyed_map.cameras, strict=True):
+        of = f"{given.name}: " if given.name else ""
+        print(f"{f'{of}images with a marker':24} {found.images} of {len(images.spotted)}")
+        deviation = found.readout_time_deviation
+        spread = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
+        print(f"{f'{of}readout time':24} {1e3 * found.readout_time:.3f}{spread} ms")
+        if images.mounting is not None:
+            mounted = replace(
+                found.extrinsics, offset=images.stamp_offset + found.extrinsics.offset
+            )
+            print("\n".join(mounting_lines(given.name, cameras[0].name, mounted, found.deviations)))
     print(
         f"{'marker':26} {'images':>6} {'x':>9} {'y':>9} {'z (m)':>9} {'+- (mm)':>8} {'+- (deg)':>8}"
     )

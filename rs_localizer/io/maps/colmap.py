@@ -1,7 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sparse models of COLMAP: cameras, images, points with who sees them, and descriptors from its
-database.
+"""Sparse models of COLMAP: cameras, images, points with who sees them, and descriptors.
 
 A landmark's descriptor is the medoid of those of the images that see it: the one nearest to the
 others. pycolmap, which reads whole models, is no help here: it takes a count in a damaged file at
@@ -81,11 +80,7 @@ def _read_binary(data: bytes) -> Model:
     if count and int(ids.max()) >= 2**63:
         raise MapError(f"points3D.bin has a point with the id {ids.max()}")
     return Model(
-        ids.astype(np.int64),
-        points,
-        colors,
-        np.frombuffer(b"".join(tracks), _OBSERVATION),
-        starts,
+        ids.astype(np.int64), points, colors, np.frombuffer(b"".join(tracks), _OBSERVATION), starts
     )
 
 

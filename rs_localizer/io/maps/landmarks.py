@@ -104,8 +104,7 @@ def make_map(
     frame: str,
     covariances: NDArray[Any] | None = None,
 ) -> Map:
-    """A map of arrays as they were read: points (n,3), integers (n,), uint8 or floats (n,d), and
-    numbers (n,3,3).
+    """A map of arrays as read: points (n,3), integers (n,), descriptors (n,d), covariances (n,3,3).
 
     Landmarks with a value that is not finite are dropped and counted.
 

@@ -1,7 +1,8 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps as NumPy archives: ``points`` (n,3), and ``ids`` (n,), ``descriptors`` (n,d) and
-``covariances`` (n,3,3; m^2, NaN: not known) where known.
+"""Maps as NumPy archives: ``points`` (n,3) and what else is known.
+
+``ids`` (n,), ``descriptors`` (n,d) and ``covariances`` (n,3,3; m^2, NaN: not known).
 
 Nothing in them is ever unpickled, and nothing is allocated before the headers of the arrays, the
 sizes in the archive and the size of the file agree.

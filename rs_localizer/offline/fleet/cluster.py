@@ -56,28 +56,28 @@ def perform_all(tasks: Sequence[Task], where: Where) -> Generator[Outcome, None,
     if not tasks:
         return
     _silence()
-    left = {task.name: task for task in tasks}
+    remaining = {task.name: task for task in tasks}
     patience, idle = 0.0, 0
-    while left:
-        before = len(left)
+    while remaining:
+        before = len(remaining)
         try:
             with _cluster(where, before) as cluster:
-                yield from _all_done(left, cluster, patience)
+                yield from _all_done(remaining, cluster, patience)
         except ClusterError as error:
             if not patience:
                 raise
-            yield from _given_up(left, str(error))
+            yield from _given_up(remaining, str(error))
             return
         # What is left was lost on its way, with the scheduler, or because no worker of this
         # machine was left: who has done it, tells again.
-        patience, idle = _PATIENCE, idle + 1 if len(left) == before else 0
+        patience, idle = _PATIENCE, idle + 1 if len(remaining) == before else 0
         if idle == _ROUNDS:
-            yield from _given_up(left, "the scheduler never answers with its result")
+            yield from _given_up(remaining, "the scheduler never answers with its result")
             return
 
 
-def _given_up(left: Iterable[str], reason: str) -> Iterator[Outcome]:
-    return (Outcome(name, None, reason) for name in left)
+def _given_up(names: Iterable[str], reason: str) -> Iterator[Outcome]:
+    return (Outcome(name, None, reason) for name in names)
 
 
 def _cluster(where: Where, tasks: int) -> AbstractContextManager[Any]:
@@ -100,11 +100,11 @@ def _check_address(address: str) -> None:
         ) from error
 
 
-def _all_done(left: dict[str, Task], cluster: Any, patience: float = 0.0) -> Iterator[Outcome]:
+def _all_done(remaining: dict[str, Task], cluster: Any, patience: float = 0.0) -> Iterator[Outcome]:
     """The outcomes of tasks, each of which is taken out of ``left``; some may be lost."""
     with _client(cluster, patience) as client:
         # Not by what they are: a result that has been removed meanwhile would be taken as done.
-        tasks = list(left.values())
+        tasks = list(remaining.values())
         futures = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
         for future in _as_they_end(list(futures), client, cluster):
             task = futures.pop(future)
@@ -112,7 +112,7 @@ def _all_done(left: dict[str, Task], cluster: Any, patience: float = 0.0) -> Ite
                 outcome = _outcome(task, future)
             except (CancelledError, OSError):  # the scheduler is gone, or who has the outcome
                 continue
-            del left[task.name]
+            del remaining[task.name]
             yield outcome
 
 
@@ -123,10 +123,10 @@ def _as_they_end(futures: Sequence[Any], client: Any, cluster: Any) -> Iterator[
     """
     from distributed import as_completed
 
-    ended, left = as_completed(futures, loop=client.loop), len(futures)
-    while left:
+    ended, remaining = as_completed(futures, loop=client.loop), len(futures)
+    while remaining:
         batch = ended.next_batch(block=False)
-        left -= len(batch)
+        remaining -= len(batch)
         yield from batch
         if not batch:
             if _deserted(cluster):
@@ -157,8 +157,8 @@ def _outcome(task: Task, future: Any) -> Outcome:
     from distributed import KilledWorker
 
     if future.status != "error":
-        found: Outcome = future.result(timeout=_CONNECT_TIMEOUT)
-        return found
+        outcome: Outcome = future.result(timeout=_CONNECT_TIMEOUT)
+        return outcome
     error = future.exception()
     if isinstance(error, KilledWorker):
         reason = "every worker process that took it died (out of memory, or killed)"

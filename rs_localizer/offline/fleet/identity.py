@@ -23,11 +23,11 @@ _PACKAGE = Path(__file__).parents[2]
 @functools.cache
 def program() -> str:
     """A digest of the sources of this package, its version among them."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for file in sorted(_PACKAGE.rglob("*.py")):
-        found.update(file.relative_to(_PACKAGE).as_posix().encode())
-        found.update(file.read_bytes())
-    return found.hexdigest()[:16]
+        digest.update(file.relative_to(_PACKAGE).as_posix().encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def identity(command: str, settings: Mapping[str, Any], inputs: Sequence[Location]) -> str:
@@ -53,13 +53,13 @@ def _fingerprint(place: Location) -> list[tuple[str, int, int]] | str:
         return fingerprint(place)
     path = Path(place)
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    found = []
+    entries = []
     for file in files:
         if file.is_file():
             about = file.stat()
             name = file.relative_to(path).as_posix()
-            found.append((name, about.st_size, about.st_mtime_ns))
-    return found
+            entries.append((name, about.st_size, about.st_mtime_ns))
+    return entries
 
 
 def write_marker(
@@ -80,11 +80,11 @@ def write_marker(
 def read_marker(folder: Path) -> dict[str, Any] | None:
     """What :func:`write_marker` wrote; None: the folder is no complete result."""
     try:
-        found = json.loads((folder / MARKER).read_text(encoding="utf-8"))
+        content = json.loads((folder / MARKER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    is_ours = isinstance(found, dict) and {"identity", "figures"} <= set(found)
-    return found if is_ours else None
+    is_ours = isinstance(content, dict) and {"identity", "figures"} <= set(content)
+    return content if is_ours else None
 
 
 def folder_names(recordings: Sequence[Location], reserved: Collection[str] = ()) -> list[str]:
@@ -100,11 +100,11 @@ def folder_names(recordings: Sequence[Location], reserved: Collection[str] = ())
     paths = [_as_path(place) for place in recordings]
     names: dict[Path, str] = {}
     depth = 1
-    while left := [path for path in paths if path not in names]:
-        labels = {path: _label(path, depth) for path in left}
+    while unnamed := [path for path in paths if path not in names]:
+        labels = {path: _label(path, depth) for path in unnamed}
         counts = Counter(labels.values())
         taken = {*reserved, *names.values()}
-        deepest = depth > max(len(path.parts) for path in left)
+        deepest = depth > max(len(path.parts) for path in unnamed)
         for path, label in labels.items():
             if counts[label] == 1 and label not in taken:
                 names[path] = label

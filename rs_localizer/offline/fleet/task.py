@@ -138,10 +138,10 @@ class Outcome:
 
 def finished(task: Task) -> Figures | None:
     """The figures of a complete result of just this task; None: there is none."""
-    found = read_marker(task.folder)
-    if found is None or found["identity"] != task.identity:
+    marker = read_marker(task.folder)
+    if marker is None or marker["identity"] != task.identity:
         return None
-    return dict(found["figures"])
+    return dict(marker["figures"])
 
 
 def perform(task: Task) -> Outcome:
@@ -179,11 +179,7 @@ def _attempt(task: Task) -> tuple[Figures | None, str]:
     try:
         with write_errors(partial):
             partial.mkdir(parents=True)
-        with (
-            _PRINTING,
-            contextlib.redirect_stdout(said),
-            contextlib.redirect_stderr(said),
-        ):
+        with _PRINTING, contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             figures = _work(task, inner)
         with write_errors(inner):
             inner.mkdir(exist_ok=True)

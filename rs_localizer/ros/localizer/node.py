@@ -21,7 +21,7 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
 from rs_localizer.io.topics import VEHICLE_ODOMETRY
-from rs_localizer.pipeline.compiling import compile_in_child, is_compiled
+from rs_localizer.pipeline.compiling import compile_in_child, give_back_compiler, is_compiled
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import Input, Results, Role
 from rs_localizer.pipeline.px4 import TYPE, Jumps, vehicle_odometry
@@ -201,6 +201,7 @@ def warm_up(frames: FrameLocalizer) -> float:
     started = time.monotonic()
     compile_in_child(frames.config.solver)
     frames.warm_up()
+    give_back_compiler()
     return time.monotonic() - started
 
 

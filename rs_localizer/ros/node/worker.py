@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -90,9 +90,7 @@ class Mailbox(Generic[State, Item]):
             self._changed.notify()
 
     def drop_frames(self) -> int:
-        """Forget the frames that wait, how many there are, and end the session of the one that is
-        worked on.
-        """
+        """Forget the frames that wait (how many?), and end the session of the current one."""
         with self._changed:
             dropped = len(self._frames)
             self._frames.clear()
@@ -113,9 +111,9 @@ class Mailbox(Generic[State, Item]):
 
 
 Result = TypeVar("Result")
-Process = Callable[[State, Any], Result | Refusal | Sequence[Result | Refusal] | None]
+Process = Callable[[State, Any], Result | Refusal | Iterator[Result | Refusal] | None]
 """What is done with a message, given what the worker alone touches; a message may have no result,
-or several.
+or several, which are published as they come.
 """
 
 _NAME = "rs_localizer worker"
@@ -262,15 +260,20 @@ class Worker(Generic[State, Result]):
         self, work: Work[State, Arrival[State, Result]], arrival: Arrival[State, Result]
     ) -> None:
         self._statistics.started()
-        result = self._attempt(lambda: arrival.process(self._state, arrival.message))
-        self._statistics.ended()
-        results = [] if result is None else result if isinstance(result, list) else [result]
-        for each in results:
+        for each in self._results(arrival):
             if isinstance(each, Waiting) and len(self._late) < _MOST_LATE:
                 deadline = time.monotonic() + each.patience
                 self._late.append(_Late(work, arrival, each, deadline))
             else:
                 self._finish(work, arrival, each)
+        self._statistics.ended()
+
+    def _results(self, arrival: Arrival[State, Result]) -> Iterator[Any]:
+        """What comes of a frame."""
+        result = self._attempt(lambda: arrival.process(self._state, arrival.message))
+        several = result if isinstance(result, Iterator) else iter([result])
+        while (each := self._attempt(lambda: next(several, None))) is not None:
+            yield each
 
     def _finish_late(self) -> None:
         """Publish what has become known, in the order in which it came; give up what is overdue."""

@@ -10,15 +10,21 @@ which are not the code's alone.
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.__main__ import EXPERIMENTS
 from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
 from benchmarks.experiments import augmented_reality, readout_time
 from benchmarks.experiments.results import Context, Result, Verdict
+from benchmarks.experiments.trials import Setting, Trials, draw_trials
+from benchmarks.experiments.views import View, synthetic_views
 from benchmarks.honesty import against_p3p
 from benchmarks.inertial import experiment as inertial
 from rs_localizer import data
+from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.estimation.refine import apply_step
 
 TRIALS = 200
 # Of many conditions; what they measure is held by tests of their own.
@@ -167,3 +173,71 @@ def test_everything_is_said_and_shown(name):
         assert {len(row) for row in table.rows} == {len(table.columns)}
     for figure in found.figures.values():
         assert all(axes.lines for axes in figure.axes)
+
+
+def bearings(trials: Trials, i: int, linear_in_camera: bool) -> np.ndarray:
+    """Where the truth of frame i puts its points at their own row times."""
+    truth = trials.truth
+    r, c, w, t = truth.rotation[i], truth.translation[i], truth.w[i], truth.t[i]
+    seen = []
+    for x, tau in zip(trials.points[i], trials.tau[i], strict=True):
+        turn = Rotation.from_rotvec(tau * w)
+        if linear_in_camera:
+            p = turn.apply(r @ x) + c + tau * t
+        else:
+            # The centre moves straight: by -tau s in the camera axes of the middle row, where
+            # t = s + w x C.
+            s = t - np.cross(w, c)
+            p = turn.apply(r @ x + c + tau * s)
+        seen.append(p[:2] / p[2])
+    return np.array(seen)
+
+
+@pytest.mark.parametrize("drifting", [False, True])
+def test_points_are_seen_at_their_own_row(drifting):
+    trials = draw_trials(5, 0, Setting(25.0, 0.2, 0.0, drifting))
+    for i in range(5):
+        np.testing.assert_allclose(trials.rays[i], bearings(trials, i, drifting), atol=1e-9)
+
+
+MOVING = Setting(angular=15.0, linear=0.15, noise=1.0)
+
+
+def moved(motion: Motion, step: np.ndarray) -> Motion:
+    """The motion one step (12,) further on."""
+    state = np.concatenate(
+        [motion.rotation.ravel(), motion.translation, motion.angular_velocity,
+         motion.linear_velocity, motion.angular_acceleration, motion.linear_acceleration]
+    )  # fmt: skip
+    state = apply_step(state, step)
+    return Motion(state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18],
+                  angular_acceleration=state[18:21], linear_acceleration=state[21:])  # fmt: skip
+
+
+def view() -> View:
+    return next(synthetic_views(1, 5, MOVING, outliers=0.4))
+
+
+def test_views_are_seen_at_their_own_row():
+    one = view()
+    pixels, _ = project_rolling(one.camera, one.motion.at_rows, one.points)
+    np.testing.assert_allclose(one.true_pixels, pixels, atol=1e-6)
+    off = (one.pixels - one.true_pixels)[one.inliers]
+    assert 0.7 < off.std() < 1.3
+    assert np.count_nonzero(~one.inliers) == 20
+    assert np.abs(one.pixels - one.true_pixels)[~one.inliers].max() > 100.0
+
+
+def test_the_bound_is_that_of_finite_differences():
+    one = view()
+    h, columns = 1e-5, []
+    for k in range(12):
+        ahead, behind = (
+            project_rolling(one.camera, moved(one.motion, s * h * np.eye(12)[k]).at_rows,
+                            one.points[one.inliers])[0]
+            for s in (1.0, -1.0)
+        )  # fmt: skip
+        columns.append(((ahead - behind) / (2.0 * h)).ravel())
+    jacobian = np.column_stack(columns)
+    expected = jacobian.T @ jacobian
+    np.testing.assert_allclose(one.information(), expected, rtol=1e-4, atol=1e-5 * expected.max())

@@ -9,13 +9,7 @@ import pytest
 
 from benchmarks.frames import __main__ as command
 from benchmarks.frames.compared import changes_of, read
-from benchmarks.frames.conditions import (
-    HAND,
-    NARROW,
-    Condition,
-    Points,
-    turning,
-)
+from benchmarks.frames.conditions import HAND, NARROW, Condition, Points, turning
 from benchmarks.frames.generated import generate
 from benchmarks.frames.judged import FIGURES, Judged, judge
 from benchmarks.independent.rotations import logarithm

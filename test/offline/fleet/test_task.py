@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """One recording of many: whole or not there, and done again only when it has changed."""
 
+import csv
 import json
 import os
+import random
 import subprocess
 import sys
 from argparse import Namespace
@@ -14,7 +16,8 @@ import killing
 import pytest
 
 from rs_localizer.offline.fleet import task as first
-from rs_localizer.offline.fleet.identity import MARKER, identity, program
+from rs_localizer.offline.fleet.identity import MARKER, folder_names, identity, program
+from rs_localizer.offline.fleet.summary import CSV, DONE, FAILED, Row, write_summary
 from rs_localizer.offline.fleet.task import LOG, PARTIAL, Figures, Kind, Task, finished, perform
 
 
@@ -166,3 +169,38 @@ def test_what_cannot_be_compiled_says_why(tmp_path):
     given = replace(task(tmp_path, kernels="k"), arguments=Namespace(said=tmp_path))
     kind = Kind("count", count_letters, "k", killing.tell)
     assert "Is a directory" in perform(replace(given, kind=kind)).reason
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (["/a/flight", "/a/drive.mcap"], ["flight", "drive"]),
+        (["/a/flight", "/b/flight", "/b/other"], ["a_flight", "b_flight", "other"]),
+        (["/a/x/flight", "/b/x/flight"], ["a_x_flight", "b_x_flight"]),
+        (["/flight", "/b/flight"], ["flight", "b_flight"]),
+        (["/a/one.mcap", "/a/one.db3"], ["a_one.mcap", "a_one.db3"]),
+    ],
+)
+def test_parents_tell_those_of_one_name_apart(paths, names):
+    assert folder_names([Path(path) for path in paths]) == names
+
+
+def test_all_names_differ_and_are_names():
+    rng = random.Random(0)
+    parts = ["a", "b", "a_b", "b.x"]
+    for _ in range(300):
+        paths = {Path("/", *rng.choices(parts, k=rng.randint(1, 4))) for _ in range(12)}
+        names = folder_names(list(paths))
+        assert len(set(names)) == len(paths)
+        assert all(name and "/" not in name for name in names)
+
+
+def test_no_cell_is_a_formula(tmp_path):
+    rows = [
+        Row(Path("=cmd|' /C calc'!A0"), "@sum", DONE, {"offset": -0.5, "why": "+1+1"}),
+        Row(Path("b"), "-c", FAILED, {}, "=1+1"),
+    ]
+    write_summary(tmp_path, "replay", rows)
+    _, first, second = csv.reader((tmp_path / CSV).read_text().splitlines())
+    assert first == ["'=cmd|' /C calc'!A0", "'@sum", DONE, "-0.5", "'+1+1", ""]
+    assert second == ["b", "'-c", FAILED, "", "", "'=1+1"]

@@ -3,6 +3,8 @@
 """The marker detector as its users meet it: its own process, real DDS, images of all kinds."""
 
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -227,3 +229,22 @@ def test_compressed_images_and_the_debug_picture(start_node, peer, map_file):
 
     assert peer.spin_until(reported)
     assert node.stop(signal.SIGTERM) == 0
+
+
+# Modules, packages not counted.
+MOST = {"markers": 50, "features": 41}
+
+
+@pytest.mark.parametrize("kind", MOST)
+def test_the_detectors_do_not_import_the_estimator(kind):
+    code = (
+        f"import sys, rs_localizer.ros.detector.{kind}\n"
+        "print(*(n for n, m in sys.modules.items() if n.startswith('rs_localizer.')"
+        " and not hasattr(m, '__path__')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    names = done.stdout.split()
+    parts = {name.split(".")[1] for name in names}
+    assert parts.isdisjoint({"estimation", "localizer", "tracking", "trajectory", "matching"})
+    assert kind == "markers" or "markers" not in parts
+    assert len(names) < MOST[kind]

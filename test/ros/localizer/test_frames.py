@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """base_frame and publish_tf of the node in its own process, with tf2_ros or a stand-in for it."""
 
-import signal
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -137,40 +135,3 @@ def compare(corrections: list[Any], sent: dict[int, Any]) -> None:
             ]
             # The same bits with tf2_ros; the stand-in calculates in its own way.
             assert np.allclose(*numbers, rtol=0.0, atol=0.0 if INSTALLED else 1e-12)
-
-
-def test_a_mounting_that_comes_and_changes_and_moves(recording, start_node, robot):
-    settings = ("-p", "base_frame:=base_link", "-p", "transform_tolerance:=10.0")
-    node = start_node(*SHUTTER, *settings, **ENVIRONMENT)
-    robot.connect()
-    pair, *_, last = inputs(recording)
-    missing = f"no_transform: from the camera '{CAMERA}' to base_frame 'base_link'"
-    for _ in range(20):  # the first ones may be lost
-        assert not robot.send(*pair, 0.5)
-        if missing in node.log:
-            break
-    assert missing in node.log
-    robot.transform(MOUNTING)
-    robot.localize(*pair)
-    before = np.array(robot.position())
-    # Calibrated anew, 2 m farther forward on the base: the base is 2 m farther back.
-    robot.transform((*MOUNTING[:2], (2.5, 0.25, 0.875), *MOUNTING[3:]))
-    robot.peer.spin_until(lambda: False, 0.2)
-    robot.localize(*pair)
-    assert np.linalg.norm(np.array(robot.position()) - before) == pytest.approx(2.0, abs=0.01)
-    # A camera on a head: the node waits for transforms as late as the frame, and goes on then.
-    last_ns = stamp_ns(last[1])
-    for milliseconds in (-60, -40):
-        robot.transform((*MOUNTING[:4], last_ns + milliseconds * 10**6))
-    robot.peer.spin_until(lambda: False, 0.2)
-    answers = len(robot.answers["inliers"])
-    assert not robot.send(*last, 0.5)
-    for milliseconds in (20, 40):
-        robot.transform((*MOUNTING[:4], last_ns + milliseconds * 10**6))
-    assert robot.peer.spin_until(lambda: len(robot.answers["inliers"]) > answers)
-    # It ends at once also while it waits.
-    last[1].header.stamp.sec += 1
-    assert not robot.send(*last, 0.3)
-    started = time.monotonic()
-    assert node.stop(signal.SIGTERM) == 0
-    assert time.monotonic() - started < 8.0  # of ten that it would wait

@@ -8,8 +8,11 @@ import signal
 import time
 from typing import Any
 
-import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
 
 from rs_localizer.io.outputs import TYPES
@@ -71,21 +74,6 @@ def test_started_with_bad_parameters(start_node):
     assert "Traceback" not in node.log
 
 
-@pytest.mark.parametrize(
-    ("override", "text"),
-    [
-        ("/correspondences.subscription.depth:=ten", "not activated: .*ten"),
-        ("/rs_localizer/pose.publisher.depth:=ten", "not configured:"),
-    ],
-)
-def test_qos_overrides_that_make_no_qos(start_node, override, text):
-    node = start_node("-p", f"qos_overrides.{override}")
-    assert node.process.wait(60.0) == 1
-    errors = [line for line in node.log.splitlines() if line.startswith("[ERROR]")]
-    assert len(errors) == 1
-    assert re.search(text, errors[0], re.IGNORECASE)
-
-
 def test_publishers_are_active_before_a_frame_can_come(monkeypatch):
     active: list[bool] = []
 
@@ -126,3 +114,50 @@ def test_what_it_says_at_start(start_node, tmp_path):
     ]
     silent = "readout_time is 0 (unknown): no twist is published and frames are not tracked"
     assert lines.count(silent) == 1
+
+
+def said(peer: Any) -> list[tuple[bytes, str]]:
+    """Levels and states of the diagnostics, as they come."""
+    found: list[tuple[bytes, str]] = []
+
+    def take(message: DiagnosticArray) -> None:
+        for status in message.status:
+            found.append((status.level, {it.key: it.value for it in status.values}["State"]))
+
+    found_by = peer.node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
+    assert found_by is not None
+    return found
+
+
+def test_services_answer_while_kernels_are_compiled(start_node, peer, tmp_path):
+    states = said(peer)
+    node = start_node(XDG_CACHE_HOME=str(tmp_path / "cache"))
+    node.wait_for_log("compiling kernels")
+    service = "/rs_localizer/get_parameters"
+    first = GetParameters.Request(names=["solver"])
+    # A few of some hundred are compiled by then.
+    while len(list(tmp_path.rglob("*.nbc"))) < 4:
+        values = peer.call(GetParameters, service, first).values
+        assert [value.string_value for value in values] == ["r6p_vcwt"]
+        state = peer.call(GetState, "/rs_localizer/get_state", GetState.Request())
+        assert state.current_state.label == "unconfigured"
+    # Diagnostics come once a second, and are heard when they have found us.
+    assert peer.spin_until(lambda: (b"\1", "compiling") in states)
+    assert "kernels are ready" not in node.log
+    assert node.stop() == 0
+    assert "Traceback" not in node.log
+
+
+def test_two_clients_configure_at_once(start_node, peer):
+    """The transition is made once, and both get an answer."""
+    node = start_node("-p", "autostart:=false")
+    clients = [peer.node.create_client(ChangeState, "/rs_localizer/change_state") for _ in range(2)]
+    assert peer.spin_until(lambda: all(client.service_is_ready() for client in clients))
+    peer.spin_until(lambda: False, 0.5)
+    request = ChangeState.Request()
+    request.transition.id = Transition.TRANSITION_CONFIGURE
+    answers = [client.call_async(request) for client in clients]
+    assert peer.spin_until(lambda: all(answer.done() for answer in answers))
+    assert sorted(answer.result().success for answer in answers) == [False, True]
+    assert "is refused: the node is inactive" in node.log
+    assert node.stop() == 0

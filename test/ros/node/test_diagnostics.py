@@ -5,11 +5,14 @@
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 
 from rs_localizer.ros.node.health import Diagnostics, Health, Level, State
+from rs_localizer.ros.node.refusals import Refusals
+from rs_localizer.ros.node.statistics import missing
 
 
 class Bench:
@@ -88,3 +91,91 @@ def test_what_is_meant_so_is_not_logged(bench, level, state):
     for _ in range(20):
         bench.tick()
     assert bench.lines == []
+
+
+RATES = (10.0, 30.0, 60.0)
+
+
+def stamps(rate: float, count: int, jitter: float, rng: np.random.Generator) -> np.ndarray:
+    """ns; jitter as a part of the period."""
+    period = 1e9 / rate
+    return (np.arange(count) * period + rng.normal(0.0, jitter * period, count)).astype(np.int64)
+
+
+@pytest.mark.parametrize(
+    ("rate", "share"), [(10.0, 0.6), (10.0, 0.9), (30.0, 0.3), (30.0, 0.9), (60.0, 0.2)]
+)
+def test_what_was_dropped_is_counted(rate, share):
+    rng = np.random.default_rng(0)
+    sent = stamps(rate, round(5 * rate), 0.02, rng)
+    keep = rng.random(len(sent)) < share
+    keep[[0, -1]] = True
+    assert missing(sent[keep]) == len(sent) - keep.sum()
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("jitter", [0.0, 0.02, 0.05])
+def test_a_steady_camera_misses_nothing(rate, jitter):
+    for seed in range(20):
+        assert missing(stamps(rate, 150, jitter, np.random.default_rng(seed))) == 0
+
+
+def test_no_rate_no_verdict():
+    rng = np.random.default_rng(0)
+    triggered = np.cumsum(rng.exponential(1e8, 200)).astype(np.int64)  # whenever something moves
+    assert missing(triggered) == 0
+    assert missing([]) == missing([5]) == missing([0, 10, 30, 40]) == 0
+
+
+class Log:
+    """Refusals with a clock that stands still, and the lines that they gave."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.now = 100.0
+        self.refusals = Refusals(self.lines.append, clock=lambda: self.now)
+        self.add = self.refusals.add
+
+
+@pytest.fixture
+def log() -> Log:
+    return Log()
+
+
+def test_one_line_for_each_reason_and_period(log):
+    log.add("dark", "no light")
+    log.add("dark", "no light")
+    log.add("late", "too late")
+    assert log.lines == ["dark: no light", "late: too late"]
+    log.now += 4.9
+    log.add("dark", "no light")
+    assert len(log.lines) == 2
+    log.now += 0.2
+    log.add("dark", "no light")
+    assert log.lines[2:] == ["dark: no light (2 more since the last report)"]
+    log.now += 5.1
+    log.add("dark", "no light")
+    assert log.lines[3:] == ["dark: no light"]
+    assert log.refusals.counts == {"dark": 5, "late": 1}
+
+
+def test_details_that_differ_in_numbers_are_one(log):
+    for inliers in range(8, 12):
+        log.add("too_few_inliers", f"{inliers} of 100 points within 2.0 px")
+    log.now += 6.0
+    log.add("too_few_inliers", "7 of 90 points within 2.0 px")
+    assert log.lines == [
+        "too_few_inliers: 8 of 100 points within 2.0 px",
+        "too_few_inliers: 7 of 90 points within 2.0 px (3 more since the last report)",
+    ]
+
+
+def test_ever_new_details_fill_neither_log_nor_memory(log):
+    letters = "abcdefghijklmnopqrstuvwxyz"
+    for second in range(60):
+        for first in letters:
+            log.add("odd", f"field {first}{letters[second % 26]}{letters[second // 26]}")
+        log.now += 1.0
+    assert 12 <= len(log.lines) <= 12 * 9
+    assert sum(map(len, log.refusals._logged.values())) <= 9
+    assert log.refusals.counts == {"odd": 60 * 26}

@@ -29,16 +29,7 @@ from fault_keypoints import (
     replaced_within_a_frame,
     without_a_map,
 )
-from fault_messages import (
-    cloud,
-    garbage,
-    info,
-    many,
-    noise,
-    resized,
-    rows,
-    stamped,
-)
+from fault_messages import cloud, garbage, info, many, noise, resized, rows, stamped
 from fault_transforms import second_parent, without_odometry
 from lifecycle_msgs.msg import Transition
 from live_world import World

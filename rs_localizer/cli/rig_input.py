@@ -1,0 +1,197 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The cameras of a rig: which recording and topics are whose, and how they are mounted."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from rs_localizer.cli import WORKING, UsageError
+from rs_localizer.cli.image_input import lenses_of
+from rs_localizer.process.arguments import number
+
+if WORKING:
+    import numpy as np
+    from scipy.spatial.transform import Rotation
+
+    from rs_localizer.config import CameraSettings, NodeConfig
+    from rs_localizer.core.arrays import Array
+    from rs_localizer.io.bags import is_bag, open_bag
+    from rs_localizer.io.rigs import read_camchain
+    from rs_localizer.io.transforms import Transform
+    from rs_localizer.offline.recordings import camera_topics, optical_frame, transform_between
+    from rs_localizer.trajectory.model import Extrinsics, Mounting
+    from rs_localizer.trajectory.rig import DETERMINED
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OfRig:
+    """One camera of the recordings."""
+
+    args: argparse.Namespace  # as of a recording of this camera alone
+    frame: str  # of its optical axes
+
+
+def check_there(recordings: Sequence[Path]) -> None:
+    """Raise ValueError for one that does not exist, before any other has been read."""
+    for path in recordings:
+        if not path.exists():
+            raise ValueError(f"{path} does not exist")
+
+
+def cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, OfRig]:
+    """The cameras of ``args.recordings``, by name: of one bag, or of a recording of each."""
+    if len(args.recordings) > 1:
+        names = [re.sub(r"\W", "_", path.stem, flags=re.ASCII) for path in args.recordings]
+        topics = [{"recording": path} for path in args.recordings]
+        frames = [f"{name}_optical_frame" for name in names]
+    else:
+        (path,) = args.recordings
+        names, topics, frames = _in_one_file(path, config.cameras if config.is_rig else None)
+    if len(set(names)) < max(len(names), 2) or not all(name[:1].isalpha() for name in names):
+        raise UsageError(
+            f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
+        )
+    check_there(args.recordings)
+    if len(set(frames)) < len(frames):  # as of single recordings put together
+        frames = [""] * len(frames)
+    lens = args.calibration
+    return {
+        name: OfRig(
+            argparse.Namespace(**vars(args) | own | {
+                "calibration": None if lens is None else lens.with_name(f"{lens.name}#{name}"),
+            }),
+            frame or f"{name}_optical_frame",
+        )
+        for name, own, frame in zip(names, topics, frames, strict=True)
+    }  # fmt: skip
+
+
+def _in_one_file(
+    path: Path, given: Sequence[str] | None
+) -> tuple[list[str], list[dict[str, Any]], list[str]]:
+    """Names of the cameras of a bag or of the lenses of a video, where each is, and its frame."""
+    if is_bag(path):
+        with open_bag(path) as bag:
+            by_name = camera_topics(bag, given)
+            frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
+        return list(by_name), [{"recording": path, **own} for own in by_name.values()], frames
+    lenses = () if path.is_dir() or not path.exists() else lenses_of(path)
+    if len(lenses) < 2:
+        raise UsageError(
+            f"--rig needs the recordings of several cameras, one bag or a video of several lenses; "
+            f"{path}"
+        )
+    names = list(given or lenses)
+    if missing := [name for name in names if name not in lenses]:
+        raise UsageError(f"cameras: {path} is of {', '.join(lenses)}, not of {', '.join(missing)}")
+    places = [{"recording": path, "lens": lenses.index(name)} for name in names]
+    return names, places, [""] * len(names)
+
+
+def mounting_lines(name: str, first: str, mounted: Extrinsics, deviations: Array) -> list[str]:
+    """Where a camera is beside the first one, and its clock; of deviations (7,) in rad, m, s."""
+    turn = Rotation.from_matrix(mounted.axes).as_quat(canonical=True)
+    turned, moved = np.degrees(deviations[:3]), 1e3 * deviations[3:6]
+    return [
+        f"{f'{name} <- {first}':26} {numbers(turn, 5)} (x y z w) +- {numbers(turned, 3)} deg",
+        f"{f'place in {first}':26} {numbers(1e3 * mounted.centre, 2)} +- {numbers(moved, 2)} mm",
+        f"{'offset of its stamps':26} {1e3 * mounted.offset:+.3f} +- {1e3 * deviations[6]:.3f} ms",
+    ]
+
+
+def numbers(values: Array, digits: int) -> str:
+    """Values (n,) beside each other."""
+    return " ".join(f"{value:.{digits}f}" for value in values)
+
+
+# What a map is made from.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapCamera:
+    """A camera that a map is made with, alone or of a rig."""
+
+    name: str  # empty: it is alone
+    args: argparse.Namespace  # with its ``recording`` and topics
+    config: NodeConfig  # with its shutter and clock
+    mounting: Mounting | None  # None: the axes are its own
+
+
+def add_mounting_argument(parser: argparse.ArgumentParser) -> None:
+    """For :func:`map_cameras`."""
+    turn, place, offset = DETERMINED
+    parser.add_argument(
+        "--mounting",
+        type=number(0.0, above=True),
+        nargs=3,
+        metavar=("DEG", "M", "S"),
+        default=[float(np.degrees(turn)), place, offset],
+        help="standard deviations of a rig's extrinsics and clocks as they are given, which are "
+        "estimated as well (default: what calibrate --rig finds is known to, %(default)s)",
+    )
+
+
+def map_cameras(args: argparse.Namespace, config: NodeConfig) -> list[MapCamera]:
+    """The cameras of ``args.recordings``; those of a rig in the axes of the first.
+
+    Raises:
+        UsageError: when it is not known how they are mounted, or what their shutters are.
+    """
+    if len(args.recordings) == 1 and not config.is_rig:
+        check_there(args.recordings)
+        alone = argparse.Namespace(**vars(args), recording=args.recordings[0])
+        return [MapCamera("", alone, config, None)]
+    sources = cameras_of(args, config)
+    if args.calibration is not None:
+        parts = read_camchain(args.calibration)
+        given = {
+            name: Transform(*parts.camera_from_rig[name])
+            for name in sources
+            if name in parts.cameras
+        }
+        shutters = {
+            name: CameraSettings(
+                camera.readout_time, camera.scan_direction, parts.time_offset.get(name, 0.0)
+            )
+            for name, camera in parts.cameras.items()
+        } | dict(config.of_cameras)
+    else:
+        given, shutters = _by_tf(sources), dict(config.of_cameras)
+    if lacking := [name for name in sources if name not in given]:
+        raise UsageError(
+            f"it is not known where {', '.join(lacking)} of the rig is mounted: give --calibration "
+            "CAMCHAIN, or a bag with TF; calibrate --rig finds it"
+        )
+    if lacking := [name for name in sources if not shutters[name].readout_time > 0.0]:
+        raise UsageError(f"no readout_time of {', '.join(lacking)}: calibrate --rig finds it")
+    first = given[next(iter(sources))].inverse()
+    cameras = list[MapCamera]()
+    for name, own in sources.items():
+        pose, mounting = given[name] @ first, None
+        if cameras:
+            extrinsics = Extrinsics(pose.rotation, -pose.rotation.T @ pose.translation, 0.0)
+            turn, place, offset = args.mounting
+            deviations = np.repeat([np.radians(turn), place, offset], [3, 3, 1])
+            mounting = Mounting(extrinsics, deviations)
+        shutter = {each.name: getattr(shutters[name], each.name) for each in fields(CameraSettings)}
+        cameras.append(MapCamera(name, own.args, replace(config, **shutter), mounting))
+    return cameras
+
+
+def _by_tf(sources: Mapping[str, OfRig]) -> dict[str, Transform]:
+    """Where TF of a bag says that the cameras are, in the axes of the first of them."""
+    first = next(iter(sources.values()))
+    path: Path = first.args.recording
+    if not is_bag(path):
+        return {}
+    with open_bag(path) as bag:
+        found = {
+            name: transform_between(bag, own.frame, first.frame) for name, own in sources.items()
+        }
+    return {name: pose for name, pose in found.items() if pose is not None}
