@@ -90,7 +90,7 @@ def calibration_effect(
         information, slope = products + variance * np.diag(_unit_of(count)), np.zeros(PARAMETERS)
         of_motion = products[:PARAMETERS, :PARAMETERS].copy()
         of_speed = terms_at(terms, speed, observed.sighted.turn is not None)
-        add_prior(*of_speed, posterior.state, variance, of_motion, slope)
+        add_prior(of_speed, posterior.state, variance, of_motion, slope)
         information[:PARAMETERS, :PARAMETERS] = of_motion
         inverse = inverted(information)
         if not np.all(np.isfinite(inverse)):
