@@ -20,7 +20,7 @@ from benchmarks.mapping.rooms import (
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.mapping.adjustment import MapProblem, apply_similarity
 from rs_localizer.mapping.gauge import through
-from rs_localizer.mapping.observations import MapObservations, Start
+from rs_localizer.mapping.observations import MapObservations, RigCamera, Start
 from rs_localizer.mapping.refine import MapFreedom, Preparation, RefinedMap, refine
 from rs_localizer.trajectory.model import Freedom, start_state
 
@@ -98,17 +98,18 @@ def bound(seed: int, trials: int = 20) -> Iterator[str]:
 def _least(seen: MapObservations, found: RefinedMap, freedom: MapFreedom) -> Array:
     """Covariances (p,3,3) of an estimator that loses nothing, at errors of zero."""
     start = Start(found.points, *found.poses())
-    prepared = Preparation(found.camera, seen, start, freedom, 0.0)
-    observed = prepared.observations()
+    prepared = Preparation([RigCamera(found.camera)], seen, start, freedom)
+    (observed,) = prepared.observations()
     free = Freedom(
         readout_time=False, angular_acceleration=freedom.angular_acceleration,
         linear_acceleration=freedom.linear_acceleration,
     )  # fmt: skip
     state = start_state(found.camera, observed, found.spline, found.readout_time)
-    problem = MapProblem(found.camera, observed, state, free, prepared.deviations, False)
-    errors = [sights.errors for sights in problem.motion.look(state)[1]]
+    (camera,) = prepared.problem([observed], state, free).cameras
+    errors = [sights.errors for sights in camera.look(state)[1]]
     fitting = replace(observed, pixels=observed.pixels + np.concatenate(errors))
-    problem = MapProblem(found.camera, fitting, state, free, prepared.deviations, False)
+    motion = prepared.problem([fitting], state, free)
+    problem = MapProblem(motion, state, prepared.deviations, False)
     return apply_similarity(
         problem, state, _NOISE, np.ones(len(found.points), np.bool_)
     ).covariances

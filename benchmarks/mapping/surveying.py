@@ -173,7 +173,7 @@ def _filmed(
     size: float, rng: np.random.Generator,
 ) -> Filmed:  # fmt: skip
     spotted = Film(camera, walk, stamps).spot(poses, size, _NOISE, rng)
-    return Filmed(estimators_camera(camera, camera.readout_time), spotted)
+    return Filmed(estimators_camera(camera, camera.readout_time), spotted=spotted)
 
 
 def _rig_line(name: str, found: Sequence[tuple[_Errors, Array, Array]]) -> str:

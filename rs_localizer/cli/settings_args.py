@@ -73,14 +73,6 @@ def given_settings(
     return build(given_values(args, also, check))
 
 
-def one_camera(config: NodeConfig) -> None:
-    """A check of :func:`given_values` for what is made with one camera."""
-    if config.is_rig:
-        raise ValueError(
-            "maps are made with one camera of a rig: leave out cameras, and choose its topics"
-        )
-
-
 def _check(values: dict[str, Any], check: Callable[[NodeConfig], object] | None) -> None:
     config = build(values)
     if check is not None:

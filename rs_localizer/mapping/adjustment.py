@@ -12,22 +12,23 @@ as a whole (LAPACK): 300 images on their own have 7200 unknowns, which is a few 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.mapping.gauge import Floating, as_held, generators, laid_over
 from rs_localizer.trajectory.banded import Undetermined
-from rs_localizer.trajectory.model import Freedom, Observations, State
+from rs_localizer.trajectory.model import Observations, State
 from rs_localizer.trajectory.normal_kernels import Normal
-from rs_localizer.trajectory.problem import Problem
+from rs_localizer.trajectory.problem import RigNormal, RigProblem
 from rs_localizer.trajectory.sight_kernels import Curve, Sights, Terms, differentiate, make_row
 from rs_localizer.trajectory.spline import Spline
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL, ORDER
@@ -304,7 +305,7 @@ _WORKERS = 2
 class MapNormal:
     """Normal equations of motion, shared numbers and landmarks."""
 
-    motion: Normal  # with the map as it is
+    motion: RigNormal  # with the map as it is
     rows: Rows
     held: Array  # (N,7) whitened directions in which the whole would float
     held_error: Array  # (7,)
@@ -323,10 +324,11 @@ class Reduced:
 
     def __init__(self, normal: MapNormal, damping: float = 0.0) -> None:
         self._rows = normal.rows._replace(damping=damping)
-        self._controls = len(normal.motion.slope)
-        self._slope = np.concatenate([normal.motion.slope, normal.motion.border_slope])
+        motion = normal.motion.whole
+        self._controls = len(motion.slope)
+        self._slope = np.concatenate([motion.slope, motion.border_slope])
         self._slope += normal.held @ normal.held_error
-        system, sequence = _dense(normal.motion, damping), _sequence(self._rows)
+        system, sequence = _dense(motion, damping), _sequence(self._rows)
         with ThreadPoolExecutor(_WORKERS) as workers:
             for _ in workers.map(
                 lambda part: eliminate(self._rows, sequence, part, _WORKERS, system),
@@ -407,27 +409,17 @@ class MapProblem:
     """The cost of a state with all landmarks free.
 
     Args:
-        camera: lens, size and scan direction.
-        observations: keypoints, and the landmarks as they are known beforehand.
+        motion: what it would be if the map were known, with landmarks as they are known beforehand.
         start: first guess.
-        freedom: what else is free; its deviation of landmarks does not matter.
         deviations: (p,) m, of the landmarks as they are known beforehand.
         floating: nothing holds the whole but its start.
     """
 
-    def __init__(
-        self, camera: Camera, observations: Observations, start: State, freedom: Freedom,
-        deviations: Array, floating: bool,
-    ) -> None:  # fmt: skip
-        # The motion's part: what it would be if the map were known.
-        self.motion = Problem(camera, observations, start, replace(freedom, landmarks=0.0))
-        self.floating = floating
-        self._whole = Floating(start.spline, self.motion.border) if floating else None
+    def __init__(self, motion: RigProblem, start: State, deviations: Array, floating: bool) -> None:
+        self.motion, self.floating = motion, floating
+        self.observations = joined([camera.observations for camera in motion.cameras])
+        self._whole = Floating(start.spline, motion.border) if floating else None
         self._precisions = deviations**-2.0
-
-    @property
-    def observations(self) -> Observations:
-        return self.motion.observations
 
     def errors(self, state: State) -> Array:
         """Squared whitened errors (n,), px^2."""
@@ -442,23 +434,26 @@ class MapProblem:
         cost, motion = self.motion.normal(state, deviation)
         rows = self._rows(state, deviation)
         cost += float(np.sum(rows.precisions[:, None] * rows.offsets**2))
-        held, error = np.zeros((len(motion.slope) + self.motion.border, 0)), np.zeros(0)
+        held, error = np.zeros((len(motion.whole.slope) + self.motion.border, 0)), np.zeros(0)
         if self._whole is not None:
             held, error = self._whole.terms(state.spline)
             cost += float(error @ error)
         return cost, MapNormal(motion, rows, held, error)
 
     def _rows(self, state: State, deviation: float) -> Rows:
-        curve, parts = self.motion.look(state)
-        terms, seen = self.motion.terms(state, deviation), self.observations
-        values = np.empty((len(seen.points), 2, LOCAL + self.motion.border + 4))
-        ends = np.cumsum([len(sights.first) for sights in parts])
-        self.motion.each(
-            lambda sights, part: record(curve, sights, terms, part),
-            parts,
-            np.split(values, ends[:-1]),
-        )
-        first = np.concatenate([sights.first for sights in parts])
+        every, firsts, seen = list[Array](), list[IntArray](), self.observations
+        motion, border = self.motion, self.motion.border
+        for camera, one, ratio, at in zip(
+            motion.cameras, motion.states(state), motion.ratios, motion.columns, strict=True
+        ):
+            curve, parts = camera.look(one)
+            terms = camera.terms(one, deviation * float(ratio))
+            own = np.empty((len(camera.observations.points), 2, LOCAL + len(at) + 4))
+            ends = np.cumsum([len(sights.first) for sights in parts])
+            camera.each(partial(_record, curve, terms), parts, np.split(own, ends[:-1]))
+            firsts += [sights.first for sights in parts]
+            every.append(own if len(at) == border else _spread(own, at, border))
+        values, first = np.concatenate(every), np.concatenate(firsts)
         count = len(state.landmarks)
         return Rows(
             values,
@@ -478,7 +473,31 @@ class MapProblem:
     def moved(self, state: State, normal: MapNormal, step: MapStep) -> State:
         """The state after a step."""
         moved = self.motion.moved(state, normal.motion, (step.controls, step.shared))
-        return replace(moved, landmarks=state.landmarks + step.landmarks)
+        return moved.with_landmarks(state.landmarks + step.landmarks)
+
+
+def _record(curve: Curve, terms: Terms, sights: Sights, part: Array) -> None:
+    record(curve, sights, terms, part)
+
+
+def _spread(own: Array, columns: IntArray, border: int) -> Array:
+    """Rows (n,2,...) of a camera with the shared numbers of all."""
+    rows = np.zeros((len(own), 2, LOCAL + border + 4))
+    rows[..., :LOCAL], rows[..., LOCAL + columns], rows[..., -4:] = np.split(
+        own, [LOCAL, LOCAL + len(columns)], axis=2
+    )
+    return rows
+
+
+def joined(parts: Sequence[Observations]) -> Observations:
+    """Those of all cameras, of one map, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    names = ("times", "row_times", "pixels", "points", "frames", "trusted")
+    every: dict[str, Any] = {
+        name: np.concatenate([getattr(one, name) for one in parts]) for name in names
+    }
+    return replace(parts[0], **every)
 
 
 def sights_of(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +15,90 @@ from scipy.sparse.csgraph import connected_components
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.types import Estimate
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.maps.landmarks import Map, make_map
+from rs_localizer.mapping.readout_check import ReadoutCheck
+from rs_localizer.trajectory.model import Extrinsics, Mounting
 from rs_localizer.trajectory.observe import Observed, localize_each
 
 # A part of the map hangs together with another by at least so many landmarks.
 _LEAST_IMAGES, _LEAST_SHARED = 3, 3
 # Fewer observations hold a landmark on one ray, nearly.
 _LEAST_OBSERVATIONS = 3
+# Images of several cameras are taken together if they begin within this time (s): at 1 rad/s, a
+# degree; what two images say of two markers may differ by eight.
+_ONE_FRAME = 0.02
 # An image with fewer keypoints does not know where it is.
 LEAST_KEYPOINTS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigCamera:
+    """A camera that a map is made with, of a rig or alone."""
+
+    camera: Camera  # its readout time: 0: a global shutter, or it is to be found
+    stamp_offset: float = 0.0  # s from a stamp to the first row's exposure, by the rig's clock
+    mounting: Mounting | None = None  # None: its axes are those of the rig
+
+    @property
+    def extrinsics(self) -> Extrinsics:
+        """As they are given."""
+        return Extrinsics.none() if self.mounting is None else self.mounting.given
+
+    @property
+    def delay(self) -> float:
+        """Seconds from a stamp to the middle row's exposure."""
+        return self.stamp_offset - self.camera.readout_time * self.camera.first_row_time
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """A camera as the images say, when map and motion have been adjusted."""
+
+    camera: Camera  # with its lens
+    readout_time: float  # s; negative: against the scan direction
+    readout_time_deviation: float  # s; NaN where it was given
+    readout_check: ReadoutCheck | None  # of a given one; None: the images do not tell, or found
+    extrinsics: Extrinsics
+    deviations: Array  # (7,) of a step of the extrinsics: rad, m, s; zeros: they are the rig's axes
+
+
+class Frame(NamedTuple):
+    """Images of several cameras, one of each at most, that were taken at about one time."""
+
+    time: float  # s, mean of the images' middle rows
+    images: list[tuple[int, int]]  # the camera, and its image
+
+
+def frames_of(times: Sequence[Array]) -> list[Frame]:
+    """Which images belong together, by the times (g,), s, of each camera's."""
+    every = sorted(
+        (float(time), camera, image)
+        for camera, own in enumerate(times)
+        for image, time in enumerate(own)
+    )
+    groups: list[list[tuple[float, int, int]]] = []
+    for one in every:
+        last = groups[-1] if groups else []
+        if last and one[0] - last[0][0] < _ONE_FRAME and one[1] not in {of[1] for of in last}:
+            last.append(one)
+        else:
+            groups.append([one])
+    return [
+        Frame(sum(of[0] for of in group) / len(group), [of[1:] for of in group])
+        for group in groups
+    ]  # fmt: skip
+
+
+def frame_numbers(times: Array, cameras: IntArray) -> IntArray:
+    """The frame of each image (g,), by its time (s) and its camera."""
+    own = [np.flatnonzero(cameras == camera) for camera in range(int(cameras.max()) + 1)]
+    numbers = np.empty(len(times), np.int64)
+    for number, frame in enumerate(frames_of([times[images] for images in own])):
+        for camera, image in frame.images:
+            numbers[own[camera][image]] = number
+    return numbers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,10 +109,17 @@ class MapObservations:
         ValueError: for arrays that do not go together.
     """
 
-    stamps_ns: IntArray  # (g,) ns, of the images' headers; rising
+    stamps_ns: IntArray  # (g,) ns, of the images' headers; those of a camera rise
     images: IntArray  # (n,) rows of ``stamps_ns``
     landmarks: IntArray  # (n,) rows of ``Start.points``
     pixels: Array  # (n,2) raw
+    cameras: IntArray | None = None  # (g,) of a rig, which of them; None: there is one
+
+    @property
+    def of_cameras(self) -> IntArray:
+        """The camera of each image (g,)."""
+        none = np.zeros(len(self.stamps_ns), np.int64)
+        return none if self.cameras is None else self.cameras
 
     def __post_init__(self) -> None:
         count = len(self.images)
@@ -48,7 +128,8 @@ class MapObservations:
                 f"images (n,), landmarks (n,) and pixels (n,2) must be of one length, got "
                 f"{self.images.shape}, {self.landmarks.shape} and {self.pixels.shape}"
             )
-        if not np.all(np.diff(self.stamps_ns) > 0):
+        of = self.of_cameras
+        if not all(np.all(np.diff(self.stamps_ns[of == k]) > 0) for k in np.unique(of)):
             raise ValueError("the images' stamps must rise")
         if count and not 0 <= self.images.min() <= self.images.max() < len(self.stamps_ns):
             raise ValueError("keypoints are of images without a stamp")
@@ -82,8 +163,12 @@ def shared_landmarks(observations: MapObservations) -> BoolArray:
     return np.bincount(pairs[:, 0]) > 1
 
 
-def check(observations: MapObservations, points: int) -> None:
-    """Raise ValueError when the images do not make one map of so many points, and say why."""
+def check(observations: MapObservations, points: int, delays: Array) -> None:
+    """Raise ValueError when the images do not make one map of so many points, and say why.
+
+    Args:
+        delays: (k,) s, of each camera's middle rows after their stamps.
+    """
     rows = observations.landmarks
     if len(rows) and not 0 <= rows.min() <= rows.max() < points:
         raise ValueError(f"keypoints are of landmarks that are not among the {points} of the map")
@@ -95,7 +180,11 @@ def check(observations: MapObservations, points: int) -> None:
     shared = shared_landmarks(observations) if len(observations.images) else np.zeros(0, np.bool_)
     if not shared.any():
         raise ValueError("no overlap: no landmark is seen by two images")
-    sizes = _parts(observations, shared[observations.landmarks])
+    times = 1e-9 * (observations.stamps_ns - observations.stamps_ns.min())
+    frames = frame_numbers(times + delays[observations.of_cameras], observations.of_cameras)
+    sizes = _parts(observations, shared[observations.landmarks], frames)
+    if len(delays) > 1:  # an image without those of other cameras, as at the ends: by the motion
+        sizes = [size for size in sizes if size > 1]
     if len(sizes) > 1:
         listed = ", ".join(str(size) for size in sizes[:6]) + (", ..." if len(sizes) > 6 else "")
         raise ValueError(
@@ -104,9 +193,9 @@ def check(observations: MapObservations, points: int) -> None:
         )
 
 
-def _parts(observations: MapObservations, usable: BoolArray) -> list[int]:
-    """Numbers of images that hang together, largest first."""
-    images, landmarks = observations.images[usable], observations.landmarks[usable]
+def _parts(observations: MapObservations, usable: BoolArray, frames: IntArray) -> list[int]:
+    """Numbers of images, or of a rig's frames, that hang together, largest first."""
+    images, landmarks = frames[observations.images[usable]], observations.landmarks[usable]
     ones = np.ones(len(images))
     sees = coo_array((ones, (images, landmarks))).tocsr()
     sees.data[:] = 1.0
@@ -154,44 +243,53 @@ class RecordedMap:
     images: int  # of the recording
 
 
-def from_recording(
-    camera: Camera, clouds: Sequence[Correspondences], landmarks: Map | None = None,
-    done: Callable[[], object] = lambda: None,
+def from_recordings(
+    cameras: Sequence[Camera], clouds: Sequence[Sequence[Correspondences]],
+    landmarks: Map | None = None, done: Callable[[], object] = lambda: None,
 ) -> RecordedMap:  # fmt: skip
     """Images with a pose, and the landmarks that they show.
 
     Args:
-        camera: with its readout time, where it is known.
-        clouds: of the recording, one an image.
-        landmarks: the map; None: that of the recording, by the points that it shows.
+        cameras: of a rig, or one alone, with their readout times, where these are known.
+        clouds: of the recording of each, one an image.
+        landmarks: the map; None: that of the recordings, by the points that they show.
         done: called after each image.
 
     Raises:
         ValueError: when points are not of the map, or no image has a pose.
     """
-    once = {cloud.stamp_ns: cloud for cloud in clouds if len(cloud.points)}
-    images = [once[stamp] for stamp in sorted(once)]
+    images: list[tuple[int, Correspondences]] = []
+    results: list[Estimate | Failure] = []
+    for k, (camera, own) in enumerate(zip(cameras, clouds, strict=True)):
+        once = {cloud.stamp_ns: cloud for cloud in own if len(cloud.points)}
+        every = [once[stamp] for stamp in sorted(once)]
+        images += [(k, cloud) for cloud in every]
+        observed = [Observed(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in every]
+        results += localize_each(camera, observed, done)
     if landmarks is None:
-        landmarks = _own_map(images)
-    rows = [_rows_of(landmarks, cloud) for cloud in images]
-    observed = [Observed(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in images]
-    results = localize_each(camera, observed, done)
-    posed = [k for k, result in enumerate(results) if isinstance(result, Estimate)]
+        landmarks = _own_map([cloud for _, cloud in images])
+    posed = [
+        (k, cloud, result)
+        for (k, cloud), result in zip(images, results, strict=True)
+        if isinstance(result, Estimate)
+    ]
     if not posed:
         raise ValueError(f"none of {len(images)} images has a pose; of the last one, {results[-1]}")
-    estimates = [result for result in results if isinstance(result, Estimate)]
-    near = [estimate.residuals < _MOST_RESIDUAL for estimate in estimates]
+    near = [result.residuals < _MOST_RESIDUAL for _, _, result in posed]
     counts = [int(np.count_nonzero(of)) for of in near]
     seen = MapObservations(
-        np.array([images[k].stamp_ns for k in posed], np.int64),
+        np.array([cloud.stamp_ns for _, cloud, _ in posed], np.int64),
         np.repeat(np.arange(len(posed)), counts),
-        np.concatenate([rows[k][of] for k, of in zip(posed, near, strict=True)]),
-        np.concatenate([images[k].pixels[of] for k, of in zip(posed, near, strict=True)]),
-    )
+        np.concatenate([
+            _rows_of(landmarks, cloud)[of] for (_, cloud, _), of in zip(posed, near, strict=True)
+        ]),
+        np.concatenate([cloud.pixels[of] for (_, cloud, _), of in zip(posed, near, strict=True)]),
+        np.array([k for k, _, _ in posed], np.int64),
+    )  # fmt: skip
     start = Start(
         landmarks.points,
-        np.array([estimate.rotation.T for estimate in estimates]),
-        np.array([estimate.position for estimate in estimates]),
+        np.array([result.rotation.T for _, _, result in posed]),
+        np.array([result.position for _, _, result in posed]),
     )
     return RecordedMap(landmarks, seen, start, len(images))
 

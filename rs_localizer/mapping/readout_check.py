@@ -39,22 +39,24 @@ class ReadoutCheck:
         )
 
 
-def readout_check(problem: MapProblem, state: State, deviation: float) -> ReadoutCheck:
-    """The readout time at the minimum of a problem.
+def readout_checks(problem: MapProblem, state: State, deviation: float) -> list[ReadoutCheck]:
+    """The readout time of each camera at the minimum of a problem.
 
     Args:
-        problem: with the readout time free.
-        state: the minimum of the same problem with the readout time held.
+        problem: with the readout times free.
+        state: the minimum of the same problem with the readout times held.
         deviation: px, of the noise.
 
     Raises:
         Undetermined: when the images leave it open.
     """
     reduced = Reduced(problem.normal(state, deviation)[1])
-    change = float(reduced.step()[1][0])
-    unit = np.zeros((reduced.size, 1))
-    place = reduced.size - problem.motion.border
-    unit[place] = 1.0
-    variance = reduced.solve(unit, np.zeros((*state.landmarks.shape, 1)))[0][place, 0]
-    given = float(state.readout_time)
-    return ReadoutCheck(given, given + change, float(np.sqrt(variance)))
+    changes, checks = reduced.step()[1], []
+    for columns, one in zip(problem.motion.columns, problem.motion.states(state), strict=True):
+        place = reduced.size - problem.motion.border + columns[0]
+        unit = np.zeros((reduced.size, 1))
+        unit[place] = 1.0
+        variance = reduced.solve(unit, np.zeros((*state.landmarks.shape, 1)))[0][place, 0]
+        given, change = float(one.readout_time), float(changes[columns[0]])
+        checks.append(ReadoutCheck(given, given + change, float(np.sqrt(variance))))
+    return checks

@@ -9,7 +9,7 @@ adjustment with a global shutter bends the map by what the camera moved while it
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,6 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.mapping.adjustment import MapProblem, apply_similarity, sights_of
-from rs_localizer.mapping.cluster_robust import Pull, pull_at_landmarks
 from rs_localizer.mapping.initial_trajectory import (
     ANGULAR_VELOCITY,
     LINEAR_VELOCITY,
@@ -27,20 +26,25 @@ from rs_localizer.mapping.initial_trajectory import (
 )
 from rs_localizer.mapping.observations import (
     LEAST_KEYPOINTS,
+    Adjusted,
     MapFreedom,
     MapObservations,
+    RigCamera,
     Start,
     check,
+    frame_numbers,
     shared_landmarks,
 )
-from rs_localizer.mapping.readout_check import ReadoutCheck, readout_check
+from rs_localizer.mapping.readout_check import ReadoutCheck, readout_checks
 from rs_localizer.trajectory.banded import Undetermined
+from rs_localizer.trajectory.cluster_robust import Pull, pull_at_landmarks
 from rs_localizer.trajectory.descent import settle
 from rs_localizer.trajectory.fit import inflation_of, left_over, steepness
 from rs_localizer.trajectory.lens import with_lens
-from rs_localizer.trajectory.model import Freedom, Observations, start_state
+from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
 from rs_localizer.trajectory.online_readout import REVERSED
-from rs_localizer.trajectory.problem import LIMIT, Problem
+from rs_localizer.trajectory.problem import LIMIT, Problem, RigProblem
+from rs_localizer.trajectory.sight_kernels import EXTRINSICS
 from rs_localizer.trajectory.spline import LONGEST_GAP, Spline
 from rs_localizer.trajectory.spline_kernels import CONTROL
 
@@ -59,13 +63,12 @@ class Preparation:
     """The keypoints that count, and the first motion."""
 
     def __init__(
-        self, camera: Camera, seen: MapObservations, start: Start, freedom: MapFreedom,
-        stamp_offset: float,
-    ) -> None:  # fmt: skip
-        self.camera, self.seen, self.start, self.freedom = camera, seen, start, freedom
-        self.start_ns = int(seen.stamps_ns[0])
-        delay = stamp_offset - camera.readout_time * camera.first_row_time
-        self.times = np.asarray(1e-9 * (seen.stamps_ns - self.start_ns) + delay, np.float64)
+        self, rig: Sequence[RigCamera], seen: MapObservations, start: Start, freedom: MapFreedom
+    ) -> None:
+        self.rig, self.seen, self.start, self.freedom = rig, seen, start, freedom
+        self.start_ns = int(seen.stamps_ns.min())
+        delays = np.array([one.delay for one in rig])[seen.of_cameras]
+        self.times = np.asarray(1e-9 * (seen.stamps_ns - self.start_ns) + delays, np.float64)
         self.size = float(np.linalg.norm(np.ptp(start.points, axis=0)))
         self.deviations, self.floating = self._known()
         self.used = self._usable()
@@ -104,12 +107,23 @@ class Preparation:
         return used & (counts >= LEAST_KEYPOINTS)[self.seen.images]
 
     def _spline(self) -> Spline:
-        """Through the images with keypoints: stretches where they follow each other."""
-        own = np.unique(self.seen.images[self.used])
-        return initial_trajectory(
-            self.times[own], self.start.rotations[own], self.start.positions[own],
-            self.camera.readout_time,
-        )  # fmt: skip
+        """Through the images with keypoints, of a rig's frames through those with most.
+
+        Images that follow each other are one stretch.
+        """
+        counts = np.bincount(self.seen.images[self.used], minlength=len(self.times))
+        frames = frame_numbers(self.times, self.seen.of_cameras)
+        order = np.lexsort((-counts, frames))
+        firsts = np.unique(frames[order], return_index=True)[1]
+        best = order[firsts]
+        beyond = np.abs(self.times - self.times[best[frames]])[counts > 0].max()
+        best = best[counts[best] > 0]
+        extrinsics = [self.rig[k].extrinsics for k in self.seen.of_cameras[best]]
+        rotations = self.start.rotations[best] @ np.array([one.axes for one in extrinsics])
+        centres = np.array([one.centre for one in extrinsics])
+        positions = self.start.positions[best] - np.einsum("gij,gj->gi", rotations, centres)
+        longest = max(one.camera.readout_time for one in self.rig) + 2.0 * float(beyond)
+        return initial_trajectory(self.times[best], rotations, positions, longest)
 
     def _check_stretches(self) -> None:
         """Raise ValueError when the readout time cannot be found."""
@@ -130,20 +144,54 @@ class Preparation:
         own = self.times[np.unique(self.seen.images[self.used])]
         return int(np.bincount(self.spline.layout.stretches(own)).max())
 
-    def observations(self) -> Observations:
-        images, pixels = self.seen.images[self.used], self.seen.pixels[self.used]
-        return Observations(
-            times=self.times[images],
-            row_times=self.camera.row_time(pixels),
-            pixels=pixels,
-            landmarks=self.start.points,
-            points=self.seen.landmarks[self.used],
-            frames=images,
-            trusted=np.ones(len(images), np.bool_),
+    def keypoints(self, camera: int) -> BoolArray:
+        """Which (n,) are used of a camera."""
+        return np.asarray(self.used & (self.seen.of_cameras[self.seen.images] == camera), np.bool_)
+
+    def observations(self) -> list[Observations]:
+        """Of each camera."""
+        every = []
+        for k, one in enumerate(self.rig):
+            used = self.keypoints(k)
+            images, pixels = self.seen.images[used], self.seen.pixels[used]
+            every.append(
+                Observations(
+                    times=self.times[images],
+                    row_times=one.camera.row_time(pixels),
+                    pixels=pixels,
+                    landmarks=self.start.points,
+                    points=self.seen.landmarks[used],
+                    frames=images,
+                    trusted=np.ones(len(images), np.bool_),
+                )
+            )
+        return every
+
+    def state(self, seen: Sequence[Observations]) -> State:
+        """The first guess."""
+        first, *others = (
+            replace(
+                start_state(one.camera, own, self.spline, one.camera.readout_time),
+                extrinsics=one.extrinsics,
+            )
+            for one, own in zip(self.rig, seen, strict=True)
         )
+        return replace(first, others=tuple(others))
+
+    def problem(
+        self, seen: Sequence[Observations], start: State, freedom: Freedom, held: bool = False
+    ) -> RigProblem:
+        """Of the motion, with the map as it is; ``held``: nothing else is free."""
+        cameras = [
+            Problem(
+                one.camera, own, state, replace(freedom, mounting=None if held else one.mounting)
+            )
+            for one, own, state in zip(self.rig, seen, (start, *start.others), strict=True)
+        ]
+        return RigProblem(cameras, np.ones(len(cameras)))
 
 
-__all__ = ["MapFreedom", "MapObservations", "RefinedMap", "Start", "refine"]
+__all__ = ["MapFreedom", "MapObservations", "RefinedMap", "Start", "refine", "refine_rig"]
 
 # A landmark that is not known to this part of the map's size is not refined.
 _KNOWN = 0.1
@@ -160,10 +208,7 @@ class RefinedMap:
     covariances: Array  # (p,3,3) m^2; NaN where not refined
     refined: BoolArray  # (p,) others are where they were given
     sights: IntArray  # (p,) keypoints that fit
-    camera: Camera  # with the readout time and the lens that were found
-    readout_time: float  # s; negative: against the scan direction
-    readout_time_deviation: float  # s; NaN where it was given
-    readout_check: ReadoutCheck | None  # of a given one; None: the images do not tell, or found
+    cameras: tuple[Adjusted, ...]  # with the readout times and the lenses that were found
     deviation: float  # px, of the noise of u and of v
     squared_errors: Array  # (n,) px^2, whitened; infinite for keypoints that took no part
     inliers: BoolArray  # (n,)
@@ -175,6 +220,26 @@ class RefinedMap:
     tells_readout: bool  # images follow each other closely enough to tell the readout time
 
     @property
+    def camera(self) -> Camera:
+        """The first one, with the readout time and the lens that were found."""
+        return self.cameras[0].camera
+
+    @property
+    def readout_time(self) -> float:
+        """Of the first camera, s; negative: against the scan direction."""
+        return self.cameras[0].readout_time
+
+    @property
+    def readout_time_deviation(self) -> float:
+        """Of the first camera, s; NaN where it was given."""
+        return self.cameras[0].readout_time_deviation
+
+    @property
+    def readout_check(self) -> ReadoutCheck | None:
+        """Of the first camera."""
+        return self.cameras[0].readout_check
+
+    @property
     def camera_as_found(self) -> Camera:
         """The camera, its scan direction reversed where the readout time is negative."""
         if self.readout_time >= 0.0:
@@ -183,7 +248,7 @@ class RefinedMap:
         return replace(self.camera, scan_direction=direction)
 
     def poses(self) -> tuple[Array, Array]:
-        """map_from_camera (g,3,3), (g,3) at the images' middle rows."""
+        """Of the rig's axes in the map (g,3,3), (g,3) at the images' middle rows."""
         states = self.spline.states(self.times)
         return states.rotations, states.positions
 
@@ -197,23 +262,39 @@ def refine(
     stamp_offset: float = 0.0,
     done: Callable[[str], object] = lambda text: None,
 ) -> RefinedMap:
-    """The most likely map and motion.
+    """The most likely map and motion, as of :func:`refine_rig`.
 
     Args:
         camera: its lens, scan direction and readout time (0: a global shutter).
+        stamp_offset: s from a stamp to the first row's exposure.
+    """
+    return refine_rig([RigCamera(camera, stamp_offset)], seen, start, freedom, done=done)
+
+
+def refine_rig(
+    rig: Sequence[RigCamera],
+    seen: MapObservations,
+    start: Start,
+    freedom: MapFreedom | None = None,
+    *,
+    done: Callable[[str], object] = lambda text: None,
+) -> RefinedMap:
+    """The most likely map and motion of a rig.
+
+    Args:
+        rig: its cameras.
         seen: keypoints of landmarks; those of landmarks that one image alone sees do not count.
         start: first guess; without landmarks of known places the map as a whole, its size too,
             stays where this has it.
         freedom: what is estimated beside (default: landmarks and motion only).
-        stamp_offset: s from a stamp to the first row's exposure.
         done: called with each part of the work that is done.
 
     Raises:
         ValueError: when the images make no single map, or are too many.
     """
     freedom = freedom or MapFreedom()
-    check(seen, len(start.points))
-    prepared = Preparation(camera, seen, start, freedom, stamp_offset)
+    check(seen, len(start.points), np.array([one.delay for one in rig]))
+    prepared = Preparation(rig, seen, start, freedom)
     try:
         return _Refinement(prepared).solved(done)
     except Undetermined as error:
@@ -224,11 +305,8 @@ class _Refinement:
     """One map on its way."""
 
     def __init__(self, prepared: Preparation) -> None:
-        self.prepared, self.camera = prepared, prepared.camera
-        self.observations = prepared.observations()
-        self.state = start_state(
-            self.camera, self.observations, prepared.spline, self.camera.readout_time
-        )
+        self.prepared, self.seen = prepared, prepared.observations()
+        self.state = prepared.state(self.seen)
         given = prepared.freedom
         self.freedom = Freedom(
             readout_time=given.readout_time,
@@ -243,7 +321,7 @@ class _Refinement:
     def solved(self, done: Callable[[str], object]) -> RefinedMap:
         # The motion that goes with the map as it is.
         held = replace(self.freedom, readout_time=False, lens=False)
-        motion = Problem(self.camera, self.observations, self.state, held)
+        motion = self.prepared.problem(self.seen, self.state, held, held=True)
         self.state, before = settle(motion, self.state, motion.noise(self.state, np.inf))
         done("motion")
         problem = self._problem(self.freedom)
@@ -257,13 +335,11 @@ class _Refinement:
         return self._result(problem, before, deviation)
 
     def _problem(self, freedom: Freedom) -> MapProblem:
-        return MapProblem(
-            self.camera, self.observations, self.state, freedom, self.prepared.deviations,
-            self.prepared.floating,
-        )  # fmt: skip
+        motion = self.prepared.problem(self.seen, self.state, freedom)
+        return MapProblem(motion, self.state, self.prepared.deviations, self.prepared.floating)
 
     def _result(self, problem: MapProblem, before: float, deviation: float) -> RefinedMap:
-        state, prepared, seen = self.state, self.prepared, self.observations
+        state, prepared, seen = self.state, self.prepared, problem.observations
         squared = problem.errors(state)
         inliers = squared < (LIMIT * deviation) ** 2
         sights, images = sights_of(seen, inliers)
@@ -278,17 +354,15 @@ class _Refinement:
             moved = np.linalg.norm(placed.points - prepared.start.points, axis=1)
             refined &= spread < _WORTH * np.median(moved[refined])
         all_squared = np.full(len(prepared.used), np.inf)
-        all_squared[prepared.used] = squared
-        readout_time, free = float(state.readout_time), self.freedom.readout_time
+        ends = np.cumsum([len(own.points) for own in self.seen])[:-1]
+        for k, own in enumerate(np.split(squared, ends)):
+            all_squared[prepared.keypoints(k)] = own
         return RefinedMap(
             points=np.where(refined[:, None], placed.points, prepared.start.points),
             covariances=np.where(refined[:, None, None], covariances, np.nan),
             refined=refined,
             sights=sights,
-            camera=with_lens(replace(self.camera, readout_time=abs(readout_time)), state.lens),
-            readout_time=readout_time,
-            readout_time_deviation=math.sqrt(inflation * placed.shared[0, 0]) if free else math.nan,
-            readout_check=self._asked(deviation, inflation),
+            cameras=self._cameras(problem, deviation, inflation, inflation * placed.shared),
             deviation=deviation * math.sqrt(left_over(len(inliers), used)),
             squared_errors=all_squared,
             inliers=all_squared < (LIMIT * deviation) ** 2,
@@ -302,7 +376,7 @@ class _Refinement:
 
     def _cluster_robust(self, problem: MapProblem, deviation: float, independent: float) -> float:
         """The covariances' inflation, with what errors of a second pull together."""
-        rows, seen = problem.normal(self.state, deviation)[1].rows, self.observations
+        rows, seen = problem.normal(self.state, deviation)[1].rows, problem.observations
         squared = problem.errors(self.state)
         inside = squared[squared < (LIMIT * deviation) ** 2]
         pull = pull_at_landmarks(rows.values[..., -4:], seen.points, seen.times, rows.precisions)
@@ -310,17 +384,44 @@ class _Refinement:
         own *= left_over(len(inside), _freedoms(self.state.spline, seen.frames))
         return Pull(own * pull.measured, pull.expected).inflation(independent)
 
-    def _asked(self, deviation: float, inflation: float) -> ReadoutCheck | None:
-        """Whether a readout time that was given is the one of the images."""
-        given = self.camera.readout_time > 0.0 and not self.freedom.readout_time
-        if not given or not self.prepared.tells_readout:
-            return None
+    def _cameras(
+        self, problem: MapProblem, deviation: float, inflation: float, shared: Array
+    ) -> tuple[Adjusted, ...]:
+        """The cameras, with the covariance (s,s) of what all images share."""
+        asked, motion, found = self._asked(deviation, inflation), problem.motion, []
+        for one, wanted, own, columns, state in zip(
+            self.prepared.rig, asked, motion.cameras, motion.columns, motion.states(self.state),
+            strict=True,
+        ):  # fmt: skip
+            readout_time = float(state.readout_time)
+            spread = np.sqrt(np.diag(shared)[columns])
+            mounted = own.mount_column >= 0
+            camera = replace(one.camera, readout_time=abs(readout_time))
+            found.append(
+                Adjusted(
+                    with_lens(camera, state.lens),
+                    readout_time,
+                    float(spread[0]) if self.freedom.readout_time else math.nan,
+                    wanted,
+                    state.extrinsics,
+                    spread[own.mount_column :][:EXTRINSICS] if mounted else np.zeros(EXTRINSICS),
+                )
+            )
+        return tuple(found)
+
+    def _asked(self, deviation: float, inflation: float) -> list[ReadoutCheck | None]:
+        """Whether readout times that were given are those of the images."""
+        known = [one.camera.readout_time > 0.0 for one in self.prepared.rig]
+        none: list[ReadoutCheck | None] = [None] * len(known)
+        if self.freedom.readout_time or not any(known) or not self.prepared.tells_readout:
+            return none
         free = self._problem(replace(self.freedom, readout_time=True))
         try:
-            asked = readout_check(free, self.state, deviation)
+            asked = readout_checks(free, self.state, deviation)
         except Undetermined:
-            return None
-        return replace(asked, deviation=math.sqrt(inflation) * asked.deviation)
+            return none
+        grown = [replace(one, deviation=math.sqrt(inflation) * one.deviation) for one in asked]
+        return [one if given else None for one, given in zip(grown, known, strict=True)]
 
 
 def _freedoms(spline: Spline, frames: IntArray) -> int:

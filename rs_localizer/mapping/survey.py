@@ -21,7 +21,6 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping.cluster_robust import cluster_robust
 from rs_localizer.mapping.gauge import of_the_shape, through
 from rs_localizer.mapping.initial_trajectory import (
     ANGULAR_VELOCITY,
@@ -29,21 +28,21 @@ from rs_localizer.mapping.initial_trajectory import (
     acceleration_prior,
     initial_trajectory,
 )
+from rs_localizer.mapping.observations import Adjusted, Frame, frames_of
 from rs_localizer.mapping.readout_check import ReadoutCheck
 from rs_localizer.mapping.unknown_markers import (
     Chained,
     Filmed,
-    Frame,
     Spotted,
     chain,
-    frames_of,
 )
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.bodies import BODY, PLACE
+from rs_localizer.trajectory.cluster_robust import cluster_robust
 from rs_localizer.trajectory.fit import Fit, solve
-from rs_localizer.trajectory.model import Extrinsics, Freedom, Observations, State, start_state
+from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
 from rs_localizer.trajectory.normal_kernels import Normal
 from rs_localizer.trajectory.problem import LIMIT, Problem, RigProblem
 from rs_localizer.trajectory.sight_kernels import EXTRINSICS
@@ -121,7 +120,7 @@ def mirrored(given: Adjustable, fitted: Fit) -> Mirrored:
     count = len(fitted.state.landmarks) // 4
     # The origin, too, may lie the other way among all others.
     problem = given.problem(fitted.state, fitted.freedom, markers_only=True)
-    other = _with_landmarks(fitted.state, _turned_over(given.seen, fitted.state))
+    other = fitted.state.with_landmarks(_turned_over(given.seen, fitted.state))
     for noise in _NOISES:
         normal = problem.normal(other, noise * fitted.deviation)[1]
         still = np.zeros(len(normal.whole.slope))
@@ -136,12 +135,6 @@ def mirrored(given: Adjustable, fitted: Fit) -> Mirrored:
         np.repeat(better & ~same, 4)[:, None], other.landmarks, fitted.state.landmarks
     )
     return Mirrored(better & ~same, doubtful & ~same, _at_the_origin(fitted.state, chosen))
-
-
-def _with_landmarks(state: State, landmarks: Array) -> State:
-    """With the same landmarks (p,3) for all cameras."""
-    others = tuple(replace(one, landmarks=landmarks) for one in state.others)
-    return replace(state, landmarks=landmarks, others=others)
 
 
 def _turned_over(every: Sequence[Observations], state: State) -> Array:
@@ -190,7 +183,7 @@ def _at_the_origin(state: State, landmarks: Array) -> State:
     back = through(landmarks[:4], state.landmarks[:4])
     moved = back(landmarks)
     moved[:4] = state.landmarks[:4]
-    return _with_landmarks(replace(state, spline=back.moved(state.spline)), moved)
+    return replace(state, spline=back.moved(state.spline)).with_landmarks(moved)
 
 
 _LEAST_IMAGES = 5
@@ -209,18 +202,6 @@ _MOST_TURNS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SurveyCamera:
-    """A camera as the survey saw it."""
-
-    readout_time: float  # s
-    readout_time_deviation: float  # s; NaN where it was given
-    readout_check: ReadoutCheck | None  # where it was given
-    extrinsics: Extrinsics
-    deviations: Array  # (7,) of a step of the extrinsics: rad, m, s; zeros: they are the rig's axes
-    images: int  # that show markers of the map
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Survey:
     """Markers and what is known of their errors."""
 
@@ -234,7 +215,8 @@ class Survey:
     # Connected, but too few images show them, or do not tell which of two ways they are turned.
     rare: tuple[Marker, ...]
     fit: Fit
-    cameras: tuple[SurveyCamera, ...]
+    cameras: tuple[Adjusted, ...]
+    images: tuple[int, ...]  # of each camera, that show markers of the map
 
     @property
     def deviations(self) -> Array:
@@ -264,7 +246,7 @@ def survey(
         spotted: images in the order of their stamps.
         stamp_offset: s from a stamp to the first row's exposure.
     """
-    return survey_rig([Filmed(camera, spotted, stamp_offset)], markers, origin=origin)
+    return survey_rig([Filmed(camera, stamp_offset, spotted=spotted)], markers, origin=origin)
 
 
 def survey_rig(
@@ -357,7 +339,8 @@ def _adjusted(
         tuple(tuple(markers[m] for m in part) for part in chained.apart),
         tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}),
         fitted,
-        tuple(_cameras(given, fitted, list(map(len, shown)))),
+        tuple(_cameras(given, fitted)),
+        tuple(map(len, shown)),
     )
     _check_places(done)
     return done
@@ -433,7 +416,7 @@ def _check_places(survey: Survey) -> None:
         )
 
 
-def _cameras(given: Adjustable, fitted: Fit, images: list[int]) -> Iterator[SurveyCamera]:
+def _cameras(given: Adjustable, fitted: Fit) -> Iterator[Adjusted]:
     """The cameras, with the readout times that the corners ask for where one was given."""
     problem, asked = given.problem(fitted.state, fitted.freedom), fitted
     if any(one.camera.readout_time > 0.0 for one in given.filmed):
@@ -448,7 +431,8 @@ def _cameras(given: Adjustable, fitted: Fit, images: list[int]) -> Iterator[Surv
         if one.mounting is not None:
             at = problem.columns[place][problem.cameras[place].mount_column :][:EXTRINSICS]
             deviations = np.sqrt(np.diag(fitted.border_covariance)[at])
-        yield SurveyCamera(
+        yield Adjusted(
+            one.camera,
             state.readout_time,
             math.nan if known else deviation,
             ReadoutCheck(one.camera.readout_time, wanted.readout_time, deviation)
@@ -456,7 +440,6 @@ def _cameras(given: Adjustable, fitted: Fit, images: list[int]) -> Iterator[Surv
             else None,
             state.extrinsics,
             deviations,
-            images[place],
         )
 
 

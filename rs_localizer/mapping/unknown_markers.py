@@ -21,15 +21,14 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.camera import Camera
 from rs_localizer.io.transforms import Transform
+from rs_localizer.mapping.observations import Frame, RigCamera
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.families import LEAST_SIDE, Family
 from rs_localizer.markers.map_check import whole_markers
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
-from rs_localizer.trajectory.model import Extrinsics, Mounting
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,32 +88,18 @@ _GROSS = 0.02
 _SHUTTER = 0.5
 # Until then (s) an image is near the one before.
 _NEAR = 0.25
-# Images of several cameras are taken together if they begin within this time (s): at 1 rad/s, a
-# degree; what two images say of two markers may differ by eight.
-_ONE_FRAME = 0.02
 
 
-@dataclass(frozen=True, slots=True)
-class Filmed:
-    """The images of one camera of a rig, or of a camera alone, in the order of their stamps."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Filmed(RigCamera):
+    """The images of one of the cameras."""
 
-    camera: Camera  # its readout time: 0: it is to be found
-    spotted: Sequence[Spotted]
-    stamp_offset: float = 0.0  # s from a stamp to the first row's exposure, by the rig's clock
-    mounting: Mounting | None = None  # None: its axes are those of the rig
-
-    @property
-    def extrinsics(self) -> Extrinsics:
-        """As they are given."""
-        if self.mounting is None:
-            return Extrinsics(np.eye(3), np.zeros(3), 0.0)
-        return self.mounting.given
+    spotted: Sequence[Spotted] = ()  # in the order of their stamps
 
     def times(self, start_ns: int) -> Array:
         """When the images' middle rows were exposed (g,), s."""
-        camera = self.camera
-        delay = self.stamp_offset - camera.readout_time * camera.first_row_time
-        return np.array([(image.stamp_ns - start_ns) * 1e-9 for image in self.spotted]) + delay
+        stamps = np.array([(image.stamp_ns - start_ns) * 1e-9 for image in self.spotted])
+        return stamps + self.delay
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,33 +154,6 @@ def chain(
     return Chained(placed, own_frames, poses, [part for part in parts if part is not own])
 
 
-class Frame(NamedTuple):
-    """Images of several cameras, one of each at most, that were taken at about one time."""
-
-    time: float  # s, mean of the images' middle rows
-    images: list[tuple[int, int]]  # the camera, and its image
-
-
-def frames_of(times: Sequence[Array]) -> list[Frame]:
-    """Which images belong together, by the times (g,), s, of each camera's."""
-    every = sorted(
-        (float(time), camera, image)
-        for camera, own in enumerate(times)
-        for image, time in enumerate(own)
-    )
-    groups: list[list[tuple[float, int, int]]] = []
-    for one in every:
-        last = groups[-1] if groups else []
-        if last and one[0] - last[0][0] < _ONE_FRAME and one[1] not in {of[1] for of in last}:
-            last.append(one)
-        else:
-            groups.append([one])
-    return [
-        Frame(sum(of[0] for of in group) / len(group), [of[1:] for of in group])
-        for group in groups
-    ]  # fmt: skip
-
-
 def _view(
     filmed: Sequence[Filmed], mounts: list[Transform], frame: Frame, markers: Sequence[Marker]
 ) -> _View:
@@ -239,13 +197,15 @@ def _between(
 ) -> tuple[dict[tuple[int, int], Transform], dict[tuple[int, int], float]]:
     """Of each pair a < b, a_from_b, and by how many images it is said."""
     images: dict[tuple[int, int], list[tuple[_Sight, _Sight]]] = {}
+    apart: dict[tuple[int, int], list[tuple[_Sight, _Sight]]] = {}  # in images of two cameras
     for view in views:
         by_marker = sorted(view.sights, key=lambda sight: sight.marker)
         for one, other in combinations(by_marker, 2):
             if one.marker != other.marker:
-                images.setdefault((one.marker, other.marker), []).append((one, other))
+                pairs = images if one.camera == other.camera else apart
+                pairs.setdefault((one.marker, other.marker), []).append((one, other))
     between, scores = {}, {}
-    for (a, b), among in images.items():
+    for (a, b), among in (apart | images).items():
         step = -(-len(among) // _MOST_IMAGES)
         said = [
             (k, first.inverse() @ second, fit * other)
@@ -255,6 +215,9 @@ def _between(
         ]
         size = max(markers[a].size, markers[b].size)
         between[a, b], scores[a, b] = _agreed(said, size)
+        if (a, b) not in images:
+            # The rig moves between images of two cameras: what one image says goes before.
+            scores[a, b] /= len(views)
     return between, scores
 
 

@@ -47,6 +47,11 @@ class Extrinsics:
     centre: Array  # (3,) m
     offset: float  # s, how much later than its stamp a middle row was exposed, by the rig's clock
 
+    @classmethod
+    def none(cls) -> Extrinsics:
+        """Of a camera whose axes are the rig's."""
+        return cls(np.eye(3), np.zeros(3), 0.0)
+
     def moved(self, step: Array) -> Extrinsics:
         """After a step (7,): turn in camera axes, centre, offset."""
         turned = so3.exp(np.ascontiguousarray(step[:3])) @ self.axes
@@ -112,9 +117,14 @@ class State:
     delays: Array  # (g,) s, how much later than stamped each image was exposed
     mount: GyroMount | None = None  # of the gyroscope, where there is one
     # Of the camera; the motion is that of what it is mounted to.
-    extrinsics: Extrinsics = field(default_factory=lambda: Extrinsics(np.eye(3), np.zeros(3), 0.0))
+    extrinsics: Extrinsics = field(default_factory=Extrinsics.none)
     # Of the other cameras of a rig; they move along this spline, whatever theirs are.
     others: tuple[State, ...] = ()
+
+    def with_landmarks(self, landmarks: Array) -> State:
+        """With the same landmarks (p,3) for all cameras."""
+        others = tuple(replace(one, landmarks=landmarks) for one in self.others)
+        return replace(self, landmarks=landmarks, others=others)
 
 
 def start_state(

@@ -24,6 +24,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.calibration import Calibration, cut, disagreement, discrepancy
+from rs_localizer.trajectory.cluster_robust import cluster_robust
 from rs_localizer.trajectory.fit import Fit, solve
 from rs_localizer.trajectory.imu import middle_row
 from rs_localizer.trajectory.lens import with_lens
@@ -119,7 +120,7 @@ def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
     noises = np.array([each.calibration.fit.deviation for each in recordings.values()])
     problem = RigProblem(cameras, noises)
     try:
-        whole = _Joint(problem, solve(problem, replace(states[0], others=tuple(states[1:]))))
+        whole = _Joint.of(problem, replace(states[0], others=tuple(states[1:])))
     except Undetermined as error:
         raise ValueError(f"{', '.join(recordings)}: {error}") from error
     parts = list(_parts(whole))
@@ -194,6 +195,14 @@ class _Joint(NamedTuple):
     problem: RigProblem
     fit: Fit
 
+    @classmethod
+    def of(cls, problem: RigProblem, start: State) -> _Joint:
+        """The estimate; with errors of a second taken together, unless images have own times."""
+        found = solve(problem, start)
+        if any(camera.freedom.stamps > 0.0 for camera in problem.cameras):
+            return cls(problem, found)
+        return cls(problem, cluster_robust(problem, found))
+
     @property
     def states(self) -> tuple[State, ...]:
         """Of all cameras."""
@@ -231,7 +240,7 @@ def _parts(whole: _Joint) -> Iterator[_Joint]:
             cameras.append(Problem(camera.camera, seen, one, camera.freedom))
         problem = RigProblem(cameras, whole.problem.ratios)
         with suppress(ValueError):  # undetermined, or without one of the cameras
-            yield _Joint(problem, solve(problem, state))
+            yield _Joint.of(problem, state)
 
 
 def _mounted(place: int, whole: _Joint, parts: list[_Joint]) -> Mounted:

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping.observations import MapObservations, Start
+from rs_localizer.mapping.observations import Adjusted, MapObservations, Start
 from rs_localizer.mapping.refine import RefinedMap
 from rs_localizer.mapping.unknown_markers import Spotted
 from rs_localizer.trajectory.imu import ImuRecording
+from rs_localizer.trajectory.model import Extrinsics
 
 READOUT = 0.03
 # A motion with an IMU.
@@ -126,7 +127,7 @@ def refined_of(felt: Felt) -> RefinedMap:
     none, empty = np.zeros((0, 3)), np.zeros(0)
     return RefinedMap(
         points=none, covariances=np.zeros((0, 3, 3)), refined=empty > 0, sights=np.zeros(0, int),
-        camera=camera(), readout_time=0.02, readout_time_deviation=np.nan, readout_check=None,
+        cameras=(Adjusted(camera(), 0.02, np.nan, None, Extrinsics.none(), np.zeros(7)),),
         deviation=0.1, squared_errors=empty, inliers=empty > 0, before=1.0, after=0.1,
         spline=felt.spline(SECONDS), start_ns=START_NS, times=np.arange(0.0, SECONDS, 1 / 15),
         tells_readout=True,

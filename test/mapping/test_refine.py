@@ -5,15 +5,19 @@
 from dataclasses import replace
 
 import numpy as np
+import projector
 import pytest
-from scenes import READOUT, Walk, camera, walk
+from scenes import READOUT, Carried, Walk, camera, hand, walk
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
+from rs_localizer.core import so3
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.mapping.adjustment import MapNormal, MapProblem, MapStep, Reduced
 from rs_localizer.mapping.gauge import through
-from rs_localizer.mapping.observations import MapObservations
-from rs_localizer.mapping.refine import MapFreedom, Preparation, RefinedMap, refine
-from rs_localizer.trajectory.model import Freedom, State, start_state
+from rs_localizer.mapping.observations import MapObservations, RigCamera, Start
+from rs_localizer.mapping.refine import MapFreedom, Preparation, RefinedMap, refine, refine_rig
+from rs_localizer.trajectory.model import Extrinsics, Freedom, Mounting, State
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
@@ -27,7 +31,7 @@ def errors(found: RefinedMap, truth: Walk) -> np.ndarray:
 
 def dense(normal: MapNormal) -> tuple[np.ndarray, np.ndarray]:
     """Matrix and slope of motion, shared numbers and landmarks, from the rows themselves."""
-    rows, motion = normal.rows, normal.motion
+    rows, motion = normal.rows, normal.motion.whole
     controls, shared = motion.band.shape[1], len(motion.corner)
     size, count = controls + shared, len(rows.precisions)
     matrix = np.zeros((size + 3 * count,) * 2)
@@ -59,11 +63,12 @@ def dense(normal: MapNormal) -> tuple[np.ndarray, np.ndarray]:
 def small_problem() -> tuple[MapProblem, State]:
     rng = np.random.default_rng(0)
     scene = walk(rng, np.array([0.0, 0.03, 0.06, 1.0, 2.0]), points=120, count=25)
-    prepared = Preparation(camera(), scene.seen, scene.start, MapFreedom(), 0.0)
+    prepared = Preparation([RigCamera(camera())], scene.seen, scene.start, MapFreedom())
     seen = prepared.observations()
-    state = start_state(camera(), seen, prepared.spline, READOUT)
+    state = prepared.state(seen)
     free = Freedom(lens=True, angular_velocity=2.0, linear_velocity=1.0)
-    problem = MapProblem(camera(), seen, state, free, prepared.deviations, floating=True)
+    motion = prepared.problem(seen, state, free)
+    problem = MapProblem(motion, state, prepared.deviations, floating=True)
     return problem, state
 
 
@@ -82,7 +87,7 @@ def test_covariances_are_those_of_the_dense_system():
     normal = problem.normal(state, 5.0)[1]
     inverse = np.linalg.inv(dense(normal)[0])
     of_landmarks, shared = Reduced(normal).covariances()
-    size = normal.motion.band.shape[1] + problem.motion.border
+    size = normal.motion.whole.band.shape[1] + problem.motion.border
     for k, covariance in enumerate(of_landmarks):
         at = slice(size + 3 * k, size + 3 * k + 3)
         np.testing.assert_allclose(covariance, inverse[at, at], rtol=1e-5, atol=1e-12)
@@ -95,7 +100,7 @@ def test_the_slope_is_the_derivative_of_the_cost():
     problem, state = small_problem()
     cost, normal = problem.normal(state, 5.0)
     slope = dense(normal)[1]
-    controls, shared = len(normal.motion.slope), problem.motion.border
+    controls, shared = len(normal.motion.whole.slope), problem.motion.border
     direction = rng.normal(size=len(slope)) * 1e-6
     costs = []
     for sign in (-1.0, 1.0):
@@ -197,7 +202,7 @@ def test_images_that_stand_alone():
     before = np.linalg.norm(scene.start.points - scene.points, axis=1)[found.refined]
     assert np.median(errors(found, scene)) < 0.5 * np.median(before)
     assert found.after < 0.35
-    with pytest.raises(ValueError, match="at least 20 images that follow each other"):
+    with pytest.raises(ValueError, match="needs 20 images in a row"):
         refine(camera(), scene.seen, scene.start, MapFreedom(readout_time=True))
 
 
@@ -244,3 +249,65 @@ def test_landmarks_that_are_known_worse_than_before_stay(video):
     # None is worse off than the worst of those that were given.
     before = np.linalg.norm(video.start.points - video.points, axis=1)
     assert errors(found, video).max() < 1.5 * before.max()
+
+
+# The second camera looks back, 10 cm beside the first; its shutter runs up.
+BACK = Rotation.from_euler("yx", [175.0, 10.0], degrees=True).as_matrix()
+CENTRE = np.array([0.1, -0.02, -0.05])
+# What its extrinsics and its clock are known to, and how far off they are given.
+DEVIATIONS = np.repeat([1.7e-3, 5e-3, 1.5e-3], [3, 3, 1])
+OFF = DEVIATIONS * [1.0, -1.0, 0.5, 1.0, 1.0, -1.0, 1.0]
+
+
+def test_cameras_that_never_see_the_same_refine_one_map():
+    rng = np.random.default_rng(8)
+    motion = hand(rng)
+    before, behind = projector.room(rng, 80), projector.room(rng, 80) @ BACK + CENTRE
+    points, stamps = np.concatenate([before, behind]), np.arange(0.0, 1.2, 1.0 / 20.0)
+    moves = (motion, Carried(motion, BACK, CENTRE))
+    exact = [
+        [
+            projector.expose(moving, stamp + 0.007 * k, (1 - 2 * k) * READOUT, points)
+            for stamp in stamps.tolist()
+        ]
+        for k, moving in enumerate(moves)
+    ]
+    pixels = np.concatenate(exact)  # (g,p,2)
+    images, landmarks = np.nonzero(np.isfinite(pixels[..., 0]))
+    times = np.concatenate([stamps, stamps + 0.007])
+    cameras = np.repeat([0, 1], len(stamps))
+    seen = MapObservations(
+        10**12 + np.round(1e9 * times).astype(np.int64),
+        images,
+        landmarks,
+        pixels[images, landmarks] + rng.normal(0.0, 0.3, (len(images), 2)),
+        cameras,
+    )
+    turns, places = zip(
+        *(m.pose(t) for m, t in zip(moves, np.split(times, 2), strict=True)), strict=True
+    )
+    start = Start(
+        points + rng.normal(0.0, 0.02, points.shape),
+        np.concatenate(turns) @ so3.exp_many(rng.normal(0.0, 0.004, (len(times), 3))),
+        np.concatenate(places) + rng.normal(0.0, 0.02, (len(times), 3)),
+    )
+    given = Mounting(Extrinsics(BACK, CENTRE, 0.0).moved(OFF), DEVIATIONS)
+    up = replace(camera(), scan_direction=ScanDirection.BOTTOM_TO_TOP)
+    rig = [RigCamera(camera()), RigCamera(up, mounting=given)]
+    # Landmarks of which each camera knows some hold the map.
+    known = np.full(len(points), np.inf)
+    known[:4] = known[80:84] = 0.02
+    found = refine_rig(rig, seen, start, MapFreedom(deviations=known))
+    off = found.points - points
+    of = found.refined
+    assert np.count_nonzero(of[:80]) > 40
+    assert np.count_nonzero(of[80:]) > 40
+    squared = np.einsum("ni,nij,nj->n", off[of], np.linalg.inv(found.covariances[of]), off[of])
+    assert np.mean(squared < chi2.isf(0.05, 3)) > 0.85
+    mounted = found.cameras[1]
+    errors = mounted.extrinsics.beside(Extrinsics(BACK, CENTRE, 0.0))
+    assert np.all(np.abs(errors) < 4.0 * mounted.deviations)
+    # The recording knows turns and the clock better than they were given.
+    assert np.all(mounted.deviations[[0, 1, 2, 6]] < 0.7 * DEVIATIONS[[0, 1, 2, 6]])
+    assert found.cameras[1].readout_check is not None
+    assert not found.cameras[1].readout_check.differs

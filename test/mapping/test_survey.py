@@ -148,8 +148,8 @@ def test_cameras_that_never_see_the_same_make_one_map():
     }
     given = Extrinsics(BACK, CENTRE, 0.0).moved(OFF)
     up = replace(camera(), scan_direction="bottom_to_top")
-    rear = Filmed(up, also, mounting=Mounting(given, DEVIATIONS))
-    found = survey_rig([Filmed(camera(), seen), rear], MARKERS)
+    rear = Filmed(up, mounting=Mounting(given, DEVIATIONS), spotted=also)
+    found = survey_rig([Filmed(camera(), spotted=seen), rear], MARKERS)
     assert [marker.id for marker in found.markers] == list(range(8))
     check(found, poses, 0.03)
     mounted = found.cameras[1]

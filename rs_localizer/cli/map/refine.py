@@ -5,18 +5,19 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, UsageError, refuse_existing
 from rs_localizer.cli.map import colmap, contradiction
-from rs_localizer.cli.settings_args import (
-    add_settings,
-    add_topics,
-    given_settings,
-    given_topics,
-    one_camera,
+from rs_localizer.cli.rig_input import (
+    MapCamera,
+    add_mounting_argument,
+    map_cameras,
+    mounting_lines,
 )
+from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.io.maps.files import WRITERS, read_map_file
 from rs_localizer.io.topics import IMU
 from rs_localizer.process.arguments import number
@@ -30,10 +31,11 @@ if WORKING:
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import open_bag
     from rs_localizer.io.calibration import read_calibration, write_calibration
+    from rs_localizer.io.clouds import Correspondences
     from rs_localizer.io.maps.landmarks import Map
-    from rs_localizer.mapping.observations import RecordedMap, from_recording
-    from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
-    from rs_localizer.offline.recordings import Recorded, read_recording
+    from rs_localizer.mapping.observations import RecordedMap, RigCamera, from_recordings
+    from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine_rig
+    from rs_localizer.offline.recordings import read_recording
     from rs_localizer.offline.replay import find_topics
 
 _GIVEN, _ESTIMATED, _GLOBAL = "given", "estimated", "global"
@@ -46,11 +48,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "keypoint is observed when its own row was exposed."
     )
     parser.add_argument(
-        "recording",
+        "recordings",
         type=Path,
-        nargs="?",
+        nargs="*",
         metavar="RECORDING",
-        help="a bag of correspondences or keypoints",
+        help="a bag of correspondences or keypoints; several are those of cameras on one body",
     )
     parser.add_argument(
         "--map", type=Path, metavar="MAP", help="the map (default: the points of the recording)"
@@ -78,7 +80,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="how well these are known (default: %(default)s)",
     )
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="instead of camera_info")
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE",
+        help="instead of camera_info; of a rig, a camchain as calibrate --rig writes it",
+    )  # fmt: skip
+    add_mounting_argument(parser)
     contradiction.add_argument(parser)
     add_settings(
         parser,
@@ -94,47 +100,56 @@ def run(args: argparse.Namespace) -> None:
     if args.colmap is not None:
         colmap.run(args)
         return
-    if args.recording is None or args.out is None:
+    if not args.recordings or args.out is None:
         raise UsageError("give RECORDING and --out OUT, or --colmap IN OUT")
     if args.out.suffix not in WRITERS:
         raise UsageError(f"--out must end in {' or '.join(WRITERS)}, got {args.out}")
-    config = given_settings(args, check=one_camera)
+    config = given_settings(args)
     refuse_existing(args)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
+    cameras = map_cameras(args, config)
+    known = all(of.config.readout_time > 0.0 for of in cameras)
+    shutter = args.shutter or (_GIVEN if known else _ESTIMATED)
+    if shutter == _GIVEN and not known:
+        raise UsageError("--shutter given needs -p readout_time:=S or --params")
+    rig, clouds = zip(*(_recorded(of, landmarks, shutter) for of in cameras), strict=True)
+    localized = _localized([one.camera for one in rig], clouds, landmarks)
+    deviations = _deviations(args, localized.landmarks, config.map_deviation)
+    freedom = MapFreedom(shutter == _ESTIMATED, args.intrinsics, deviations)
+    refined = refine_rig(rig, localized.seen, localized.start, freedom, done=_print_step)
+    _tell(localized, refined, [of.name for of in cameras])
+    for of, found in zip(cameras, refined.cameras, strict=True):
+        contradiction.check(args, found.readout_check, "see --shutter estimated", of.name)
+    _write(args, localized.landmarks, refined, [of.name for of in cameras])
+
+
+def _recorded(
+    of: MapCamera, landmarks: Map | None, shutter: str
+) -> tuple[RigCamera, tuple[Correspondences, ...]]:
+    """A camera, and what it saw of the map."""
+    config, args = of.config, of.args
     with open_bag(args.recording) as bag:
         topics = find_topics(bag, given_topics(args, but=(IMU,))).without(IMU)
         recorded = read_recording(bag, topics, config.matching, landmarks)
-    shutter = args.shutter or (_GIVEN if config.readout_time > 0.0 else _ESTIMATED)
-    if shutter == _GIVEN and not config.readout_time > 0.0:
-        raise UsageError("--shutter given needs -p readout_time:=S or --params")
     readout_time = 0.0 if shutter == _GLOBAL else config.readout_time
     camera = recorded.calibration.camera(readout_time, config.scan_direction)
     if args.calibration is not None:
         lens = read_calibration(args.calibration)
         camera = replace(lens, readout_time=readout_time, scan_direction=config.scan_direction)
-    localized = _localized(camera, recorded, landmarks)
-    deviations = _deviations(args, localized.landmarks, config.map_deviation)
-    freedom = MapFreedom(shutter == _ESTIMATED, args.intrinsics, deviations)
-    refined = refine(
-        camera,
-        localized.seen,
-        localized.start,
-        freedom,
-        stamp_offset=config.stamp_offset,
-        done=_print_step,
-    )
-    _tell(localized, refined)
-    contradiction.check(args, refined.readout_check, "see --shutter estimated")
-    _write(args, localized.landmarks, refined)
+    return RigCamera(camera, config.stamp_offset, of.mounting), recorded.clouds
 
 
 def _print_step(step: str) -> None:
     print(f"adjusted: {step}", flush=True)
 
 
-def _localized(camera: Camera, recorded: Recorded, landmarks: Map | None) -> RecordedMap:
-    with tqdm(total=len(recorded.clouds), unit="image", desc="localize", disable=None) as bar:
-        return from_recording(camera, recorded.clouds, landmarks, bar.update)
+def _localized(
+    cameras: Sequence[Camera],
+    clouds: Sequence[Sequence[Correspondences]],
+    landmarks: Map | None,
+) -> RecordedMap:
+    with tqdm(total=sum(map(len, clouds)), unit="image", desc="localize", disable=None) as bar:
+        return from_recordings(cameras, clouds, landmarks, bar.update)
 
 
 def _deviations(args: argparse.Namespace, landmarks: Map, map_deviation: float) -> Array | None:
@@ -150,7 +165,7 @@ def _deviations(args: argparse.Namespace, landmarks: Map, map_deviation: float) 
     return np.where(np.isin(landmarks.ids, args.hold), args.hold_deviation, every)
 
 
-def _tell(localized: RecordedMap, refined: RefinedMap) -> None:
+def _tell(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> None:
     """The table of what changed."""
     moved = np.linalg.norm(refined.points - localized.start.points, axis=1)[refined.refined]
     spread = np.sqrt(np.trace(refined.covariances[refined.refined], axis1=1, axis2=2))
@@ -169,27 +184,38 @@ def _tell(localized: RecordedMap, refined: RefinedMap) -> None:
             ),
             ("deviation of a landmark", f"{1e3 * np.median(spread):.1f} mm (median)"),
         ]
-    deviation = refined.readout_time_deviation
-    spread_text = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
-    rows.append(("readout time", f"{1e3 * refined.readout_time:.3f}{spread_text} ms"))
+    for of, found in zip(names, refined.cameras, strict=True):
+        deviation = found.readout_time_deviation
+        spread_text = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
+        name = f"{of}: readout time" if of else "readout time"
+        rows.append((name, f"{1e3 * found.readout_time:.3f}{spread_text} ms"))
     for name, text in rows:
         print(f"{name:26} {text}")
-    if refined.readout_time < 0.0:
-        print("the readout time is negative: the scan direction is the reverse of what was set")
+    for of, found in zip(names, refined.cameras, strict=True):
+        if found.deviations.any():
+            lines = mounting_lines(of, names[0], found.extrinsics, found.deviations)
+            print("\n".join([*lines[:-1], f"{lines[-1]} besides what is set"]))
+        if found.readout_time < 0.0:
+            whose = f"the readout time of {of}" if of else "the readout time"
+            print(f"{whose} is negative: the scan direction is the reverse of what was set")
 
 
 def _millimetres(lengths: Array) -> str:
     return f"{1e3 * np.median(lengths):.1f} mm (median)"
 
 
-def _write(args: argparse.Namespace, landmarks: Map, result: RefinedMap) -> None:
+def _write(
+    args: argparse.Namespace, landmarks: Map, result: RefinedMap, names: Sequence[str]
+) -> None:
     refined = replace(landmarks, points=result.points, covariances=result.covariances)
-    lens = args.out.with_name(f"{args.out.stem}_camera_info.yaml")
-    files = [args.out, lens] if args.intrinsics else [args.out]
-    with atomic_files(*files) as (part, *lens_part):
+    files = [args.out]
+    for name in names if args.intrinsics else ():
+        of = f"{args.out.stem}_{name}" if name else args.out.stem
+        files.append(args.out.with_name(f"{of}_camera_info.yaml"))
+    with atomic_files(*files) as (part, *lenses):
         WRITERS[args.out.suffix](part, refined)
-        if lens_part:
-            write_calibration(lens_part[0], result.camera)
+        for lens, found in zip(lenses, result.cameras, strict=False):
+            write_calibration(lens, found.camera)
     print(f"written: {', '.join(map(str, files))}")
     unchanged = np.count_nonzero(~result.refined)
     if unchanged:

@@ -191,7 +191,7 @@ def _filmed(given: MapCamera, spotter: Spotter) -> Filmed:
     if calibration is None:
         raise ValueError(f"{args.recording} has no image that can be read")
     every = [spotted[stamp] for stamp in sorted(spotted)]
-    return Filmed(camera, every, config.stamp_offset, given.mounting)
+    return Filmed(camera, config.stamp_offset, given.mounting, every)
 
 
 def _tell(
@@ -200,9 +200,11 @@ def _tell(
     """The table of the markers, with their deviations (m,6)."""
     fit = surveyed_map.fit
     print(f"noise of the corners     {fit.deviation:.3f} px, {np.mean(fit.inliers):.1%} fit")
-    for given, images, found in zip(cameras, filmed, surveyed_map.cameras, strict=True):
+    for given, images, found, count in zip(
+        cameras, filmed, surveyed_map.cameras, surveyed_map.images, strict=True
+    ):
         of = f"{given.name}: " if given.name else ""
-        print(f"{f'{of}images with a marker':24} {found.images} of {len(images.spotted)}")
+        print(f"{f'{of}images with a marker':24} {count} of {len(images.spotted)}")
         deviation = found.readout_time_deviation
         spread = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
         print(f"{f'{of}readout time':24} {1e3 * found.readout_time:.3f}{spread} ms")
