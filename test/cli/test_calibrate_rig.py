@@ -123,16 +123,6 @@ def test_samples_of_the_motion(pair, tmp_path, capsys):
     assert lost < 10
 
 
-def test_a_map_refined_with_both_cameras(pair, tmp_path, capsys):
-    words = ["--params", f"{pair}/parameters.yaml", "--out", str(tmp_path / "map.npz")]
-    assert main(["map", "refine", pair, *words]) == 0
-    said = capsys.readouterr().out
-    assert "front: readout time        20.000 ms" in said
-    assert "rear <- front " in said
-    deviation = next(line for line in said.splitlines() if "offset of its stamps" in line)
-    assert abs(float(deviation.split()[4])) < 1.0  # ms, of the offset that is set
-
-
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
