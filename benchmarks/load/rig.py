@@ -15,6 +15,7 @@ import importlib
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,6 +40,7 @@ from rs_localizer.process.arguments import integer, number
 from rs_localizer.ros.node.conversion import copy_message, make_message, message_class
 from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.settings import NODE_NAME, write_parameters
+from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.rig import camera_stamps, rig_parameters, simulate_rig
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.settings import FrameSettings
@@ -220,7 +222,11 @@ def main() -> int:
         name: of[: round(60.0 * args.minutes * _RATE)]
         for name, of in camera_stamps(_PARTS, motion, _RATE, seed=4, triggered=False).items()
     }
-    images = list(simulate_rig(_PARTS, motion, world, settings, stamps_ns=stamps))
+
+    def see(name: str, mounted: TrueMotion, seed: int) -> Iterator[SimulatedFrame]:
+        return simulate_frames(CAMERA, mounted, world, settings, stamps_ns=stamps[name], seed=seed)
+
+    images = list(simulate_rig(_PARTS, motion, see))
     heard = Heard()
     with tempfile.TemporaryDirectory() as directory:
         file = Path(directory) / "rig.yaml"
