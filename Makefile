@@ -5,7 +5,8 @@
 # make test   lint, types and tests
 # make bench  the statistical tests, which take longer: coverage of regions, verdicts of experiments
 # make coverage  the tests once more, and which lines they run: without what Numba compiles, and
-#                without what runs in processes of its own (nodes, some commands)
+#                without what runs in processes of its own (nodes, some commands); COVERAGE is
+#                what pytest is told instead, as by .ci/run
 # make docs   the pages as a site, in out/docs; a link that leads nowhere is an error
 # make clean  removes everything that make has made
 #
@@ -13,6 +14,7 @@
 
 VENV ?= .venv
 OUT ?= out
+COVERAGE ?= --cov
 
 # The first interpreter that will do; without any, python3 is refused below with the reason.
 supported = import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
@@ -54,7 +56,7 @@ bench: $(ready) warm
 coverage: $(ready) warm
 	@$(python) -m pip install -qq --disable-pip-version-check --no-input --upgrade --no-deps --target $(VENV)/coverage coverage pytest-cov
 	@PYTHONPATH="$$(cd $(VENV) && pwd)/coverage" OPENBLAS_NUM_THREADS=1 \
-	    $(python) -m pytest -q -n 2 --dist loadfile --timeout 900 --cov --cov-report term:skip-covered
+	    $(python) -m pytest -q -n 2 --dist loadfile --timeout 900 --cov-report term:skip-covered $(COVERAGE)
 
 docs: $(ready)
 	@$(python) -m pip install -qq --disable-pip-version-check --no-input --editable '.[docs]'

@@ -21,7 +21,7 @@ from rs_localizer.core.lens import LensError, with_lens
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import POSE, step_between
+from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation import frame_fit, mirror, motion_model, observations, ransac
 from rs_localizer.estimation.acceptance import refusal, uncertain
@@ -46,7 +46,13 @@ from rs_localizer.estimation.observations import (
     unfit,
 )
 from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
-from rs_localizer.estimation.prior import Prior, PriorTerms, state_in, with_motion
+from rs_localizer.estimation.prior import (
+    Prior,
+    PriorTerms,
+    offset_between,
+    state_in,
+    with_motion,
+)
 from rs_localizer.estimation.ransac import Candidate, generator
 from rs_localizer.estimation.result import estimate_of
 from rs_localizer.estimation.searching import MotionSearch
@@ -214,8 +220,10 @@ class Localizer:
         sights = self._sights(points, pixels, scores, stamps)
         given = _Given(*sights, prior, expected_share, turn)
         lens = None if prior is None else prior.lens
-        if not given.exposure.alone and (turn is not None or lens is not None):
-            raise ValueError("a known turn, or a lens, is that of a camera alone, not of a rig")
+        if turn is not None or lens is not None:
+            if len(given.exposure.cameras) > 1:
+                raise ValueError("a known turn, or a lens, is that of a camera alone, not of a rig")
+            given = given._replace(exposure=given.exposure.ahead)
         found = self._found(given, lens)
         if lens is not None:
             plain = self._found(given, None)
@@ -326,7 +334,7 @@ class Localizer:
         best = self._search.optimize(observed, predicted, _PREDICTION_SCALE * threshold, terms)
         start = Candidate(predicted, best.cost)
         posterior = self._settle(observed, best, terms)
-        innovation = step_between(predicted, posterior.state)
+        innovation, _ = offset_between(predicted, posterior.state, terms.pivots[-1])
         known = len(terms.informations) > len(observed.terms.informations)
         if known and innovation @ terms.informations[-1] @ innovation > _MOST_INNOVATION:
             # A jump: the points know better.

@@ -25,7 +25,7 @@ from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.shutter import motion_of, numbers_of
-from rs_localizer.core.state import PARAMETERS, step_between
+from rs_localizer.core.state import PARAMETERS
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.motion_model import (
@@ -36,7 +36,7 @@ from rs_localizer.estimation.motion_model import (
     unshaken,
     with_mean_turn,
 )
-from rs_localizer.estimation.prior import Prior, state_in
+from rs_localizer.estimation.prior import Prior, offset_between, pivot_of, state_in
 from rs_localizer.inertial.aiding import Before, Found, GyroPrediction, GyroscopeAid, without_gyro
 from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.samples import ImuSamples
@@ -347,9 +347,11 @@ def _innovation(prior: Prior, newest: Estimate) -> Array:
     if np.isinf(prior.covariance.diagonal()).any():
         return np.ones(2)  # a first guess predicts nothing
     motion, origin = newest.without_gyro(), np.zeros(3)
-    step = step_between(state_in(prior.motion, origin), state_in(motion, origin))
-    joint = np.ascontiguousarray(newest.joint_covariance)
-    innovation: Array = surprises_of(step, np.ascontiguousarray(prior.covariance), joint)
+    joint, expected = map(np.ascontiguousarray, (newest.joint_covariance, prior.covariance))
+    step, _ = offset_between(
+        state_in(prior.motion, origin), state_in(motion, origin), pivot_of(expected)
+    )
+    innovation: Array = surprises_of(step, expected, joint)
     return innovation
 
 

@@ -308,7 +308,8 @@ def followed(times_deviation, tracked=True, jolts=1.0, of=None):
 
 def test_surprises_raise_what_is_expected_and_calm_lowers_it():
     assert followed(1.0).process_noise_scale == pytest.approx([1.0, 1.0], abs=0.01)
-    assert followed(10.0).process_noise_scale == pytest.approx([10.0, 10.0], rel=0.02)
+    # A turn by 0.3 rad, whose move is told about what the camera sees.
+    assert followed(10.0).process_noise_scale == pytest.approx([10.0, 10.0], rel=0.03)
     assert followed(0.1, jolts=20.0).process_noise_scale == pytest.approx([2.0, 2.0], rel=0.02)
     # Never below what the configuration says, nor without bound.
     assert followed(0.0).process_noise_scale == pytest.approx([0.3, 0.3])  # a calm camera

@@ -53,7 +53,7 @@ def residual(camera: Camera, cloud, start: rsl.Motion, velocities) -> tuple[rsl.
     state[12:] = held[12:]
     state = refine(
         observations.packed, state, 1e6, 0.0,
-        PriorTerms(precision[None], held[None], np.zeros(7)), 0.1, 2, 50, 1e-6,
+        PriorTerms(precision[None], held[None], np.zeros(7), np.zeros((1, 3))), 0.1, 2, 50, 1e-6,
     )[0]  # fmt: skip
     rotation = state[:9].reshape(3, 3)
     motion = rsl.Motion(rotation, state[9:12] - rotation @ centre, state[12:15], state[15:18])

@@ -114,6 +114,30 @@ def test_exact_points_of_askew_cameras_give_the_motion(scan):
     assert not result or errors(result, motions, 0, middle_of(mounted))[1] > 0.01
 
 
+def test_a_pair_whose_lenses_are_off_as_calibrations_are_is_localized():
+    """Errors of two lenses do not move both images alike: no motion takes them up."""
+    mounted, rng = pair(), np.random.default_rng(1)
+    made, motions = frames(mounted, fast, 12, points=76, noise=0.3, seed=3)
+    held = []
+    for frame, parts in enumerate(made):
+        rig = rig_of(mounted)
+        cameras = {
+            name: replace(
+                camera, K=camera.K + np.outer([1, 1, 0], [0, 0, 1]) * rng.normal(size=(3, 3))
+            )
+            for name, camera in rig.cameras.items()
+        }
+        result = rsl.Localizer(rsl.Rig(cameras, rig.camera_from_rig)).localize(parts)
+        assert result, result
+        state = motions.states(np.array([frame]), np.array([middle_of(mounted)]))
+        off = np.concatenate([
+            logarithm(result.rotation @ state.rotation[0]),
+            result.rotation @ (state.position[0] - result.position),
+        ])  # fmt: skip
+        held.append(off @ np.linalg.solve(result.covariance[:6, :6], off) < 12.6)
+    assert np.mean(held) > 0.8
+
+
 def test_a_camera_alone_is_a_rig_of_one():
     """The same bytes, with and without outliers, scores, and before a wall."""
     alone = {"one": Mounted(TRUE, UPRIGHT, np.zeros(3))}

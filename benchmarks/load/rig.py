@@ -11,9 +11,11 @@ behind. The exit code is 1 if an image has no pose and the node does not say why
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,14 +34,14 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.io import topics
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import make_camera_info, make_correspondences
-from rs_localizer.io.rigs import RigParts, optical_frame
+from rs_localizer.io.rigs import RIG_FRAME, RigParts, optical_frame
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.ros.node.conversion import copy_message, make_message, message_class
 from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.settings import NODE_NAME, write_parameters
 from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.simulation.rig import RIG_FRAME, camera_stamps, rig_parameters, simulate_rig
+from rs_localizer.simulation.rig import camera_stamps, rig_parameters, simulate_rig
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import TrueMotion, sampled_states
@@ -108,13 +110,13 @@ def _clock(seconds: float, faults: bool) -> float | None:
 
 def _publish(node: Node, prefix: str, images: list[Any], faults: bool) -> list[Sent]:
     """Send the images of both cameras, each when it has been read and processed."""
-    from tf2_ros import StaticTransformBroadcaster
-
     mounts = [
         make_transform(make_message, 0, RIG_FRAME, optical_frame(name), Transform(*mount).inverse())
         for name, mount in _PARTS.camera_from_rig.items()
     ]
-    StaticTransformBroadcaster(node).sendTransform(mounts)
+    tf2_ros = importlib.import_module("tf2_ros")  # which not every machine has
+    broadcaster = tf2_ros.StaticTransformBroadcaster(node)
+    broadcaster.sendTransform(mounts)
     publishers = {
         (name, topic): node.create_publisher(
             message_class(kind), f"{prefix}/{name}/{topic}", qos_profile_sensor_data
@@ -169,8 +171,8 @@ def _report(heard: Heard, sent: list[Sent], motion: TrueMotion, faults: bool) ->
             continue
         at, place = answered[image.true_ns]
         partner = second[int(np.abs(times - image.true_ns).argmin())]
-        near = abs(partner.true_ns - image.true_ns) < 0.5e9 / _RATE and partner.at < at
-        latencies.append(at - max(image.at, partner.at if near else image.at))
+        is_near = abs(partner.true_ns - image.true_ns) < 0.5e9 / _RATE and partner.at < at
+        latencies.append(at - max(image.at, partner.at if is_near else image.at))
         true = motion.state(image.true_ns, np.zeros(1)).positions[0]
         errors.append(np.linalg.norm([place.x, place.y, place.z] - true))
         seconds.append(1e-9 * (image.true_ns - sent[0].true_ns))
@@ -221,10 +223,8 @@ def main() -> int:
         for name, of in camera_stamps(_PARTS, motion, _RATE, seed=4, triggered=False).items()
     }
 
-    def see(name: str, mounted: TrueMotion, place: int) -> Iterator[SimulatedFrame]:
-        return simulate_frames(
-            _PARTS.cameras[name], mounted, world, settings, stamps_ns=stamps[name], seed=place
-        )
+    def see(name: str, mounted: TrueMotion, seed: int) -> Iterator[SimulatedFrame]:
+        return simulate_frames(CAMERA, mounted, world, settings, stamps_ns=stamps[name], seed=seed)
 
     images = list(simulate_rig(_PARTS, motion, see))
     heard = Heard()

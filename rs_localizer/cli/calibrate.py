@@ -280,7 +280,7 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
         written = _write(args, found, source.map, intrinsics, config, refused)
         if refused and written:
             refusal += (
-                f". Written to {args.out} and beside it: lens, map. Not written: readout time and "
+                f"; written to {args.out} and beside it: lens, map; not written: readout time and "
                 "scan direction, which stay unknown: no twists (--force writes them, too)"
             )
     if refusal:
@@ -509,12 +509,13 @@ def _write(
         text += "".join(f"    calibration.{name}: {value:.4g}\n" for name, value in values)
         lens = path.with_name(f"{path.stem}_{_LENS}")
         writers[lens] = lambda part: write_calibration(part, found.fit.camera)
-    if marker_map is not None and verdict.shape_is_free(found):
-        shape = path.with_name(f"{path.stem}_{_MAP}")
-        places = verdict.moved(found, marker_map.points)
-        marker_map = marker_map.with_points(places, found.shape_deviation)
-        writers[shape] = partial(write_marker_map, marker_map=marker_map)
     if marker_map is not None:
+        if verdict.shape_is_free(found):
+            places = verdict.moved(found, marker_map.points)
+            marker_map = marker_map.with_points(places, found.shape_deviation)
+        if verdict.shape_is_free(found) or shape is None:
+            shape = path.with_name(f"{path.stem}_{_MAP}")
+            writers[shape] = partial(write_marker_map, marker_map=marker_map)
         declared = config.map_deviation or marker_map.settings.get("map_deviation", 0.0)
         text += f"    map_deviation: {declared:.3g}\n" if declared else ""
     if refused and not writers:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from rs_localizer.core import lens_laws
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.double_sphere import DOUBLE_SPHERE
+from rs_localizer.core.equidistant import EQUIDISTANT
 from rs_localizer.core.eucm import EUCM
 from rs_localizer.core.lens_laws import LensLaw, Sphere
 from rs_localizer.core.scanning import ScanDirection
@@ -72,7 +73,7 @@ class DistortionModel(StrEnum):
 
     PLUMB_BOB = "plumb_bob", lens_laws.PLUMB_BOB
     RATIONAL_POLYNOMIAL = "rational_polynomial", lens_laws.RATIONAL_POLYNOMIAL
-    EQUIDISTANT = "equidistant", lens_laws.EQUIDISTANT
+    EQUIDISTANT = "equidistant", EQUIDISTANT
     EUCM = "eucm", EUCM
     DOUBLE_SPHERE = "ds", DOUBLE_SPHERE
 
@@ -293,7 +294,7 @@ class Camera:
         """
         points = np.asarray(points, float)
         if (sphere := self._sphere) is not None:
-            sensor = sphere.see(points, self.D) * np.diag(self.K)[:2] + self.K[:2, 2]
+            sensor = sphere.project(points, self.K, self.D).pixels
             return np.asarray((sensor - self._offset()) / self.binning)
         depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
         return self.distort(points[:, :2] / depth[:, None])[0]
@@ -318,10 +319,10 @@ class Camera:
         """Whether some of the image shows what lies behind the image plane."""
         if self._sphere is None:
             return False
-        right, bottom = np.array(self.size) - 1.0
-        across, down = np.meshgrid([0.0, 0.5 * right, right], [0.0, 0.5 * bottom, bottom])
-        border = np.column_stack([across.ravel(), down.ravel()])
-        return bool(np.any(self.bearings(border)[:, 2] <= 0.0))  # NaN compares false
+        # All over the image: its corners may show nothing, the middle of a side nothing behind.
+        places = np.meshgrid(*(np.linspace(0.0, size - 1.0, 33) for size in self.size))
+        pixels = np.column_stack([each.ravel() for each in places])
+        return bool(np.any(self.bearings(pixels)[:, 2] <= 0.0))  # NaN compares false
 
     @property
     def _sphere(self) -> Sphere | None:

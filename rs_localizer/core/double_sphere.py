@@ -53,4 +53,4 @@ def look(places: Array, D: Array) -> Array:
     return bearings
 
 
-DOUBLE_SPHERE: LensLaw = sphere_law(see, look, limits=((-1.0, 1.0), (0.0, 1.0)))
+DOUBLE_SPHERE: LensLaw = sphere_law(see, look, 2, limits=((-1.0, 1.0), (0.0, 1.0)))

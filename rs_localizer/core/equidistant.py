@@ -5,8 +5,8 @@
     r = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
 
 Kannala, Brandt, "A generic camera model and calibration method for conventional, wide-angle, and
-fish-eye lenses" (PAMI 2006), equation 6, with the first coefficient in the focal length. OpenCV,
-which computes the bearings before the camera, ends at 90 degrees.
+fish-eye lenses" (PAMI 2006), equation 6, with the first coefficient in the focal length: OpenCV's
+``fisheye``, which ends at 90 degrees.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.lens_laws import LensLaw, Seen, sphere_law
 
 _STEPS = 30
-_SMALL = 1e-12
+_SMALL = 1e-9  # of the distance along the axis
 
 
 def _radius(angle: Array, D: Array) -> tuple[Array, Array]:
@@ -36,14 +37,30 @@ def widest(D: Array) -> float:
     return float(np.sqrt(min([np.pi**2, *folds])))
 
 
-def see(bearings: Array, D: Array) -> Array:
-    """Where bearings (n,3) are seen, (n,2) in focal lengths; NaN beyond :func:`widest`."""
+def see(bearings: Array, D: Array) -> Seen:
+    """Where bearings (n,3) are seen, with all derivatives; NaN beyond :func:`widest`."""
+    z = bearings[:, 2]
     across = np.hypot(bearings[:, 0], bearings[:, 1])
-    angle = np.arctan2(across, bearings[:, 2])
-    radius = _radius(angle, D)[0]
-    # On the axis the direction is any, and the radius zero.
-    scale = np.where(angle < widest(D), radius / np.maximum(across, _SMALL), np.nan)
-    return np.asarray(scale[:, None] * bearings[:, :2])
+    angle = np.where((angle := np.arctan2(across, z)) < widest(D), angle, np.nan)
+    radius, rate = _radius(angle, D)
+    square = across**2 + z**2
+    # Near the axis the direction is any, and a radius as far as across over z.
+    far = across > _SMALL * np.abs(z)
+    off = np.where(far, across, 1.0)
+    scale = np.where(far, radius / off, 1.0 / np.where(far, 1.0, z))
+    by_across = np.where(far, (rate * z / square - scale) / off**2, 0.0)
+    towards = bearings[:, :2]
+    by_bearing = np.empty((len(bearings), 2, 3))
+    by_bearing[:, :, :2] = (
+        scale[:, None, None] * np.eye(2)
+        + by_across[:, None, None] * towards[:, :, None] * towards[:, None, :]
+    )
+    by_bearing[:, :, 2] = -(rate / square)[:, None] * towards
+    powers = angle[:, None] ** (2.0 * np.arange(1, len(D) + 1) + 1.0)
+    directions = towards / off[:, None]
+    return Seen(
+        scale[:, None] * towards, by_bearing, directions[:, :, None] * powers[:, None, :]
+    )  # fmt: skip
 
 
 def look(places: Array, D: Array) -> Array:
@@ -62,3 +79,6 @@ def look(places: Array, D: Array) -> Array:
     angle = np.where(radius < _radius(np.array([most]), D)[0], angle, np.nan)
     scale = np.sin(angle) / np.maximum(radius, _SMALL)
     return np.column_stack([scale[:, None] * places, np.cos(angle)])
+
+
+EQUIDISTANT: LensLaw = sphere_law(see, look, 4)

@@ -47,4 +47,4 @@ def look(places: Array, D: Array) -> Array:
     return np.column_stack([places, ahead])
 
 
-EUCM: LensLaw = sphere_law(see, look, limits=((0.0, 1.0), (1e-3, 1e3)))
+EUCM: LensLaw = sphere_law(see, look, 2, limits=((0.0, 1.0), (1e-3, 1e3)))

@@ -86,9 +86,9 @@ def with_lens(camera: Camera, coefficients: Array) -> Camera:
     return replace(camera, K=K, D=distortion, distortion_model=_model_of(camera))
 
 
-def by_lens(camera: Camera, rays: Array) -> Array:
-    """Derivatives (n,2,k) of the pixels of rays (n,2) by all coefficients."""
-    projected = _law_of(camera).project(rays, camera.K, _distortion_of(camera))
+def by_lens(camera: Camera, towards: Array) -> Array:
+    """Derivatives (n,2,k) by all coefficients of the pixels of rays (n,2) or bearings (n,3)."""
+    projected = _law_of(camera).see(towards, camera.K, _distortion_of(camera))
     correctable = projected.by_coefficients[:, :, : _distorting(camera)]
     columns = np.concatenate([correctable, projected.by_matrix], axis=2)
     scaled: Array = columns * _scales_of(camera) / np.array(camera.binning)[:, None]

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lens laws: where a bearing falls on the sensor, and back.
 
-Three are those of sensor_msgs/CameraInfo; :mod:`rs_localizer.core.eucm` and
-:mod:`rs_localizer.core.double_sphere` have their names from Kalibr. A new law is a file with its
-own :class:`LensLaw`, and a row in :class:`rs_localizer.core.camera.DistortionModel`; all else
-reads what stands here.
+Those of sensor_msgs/CameraInfo are here and in :mod:`rs_localizer.core.equidistant`;
+:mod:`rs_localizer.core.eucm` and :mod:`rs_localizer.core.double_sphere` have Kalibr's names. A new
+law is a file with its own :class:`LensLaw`, and a row in
+:class:`rs_localizer.core.camera.DistortionModel`; all else reads what stands here.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from rs_localizer.core import equidistant
 from rs_localizer.core.arrays import Array
 
 # OpenCV's own default of five iterations leaves errors of pixels at the rim of wide lenses.
@@ -32,11 +31,32 @@ class Projection(NamedTuple):
     by_coefficients: Array  # (n,2,d)
 
 
+class Seen(NamedTuple):
+    """Where bearings are seen, in focal lengths from the centre."""
+
+    places: Array  # (n,2)
+    by_bearing: Array  # (n,2,3)
+    by_coefficients: Array  # (n,2,d)
+
+
 class Sphere(NamedTuple):
     """How a lens sees bearings of any direction, also those behind the image plane."""
 
-    see: Callable[[Array, Array], Array]  # bearings (n,3), D: places (n,2), in focal lengths
+    see: Callable[[Array, Array], Seen]  # bearings (n,3), D
     look: Callable[[Array, Array], Array]  # places, D: bearings (n,3) of any length
+
+    def project(self, bearings: Array, K: Array, D: Array) -> Projection:
+        """As that of a law, of bearings (n,3) in place of rays: ``by_ray`` is (n,2,3)."""
+        seen, focal = self.see(bearings, D), np.diag(K)[:2]
+        by_matrix = np.zeros((len(bearings), 2, 4))
+        for axis in range(2):
+            by_matrix[:, axis, axis], by_matrix[:, axis, 2 + axis] = seen.places[:, axis], 1.0
+        return Projection(
+            seen.places * focal + K[:2, 2],
+            seen.by_bearing * focal[:, None],
+            by_matrix,
+            seen.by_coefficients * focal[:, None],
+        )
 
 
 class LensLaw(NamedTuple):
@@ -60,6 +80,13 @@ class LensLaw(NamedTuple):
     # powers of the radius at once: one of 1 moves the corner by its distance from the centre.
     limits: tuple[tuple[float, float], ...] | None = None
 
+    def see(self, towards: Array, K: Array, D: Array) -> Projection:
+        """As ``project``, of rays (n,2) or bearings (n,3): ``by_ray`` is (n,2,2) or (n,2,3)."""
+        if towards.shape[1] == 2:
+            return self.project(towards, K, D)
+        assert self.sphere is not None  # who else has bearings
+        return self.sphere.project(towards, K, D)
+
     @property
     def correctable(self) -> tuple[int | None, ...]:
         """The orders of the leading coefficients that a single image may correct."""
@@ -78,14 +105,6 @@ def _project(rays: Array, K: Array, D: Array) -> Projection:
     )
 
 
-def _project_fisheye(rays: Array, K: Array, D: Array) -> Projection:
-    bearings, zero = np.column_stack([rays, np.ones(len(rays))])[:, None], np.zeros(3)
-    projected: Any = cv2.fisheye.projectPoints(bearings, zero, zero, K, D)
-    pixels, jacobian = projected[:2]
-    by = jacobian.reshape(len(rays), 2, -1)  # focal lengths, centre, D, rotation, translation
-    return Projection(pixels.reshape(-1, 2), by[:, :, 11:13], by[:, :, :4], by[:, :, 4:8])
-
-
 def _undistort(pixels: Array, K: Array, D: Array) -> Array:
     points = pixels[:, None]
     rays: Any
@@ -94,19 +113,6 @@ def _undistort(pixels: Array, K: Array, D: Array) -> Array:
     else:
         rays = cv2.undistortPoints(points, K, D, criteria=_CRITERIA)
     return np.asarray(rays[:, 0], np.float64)
-
-
-def _undistort_fisheye(pixels: Array, K: Array, D: Array) -> Array:
-    rays: Any = cv2.fisheye.undistortPoints(pixels[:, None], K, D, criteria=_CRITERIA)
-    return np.asarray(rays[:, 0], np.float64)
-
-
-class Seen(NamedTuple):
-    """Where bearings are seen, in focal lengths from the centre."""
-
-    places: Array  # (n,2)
-    by_bearing: Array  # (n,2,3)
-    by_coefficients: Array  # (n,2,d)
 
 
 def onto_sensor(bearings: Array, below: Array, by_bearing: Array, by_coefficients: Array) -> Seen:
@@ -129,38 +135,32 @@ def onto_sensor(bearings: Array, below: Array, by_bearing: Array, by_coefficient
 def sphere_law(
     see: Callable[[Array, Array], Seen],
     look: Callable[[Array, Array], Array],
-    limits: tuple[tuple[float, float], ...],
+    coefficients: int,
+    limits: tuple[tuple[float, float], ...] | None = None,
 ) -> LensLaw:
-    """The law of a lens with a closed formula for bearings (n,3) of any direction.
+    """The law of a lens that sees bearings (n,3) of any direction.
 
     Args:
         see: of bearings and D.
         look: bearings of places (n,2), in focal lengths from the centre, and D.
-        limits: of each coefficient.
+        coefficients: how many it has; without any it is a pinhole where it has no limits.
+        limits: of each.
     """
+    sphere = Sphere(see, look)
 
     def project(rays: Array, K: Array, D: Array) -> Projection:
-        seen = see(np.column_stack([rays, np.ones(len(rays))]), D)
-        focal = np.diag(K)[:2]
-        by_matrix = np.zeros((len(rays), 2, 4))
-        for axis in range(2):
-            by_matrix[:, axis, axis], by_matrix[:, axis, 2 + axis] = seen.places[:, axis], 1.0
-        return Projection(
-            seen.places * focal + K[:2, 2],
-            seen.by_bearing[:, :, :2] * focal[:, None],
-            by_matrix,
-            seen.by_coefficients * focal[:, None],
-        )
+        projected = sphere.project(np.column_stack([rays, np.ones(len(rays))]), K, D)
+        return projected._replace(by_ray=projected.by_ray[:, :, :2])
 
     def undistort(pixels: Array, K: Array, D: Array) -> Array:
         bearings = look((pixels - K[:2, 2]) / np.diag(K)[:2], D)
         ahead = np.where(bearings[:, 2:] > 0.0, bearings[:, 2:], np.nan)
         return np.asarray(bearings[:, :2] / ahead)
 
-    # All coefficients act from the third power on: the lowest, and one that differs above it.
-    orders = tuple(range(len(limits)))
-    sphere = Sphere(lambda bearings, D: see(bearings, D).places, look)
-    return LensLaw((len(limits),), orders, project, undistort, sphere=sphere, limits=limits)
+    # All coefficients act from the third power on: the lowest, and those that differ above it.
+    counts = (0, coefficients) if limits is None else (coefficients,)
+    orders = tuple(range(coefficients))
+    return LensLaw(counts, orders, project, undistort, sphere=sphere, limits=limits)
 
 
 PLUMB_BOB = LensLaw(  # k1 k2 p1 p2 k3
@@ -169,7 +169,3 @@ PLUMB_BOB = LensLaw(  # k1 k2 p1 p2 k3
 RATIONAL_POLYNOMIAL = LensLaw(  # k1 k2 p1 p2 k3, k4 k5 k6, s1 s2 s3 s4, tau_x tau_y
     (0, 8, 12, 14), (0, 1, None, None, 2, 0, 1, 2), _project, _undistort, is_polynomial=True
 )
-EQUIDISTANT = LensLaw(  # k1 k2 k3 k4
-    (0, 4), (0, 1, 2, 3), _project_fisheye, _undistort_fisheye,
-    sphere=Sphere(equidistant.see, equidistant.look),
-)  # fmt: skip

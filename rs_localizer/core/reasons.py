@@ -70,7 +70,6 @@ class Notice(StrEnum):
     MAP_IS_CAMERA = "map_is_camera"
     COARSE_COORDINATES = "coarse_coordinates"
     PIXELS_OUTSIDE = "pixels_outside"
-    BEHIND_IMAGE_PLANE = "behind_image_plane"
     TOO_MANY_POINTS = "too_many_points"
     READOUT_TIME = "readout_time"
     LENS = "lens"

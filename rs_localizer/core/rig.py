@@ -15,12 +15,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, instance
+from rs_localizer.core.arrays import Array, IntArray, instance
+from rs_localizer.core.bearings import bearings
 from rs_localizer.core.camera import Camera, numbers
 from rs_localizer.core.types import Estimate
 
@@ -139,8 +141,14 @@ class Rig:
                 f"the exposures of a frame are {span:.3g} s apart: stamps are in seconds, of one "
                 "frame, and by one clock but for time_offset"
             )
+        sides = tuple(
+            Side(camera, place, axes)
+            for place, camera in enumerate(cameras)
+            for axes in _sides_of(camera)
+        )
         axes = np.array([self.camera_from_rig[name][0] for name in chosen])
         moved = np.array([self.camera_from_rig[name][1] for name in chosen])
+        centres, of = -np.einsum("kji,kj->ki", axes, moved), [side.place for side in sides]
         per_span = readouts / span if span > 0.0 else np.ones(len(chosen))
         gradients = np.array([camera.row_time_gradient for camera in cameras]) * per_span[:, None]
         return Exposure(
@@ -150,7 +158,12 @@ class Rig:
             span,
             per_span,
             (middles - middle) / span if span > 0.0 else np.zeros(len(chosen)),
-            Mounts(axes, -np.einsum("kji,kj->ki", axes, moved), gradients),
+            sides,
+            Mounts(
+                np.array([side.turned(axes[side.place]) for side in sides]),
+                centres[of],
+                gradients[of],
+            ),
         )
 
 
@@ -191,10 +204,55 @@ def _seconds(name: str, value: Any) -> float:
     return float(seconds)
 
 
-class Mounts(NamedTuple):
-    """How the k cameras of a frame are mounted to the rig, and how their shutters run."""
+# Camera axes of the sides of a cube about a camera: ahead, behind, and along x and y.
+_CUBE = np.array([
+    [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],
+    [[0, 1, 0], [0, 0, 1], [1, 0, 0]], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+    [[0, 0, 1], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+], float)  # fmt: skip
 
-    axes: Array  # (k,3,3) camera_from_rig
+
+@lru_cache(64)
+def _sides_of(camera: Camera) -> tuple[Array | None, ...]:
+    return tuple(_CUBE) if camera.sees_behind else (None,)
+
+
+class Side(NamedTuple):
+    """What a camera sees about one axis, as a camera of its own that looks there.
+
+    Rays ``x/z, y/z`` end at 90 degrees from the axis, and long before that a pixel is many of them
+    wide. A lens that sees more is six cameras at one place, each with less than 55 degrees.
+    """
+
+    camera: Camera
+    place: int  # of the camera in the frame
+    axes: Array | None  # (3,3) side_from_camera; None: all that the camera sees, in its axes
+
+    def turned(self, camera_from_rig: Array) -> Array:
+        """side_from_rig (3,3)."""
+        return camera_from_rig if self.axes is None else self.axes @ camera_from_rig
+
+    def towards(self, rays: Array) -> Array:
+        """Bearings (n,3) in the camera's axes of rays (n,2) of this side; of all, the rays."""
+        if self.axes is None:
+            return rays
+        towards: Array = np.column_stack([rays, np.ones(len(rays))]) @ self.axes
+        return towards
+
+    def pixel_jacobian(self, rays: Array) -> Array:
+        """Derivatives (n,2,2) of the raw pixel by rays (n,2) of this side."""
+        if self.axes is None:
+            return self.camera.pixel_jacobian(rays)
+        camera = self.camera
+        by_bearing = camera.law.see(self.towards(rays), camera.K, camera.D).by_ray
+        by_ray: Array = by_bearing @ self.axes[:2].T / np.array(camera.binning)[:, None]
+        return by_ray
+
+
+class Mounts(NamedTuple):
+    """How the k sides of a frame's cameras are mounted to the rig, and how their shutters run."""
+
+    axes: Array  # (k,3,3) side_from_rig
     centres: Array  # (k,3) m, of the cameras in the rig
     gradients: Array  # (k,2) of the row time by the pixel
 
@@ -218,12 +276,38 @@ class Exposure:
     span: float  # s; 0: the readout time of a camera alone is unknown
     readouts: Array  # (k,) in spans
     middles: Array  # (k,) row times of their middle rows
-    mounts: Mounts
+    sides: tuple[Side, ...]  # of all cameras, one after the other
+    mounts: Mounts  # of the sides
 
     @property
     def alone(self) -> bool:
-        """Whether one camera sees the frame."""
-        return len(self.cameras) == 1
+        """Whether one camera sees the frame, and nothing behind its image plane."""
+        return len(self.sides) == 1
+
+    @property
+    def ahead(self) -> Exposure:
+        """Of a camera alone: what it sees before its image plane."""
+        if self.alone:
+            return self
+        first = Mounts(*(values[:1] for values in self.mounts))
+        return replace(self, sides=(Side(self.cameras[0], 0, None),), mounts=first)
+
+    def look(self, place: int, pixels: Array) -> tuple[Array, Array, IntArray]:
+        """Rays (n,2) of raw pixels (n,2) of a camera, their derivatives, and sides.
+
+        NaN where it has none; (n,2,2) of the pixels by the rays; (n,) of which side they are.
+        """
+        own = [i for i, side in enumerate(self.sides) if side.place == place]
+        if len(own) == 1:
+            return *bearings(self.cameras[place], pixels), np.full(len(pixels), own[0])
+        towards = self.cameras[place].bearings(pixels)
+        chosen = np.argmax(towards @ _CUBE[:, 2].T, axis=1)
+        local = np.einsum("nij,nj->ni", _CUBE[chosen], towards)
+        rays, by_ray = local[:, :2] / local[:, 2:], np.empty((len(pixels), 2, 2))
+        for number, i in enumerate(own):
+            here = chosen == number
+            by_ray[here] = self.sides[i].pixel_jacobian(rays[here])
+        return rays, by_ray, chosen + own[0]
 
     def row_time(self, place: int, pixels: Array) -> Array:
         """Row times (n,) of raw pixels (n,2) of a camera."""
@@ -233,7 +317,7 @@ class Exposure:
 
     def by(self, camera: Camera) -> Exposure:
         """The same through another lens of a camera alone."""
-        return replace(self, cameras=(camera,))
+        return replace(self, cameras=(camera,), sides=(Side(camera, 0, None),))
 
 
 class ByCamera(np.ndarray[Any, Any]):

@@ -29,8 +29,8 @@ class Estimate(Motion):
     camera position in camera axes, angular velocity, linear velocity; units as the fields.
     Accelerations and shaking are averaged out of it; ``joint_covariance`` has them behind, in the
     order of ``rs_localizer.core.state`` and of ``shake``. The former has the errors of the
-    calibration, which are the same in all frames, and of vibration that hides in the noise; the
-    latter is what goes on to the next frame.
+    calibration, which are the same in all frames, and what belongs to this frame alone, as of
+    vibration that hides in the noise; the latter is what goes on to the next frame.
     """
 
     inliers: BoolArray  # (n,)
@@ -42,7 +42,8 @@ class Estimate(Motion):
     calibration_covariance: Array = field(
         default_factory=lambda: np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
     )
-    # (12,12) of vibration that hides in the noise of this frame, likewise
+    # (12,12) of vibration that hides in the noise of this frame, which is an estimate, and of arcs
+    # about what is seen, which leave their tangents; likewise
     undetected_covariance: Array = field(
         default_factory=lambda: np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
     )

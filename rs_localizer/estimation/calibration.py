@@ -42,7 +42,7 @@ class CalibrationEffect(NamedTuple):
     """What the calibration's errors, one standard deviation of each, do to a frame."""
 
     covariance: Array  # (12,12) of pose and velocities
-    residual: float  # px, root mean square of what no motion takes up
+    residual: float  # px, root mean square of what no motion takes up; a smooth error may
     # rad, of the orientation about the axis known worst, if the camera's motion were known
     still_deviation: float
 
@@ -64,12 +64,13 @@ def calibration_effect(
         shake_at(observations.tau, posterior.shake),
     )  # fmt: skip
     rays = rays_of_lens(observed.sighted, observations.tau[chosen], lines.image[chosen])
-    of_camera, cameras = observations.camera[chosen], observed.sighted.exposure.cameras
-    columns = np.zeros((len(rays), 2, _ERRORS * len(cameras)))
-    for place, camera in enumerate(cameras):
-        here, own = of_camera == place, slice(_ERRORS * place, _ERRORS * (place + 1))
+    of_camera, exposure = observations.camera[chosen], observed.sighted.exposure
+    columns = np.zeros((len(rays), 2, _ERRORS * len(exposure.cameras)))
+    for place, side in enumerate(exposure.sides):
+        here, first = of_camera == place, _ERRORS * side.place
         if np.any(here):
-            columns[here, :, own] = _columns(camera, rays[here], deviation)
+            towards = side.towards(rays[here])
+            columns[here, :, first : first + _ERRORS] = _columns(side.camera, towards, deviation)
     smooth = _smooth_columns(posterior, lines, chosen)
     pixels = columns.reshape(-1, columns.shape[2])
     by_motion = np.ascontiguousarray(lines.by_motion[chosen].reshape(-1, PARAMETERS))
@@ -81,6 +82,7 @@ def calibration_effect(
     still = np.sqrt(np.linalg.eigvalsh(of_pose[TURN, TURN])[-1]) if determined else np.inf
     count = len(products) - PARAMETERS
     pull = np.zeros((len(products), crossed.shape[1] + count))
+    taken = np.zeros((PARAMETERS, crossed.shape[1]))
     parts = posterior.speeds if len(posterior.speeds) else _CONFIGURED
     for speed, part in zip(SPEEDS, parts, strict=True):
         if part < _NO_PART:
@@ -88,13 +90,14 @@ def calibration_effect(
         information, slope = products + variance * np.diag(_unit_of(count)), np.zeros(PARAMETERS)
         of_motion = products[:PARAMETERS, :PARAMETERS].copy()
         of_speed = terms_at(terms, speed, observed.sighted.turn is not None)
-        add_prior(*of_speed, posterior.state, variance, of_motion, slope)
+        add_prior(of_speed, posterior.state, variance, of_motion, slope)
         information[:PARAMETERS, :PARAMETERS] = of_motion
         inverse = inverted(information)
         if not np.all(np.isfinite(inverse)):
             return NO_EFFECT._replace(still_deviation=float(still))
         pull -= part * np.hstack([inverse @ crossed, variance * inverse[:, PARAMETERS:]])
-    left = pixels + by_all @ pull[:, : crossed.shape[1]]
+        taken += part * (inverted(of_motion) @ crossed[:PARAMETERS])
+    left = pixels - by_motion @ taken
     residual = float(np.sqrt(np.square(left).sum() / max(len(pixels), 1)))
     pulled = pull[:MOTION_PARAMETERS]
     return CalibrationEffect(pulled @ pulled.T, residual, float(still))
@@ -122,12 +125,12 @@ def _smooth_columns(posterior: Posterior, lines: Lines, chosen: BoolArray) -> Ar
     return columns
 
 
-def _columns(camera: Camera, rays: Array, deviation: CalibrationErrors) -> Array:
-    """By how many pixels a standard deviation of each error moves rays (n,2): (n,2,4)."""
-    by_all = by_lens(camera, rays)
+def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Array:
+    """By how many pixels a standard deviation of each error moves rays or bearings: (n,2,4)."""
+    by_all = by_lens(camera, towards)
     focal = coefficients_of(camera) - 4
     corner = corner_of(camera) * camera.focal_length / camera.binning[0]
-    columns = np.zeros((len(rays), 2, _ERRORS))
+    columns = np.zeros((len(towards), 2, _ERRORS))
     columns[:, 0, 0] = columns[:, 1, 1] = deviation.principal_point
     columns[:, :, 2] = deviation.focal_length * by_all[:, :, focal : focal + 2].sum(axis=2)
     columns[:, :, 3] = deviation.distortion / corner * by_all[:, :, 0]

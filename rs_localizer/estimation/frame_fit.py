@@ -242,10 +242,7 @@ def full_prior(
         for axis in range(3):
             step[axis] -= values[k] * turns[k, axis]
             step[6 + axis] -= rates[k] * turns[k, axis]
-    cost = add_prior(
-        prior.informations, prior.references, prior.gravity, apply_step(state, step), 1.0,
-        information, slope,
-    )  # fmt: skip
+    cost = add_prior(prior, apply_step(state, step), 1.0, information, slope)
     whole, along = np.zeros((size, size)), np.zeros(size)
     whole[:PARAMETERS, :PARAMETERS] = information
     along[:PARAMETERS] = slope
@@ -765,9 +762,7 @@ def score_products(
     front = squared_errors(data, count, state)
     frequencies = SCALES - 1
     information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    add_prior(
-        prior.informations, prior.references, prior.gravity, state, variance, information, slope
-    )
+    add_prior(prior, state, variance, information, slope)
     # By the functions of the row time: the derivatives' products with motion and errors, and with
     # themselves (the functions squared and multiplied).
     crossed, own = np.zeros((FUNCTIONS, _OUTER)), np.zeros((6, 3 * frequencies))

@@ -37,7 +37,6 @@ from rs_localizer.estimation.modes import (
     TEMPER,
     Inliers,
     SmoothError,
-    along_arcs,
     log_evidence,
     mixture_of,
 )
@@ -202,8 +201,7 @@ def _of_points(
     if frame.smooth or frame.planar or slowest == 0:
         posterior, evidence = _merged(frame, slowest)
     else:
-        covariance = along_arcs(best.inflation * best.covariance, best.state[9:12])
-        posterior, evidence = replace(best, covariance=covariance), -math.inf
+        posterior, evidence = best, -math.inf
         if shaken is not None:
             evidence = _evidence_of(frame)
     # A smooth error that is fitted explains the same errors: both together would count them twice.
@@ -338,9 +336,8 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
         scales=scales,
         near_outliers=0,
     )
-    covariance = along_arcs(fitted.inflation * fit.covariance, fit.state[9:12])
     near = _near_outliers(fitted, threshold)
-    fitted = replace(fitted, covariance=covariance, near_outliers=near)
+    fitted = replace(fitted, near_outliers=near)
     evidence = log_evidence(
         fit.log_determinant, fit.left + fit.prior_cost, terms, _inliers(frame), fit.inliers,
         fit.noise,
@@ -403,7 +400,7 @@ def _inliers(frame: _Frame) -> Inliers:
     observations, best = frame.observations, frame.best
     return Inliers(
         observations.packed, observations.points, best.inliers,
-        best.noise, best.freedom, best.cost / best.noise**2, best.inflation,
+        best.noise, best.freedom, best.cost / best.noise**2,
         frame.assumed.focal_length, frame.threshold,
     )  # fmt: skip
 

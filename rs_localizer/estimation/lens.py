@@ -287,7 +287,7 @@ def _told(
     dense, left = lines.by_motion[chosen].reshape(-1, PARAMETERS), lines.errors[chosen].ravel()
     variance = best.noise**2
     information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    add_prior(*terms, best.state, variance, information, slope)
+    add_prior(terms, best.state, variance, information, slope)
     information += dense.T @ dense
     inverse = inverted(information)
     if not np.all(np.isfinite(inverse)):  # only the frames before determine it

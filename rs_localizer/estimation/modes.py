@@ -40,7 +40,7 @@ from rs_localizer.estimation.frame_fit import (
 from rs_localizer.estimation.mirror import leaning_less, plane_of
 from rs_localizer.estimation.observations import weighted
 from rs_localizer.estimation.posterior import WIDEST_GATE
-from rs_localizer.estimation.prior import PriorTerms, add_prior, terms_at
+from rs_localizer.estimation.prior import PriorTerms, add_prior, offset_between, terms_at
 from rs_localizer.estimation.refine import (
     apply_step,
     half_inverse,
@@ -132,75 +132,36 @@ def along_arcs(covariance: Array, centre: Array) -> Array:
     return farther
 
 
-@inlined
-def told_from(covariance: Array, turn: Array) -> Array:
-    """The covariance (n,n) of steps from one state as that of steps from another one.
-
-    With the turn ``a`` from the other state to the one, steps from the other one are
-
-        log(exp([a]x) exp([phi]x)) = a + J(a)^-1 phi + ...   and   ... + exp([a]x) rho,
-
-    where J is the right Jacobian of SO(3).
-
-    Args:
-        turn: (3,) first part of the step from the other state to the one.
-    """
-    x, y, z = turn[0], turn[1], turn[2]
-    squared = x * x + y * y + z * z
-    angle = np.sqrt(squared)
-    second = 1.0 / 12.0
-    if angle > 1e-3:
-        second = (1.0 - 0.5 * angle * np.sin(angle) / (1.0 - np.cos(angle))) / squared
-    # Of the Jacobian only two blocks are not those of the identity.
-    blocks = np.zeros((2, 3, 3))
-    part = np.array([x, y, z])
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        blocks[0, i, i] = 1.0 - second * squared
-        blocks[0, j, k], blocks[0, k, j] = -0.5 * part[i], 0.5 * part[i]
-    for i in range(3):
-        for j in range(3):
-            blocks[0, i, j] += second * part[i] * part[j]
-    blocks[1] = exp(turn)
-    told = covariance
-    for _ in range(2):  # the rows, then those of the transpose
-        rows = told.copy()
-        for i in range(6):
-            block, first = blocks[i // 3, i % 3], i // 3 * 3
-            for j in range(len(covariance)):
-                rows[i, j] = 0.0
-                for k in range(3):
-                    rows[i, j] += block[k] * told[first + k, j]
-        told = rows.T.copy()
-    return told
-
-
 @kernel
 def averaged(
     states: Array, covariances: Array, best: int, counting: Array, possible: Array
 ) -> tuple[Array, Array, Array]:
     """Mean (24,) of Gaussians by the ones probabilities (k,), covariance (18,18) by the others.
 
-    And the steps (k,18) from the best one to all.
+    Both about the middle of the points, where arcs are straight (:func:`offset_between`). And the
+    offsets (k,18) from the best one to all.
     """
-    count = len(states)
-    steps, mean = np.empty((count, PARAMETERS)), np.empty(PARAMETERS)
+    count, first = len(states), states[best]
+    steps, mean, by_step = np.empty((count, PARAMETERS)), np.zeros(PARAMETERS), np.eye(PARAMETERS)
     for k in range(count):
-        write(steps[k], step_between(states[best], states[k]))
-    for i in range(PARAMETERS):
-        total = 0.0
-        for k in range(count):
-            total += counting[k] * steps[k, i]
-        mean[i] = total
+        steps[k], _ = offset_between(first, states[k], first[9:12])
+        mean += counting[k] * steps[k]
+    # About the pivot, which the move of a step is not.
+    state, middle = apply_step(first, mean), np.empty(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        middle[i] = first[9 + i] - mean[3 + i]
+        middle[i] += first[9 + j] * mean[k] - first[9 + k] * mean[j]
+    state[9:12] = middle
     covariance = np.zeros((PARAMETERS, PARAMETERS))
     for k in range(count):
-        offset = steps[k] - mean
-        for i in range(PARAMETERS):
-            for j in range(PARAMETERS):
-                covariance[i, j] += possible[k] * offset[i] * offset[j]
-        if possible[k] > _NO_PART:
-            covariance += possible[k] * told_from(covariances[k], offset[TURN])
-    return apply_step(states[best], mean), covariance, steps
+        if possible[k] > 0.0:
+            offset, by_turn = offset_between(state, states[k], middle)
+            covariance += possible[k] * np.outer(offset, offset)
+            if possible[k] > _NO_PART:
+                by_step[:6, :3] = by_turn
+                covariance += possible[k] * (by_step @ covariances[k] @ by_step.T)
+    return state, covariance, steps
 
 
 class _Held(NamedTuple):
@@ -258,7 +219,6 @@ class Inliers(NamedTuple):
     noise: float  # px
     freedom: float
     cost: float  # noise variances
-    inflation: float  # of variances, for the noise is an estimate
     focal_length: float  # px
     threshold: float  # px
 
@@ -437,7 +397,6 @@ def _mode(
             held = _Held(fit.inliers, fit.noise, np.nan, fit.freedom, held.field, held.pulls)
     if not (np.isfinite(evidence) and np.all(np.isfinite(covariance))):
         return Mode(start, np.zeros((PARAMETERS, PARAMETERS)), -np.inf, np.inf, 0.0, held)
-    covariance = along_arcs(inliers.inflation * covariance, state[9:12])
     return Mode(state, covariance, evidence + odds, cost, scale, held)
 
 
@@ -500,10 +459,7 @@ def _equations(
         cost -= np.sum(along * along)
         slope -= shared.T @ along
         information -= shared.T @ shared
-    cost += add_prior(
-        terms.informations, terms.references, terms.gravity, state, variance, information, slope
-    )
-    return cost / variance
+    return (cost + add_prior(terms, state, variance, information, slope)) / variance
 
 
 @kernel
@@ -561,9 +517,10 @@ def _over_leans(
     volume = log_determinant_of_inverse(held.noise * held.noise * inverted(information))
     whole = 0.5 * (volume - _of_unknown_noise(cost, held))
     informations = np.zeros((count + 1, PARAMETERS, PARAMETERS))
-    references = np.empty((count + 1, STATE_SIZE))
+    references, pivots = np.empty((count + 1, STATE_SIZE)), np.zeros((count + 1, 3))
     informations[:count], references[:count] = terms.informations, terms.references
-    pinned = PriorTerms(informations, references, terms.gravity)
+    pivots[:count] = terms.pivots
+    pinned = PriorTerms(informations, references, terms.gravity, pivots)
     places, starts = np.zeros((_MOST_PARTS, used), np.int64), np.empty((_MOST_PARTS, STATE_SIZE))
     states, evidences = np.empty((_MOST_PARTS, STATE_SIZE)), np.empty(_MOST_PARTS)
     covariances = np.empty((_MOST_PARTS, PARAMETERS, PARAMETERS))
@@ -607,8 +564,8 @@ def _over_leans(
     probable = np.exp(evidences[:last] - best)
     total = np.sum(probable)
     state, covariance, _ = averaged(
-        states[:last], inliers.inflation * covariances[:last], int(np.argmax(probable)),
-        probable / total, probable / total,
+        states[:last], covariances[:last], int(np.argmax(probable)), probable / total,
+        probable / total,
     )  # fmt: skip
     area = np.prod(steps / (_PIN * steps[used - 1] * math.sqrt(2.0 * math.pi)))
     evidence = mode.evidence - whole + best + math.log(area * total)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray, Random
-from rs_localizer.core.bearings import bearings
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
 from rs_localizer.core.lens import LensError
@@ -193,7 +192,7 @@ def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Fai
         )
     of_camera = usable.camera[indices]
     extent = max(
-        _extent(pixels, indices[of_camera == place]) for place in range(len(exposure.cameras))
+        _extent(pixels, indices[of_camera == place]) for place in range(len(exposure.sides))
     )
     if extent < _LEAST_EXTENT:
         return Failure(
@@ -274,7 +273,7 @@ class Observations:
     points: Array  # (n,3) m, in a frame near them
     rays: Array  # (n,2) in the axes of their cameras
     tau: Array  # (n,)
-    camera: IntArray  # (n,) which of the mounted ones sees each
+    camera: IntArray  # (n,) which of the mounted sides sees each
     mounts: Mounts
     packed: Array
     count: int
@@ -355,9 +354,9 @@ def relinearized(
     rays = np.where(near[:, None], lines.image, observations.rays)
     if turn is None:
         by_ray = np.empty((count, 2, 2))
-        for place, camera in enumerate(exposure.cameras):
+        for place, side in enumerate(exposure.sides):
             here = observations.camera == place
-            by_ray[here] = camera.pixel_jacobian(rays[here])
+            by_ray[here] = side.pixel_jacobian(rays[here])
     else:
         (camera,), gradient = exposure.cameras, observations.mounts.gradients[0]
         local = np.einsum(
@@ -386,7 +385,7 @@ class Usable(NamedTuple):
     rays: Array  # (n,2), compensated
     by_ray: Array  # (n,2,2) derivatives of the pixels by them
     tau: Array  # (n,) row times
-    camera: IntArray  # (n,) which of the frame's cameras sees each
+    camera: IntArray  # (n,) which side of the frame's cameras sees each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -410,7 +409,7 @@ class Sighted:
         one.
         """
         exposure = self.exposure.by(camera)
-        rays, by_ray = _rays(exposure, 0, self.pixels, self.usable.tau, self.turn)
+        rays, by_ray, _ = _rays(exposure, 0, self.pixels, self.usable.tau, self.turn)
         if not np.all(np.isfinite(rays[self.usable.indices])):
             return None
         return packed(exposure, self.points, self.usable._replace(rays=rays, by_ray=by_ray))
@@ -446,15 +445,16 @@ def find_usable(
     """
     rays, by_ray = np.empty((len(pixels), 2)), np.empty((len(pixels), 2, 2))
     tau, shown = np.empty(len(pixels)), np.empty(len(pixels), dtype=np.bool_)
-    first = 0
+    of_camera, first = np.empty(len(pixels), np.int64), 0
     for place, (camera, count) in enumerate(zip(exposure.cameras, counts, strict=True)):
         here = slice(first, first + count)
         tau[here] = exposure.row_time(place, pixels[here])
-        rays[here], by_ray[here] = _rays(exposure, place, pixels[here], tau[here], turn)
+        rays[here], by_ray[here], of_camera[here] = _rays(
+            exposure, place, pixels[here], tau[here], turn
+        )
         width, height = camera.size
         shown[here] = near_image(pixels[here], float(width), float(height))
         first += count
-    of_camera = np.repeat(np.arange(len(counts)), counts)
     centre, candidates = _candidates(points, rays, shown)
     chosen = distinct(points, pixels, of_camera, candidates)
     return Usable(chosen, shown, centre, rays, by_ray, tau, of_camera)
@@ -462,12 +462,13 @@ def find_usable(
 
 def _rays(
     exposure: Exposure, place: int, pixels: Array, tau: Array, turn: GyroRotation | None
-) -> tuple[Array, Array]:
-    """Bearings (n,2) and derivatives (n,2,2) of a camera's pixels by them, compensated."""
-    rays, by_ray = bearings(exposure.cameras[place], pixels)
-    if turn is None:
-        return rays, by_ray
-    return gyro_compensated(rays, tau, by_ray, exposure.mounts.gradients[place], turn)
+) -> tuple[Array, Array, IntArray]:
+    """As :meth:`Exposure.look`, compensated."""
+    rays, by_ray, side = exposure.look(place, pixels)
+    if turn is not None:
+        gradient = exposure.mounts.gradients[0]  # of a camera alone
+        rays, by_ray = gyro_compensated(rays, tau, by_ray, gradient, turn)
+    return rays, by_ray, side
 
 
 @kernel

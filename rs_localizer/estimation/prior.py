@@ -222,6 +222,8 @@ def state_in(motion: Motion, centre: Array) -> Array:
 
 # A precision that holds a velocity at its mean whatever the points say.
 _HOLDING = 1e18
+# Of the turn's variance, for the axis about which it may not turn.
+_RIDGE = 1e-9
 # A tenth of the speed goes with the accelerations of the whole.
 _JOLTS = 10.0
 WALKING = 0.1
@@ -234,6 +236,7 @@ class PriorTerms(NamedTuple):
     informations: Array  # (k,18,18)
     references: Array  # (k,24) states of their means
     gravity: Array  # (7,) in the map, in the camera, precision
+    pivots: Array  # (k,3) about which they turn, in the axes of the means: see offset_between
 
 
 _NO_GRAVITY = np.zeros(7)
@@ -280,12 +283,12 @@ def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
             for j in range(6):
                 row, column = _turning(i), _turning(j)
                 informations[0, row, column] = terms.informations[0, row, column]
-    return PriorTerms(informations, references, terms.gravity)
+    return PriorTerms(informations, references, terms.gravity, terms.pivots[: len(references)])
 
 
 def with_turn(terms: PriorTerms, error: Array) -> PriorTerms:
     """The terms of a motion beside a known turn; error (6,6): see ``GyroRotation.error``."""
-    return PriorTerms(_with_turn(terms.informations, error), terms.references, terms.gravity)
+    return terms._replace(informations=_with_turn(terms.informations, error))
 
 
 @kernel
@@ -305,12 +308,12 @@ def _turning(i: int) -> int:
 
 
 def _single(information: Array, reference: Array) -> PriorTerms:
-    return PriorTerms(information[None], reference[None].copy(), _NO_GRAVITY)
+    return PriorTerms(information[None], reference[None].copy(), _NO_GRAVITY, np.zeros((1, 3)))
 
 
 def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
     """The terms and what a prior says but for the motion: angular velocity and gravity."""
-    informations, references, gravity = terms
+    informations, references, gravity, pivots = terms
     if prior.angular_velocity is not None:
         information = np.zeros((PARAMETERS, PARAMETERS))
         information[ANGULAR, ANGULAR] = np.eye(3) / prior.angular_velocity_deviation**2
@@ -318,6 +321,7 @@ def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
         reference[STATE_ANGULAR] = prior.angular_velocity
         informations = np.concatenate([informations, information[None]])
         references = np.concatenate([references, reference[None]])
+        pivots = np.concatenate([pivots, np.zeros((1, 3))])
     if prior.gravity is not None:
         gravity = np.concatenate(
             [
@@ -326,7 +330,7 @@ def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
                 [prior.gravity_deviation**-2],
             ]
         )
-    return PriorTerms(informations, references, gravity)
+    return PriorTerms(informations, references, gravity, pivots)
 
 
 def with_motion(
@@ -341,21 +345,15 @@ def with_motion(
         return terms
     if np.isinf(np.diagonal(prior.covariance)).all():
         return terms  # the motion is a first guess
-    informations, references = _with_motion(
-        terms.informations,
-        terms.references,
-        np.ascontiguousarray(prior.covariance, np.float64),
-        state_in(prior.motion, centre),
-        turn_known,
-    )
-    return PriorTerms(informations, references, terms.gravity)
+    covariance = np.ascontiguousarray(prior.covariance, np.float64)
+    return _with_motion(terms, covariance, state_in(prior.motion, centre), turn_known)
 
 
 @kernel
 def _with_motion(
-    informations: Array, references: Array, covariance: Array, reference: Array, turn_known: bool
-) -> tuple[Array, Array]:
-    count = len(informations)
+    terms: PriorTerms, covariance: Array, reference: Array, turn_known: bool
+) -> PriorTerms:
+    informations, references, count = terms.informations, terms.references, len(terms.informations)
     found = np.empty((count + 1, PARAMETERS, PARAMETERS))
     of = np.empty((count + 1, STATE_SIZE))
     found[:count], of[:count] = informations, references
@@ -366,7 +364,29 @@ def _with_motion(
             for i in range(6):
                 for j in range(6):
                     found[0, _turning(i), _turning(j)] = 0.0
-    return found, of
+    pivots = np.zeros((count + 1, 3))
+    pivots[:count], pivots[count] = terms.pivots, pivot_of(covariance)
+    return PriorTerms(found, of, terms.gravity, pivots)
+
+
+@kernel
+def pivot_of(covariance: Array) -> Array:
+    """The point (3,), in camera axes, of which is known best where the camera sees it.
+
+    Who turns about it moves by its distance times the turn: that is the part of the move that goes
+    with the turn. A camera that a measured position holds turns about itself.
+    """
+    turned, along = np.zeros((3, 3)), np.zeros(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        along[i] = covariance[j, 3 + k] - covariance[k, 3 + j]
+        for m in range(3):
+            turned[i, m] -= covariance[i, m]
+            turned[i, i] += (1.0 + _RIDGE) * covariance[m, m]
+    pivot = np.zeros(3)
+    if np.all(np.isfinite(covariance[:6, :6])):
+        pivot[:] = np.linalg.solve(turned, along)
+    return pivot if np.all(np.isfinite(pivot)) else np.zeros(3)
 
 
 @inlined
@@ -394,13 +414,7 @@ def _unit(vector: ArrayLike) -> Array:
 
 @kernel
 def add_prior(
-    informations: Array,
-    references: Array,
-    gravity: Array,
-    state: Array,
-    weight: float,
-    information: Array,
-    slope: Array,
+    terms: PriorTerms, state: Array, weight: float, information: Array, slope: Array
 ) -> float:
     """Add the prior's part, times ``weight``, to the normal equations; returns its cost.
 
@@ -410,10 +424,9 @@ def add_prior(
     size = len(slope)
     offset = np.empty(PARAMETERS)
     pulled = np.empty(PARAMETERS)
-    # Derivative of the offset by a step: identity but for the rotation and position blocks.
-    by_turn, by_move = np.empty((3, 3)), np.empty((3, 3))
-    for term in range(len(informations)):
-        prior, reference = informations[term], references[term]
+    by_turn = np.empty((6, 3))
+    for term in range(len(terms.informations)):
+        prior, reference = terms.informations[term], terms.references[term]
         posed = (
             prior[0, 0] + prior[1, 1] + prior[2, 2] + prior[3, 3] + prior[4, 4] + prior[5, 5] > 0
         )
@@ -423,7 +436,7 @@ def add_prior(
         for i in range(6, PARAMETERS):
             offset[i] = state[6 + i] - reference[6 + i]
         if posed:
-            _pose_offset(state, reference, offset, by_turn, by_move)
+            _pose_offset(state, reference, terms.pivots[term], offset, by_turn)
         for i in range(first, PARAMETERS):
             total = 0.0
             for j in range(first, PARAMETERS):
@@ -436,65 +449,65 @@ def add_prior(
                 for j in range(6, size):
                     information[i, j] += weight * prior[i, j]
             continue
-        _add_posed(prior, pulled, by_turn, by_move, weight, information, slope)
-    if gravity[6] > 0.0:
-        cost += _add_gravity(gravity, state, weight, information, slope)
+        _add_posed(prior, pulled, by_turn, weight, information, slope)
+    if terms.gravity[6] > 0.0:
+        cost += _add_gravity(terms.gravity, state, weight, information, slope)
     return cost
 
 
 @inlined
 def _add_posed(
-    prior: Array,
-    pulled: Array,
-    by_turn: Array,
-    by_move: Array,
-    weight: float,
-    information: Array,
-    slope: Array,
+    prior: Array, pulled: Array, by_turn: Array, weight: float, information: Array, slope: Array
 ) -> None:
-    """Add J^T P J and J^T p, where J is the identity but for the blocks of turn and move."""
+    """Add J^T P J and J^T p, where J is the identity but for the columns of the turn."""
     size = len(slope)
     half = prior.copy()  # P J
     for i in range(size):
         for j in range(3):
-            turned, moved = 0.0, 0.0
-            for k in range(3):
-                turned += prior[i, k] * by_turn[k, j]
-                moved += prior[i, 3 + k] * by_move[k, j]
-            half[i, j], half[i, 3 + j] = turned, moved
+            half[i, j] = 0.0
+            for k in range(6):
+                half[i, j] += prior[i, k] * by_turn[k, j]
     for i in range(3):
-        for j in range(size):
-            turned, moved = 0.0, 0.0
-            for k in range(3):
-                turned += by_turn[k, i] * half[k, j]
-                moved += by_move[k, i] * half[3 + k, j]
-            information[i, j] += weight * turned
-            information[3 + i, j] += weight * moved
-        turned, moved = 0.0, 0.0
-        for k in range(3):
-            turned += by_turn[k, i] * pulled[k]
-            moved += by_move[k, i] * pulled[3 + k]
-        slope[i] += turned
-        slope[3 + i] += moved
-    for i in range(6, size):
+        for k in range(6):
+            slope[i] += by_turn[k, i] * pulled[k]
+            for j in range(size):
+                information[i, j] += weight * by_turn[k, i] * half[k, j]
+    for i in range(3, size):
         slope[i] += pulled[i]
         for j in range(size):
             information[i, j] += weight * half[i, j]
 
 
+@kernel
+def offset_between(reference: Array, state: Array, pivot: Array) -> tuple[Array, Array]:
+    """The offset (18,) from one state to another, and its derivative (6,3) by a turn from there.
+
+    Its turn ``phi`` is that of a step, its move what turns and then sees the pivot ``p`` at ``q``:
+
+        phi x p = -(p x phi),      move = p x phi - (q - p),
+
+    a step's to first order. What an image says is nearly Gaussian in it, far along the arcs about
+    the points, where a step's move leaves its tangent. By a move, it changes as the step does.
+    """
+    offset, by_turn = np.empty(PARAMETERS), np.empty((6, 3))
+    _pose_offset(state, reference, pivot, offset, by_turn)
+    for i in range(6, PARAMETERS):
+        offset[i] = state[6 + i] - reference[6 + i]
+    return offset, by_turn
+
+
 @inlined
 def _pose_offset(
-    state: Array, reference: Array, offset: Array, by_turn: Array, by_move: Array
+    state: Array, reference: Array, pivot: Array, offset: Array, by_turn: Array
 ) -> None:
-    """The step (turn, move) from the reference pose to the state's and its derivatives."""
-    relative = np.empty((3, 3))  # reference from state: exp([turn]x)
+    """Fill in the first six numbers of :func:`offset_between`, and the derivative."""
+    relative, seen = np.empty((3, 3)), np.empty(3)  # reference from state: exp([turn]x); the pivot
     for i in range(3):
         for j in range(3):
             total = 0.0
             for k in range(3):
                 total += reference[3 * i + k] * state[3 * j + k]
             relative[i, j] = total
-            by_move[i, j] = total
     turn = log(relative)
     x, y, z = turn[0], turn[1], turn[2]
     squared = x * x + y * y + z * z
@@ -504,18 +517,22 @@ def _pose_offset(
         second = 1.0 / 12.0
     else:
         second = (1.0 - 0.5 * angle * np.sin(angle) / (1.0 - np.cos(angle))) / squared
-    by_turn[0, 0] = 1.0 - second * (y * y + z * z)
-    by_turn[1, 1] = 1.0 - second * (x * x + z * z)
-    by_turn[2, 2] = 1.0 - second * (x * x + y * y)
-    by_turn[0, 1], by_turn[1, 0] = -0.5 * z + second * x * y, 0.5 * z + second * x * y
-    by_turn[0, 2], by_turn[2, 0] = 0.5 * y + second * x * z, -0.5 * y + second * x * z
-    by_turn[1, 2], by_turn[2, 1] = -0.5 * x + second * y * z, 0.5 * x + second * y * z
     for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        by_turn[i, i] = 1.0 - second * (squared - turn[i] * turn[i])
+        by_turn[i, j] = -0.5 * turn[k] + second * turn[i] * turn[j]
+        by_turn[j, i] = 0.5 * turn[k] + second * turn[i] * turn[j]
+        seen[i] = state[9 + i]
+        for m in range(3):
+            seen[i] += relative[m, i] * (pivot[m] - reference[9 + m])
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
         offset[i] = turn[i]
-        moved = 0.0
-        for j in range(3):
-            moved += relative[i, j] * state[9 + j]
-        offset[3 + i] = reference[9 + i] - moved
+        offset[3 + i] = pivot[j] * turn[k] - pivot[k] * turn[j] + pivot[i] - seen[i]
+        for m in range(3):
+            by_turn[3 + i, m] = pivot[j] * by_turn[k, m] - pivot[k] * by_turn[j, m]
+        by_turn[3 + i, k] -= seen[j]
+        by_turn[3 + i, j] += seen[k]
 
 
 @inlined

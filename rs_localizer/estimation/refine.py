@@ -105,15 +105,7 @@ def _posterior(
 ) -> float:
     """Normal equations and cost with the prior, in squared pixels."""
     cost = normal_equations(data, state, scale, softness, looks, information, slope)
-    return cost + add_prior(
-        prior.informations,
-        prior.references,
-        prior.gravity,
-        state,
-        noise * noise,
-        information,
-        slope,
-    )
+    return cost + add_prior(prior, state, noise * noise, information, slope)
 
 
 @kernel

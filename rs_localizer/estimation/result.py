@@ -26,6 +26,7 @@ from rs_localizer.core.rate_spline import multiplied
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
+    MOTION_PARAMETERS,
     PARAMETERS,
     STATE_ANGULAR,
     STATE_ANGULAR_ACCELERATION,
@@ -35,6 +36,7 @@ from rs_localizer.core.state import (
     rotation_of,
 )
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.modes import along_arcs
 from rs_localizer.estimation.observations import Observations, Observed
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.residuals import linearized
@@ -143,6 +145,9 @@ def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: i
     inliers = np.zeros(observed.count, dtype=np.bool_)
     inliers[observed.usable] = posterior.inliers
     rate, change = state[STATE_ANGULAR], state[STATE_ANGULAR_ACCELERATION]
+    covariance = posterior.covariance
+    # The noise of this frame is an estimate, and what is on an arc leaves its tangent.
+    beside = along_arcs(posterior.inflation * covariance, state[STATE_TRANSLATION]) - covariance
     delay = _NO_DELAY
     if turn is not None:
         rate, change = rate + turn.rate, change + turn.change
@@ -156,8 +161,8 @@ def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: i
         linear_acceleration=state[STATE_LINEAR_ACCELERATION],
         inliers=inliers,
         residuals=residuals,
-        joint_covariance=posterior.covariance,
-        undetected_covariance=posterior.undetected,
+        joint_covariance=covariance,
+        undetected_covariance=posterior.undetected + beside[:MOTION_PARAMETERS, :MOTION_PARAMETERS],
         shake=posterior.shake,
         model_error=posterior.model_error,
         scales=posterior.scales,

@@ -168,7 +168,6 @@ def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[
         Notice.MAP_IS_CAMERA: _frame(cloud.frame, camera_frame),
         Notice.COARSE_COORDINATES: _coordinates(cloud),
         Notice.PIXELS_OUTSIDE: _pixels(cloud, camera),
-        Notice.BEHIND_IMAGE_PLANE: _behind(cloud, camera),
     }
     return {name: text for name, text in notices.items() if text}
 
@@ -206,14 +205,6 @@ def _pixels(cloud: Correspondences, camera: Camera) -> str:
         f"{outside.sum()} of {len(outside)} pixels lie outside the {width} x {height} of "
         f"camera_info, as ({u:.0f}, {v:.0f}): are both of the same camera and resolution?"
     )
-
-
-def _behind(cloud: Correspondences, camera: Camera) -> str:
-    if not camera.sees_behind:
-        return ""
-    behind = int(np.count_nonzero(camera.bearings(cloud.pixels)[:, 2] <= 0.0))
-    text = f"{behind} of {len(cloud.pixels)} pixels look 90 degrees or more away from the axis"
-    return f"{text}: poses leave them out" if behind else ""
 
 
 def lens_is_off(lens: LensError) -> str:

@@ -139,29 +139,30 @@ def test_a_film_gives_lens_readout_time_and_direction(film, tmp_path, capsys):
 
 
 def test_lens_and_board_come_without_a_readout_time(film, tmp_path, capsys):
-    """Stamps that are not the images' own put the readout time in doubt, and nothing else."""
-    late, out = tmp_path / "late", tmp_path / "camera.yaml"
-    late.mkdir()
-    rng = np.random.default_rng(0)
-    for file in sorted(film.iterdir()):
-        (late / f"{int(file.stem) + round(4e6 * rng.normal())}.png").symlink_to(file)
+    """Few images tell the lens, and not when their rows were exposed; nor the board's shape, which
+    is written as that of paper.
+    """
+    few, out = tmp_path / "few", tmp_path / "camera.yaml"
+    few.mkdir()
+    for file in sorted(film.iterdir())[::4]:
+        (few / file.name).symlink_to(file)
     board = ["--board", f"{COLUMNS}x{ROWS}", "--square", str(SQUARE)]
-    assert main(["calibrate", str(late), *board, "--out", str(out)]) == 1
+    assert main(["calibrate", str(few), *board, "--out", str(out)]) == 1
     said = capsys.readouterr()
-    assert "beside their stamps" in said.err
-    assert "beside it: lens, map. Not written: readout time and scan direction" in said.err
+    assert "0 of 3 parts" in said.err
+    assert "beside it: lens, map; not written: readout time and scan direction" in said.err
     values = load_params_file(out)
     assert "readout_time" not in values
     camera = read_calibration(tmp_path / "camera_camera_info.yaml")
     focal = values["calibration.focal_length"]
     assert camera.K[0, 0] == pytest.approx(FOCAL, rel=4.0 * focal)
-    assert focal < 0.01
+    assert focal < 0.02
     # Twists need it, poses do not; both commands name the same one to come next.
     line = paste_next(said.out)
     own = capsys.readouterr().out
     assert f"next: {line.rpartition(' && ')[2]}" in own
     assert "-p readout_time:=SECONDS" in own
-    assert len(read_tum(tmp_path / "camera_seen_poses" / "poses.txt").positions) > 80
+    assert len(read_tum(tmp_path / "camera_seen_poses" / "poses.txt").positions) > 20
 
 
 def test_a_video_with_the_log_of_a_phone(film, tmp_path, capsys):

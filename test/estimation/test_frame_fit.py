@@ -15,6 +15,7 @@ from rs_localizer.core.shake import CYCLES, FUNCTIONS, shake_at
 from rs_localizer.estimation.frame_fit import (
     SMOOTH_TERMS,
     TURNS,
+    _of_scales,
     fit_frame,
     full_prior,
     log_determinant_of_inverse,
@@ -370,6 +371,29 @@ def test_more_than_a_motion_is_chosen_by_the_evidence_only_if_there_is_more():
         assert np.median(gains) > 10.0 if shakes else np.median(gains) < 3.0
 
 
+def test_scales_cost_what_is_known_of_them_and_gain_what_is_not():
+    """The hyperprior's Gaussian, and Laplace's volume, with plain matrices."""
+    rng = np.random.default_rng(5)
+    scales, precision = rng.normal(size=SCALES), rng.uniform(0.2, 4.0, SCALES)
+    mean, decided = rng.normal(size=SCALES), rng.uniform(0.0, 5.0, SCALES)
+    chain = np.diff(np.eye(SCALES - 1), axis=0)  # neighbouring frequencies, to a factor of e
+    alike = np.zeros((SCALES, SCALES))
+    alike[:-1, :-1] = chain.T @ chain
+    for first, last in ((0, SCALES), (0, SCALES - 1), (SCALES - 1, SCALES)):
+        part = slice(first, last)
+        before = (np.diag(precision) + alike)[part, part]
+        away, differences = (
+            (scales - mean)[part],
+            (chain @ scales[:-1])[: last if first == 0 else 0],
+        )
+        cost, volume = _of_scales(scales - mean, scales, precision, decided, first, last)
+        expected = np.sum(precision[part] * away**2) + np.sum(differences**2)
+        assert cost == pytest.approx(expected)
+        after = before + 2.0 * np.diag(decided[part])
+        expected = np.linalg.slogdet(before)[1] - np.linalg.slogdet(after)[1]
+        assert volume == pytest.approx(expected)
+
+
 def test_too_few_points_are_no_fit():
     observations, truth = frame(0, 0.02, 0.3, 5)
     assert not fitted(observations, truth).finite
@@ -393,7 +417,7 @@ def test_the_covariance_is_beside_the_smooth_error_and_allows_for_it(of_map):
         moved = -lines.by_motion[:, :, 3:6]
         smooth = np.einsum("nka,nb->nkba", moved, bend).reshape(len(motion), -1)
     information, slope = np.zeros((18, 18)), np.zeros(18)
-    add_prior(*PRIOR, fit.state, 1.0, information, slope)
+    add_prior(PRIOR, fit.state, 1.0, information, slope)
     inverse = np.linalg.inv(fit.noise**2 * np.eye(len(motion)) + scale**2 * smooth @ smooth.T)
     whole = np.linalg.inv(motion.T @ inverse @ motion + information)
     gain = whole @ motion.T @ inverse

@@ -12,6 +12,7 @@ from rs_localizer.estimation.prior import (
     add_prior,
     held_terms,
     motion_terms,
+    pivot_of,
     state_in,
     terms_at,
     with_measurements,
@@ -36,7 +37,7 @@ def covariance(seed=1, size=18):
 
 def evaluate(terms, state, weight=1.0, size=18):
     information, slope = np.zeros((size, size)), np.zeros(size)
-    return add_prior(*terms, state, weight, information, slope), information, slope
+    return add_prior(terms, state, weight, information, slope), information, slope
 
 
 NOTHING = motion_terms((0.0, 0.0), (0.0, 0.0))
@@ -84,15 +85,36 @@ def test_the_information_is_the_curvature_at_the_minimum(name):
         assert bent == pytest.approx(information[k, k], rel=1e-4, abs=1e-4)
 
 
+def pivot(spread):
+    """The point about which a camera turns that moves as it turns, as far as it can."""
+    root = np.linalg.cholesky(spread)[:6]
+    moved = np.concatenate([np.cross(np.eye(3), turn).T for turn in root[:3].T])  # p x turn
+    return np.linalg.lstsq(moved, root[3:].T.ravel(), rcond=None)[0]
+
+
 @pytest.mark.parametrize("size", [12, 18])
-def test_a_motion_prior_costs_the_mahalanobis_distance(size):
+def test_a_motion_prior_costs_the_mahalanobis_distance_about_its_pivot(size):
     mean, spread = motion(), covariance(size=size)
     terms = with_motion(NOTHING, Prior(motion=mean, covariance=spread), CENTRE)
+    np.testing.assert_allclose(terms.pivots[-1], pivot(spread), rtol=1e-6)
     # Of (12,12) the accelerations are free.
     step = 0.5 * np.random.default_rng(3).normal(size=18)
     cost, _, _ = evaluate(terms, apply_step(state_in(mean, CENTRE), step))
+    place, turn = pivot(spread), step[:3]
+    step[3:6] = place + np.cross(place, turn) - so3.exp(-turn) @ (place - step[3:6])
     step = step[:size]
-    assert cost == pytest.approx(step @ np.linalg.solve(spread, step), rel=1e-9)
+    assert cost == pytest.approx(step @ np.linalg.solve(spread, step), rel=1e-6)
+
+
+def test_the_pivot_is_what_an_image_sees_and_the_camera_where_its_place_is_measured():
+    turn, seen, place = np.diag([0.2, 0.1, 0.05]), np.diag([0.01, 0.01, 0.05]), [0.3, -0.2, 3.0]
+    hat = np.cross(place, np.eye(3)).T  # place x turn
+    spread = np.zeros((18, 18))
+    by = np.block([[np.eye(3), np.zeros((3, 3))], [hat, -np.eye(3)]])
+    spread[:6, :6] = by @ np.diag(np.r_[np.diag(turn), np.diag(seen)] ** 2) @ by.T
+    np.testing.assert_allclose(pivot_of(spread), place, rtol=1e-6)
+    np.testing.assert_allclose(pivot_of(np.eye(18)), 0.0, atol=1e-12)
+    assert not np.any(pivot_of(np.diag(np.full(18, np.inf))))
 
 
 def test_infinite_variances_leave_parameters_free():

@@ -202,7 +202,7 @@ def test_images_that_stand_alone():
     before = np.linalg.norm(scene.start.points - scene.points, axis=1)[found.refined]
     assert np.median(errors(found, scene)) < 0.5 * np.median(before)
     assert found.after < 0.35
-    with pytest.raises(ValueError, match="at least 20 images that follow each other"):
+    with pytest.raises(ValueError, match="needs 20 images in a row"):
         refine(camera(), scene.seen, scene.start, MapFreedom(readout_time=True))
 
 

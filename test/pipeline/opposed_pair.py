@@ -15,6 +15,7 @@ from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.rigs import RigParts, make_mounts
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import write_parameters
+from rs_localizer.simulation.frames import simulate_frames
 from rs_localizer.simulation.rig import (
     RigFrame,
     camera_stamps,
@@ -91,9 +92,16 @@ def record(
     true = true._replace(cameras=parts.cameras)
     stamps = camera_stamps(parts, motion, settings.rate, seed=4, triggered=False)
     points = wall() if points is None else points
+
+    def see(name: str, mounted: TrueMotion, seed: int) -> Any:
+        camera = true.cameras[name]
+        return simulate_frames(
+            camera, mounted, points, settings, stamps_ns=stamps[name], seed=1 + seed
+        )
+
     with BagWriter(path) as bag:
         bag.write("/tf_static", make_mounts(parts), motion.intervals_ns[0][0] - 100_000_000)
-        for image in simulate_rig(true, motion, points, settings, stamps_ns=stamps, seed=1):
+        for image in simulate_rig(true, motion, see):
             if keep(image):
                 write_rig_frame(bag, parts, motion, replace(image, stamp_ns=stamp(image)))
     write_parameters(path / "parameters.yaml", rig_parameters(parts) | parameters)

@@ -1,0 +1,132 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Lenses of more than 180 degrees, from points all around to poses, against pixels of their own.
+
+The pixels are those of the papers' formulas along a motion of constant velocities, found row by
+row: nothing of the package has a part in them.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+import rs_localizer as rsl
+from rs_localizer.config import CalibrationErrors
+
+SIZE, FOCAL, READOUT = 800, 210.0, 0.03
+K = np.array([[FOCAL, 0.0, 399.5], [0.0, FOCAL, 399.5], [0.0, 0.0, 1.0]])
+WIDEST = math.radians(100.0)
+
+
+def kannala_brandt(points, k1, k2, k3, k4):
+    """Equation 6 of Kannala and Brandt (2006), the first coefficient in the focal length."""
+    angle = np.arccos(points[:, 2] / np.linalg.norm(points, axis=1))
+    radius = angle + k1 * angle**3 + k2 * angle**5 + k3 * angle**7 + k4 * angle**9
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    return radius[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)])
+
+
+def double_sphere(points, xi, alpha):
+    """Equation 40 of Usenko, Demmel, Cremers (2018)."""
+    z = xi * np.linalg.norm(points, axis=1) + points[:, 2]
+    across = np.hypot(points[:, 0], points[:, 1])
+    return points[:, :2] / (alpha * np.hypot(across, z) + (1.0 - alpha) * z)[:, None]
+
+
+def extended_unified(points, alpha, beta):
+    """Equation 12 of Khomutenko, Garcia, Martinet (2016)."""
+    across = beta * (points[:, 0] ** 2 + points[:, 1] ** 2)
+    rho = np.sqrt(across + points[:, 2] ** 2)
+    return points[:, :2] / (alpha * rho + (1.0 - alpha) * points[:, 2])[:, None]
+
+
+LENSES = {
+    "equidistant": (kannala_brandt, [0.01, -0.004, 0.002, -3e-4]),
+    "ds": (double_sphere, [-0.2, 0.59]),
+    "eucm": (extended_unified, [0.63, 1.05]),
+}
+
+
+def frame(rng, lens, count, noise, least=0.0):
+    """Points (n,3) in the map, their pixels (n,2), and the true motion at the middle row."""
+    see, D = LENSES[lens]
+    rotation, position = Rotation.random(random_state=rng), rng.uniform(-2.0, 2.0, 3)
+    turn, speed = (of * rng.normal(size=3) / math.sqrt(3.0) for of in (1.2, 0.5))
+    angle = np.arccos(rng.uniform(math.cos(WIDEST), math.cos(least), count))
+    azimuth = rng.uniform(-math.pi, math.pi, count)
+    across = np.sin(angle)
+    unit = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), np.cos(angle)])
+    points = position + rotation.apply(rng.uniform(1.5, 5.0, (count, 1)) * unit)
+    row = np.full(count, 0.5 * (SIZE - 1))
+    for _ in range(20):
+        time = READOUT * (row / (SIZE - 1) - 0.5)
+        body = rotation.inv().apply(points - position) - time[:, None] * speed
+        pixels = FOCAL * see(Rotation.from_rotvec(-time[:, None] * turn).apply(body), *D) + 399.5
+        row = pixels[:, 1]
+    pixels = pixels + noise * rng.normal(size=pixels.shape)
+    shown = np.all((pixels > -0.5) & (pixels < SIZE - 0.5), axis=1)
+    return points[shown], pixels[shown], (rotation, position, turn, speed), angle[shown]
+
+
+def errors(result, motion):
+    """Errors (12,) in the camera's axes, per span."""
+    rotation, position, turn, speed = motion
+    return np.concatenate([
+        Rotation.from_matrix(result.rotation @ rotation.as_matrix()).as_rotvec(),
+        result.rotation @ (position - result.position),
+        turn * READOUT - result.angular_velocity,
+        speed * READOUT - result.linear_velocity,
+    ])  # fmt: skip
+
+
+def camera(lens):
+    return rsl.Camera(SIZE, SIZE, K, LENSES[lens][1], lens, readout_time=READOUT)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_points_beyond_90_degrees_are_as_good_as_others(lens):
+    rng = np.random.default_rng(7)
+    exact = rsl.LocalizerConfig(calibration=CalibrationErrors(0.0, 0.0, 0.0))
+    localizer, squares, used = rsl.Localizer(camera(lens), exact), [], []
+    for _ in range(15):
+        points, pixels, motion, angle = frame(rng, lens, 150, 0.5)
+        wrong = rng.uniform(size=len(pixels)) < 0.2
+        pixels[wrong] = rng.uniform(0.0, SIZE - 1.0, (wrong.sum(), 2))
+        result = localizer.localize(points, pixels)
+        assert result
+        off = errors(result, motion)
+        squares.append(off[:6] @ np.linalg.solve(result.covariance[:6, :6], off[:6]))
+        behind = (angle > math.radians(92.0)) & ~wrong
+        used.extend(result.inliers[behind])
+    assert len(used) > 40
+    assert np.mean(used) > 0.95
+    assert np.mean(np.array(squares) < chi2.ppf(0.95, 6)) > 0.8
+    assert np.mean(squares) < 9.0  # 6 is as claimed
+
+
+def test_points_behind_the_image_plane_alone_give_the_pose():
+    rng = np.random.default_rng(8)
+    points, pixels, motion, _ = frame(rng, "equidistant", 200, 0.5, math.radians(91.0))
+    result = rsl.Localizer(camera("equidistant")).localize(points, pixels)
+    assert result
+    assert len(points) > 60
+    off = errors(result, motion)
+    assert np.degrees(np.linalg.norm(off[:3])) < 0.5
+    assert np.linalg.norm(off[3:6]) < 0.03
+
+
+def test_a_wide_camera_of_a_rig_and_one_that_looks_ahead():
+    rng = np.random.default_rng(9)
+    points, pixels, motion, _ = frame(rng, "ds", 120, 0.5)
+    wide, back = camera("ds"), np.diag([-1.0, 1.0, -1.0])
+    straight = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 240.0], [0.0, 0.0, 1.0]])
+    pinhole = rsl.Camera(640, 480, straight, readout_time=READOUT)
+    rig = rsl.Rig({"ahead": pinhole, "wide": wide},
+                  {"wide": (np.eye(3), np.zeros(3)), "ahead": (back, np.zeros(3))})  # fmt: skip
+    result = rsl.Localizer(rig).localize({"wide": (points, pixels)})
+    assert result
+    assert result.inliers["wide"].mean() > 0.95
+    assert np.degrees(np.linalg.norm(errors(result, motion)[:3])) < 0.5
