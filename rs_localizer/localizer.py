@@ -222,9 +222,9 @@ class Localizer:
         sights = self._sights(points, pixels, scores, stamps)
         given = _Given(*sights, prior, expected_share, turn)
         lens = None if prior is None else prior.lens
-        if turn is not None or lens is not None:
-            if len(given.exposure.cameras) > 1:
-                raise ValueError("a known turn, or a lens, is that of a camera alone, not of a rig")
+        if not given.exposure.alone and (turn is not None or lens is not None):
+            raise ValueError("a known turn, or a lens, is that of a camera alone, not of a rig")
+        if turn is not None:
             given = given._replace(exposure=given.exposure.ahead)
         found = self._found(given, lens)
         if lens is not None:

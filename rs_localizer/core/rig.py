@@ -281,13 +281,13 @@ class Exposure:
 
     @property
     def alone(self) -> bool:
-        """Whether one camera sees the frame, and nothing behind its image plane."""
-        return len(self.sides) == 1
+        """Whether one camera sees the frame."""
+        return len(self.cameras) == 1
 
     @property
     def ahead(self) -> Exposure:
         """Of a camera alone: what it sees before its image plane."""
-        if self.alone:
+        if len(self.sides) == 1:
             return self
         first = Mounts(*(values[:1] for values in self.mounts))
         return replace(self, sides=(Side(self.cameras[0], 0, None),), mounts=first)
@@ -317,7 +317,8 @@ class Exposure:
 
     def by(self, camera: Camera) -> Exposure:
         """The same through another lens of a camera alone."""
-        return replace(self, cameras=(camera,), sides=(Side(camera, 0, None),))
+        sides = tuple(side._replace(camera=camera) for side in self.sides)
+        return replace(self, cameras=(camera,), sides=sides)
 
 
 class ByCamera(np.ndarray[Any, Any]):

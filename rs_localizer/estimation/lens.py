@@ -281,9 +281,13 @@ def _told(
         best.state,
         shake_at(observations.tau, best.shake),
     )
-    camera = sighted.camera
+    camera, side_of = sighted.camera, observations.camera[chosen]
     seen = rays_of_lens(sighted, observations.tau[chosen], lines.image[chosen])
-    columns = by_lens(camera, seen).reshape(-1, len(coefficients))
+    by_coefficients = np.empty((len(seen), 2, len(coefficients)))
+    for place, side in enumerate(sighted.exposure.sides):
+        here = side_of == place
+        by_coefficients[here] = by_lens(camera, side.towards(seen[here]))
+    columns = by_coefficients.reshape(-1, len(coefficients))
     dense, left = lines.by_motion[chosen].reshape(-1, PARAMETERS), lines.errors[chosen].ravel()
     variance = best.noise**2
     information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)

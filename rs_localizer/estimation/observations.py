@@ -409,10 +409,11 @@ class Sighted:
         one.
         """
         exposure = self.exposure.by(camera)
-        rays, by_ray, _ = _rays(exposure, 0, self.pixels, self.usable.tau, self.turn)
+        rays, by_ray, side = _rays(exposure, 0, self.pixels, self.usable.tau, self.turn)
         if not np.all(np.isfinite(rays[self.usable.indices])):
             return None
-        return packed(exposure, self.points, self.usable._replace(rays=rays, by_ray=by_ray))
+        usable = self.usable._replace(rays=rays, by_ray=by_ray, camera=side)
+        return packed(exposure, self.points, usable)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
