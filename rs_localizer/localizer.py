@@ -223,7 +223,7 @@ class Localizer:
         if turn is not None or lens is not None:
             if len(given.exposure.cameras) > 1:
                 raise ValueError("a known turn, or a lens, is that of a camera alone, not of a rig")
-            given = given._replace(exposure=given.exposure.ahead)
+            given = given._replace(exposure=given.exposure.ahead())
         found = self._found(given, lens)
         if lens is not None:
             plain = self._found(given, None)
@@ -242,7 +242,8 @@ class Localizer:
             if isinstance(points, Mapping) or stamps is not None:
                 raise ValueError("images by names, and their stamps, are those of a Rig")
             points, pixels, scores = checked(points, pixels, scores)
-            return self._exposure, [len(points)], points, pixels, scores
+            # Of one side the lens is estimated, too.
+            return self._exposure.ahead(pixels), [len(points)], points, pixels, scores
         if not isinstance(points, Mapping) or pixels is not None or scores is not None:
             raise ValueError(
                 "a frame of a rig is {name: (points, pixels)}, also with scores behind them; its "
