@@ -79,7 +79,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   fuzzing                          wrong input for everything that reads
   profiling, frame_times           where the time of a frame goes
   size                             lines, modules, constants, and calls of one cloud
-  load, load.signals               a live node under load, and stopped at random moments
+  load, load.rig, load.signals     live nodes under load, of a rig, and stopped at random moments
   image_flight, marker_flight      rendered flights through live nodes and through commands
   signals                          commands that are stopped at random moments
   rig_calibration                  calibrate --rig against its bounds

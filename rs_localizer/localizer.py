@@ -50,6 +50,7 @@ from rs_localizer.estimation.prior import (
     Prior,
     PriorTerms,
     offset_between,
+    pivot_of,
     state_in,
     with_motion,
 )
@@ -143,6 +144,7 @@ class Localizer:
                       gravity_deviation=1.0, gravity_in_map=(0.0, 0.0, 1.0))  # fmt: skip
         self.localize(points, pixels, np.arange(count, dtype=np.float64), prior)
         self.localize(points, pixels)
+        pivot_of(prior.covariance)  # by a tracker
         # And with one that shakes, rows to and fro.
         swing = 2.0 * self.config.inlier_threshold * np.sin(12.0 * self.camera.row_time(pixels))
         self.localize(points, pixels + np.outer(swing, self.camera.row_time_gradient[::-1] != 0.0))
@@ -223,7 +225,7 @@ class Localizer:
         if not given.exposure.alone and (turn is not None or lens is not None):
             raise ValueError("a known turn, or a lens, is that of a camera alone, not of a rig")
         if turn is not None:
-            given = given._replace(exposure=given.exposure.ahead)
+            given = given._replace(exposure=given.exposure.ahead())
         found = self._found(given, lens)
         if lens is not None:
             plain = self._found(given, None)
@@ -242,7 +244,8 @@ class Localizer:
             if isinstance(points, Mapping) or stamps is not None:
                 raise ValueError("images by names, and their stamps, are those of a Rig")
             points, pixels, scores = checked(points, pixels, scores)
-            return self._exposure, [len(points)], points, pixels, scores
+            # One camera costs less than six.
+            return self._exposure.ahead(pixels), [len(points)], points, pixels, scores
         if not isinstance(points, Mapping) or pixels is not None or scores is not None:
             raise ValueError(
                 "a frame of a rig is {name: (points, pixels)}, also with scores behind them; its "

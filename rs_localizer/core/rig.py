@@ -284,10 +284,15 @@ class Exposure:
         """Whether one camera sees the frame."""
         return len(self.cameras) == 1
 
-    @property
-    def ahead(self) -> Exposure:
-        """Of a camera alone: what it sees before its image plane."""
+    def ahead(self, pixels: Array | None = None) -> Exposure:
+        """Of a camera alone: what it sees before its image plane.
+
+        Args:
+            pixels: (n,2) raw; where some show more than that, the exposure is as it was.
+        """
         if len(self.sides) == 1:
+            return self
+        if pixels is not None and np.any(self.cameras[0].bearings(pixels)[:, 2] <= 0.0):
             return self
         first = Mounts(*(values[:1] for values in self.mounts))
         return replace(self, sides=(Side(self.cameras[0], 0, None),), mounts=first)

@@ -142,7 +142,7 @@ def averaged(
     offsets (k,18) from the best one to all.
     """
     count, first = len(states), states[best]
-    steps, mean, by_step = np.empty((count, PARAMETERS)), np.zeros(PARAMETERS), np.eye(PARAMETERS)
+    steps, mean = np.empty((count, PARAMETERS)), np.zeros(PARAMETERS)
     for k in range(count):
         steps[k], _ = offset_between(first, states[k], first[9:12])
         mean += counting[k] * steps[k]
@@ -159,9 +159,16 @@ def averaged(
             offset, by_turn = offset_between(state, states[k], middle)
             covariance += possible[k] * np.outer(offset, offset)
             if possible[k] > _NO_PART:
-                by_step[:6, :3] = by_turn
-                covariance += possible[k] * (by_step @ covariances[k] @ by_step.T)
+                covariance += possible[k] * _about_pivot(covariances[k], by_turn)
     return state, covariance, steps
+
+
+@inlined
+def _about_pivot(covariance: Array, by_turn: Array) -> Array:
+    """A covariance (18,18) of steps as one of offsets, which go with the turn by (6,3)."""
+    by_step = np.eye(PARAMETERS)
+    by_step[:6, :3] = by_turn
+    return by_step @ covariance @ by_step.T
 
 
 class _Held(NamedTuple):

@@ -464,9 +464,10 @@ def _add_posed(
     half = prior.copy()  # P J
     for i in range(size):
         for j in range(3):
-            half[i, j] = 0.0
+            total = 0.0
             for k in range(6):
-                half[i, j] += prior[i, k] * by_turn[k, j]
+                total += prior[i, k] * by_turn[k, j]
+            half[i, j] = total
     for i in range(3):
         for k in range(6):
             slope[i] += by_turn[k, i] * pulled[k]

@@ -67,7 +67,10 @@ def test_a_bag_of_images(here, kind, width, capsys):
     assert re.search(rf"out: 3 of 5 images, \d\d keypoints \({kind}\) each \(median\)", said)
     assert "1 images have no keypoint\n" in said
     assert "left out, the first one because the data are truncated" in said
-    assert f"replay {here.out} --params {here.out}/parameters.yaml --map MAP" in said
+    assert (
+        f"replay {here.out} --params {here.out}/parameters.yaml --out {here.out}_poses --map MAP"
+        in said
+    )
     assert re.search(r"time per image: [\d.]+ ms, \d+ images/s", said)
     # As the node does it, to the last bit.
     extractor = FrameExtractor(FeatureConfig(features=kind, max_keypoints=40))

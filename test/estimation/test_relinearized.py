@@ -52,7 +52,7 @@ def test_derivatives_are_those_of_exact_points(turn):
     points, pixels = seen(400, turn)
     noisy = pixels + np.random.default_rng(1).normal(size=pixels.shape)
     # Its corners see 93 degrees; beside a known turn there is what lies ahead.
-    exposure = EXPOSURE if turn is None else EXPOSURE.ahead
+    exposure = EXPOSURE if turn is None else EXPOSURE.ahead()
 
     def observed(measured):
         usable = find_usable(exposure, points, measured, [len(points)], turn)

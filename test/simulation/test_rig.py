@@ -101,8 +101,7 @@ def test_the_recording_says_how_the_rig_is_mounted_and_set(recording):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--images", "--rig is for points"),
-        ("--imu", "--rig is for points"),
+        ("--imu", "--imu is for one camera"),
         ("", "has no readout_time of cam0"),
     ],
 )

@@ -30,7 +30,7 @@ if WORKING:
 _LIST, _IMAGES = "images.txt", "images"
 _NUMBER = re.compile(r"\d+")
 # What a recording needs, and a model has itself or cannot have.
-_OF_RECORDINGS = ("recording", "out", "map", "hold")
+_OF_RECORDINGS = ("recordings", "out", "map", "hold")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,8 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Undo the shutter of a model."""
     for name in _OF_RECORDINGS:
-        if getattr(args, name) is not None:
-            raise UsageError(f"--colmap goes without {'--' * (name != 'recording')}{name}")
+        if getattr(args, name) not in (None, []):
+            raise UsageError(f"--colmap goes without {'--' * (name != 'recordings')}{name}")
     if args.shutter == "global":
         raise UsageError("a model of a global shutter needs no refinement")
     folder, args.out = args.colmap

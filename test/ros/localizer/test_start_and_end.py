@@ -153,8 +153,13 @@ def test_two_clients_configure_at_once(start_node, peer):
     node = start_node("-p", "autostart:=false")
     clients = [peer.node.create_client(ChangeState, "/rs_localizer/change_state") for _ in range(2)]
     assert peer.spin_until(lambda: all(client.service_is_ready() for client in clients))
-    peer.spin_until(lambda: False, 0.5)
+    # Answers reach a client that the service knows; on a busy machine that takes a while.
     request = ChangeState.Request()
+    request.transition.id = Transition.TRANSITION_ACTIVATE
+    for client in clients:
+        assert any(peer.spin_until(client.call_async(request).done, 2.0) for _ in range(10)), (
+            "no answer"
+        )
     request.transition.id = Transition.TRANSITION_CONFIGURE
     answers = [client.call_async(request) for client in clients]
     assert peer.spin_until(lambda: all(answer.done() for answer in answers))
