@@ -192,6 +192,9 @@ def _report(heard: Heard, sent: list[Sent], motion: TrueMotion, faults: bool) ->
         expected = sum(
             0.0 <= 1e-9 * (it.true_ns - sent[0].true_ns) - start < _SETTLING for it in first
         )
+        if not near.any():
+            print(f"  at {start:.0f} s: no pose of {expected} images")
+            continue
         what = "stops" if state is None else f"clock {1e3 * state:+.0f} ms"
         print(
             f"  at {start:.0f} s, {what}: {near.sum()} poses of {expected} images in "
