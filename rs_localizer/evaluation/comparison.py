@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two methods on the same recording: answers, how far they are from the truth, and a table."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

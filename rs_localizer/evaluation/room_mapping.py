@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A rendered room that is mapped from one walk, and flights that are localized in the map."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

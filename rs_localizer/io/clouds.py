@@ -6,8 +6,6 @@ Fields are looked up by name and may lie anywhere in a row; unknown ones are ign
 read in place through a NumPy structured view, whatever their padding and byte order.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses and twists from whatever holds them: text files, recordings, outputs of replay."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path

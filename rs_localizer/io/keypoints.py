@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """PointCloud2 -> keypoints, and -> a map."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -33,8 +33,6 @@ What is missing of a pose is that of the origin. Standalone tags have no place::
           - {id: 0, size: 0.16, x: 0, y: 0, z: 0, qw: 1, qx: 0, qy: 0, qz: 0}
 """
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass

@@ -48,8 +48,6 @@ viewer (the identity is a print that lies on the floor of a map whose z points u
 the top left one clockwise, as seen from the front.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """All correspondences, or the whole IMU, of a recording at once: for estimators of many images."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of a replay -> a recording of the Rerun viewer, or the viewer itself."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator, Sequence

@@ -9,8 +9,6 @@ map. That changes slowly, so it is stamped ``transform_tolerance`` into the futu
 and slam_toolbox do: until the next frame comes, others can still use it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from rs_localizer.config import NodeConfig, PublishTf

@@ -5,8 +5,6 @@
 The node and the offline ``rs_localizer detect`` run this one class.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal

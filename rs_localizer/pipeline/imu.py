@@ -7,8 +7,6 @@ localizes. What a frame gets depends on stamps alone, not on when a reading came
 recording gives the same poses live and offline.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import Counter, deque

@@ -5,8 +5,6 @@
 The node and the offline ``rs_localizer detect --features`` run this one class.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from typing import Any, Literal

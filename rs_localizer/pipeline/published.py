@@ -16,8 +16,6 @@ head: of its origin in camera axes, and its turn in base axes. TF carries no cov
 extrinsics are treated as exact.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

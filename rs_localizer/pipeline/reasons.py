@@ -5,8 +5,6 @@
 And the reasons for which an image is localized, but without the IMU.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from rs_localizer.core.reasons import ImuReason, Reason

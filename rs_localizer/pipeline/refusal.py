@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A message without a result, and why; who is told what is odd."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar

@@ -6,8 +6,6 @@ The OpenBLAS of SciPy 1.11 wakes a thread per core for systems of 12 unknowns: a
 500 points then takes 150 % of a core instead of 17 %.
 """
 
-from __future__ import annotations
-
 import os
 
 _VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")

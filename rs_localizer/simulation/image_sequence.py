@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sequences of rendered images: rendered and encoded by all cores, in order, a few at a time."""
 
-from __future__ import annotations
-
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of the augmented-reality experiment: marker walls, rendered and detected; the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated frames and their truth as messages of a recording."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ Every line of pixels (a row, or a column if the shutter moves sideways) is seen 
 at its own time; the lens distortion bends the rays of the pixels, never their time.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files that hold maps: which there are, and how they are read and written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from rs_localizer.io.maps.colmap import read_colmap

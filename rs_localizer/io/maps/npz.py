@@ -8,8 +8,6 @@ Nothing in them is ever unpickled, and nothing is allocated before the headers o
 sizes in the archive and the size of the file agree.
 """
 
-from __future__ import annotations
-
 import struct
 import tokenize
 import warnings

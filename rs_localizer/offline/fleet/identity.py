@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a result depends on, so that it is known again, and what its folder is called."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import json

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One recording of many: what a worker does with it, and what it answers."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import hashlib

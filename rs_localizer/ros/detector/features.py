@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``feature_detector``: images in; keypoints with descriptors out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the numbers mean for a user: a level, one sentence, and the numbers by readable names."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

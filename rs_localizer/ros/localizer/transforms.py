@@ -7,8 +7,6 @@ Transforms are taken in a thread of their own. Nobody waits in here for those th
 yet: frames are kept until they are, while others are localized.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import importlib
