@@ -45,8 +45,9 @@ def setting(
     """
     if isinstance(default, StrEnum):
         default, choices = default.value, tuple(item.value for item in type(default))
-    metadata = {"description": description, "minimum": limits[0], "maximum": limits[1]}
-    metadata |= {"choices": choices, "read_only": read_only, "fixed": fixed}
+    metadata: dict[str, Any] = {"description": description, "choices": choices}
+    metadata |= {"minimum": limits[0], "maximum": limits[1]}
+    metadata |= {"read_only": read_only, "fixed": fixed}
     return field(default=default, metadata=metadata)
 
 

@@ -44,9 +44,8 @@ import yaml
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.yaml_text import YamlError, check_tree, load_yaml
-from rs_localizer.markers.entries import Entry
 from rs_localizer.markers.families import FAMILIES, Family, family
-from rs_localizer.markers.map_files import read_marker_map, write_marker_map
+from rs_localizer.markers.map_files import Entry, read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose, quaternion_of_rotation, rotation_of_quaternion
 from rs_localizer.markers.prints import Marker

@@ -24,7 +24,7 @@ from rs_localizer.io.recording import (
     write_image,
 )
 from rs_localizer.simulation.frames import SimulatedFrame
-from rs_localizer.simulation.image_sequence import RenderedFrame
+from rs_localizer.simulation.renderer import RenderedFrame
 from rs_localizer.simulation.true_motion import TrueState
 
 TRUE_POSE_TOPIC = "/truth/pose"

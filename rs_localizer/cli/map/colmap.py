@@ -8,9 +8,8 @@ import argparse
 import re
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, replaced
+from rs_localizer.cli import WORKING, UsageError, number, replaced
 from rs_localizer.cli.settings_args import given_values, row_time
-from rs_localizer.process.arguments import number
 
 if WORKING:
     import cv2

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, refuse_existing
+from rs_localizer.cli import WORKING, UsageError, number, refuse_existing
 from rs_localizer.cli.map import colmap, contradiction
 from rs_localizer.cli.rig_input import (
     MapCamera,
@@ -20,7 +20,6 @@ from rs_localizer.cli.rig_input import (
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.io.maps.files import WRITERS, read_map_file
 from rs_localizer.io.topics import IMU
-from rs_localizer.process.arguments import number
 
 if WORKING:
     import numpy as np

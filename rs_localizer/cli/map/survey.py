@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, refuse_existing
+from rs_localizer.cli import WORKING, UsageError, number, refuse_existing
 from rs_localizer.cli.map import contradiction
 from rs_localizer.cli.rig_input import (
     MapCamera,
@@ -19,7 +19,6 @@ from rs_localizer.cli.rig_input import (
 )
 from rs_localizer.cli.settings_args import add_settings, given_settings
 from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family, family
-from rs_localizer.process.arguments import number
 
 if WORKING:
     import numpy as np

@@ -11,7 +11,7 @@ import numpy as np
 from rs_localizer.io.outputs import CameraShare, Localized
 from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.inputs import Role, input_named, said
-from rs_localizer.pipeline.reasons import IMU_REASONS
+from rs_localizer.pipeline.refusal import IMU_REASONS
 from rs_localizer.ros.node.health import (
     SOME,
     Health,
