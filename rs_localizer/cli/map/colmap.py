@@ -16,7 +16,7 @@ if WORKING:
     import numpy as np
     from tqdm import tqdm
 
-    from rs_localizer.cli.map import contradiction
+    from rs_localizer.cli.map import check_readout
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.calibration import read_calibration
     from rs_localizer.io.maps.colmap import read_camera, read_images, read_model, write_model
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> None:
             raise ValueError(f"{args.images} has no {missing[0]}, an image of the model")
     with atomic_directory(args.out, replaced(args, _LIST)) as out:
         found = undo_shutter(camera, model, images, stamps, _known(args), _print_step)
-        contradiction.check(args, found.refined.readout_check, "see --shutter estimated")
+        check_readout(args, found.refined.readout_check, "see --shutter estimated")
         out.mkdir()
         write_model(out, found.camera, found.images, found.points)
         share = None if args.images is None else _write_images(args, found, out / _IMAGES)
