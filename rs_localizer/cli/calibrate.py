@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, add_overwrite, refuse_existing
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, number, refuse_existing
 from rs_localizer.cli.batch import (
     Plan,
     add_batch_arguments,
@@ -38,7 +38,6 @@ from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.rig_input import cameras_of, mounting_lines, numbers
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.io.topics import IMU
-from rs_localizer.process.arguments import number
 
 if WORKING:
     import numpy as np

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, integer, number, replaced
 from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
 from rs_localizer.cli.image_input import (
     Source,
@@ -29,7 +29,6 @@ from rs_localizer.cli.rig_input import cameras_of
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
 from rs_localizer.io.bags import STORAGES, BagWriter, is_bag
 from rs_localizer.io.image_clock import DEFAULT_START_NS
-from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import build, settings
 
 if WORKING:
@@ -42,8 +41,7 @@ if WORKING:
     from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
     from rs_localizer.offline.fleet.task import Figures, Kind
     from rs_localizer.offline.image_sources import Carried, Shot
-    from rs_localizer.pipeline.images import FrameDetector
-    from rs_localizer.pipeline.keypoints import FrameExtractor
+    from rs_localizer.pipeline.images import FrameDetector, FrameExtractor
 
 # Options of markers and boards.
 _OF_MARKERS = ("map", "board", "pattern", "square", "min_side")

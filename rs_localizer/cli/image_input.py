@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, UsageError
+from rs_localizer.cli import WORKING, UsageError, number
 from rs_localizer.cli.settings_args import add_settings, given_values
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
-from rs_localizer.process.arguments import number
 from rs_localizer.settings import build, settings, write_parameters
 
 if WORKING:

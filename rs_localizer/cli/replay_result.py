@@ -45,18 +45,16 @@ if WORKING:
     from rs_localizer.io.topics import TF
     from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
     from rs_localizer.io.transforms import TransformError, make_transform
-    from rs_localizer.offline.fleet.identity import MARKER
-    from rs_localizer.offline.fleet.task import LOG, Figures
+    from rs_localizer.offline.fleet.task import LOG, MARKER, Figures
     from rs_localizer.offline.image_sources import IMAGE_TYPES
     from rs_localizer.offline.replay import TF_TYPE
     from rs_localizer.offline.smoothed import SmoothedFrames
     from rs_localizer.offline.table import FrameTable
-    from rs_localizer.pipeline.broadcasts import broadcast
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.pipeline.imu import ImuState
     from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
-    from rs_localizer.pipeline.reasons import explained
-    from rs_localizer.pipeline.refusal import Refusal
+    from rs_localizer.pipeline.published import broadcast
+    from rs_localizer.pipeline.refusal import Refusal, explained
     from rs_localizer.settings import NODE_NAME
     from rs_localizer.solvers.table import find_solver
 

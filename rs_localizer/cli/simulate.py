@@ -9,12 +9,11 @@ import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, integer, number, replaced
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import STORAGES, BagWriter
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
-from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import settings, write_parameters
 from rs_localizer.simulation.settings import (
     BODY_FROM_CAMERA,
@@ -40,10 +39,9 @@ if WORKING:
     from rs_localizer.io.trajectories import read_tum
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
-    from rs_localizer.simulation.image_sequence import rendered_frames
     from rs_localizer.simulation.imu import ImuBagWriter, Lever, simulate_imu
     from rs_localizer.simulation.recording import write_rendered, write_simulated
-    from rs_localizer.simulation.renderer import Renderer
+    from rs_localizer.simulation.renderer import Renderer, rendered_frames
     from rs_localizer.simulation.rig import (
         Frame,
         camera_stamps,

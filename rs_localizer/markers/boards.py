@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Chessboards, ChArUco boards and grids of circles in images, by OpenCV's own detectors."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Offline detection: images -> a recording of correspondences or keypoints, as the nodes do."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -30,8 +28,13 @@ from rs_localizer.markers.detection import recognized
 from rs_localizer.markers.map_check import LeaveOneOut, Predict, rms, still_errors, still_pose
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
-from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
+from rs_localizer.pipeline.images import (
+    Detected,
+    FrameDetector,
+    FrameExtractor,
+    correspondences,
+    keypoints,
+)
 from rs_localizer.pipeline.refusal import Refusal
 
 # Fewer corners than this say nothing about how well a pose fits.

@@ -5,8 +5,6 @@
 Imports nothing that takes time, so that a program can begin with it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -12,7 +12,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.io.keypoints import Keypoints
+from rs_localizer.io.clouds import Keypoints
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.matching import Matcher, Visible, find_view, predict
 from rs_localizer.simulation.scene import room

@@ -12,9 +12,8 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
-from rs_localizer.simulation.image_sequence import in_order
 from rs_localizer.simulation.planes import TexturedPlane
-from rs_localizer.simulation.renderer import Renderer
+from rs_localizer.simulation.renderer import Renderer, in_order
 from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 

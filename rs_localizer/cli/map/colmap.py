@@ -8,16 +8,15 @@ import argparse
 import re
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, replaced
+from rs_localizer.cli import WORKING, UsageError, number, replaced
 from rs_localizer.cli.settings_args import given_values, row_time
-from rs_localizer.process.arguments import number
 
 if WORKING:
     import cv2
     import numpy as np
     from tqdm import tqdm
 
-    from rs_localizer.cli.map import contradiction
+    from rs_localizer.cli.map import check_readout
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.calibration import read_calibration
     from rs_localizer.io.maps.colmap import read_camera, read_images, read_model, write_model
@@ -90,7 +89,7 @@ def run(args: argparse.Namespace) -> None:
             raise ValueError(f"{args.images} has no {missing[0]}, an image of the model")
     with atomic_directory(args.out, replaced(args, _LIST)) as out:
         found = undo_shutter(camera, model, images, stamps, _known(args), _print_step)
-        contradiction.check(args, found.refined.readout_check, "see --shutter estimated")
+        check_readout(args, found.refined.readout_check, "see --shutter estimated")
         out.mkdir()
         write_model(out, found.camera, found.images, found.points)
         share = None if args.images is None else _write_images(args, found, out / _IMAGES)

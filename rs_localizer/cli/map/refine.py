@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, refuse_existing
-from rs_localizer.cli.map import colmap, contradiction
+from rs_localizer.cli import WORKING, UsageError, number, refuse_existing
+from rs_localizer.cli.map import add_readout_argument, check_readout, colmap
 from rs_localizer.cli.rig_input import (
     MapCamera,
     add_mounting_argument,
@@ -20,7 +20,6 @@ from rs_localizer.cli.rig_input import (
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.io.maps.files import WRITERS, read_map_file
 from rs_localizer.io.topics import IMU
-from rs_localizer.process.arguments import number
 
 if WORKING:
     import numpy as np
@@ -85,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="instead of camera_info; of a rig, a camchain as calibrate --rig writes it",
     )  # fmt: skip
     add_mounting_argument(parser)
-    contradiction.add_argument(parser)
+    add_readout_argument(parser)
     add_settings(
         parser,
         "readout_time, scan_direction, stamp_offset, matching.*; map_deviation: how well all "
@@ -119,7 +118,7 @@ def run(args: argparse.Namespace) -> None:
     refined = refine_rig(rig, localized.seen, localized.start, freedom, done=_print_step)
     _tell(localized, refined, [of.name for of in cameras])
     for of, found in zip(cameras, refined.cameras, strict=True):
-        contradiction.check(args, found.readout_check, "see --shutter estimated", of.name)
+        check_readout(args, found.readout_check, "see --shutter estimated", of.name)
     _write(args, localized.landmarks, refined, [of.name for of in cameras])
 
 

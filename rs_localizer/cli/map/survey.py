@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, refuse_existing
-from rs_localizer.cli.map import contradiction
+from rs_localizer.cli import WORKING, UsageError, number, refuse_existing
+from rs_localizer.cli.map import add_readout_argument, check_readout
 from rs_localizer.cli.rig_input import (
     MapCamera,
     add_mounting_argument,
@@ -19,7 +19,6 @@ from rs_localizer.cli.rig_input import (
 )
 from rs_localizer.cli.settings_args import add_settings, given_settings
 from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family, family
-from rs_localizer.process.arguments import number
 
 if WORKING:
     import numpy as np
@@ -95,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rate", type=number(0.0, above=True), metavar="HZ",
         help="images per second of a video or of files",
     )  # fmt: skip
-    contradiction.add_argument(parser)
+    add_readout_argument(parser)
     add_settings(parser, "readout_time (0: it is found), scan_direction, stamp_offset")
     topics = parser.add_argument_group("topics of a bag (default: the only ones of their types)")
     topics.add_argument("--image", metavar="TOPIC")
@@ -117,7 +116,7 @@ def run(args: argparse.Namespace) -> None:
     _tell(surveyed_map, every, cameras, filmed)
     for camera, found in zip(cameras, surveyed_map.cameras, strict=True):
         instead = "calibrate --rig finds it" if camera.name else "without one it is found"
-        contradiction.check(args, found.readout_check, instead, camera.name)
+        check_readout(args, found.readout_check, instead, camera.name)
     surveyed = tuple(
         replace(marker, deviations=deviations)
         for marker, deviations in zip(surveyed_map.markers, every, strict=True)
