@@ -176,7 +176,8 @@ class Exports:
     """What other programs want of each frame, as it comes.
 
     Args:
-        args: of :func:`add_export_arguments`; ``smooth`` among them.
+        args: of :func:`add_export_arguments`; ``smooth`` among them, and ``exposure`` (s) where a
+            video says it.
         localizer: that makes the frames; it has their camera.
         out: directory of the result.
     """
@@ -188,6 +189,7 @@ class Exports:
         self._gsplat: Path | None = args.gsplat
         self._ncore: Path | None = args.ncore
         self._smoothed: bool = args.smooth
+        self._exposure: float = getattr(args, "exposure", None) or 0.0
         self._rows = {name: Track() for name in self._named}
         self._views: dict[int, View] = {}
         self._rolling: dict[int, Array] = {}  # (3,4,4) at the first, middle and last row
@@ -282,7 +284,7 @@ class Exports:
             replace(view, file=files.get(stamp, view.file))
             for stamp, view in sorted(self._views.items())
         ]
-        text = json.dumps(transforms(self._camera, views), indent=1)
+        text = json.dumps(transforms(self._camera, views, self._exposure), indent=1)
         (self._out / TRANSFORMS).write_text(text, encoding="utf-8")
         if missing := len(views) - len(files):
             print(
