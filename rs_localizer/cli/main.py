@@ -308,7 +308,11 @@ def _plain_output(shown: Callable[[str], str]) -> Iterator[None]:
     """Within ``with``, what is printed cannot steer the terminal."""
     write = sys.stdout.write
     output = sys.stdout
-    output.write = lambda text: write(shown(text).translate(_STEERING))  # type: ignore[method-assign]
+
+    def plain(text: str) -> int:
+        return write(shown(text).translate(_STEERING))
+
+    output.write = plain  # type: ignore[method-assign]
     try:
         yield
     finally:

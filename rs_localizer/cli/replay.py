@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from rs_localizer.cli import WORKING, UsageError, detect, import_ros
 from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
-from rs_localizer.cli.image_input import add_telemetry
+from rs_localizer.cli.image_input import add_telemetry, telemetry_of
 from rs_localizer.cli.replay_result import (
     BRIDGED,
     POSES,
@@ -225,6 +225,8 @@ def _replay_one(
         alone = argparse.Namespace(**vars(args))
         alone.params, alone.assignments = own if own.exists() else None, []
         alone.map = None if by_markers else _map_file(Path(args.map))
+        telemetry = telemetry_of(Path(recording), args)
+        alone.exposure = None if telemetry is None else telemetry.exposure
         return _replay_matches(alone, matches, recording, out, timed)
 
 

@@ -15,7 +15,7 @@ from rs_localizer.core.scales import Scales
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations, weighted
-from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.refine import (
     EXPECTED_NOISE,
     LEAST_NOISE,
@@ -179,7 +179,6 @@ def _rounds(
     """Refine, measure the noise, choose the inliers, and again."""
     # From the wide side: a start that fits few points well would see little noise and keep few.
     state, gate, noise, freedom = start, WIDEST_GATE * threshold, EXPECTED_NOISE * threshold, 0.0
-    cost = 0.0
     errors = squared_errors(data, count, state)
     weights = np.empty(count)
     information = np.empty((PARAMETERS, PARAMETERS))
@@ -187,7 +186,7 @@ def _rounds(
     for turn in range(_ROUNDS):
         for i in range(count):
             weights[i] = 1.0 if errors[i] < gate * gate else 0.0
-        state, information, cost, _ = refine(
+        state, information, _, _ = refine(
             weighted(data, weights),
             state,
             _NO_SCALE,
@@ -205,6 +204,9 @@ def _rounds(
         noise = noise_deviation(errors, gate, freedom)
         gate = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
     inliers = errors < gate * gate
+    # Of all of these: a start that is far off may have been fitted to few of them.
+    cost = add_prior(prior, state, noise * noise, information.copy(), np.zeros(PARAMETERS))
+    cost += np.sum(errors[inliers])
     return _Best(
         state, cost, noise * noise * inverse, noise, 2.0 * np.sum(inliers) - freedom,
         _least_eigenvalue(information, inverse), inliers, errors,

@@ -6,8 +6,6 @@ Every method keeps its color, its marker and its line in all of them, and they d
 too, so that a print in black and white can be read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

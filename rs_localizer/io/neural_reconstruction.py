@@ -78,8 +78,13 @@ def pixel_intrinsics(camera: Camera) -> tuple[Array, Array]:
     return np.diag(camera.K)[:2] / binning, (camera.K[:2, 2] - offset) / binning + _HALF
 
 
-def transforms(camera: Camera, views: Sequence[View]) -> dict[str, Any]:
+def transforms(camera: Camera, views: Sequence[View], exposure: float = 0.0) -> dict[str, Any]:
     """What ``transforms.json`` holds.
+
+    Args:
+        camera: of all views.
+        views: the images.
+        exposure: of a row, s; 0: not known.
 
     Raises:
         NerfstudioError: for a lens or a shutter that it has no words for.
@@ -108,7 +113,7 @@ def transforms(camera: Camera, views: Sequence[View]) -> dict[str, Any]:
         "cx": float(centre[0]), "cy": float(centre[1]),
         **lens,
         "rolling_shutter_time": seconds,
-        "exposure_time": 0.0,
+        "exposure_time": exposure,
         "frames": [_frame(view) for view in views],
     }  # fmt: skip
 
@@ -166,7 +171,7 @@ def write_gsplat(
     (folder / "shutter.txt").write_text(f"{shutter_type(camera)}\n", encoding="utf-8")
 
 
-_COEFFICIENTS = 8  # of plumb_bob and rational_polynomial: k1 k2 p1 p2 k3 k4 k5 k6
+_COEFFICIENTS = 12  # of OpenCV's polynomials: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4
 
 
 def sequence(camera: Camera, names: list[str], stamps_ns: IntArray, poses: Array) -> dict[str, Any]:
@@ -189,19 +194,20 @@ def sequence(camera: Camera, names: list[str], stamps_ns: IntArray, poses: Array
     D = [*camera.D.tolist(), *[0.0] * _COEFFICIENTS][:_COEFFICIENTS]
     if camera.distortion_model == DistortionModel.EQUIDISTANT:
         model |= {"camera_model_type": "opencv-fisheye", "radial_coeffs": D[:4]}
-        corners = np.array(
-            [[x, y] for x in (0, camera.size[0] - 1) for y in (0, camera.size[1] - 1)]
+        # All over the image: its corners may show nothing.
+        places = np.meshgrid(*(np.linspace(0.0, size - 1.0, 99) for size in camera.size))
+        ahead = camera.bearings(np.column_stack([each.ravel() for each in places]))[:, 2]
+        model["max_angle"] = float(np.arccos(np.nanmin(ahead)))
+    elif not camera.law.is_polynomial or np.any(camera.D[_COEFFICIENTS:]):
+        raise ValueError(
+            f"ncore.json has no lens {camera.distortion_model} of {len(camera.D)} coefficients"
         )
-        slopes = np.hypot(*camera.rays(corners.astype(float)).T)  # NaN beyond 90 degrees
-        model["max_angle"] = float(np.nanmax(np.arctan(slopes), initial=0.0))
-    elif not camera.law.is_polynomial:
-        raise ValueError(f"ncore.json has no lens {camera.distortion_model}")
     else:
         model |= {
             "camera_model_type": "opencv-pinhole",
-            "radial_coeffs": [D[0], D[1], *D[4:]],
+            "radial_coeffs": [D[0], D[1], *D[4:8]],
             "tangential_coeffs": D[2:4],
-            "thin_prism_coeffs": [0.0] * 4,
+            "thin_prism_coeffs": D[8:],
         }
     frames = [
         {

@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import csv
 import functools
+import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -27,7 +28,9 @@ CAMERA_FROM_SENSOR = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1
 # What announces telemetry in the first or the last bytes of a file: GoPro, DJI, Sony, Insta360.
 _MARKS = (b"gpmd", b"djmd", b"rtmd", b"8db42d694ccc418790edff439fe026bf")
 _LOOKED_AT = 2**18  # bytes
-# Readout times in ms: of GoPro (SROT), Sony and Canon, and those that add it themselves.
+_MOST_TRACKS = 2**26  # bytes, for a file that lies: a day at 60 Hz
+# Readout times in ms: of GoPro (SROT; of HERO7 for each image), Sony and Canon, and those that add
+# it themselves.
 _READOUT_NAMES = ("0x53524f54", "FrameReadoutTime", "frame_readout_time")
 _STABILIZED, _STABILIZER = "0x45495345", "0x45495341"  # GoPro: EISE, whether, and EISA, how
 _OFF = ("", "N", "N/A", "OFF")
@@ -66,10 +69,23 @@ def has_telemetry(path: Path) -> bool:
     """Whether a file looks as if it had any, without reading it."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(_LOOKED_AT)
+        looked_at = file.read(_LOOKED_AT)
         file.seek(max(0, size - _LOOKED_AT))
-        ends = head + file.read(_LOOKED_AT)
-    return any(mark in ends for mark in _MARKS)
+        looked_at += file.read(_LOOKED_AT) + _tracks(file)
+    return any(mark in looked_at for mark in _MARKS)
+
+
+def _tracks(file: BinaryIO) -> bytes:
+    """The box of an MP4 that lists its tracks: megabytes, of long videos; empty: none."""
+    at = file.seek(0)
+    while len(start := file.read(16)) >= 8:
+        size, kind = struct.unpack(">I4s", start[:8])
+        if size == 1:
+            size = int.from_bytes(start[8:], "big")
+        if kind == b"moov" or size < 8:
+            return start + file.read(min(size, _MOST_TRACKS)) if kind == b"moov" else b""
+        at = file.seek(at + size)
+    return b""
 
 
 @functools.lru_cache(maxsize=1)
@@ -87,7 +103,9 @@ def read_telemetry(path: Path) -> Telemetry | None:
         samples = parser.normalized_imu()
         tags = parser.telemetry(False)
     except Exception as error:  # the library's own, of any kind
-        raise TelemetryError(f"{path}: its telemetry cannot be read: {error}") from error
+        raise TelemetryError(
+            f"{path}: its telemetry cannot be read, --no-telemetry goes on without: {error}"
+        ) from error
     turning = [sample for sample in samples if sample["gyro"] is not None]
     if len(turning) < 2:
         return None
@@ -200,13 +218,14 @@ def _spread(forces: Array, times: Array) -> Array:
 
 
 def _values(tags: list[dict[str, Any]]) -> dict[str, Any]:
-    """Single values by name, whatever group they stand in; of one name, the first."""
+    """Values by name, whatever group they stand in; of one name, and of a list, the first."""
     found: dict[str, Any] = {}
     for part in reversed([part for groups in tags for part in groups.values()]):
         if isinstance(part, dict):
             nested = [item for item in part.values() if isinstance(item, dict)]
             for items in (*nested, part):
-                found |= {k: v for k, v in items.items() if isinstance(v, (str, int, float))}
+                first = {k: v[0] if isinstance(v, list) and v else v for k, v in items.items()}
+                found |= {k: v for k, v in first.items() if isinstance(v, (str, int, float))}
     return found
 
 

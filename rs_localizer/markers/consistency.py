@@ -5,8 +5,6 @@
 :mod:`rs_localizer.markers.map_check` holds it against images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels are compiled in a process of their own: a node does not keep the compiler's memory."""
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import re

@@ -9,8 +9,6 @@ variances: of positions along the axes of its world, of orientations about those
 velocities along the latter (PX4-Autopilot, msg/versioned/VehicleOdometry.msg).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The readout time that the camera's own motion shows, beside the one that is set."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from enum import Enum, auto

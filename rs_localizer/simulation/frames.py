@@ -6,8 +6,6 @@ Every point is projected at the time of its own row along the true motion; noise
 added to the raw pixels, so that they disturb the row time too, as in a real image.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

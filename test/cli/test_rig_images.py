@@ -13,11 +13,11 @@ from scipy.stats import chi2
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
-from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.maps.files import read_map_file, write_map_file
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import MARKER_MAP
 from rs_localizer.io.rigs import RigParts, write_camchain
+from rs_localizer.io.trajectories import read_motions
 from rs_localizer.markers.map_files import read_marker_map
 
 K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])

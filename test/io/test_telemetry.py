@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import os
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -166,6 +168,119 @@ def test_a_file_of_insta360(tmp_path: Path) -> None:
     assert inside.sum() > 150
     seen = found.profile.project(bearings)
     np.testing.assert_allclose(seen[inside], pixels[inside], atol=0.1)
+
+
+def box(kind: str, *parts: bytes) -> bytes:
+    """A box of MP4."""
+    return struct.pack(">I4s", 8 + sum(map(len, parts)), kind.encode()) + b"".join(parts)
+
+
+def klv(key: str, kind: str, values: Any, width: int = 1) -> bytes:
+    """An item of GPMF: what it is, its type, the size of a value, how many, the values."""
+    kinds = {"L": ">u4", "f": ">f4", "s": ">i2"}
+    data = values.encode() if kind == "c" else np.asarray(values, kinds[kind]).tobytes()
+    size = width * (1 if kind == "c" else np.dtype(kinds[kind]).itemsize)
+    head = key.encode() + struct.pack(">cBH", kind.encode(), size, len(data) // size)
+    return head + data + bytes(-len(data) % 4)
+
+
+def nest(key: str, *items: bytes) -> bytes:
+    data = b"".join(items)
+    return key.encode() + struct.pack(">BBH", 0, 1, len(data)) + data
+
+
+def of_gopro(payloads: list[bytes], *settings: bytes, padding: int = 0) -> bytes:
+    """An MP4 with a track of GPMF, a payload a second, and the settings of the camera."""
+    count, first = len(payloads), box("ftyp", b"mp41")
+    places = len(first) + 8 + np.cumsum([0, *map(len, payloads)])[:-1]
+    length = struct.pack(">4I", 0, 0, 1000, 1001 * count)
+    tables = box(
+        "stbl",
+        box("stsd", struct.pack(">2I", 0, 1), box("gpmd", bytes(7), b"\1")),
+        box("stts", struct.pack(">4I", 0, 1, count, 1001)),
+        box("stsc", struct.pack(">5I", 0, 1, 1, 1, 1)),
+        box("stsz", struct.pack(f">{3 + count}I", 0, 0, count, *map(len, payloads))),
+        box("stco", struct.pack(f">{2 + count}I", 0, count, *places.tolist())),
+    )
+    track = box(
+        "trak",
+        box("tkhd", struct.pack(">6I", 15, 0, 0, 1, 0, 1001 * count), bytes(60)),
+        box("mdia", box("mdhd", bytes(4), length, bytes(4)),
+            box("hdlr", bytes(8), b"meta", bytes(12), b"GoPro MET\0"), box("minf", tables)),
+    )  # fmt: skip
+    about = box("udta", box("GPMF", nest("DEVC", klv("DVID", "L", 1), *settings)))
+    content = box("mvhd", bytes(4), length, bytes(80)), about, box("free", bytes(padding)), track
+    return first + box("mdat", *payloads) + box("moov", *content, box("free", bytes(padding)))
+
+
+def test_a_file_of_gopro(tmp_path: Path) -> None:
+    """As GPMF's documentation has it: up, right to left, forward to back; a HERO7's readout times
+    stand in a stream of their own.
+    """
+    rates, forces = np.tile([500, 0, 100], (200, 1)), np.tile([4096, 0, 0], (200, 1))
+    payload = nest(
+        "DEVC", klv("DVID", "L", 1), klv("DVNM", "c", "Hero7 Black"),
+        nest("STRM", klv("SIUN", "c", "m/s2"), klv("SCAL", "s", 418), klv("ACCL", "s", forces, 3)),
+        nest("STRM", klv("SIUN", "c", "rad/s"), klv("SCAL", "s", 1000), klv("GYRO", "s", rates, 3)),
+        nest("STRM", klv("SHUT", "f", np.full(30, 0.002))),
+        nest("STRM", klv("STNM", "c", "Sensor read out time"), klv("SROT", "f", [8.744] * 30)),
+    )  # fmt: skip
+    settings = klv("MINF", "c", "HERO7 Black"), klv("VFOV", "c", "W"), klv("EISE", "c", "N")
+    path = tmp_path / "GX010001.MP4"
+    # As of half an hour: what the track is called is far from both ends.
+    path.write_bytes(of_gopro(3 * [payload], *settings, padding=2**19))
+    assert has_telemetry(path)
+    found = read_telemetry(path)
+    assert found is not None
+    assert (found.camera, found.lens, found.stabilizer) == (
+        "GoPro HERO7 Black", "field of view W", ""
+    )  # fmt: skip
+    assert found.readout_time == pytest.approx(0.008744)
+    assert found.exposure == pytest.approx(0.002)
+    assert found.rate == pytest.approx(200.0, rel=2e-3)
+    np.testing.assert_allclose(found.rates, np.tile([0.0, -0.5, -0.1], (600, 1)), atol=1e-6)
+    np.testing.assert_allclose(found.forces[0], [0.0, -4096 / 418, 0.0], atol=1e-6)
+    path.write_bytes(of_gopro([payload], *settings[:2], klv("EISE", "c", "Y"), padding=0))
+    read_telemetry.cache_clear()
+    stabilized = read_telemetry(path)
+    assert stabilized is not None
+    assert stabilized.stabilizer == "electronic stabilization"
+
+
+# Of gopro/gpmf-parser and JuanIrache/gopro-telemetry: Hz as GoPro documents them, ms, whether the
+# camera stands upright; payloads alone (.raw) become a file.
+SAMPLES = {
+    "karma.mp4": (400, None, True), "max-heromode.mp4": (200, 20.601, True),
+    "hero5.raw": (400, None, True), "hero6.raw": (200, None, True),
+    "hero6+ble.raw": (200, None, False), "Fusion.raw": (3200, None, False),
+    "karma.raw": (400, None, True), "hero7.raw": (200, 8.015, False),
+    "consecutive1.raw": (200, 8.744, True), "hero11.raw": (200, None, True),
+}  # fmt: skip
+
+
+@pytest.mark.skipif("GOPRO_SAMPLES" not in os.environ, reason="GOPRO_SAMPLES=FOLDER has them")
+def test_real_samples(tmp_path: Path) -> None:
+    for sample in sorted(Path(os.environ["GOPRO_SAMPLES"]).iterdir()):
+        if sample.name not in SAMPLES:
+            continue
+        rate, readout, upright = SAMPLES[sample.name]
+        path = sample
+        if sample.suffix == ".raw":
+            data = sample.read_bytes()
+            starts = [k for k in range(len(data)) if data.startswith(b"DEVC", k)]
+            first = data[starts[0] + 8 : starts[0] + 20]
+            begins = [k for k in starts if data.startswith(first, k + 8)]
+            payloads = [data[a:b] for a, b in itertools.pairwise([*begins, len(data)])]
+            path = tmp_path / f"{sample.name}.mp4"
+            path.write_bytes(of_gopro(payloads))
+        found = read_telemetry(path)
+        assert found is not None, sample
+        down = -np.mean(found.forces, axis=0)
+        pull = float(np.median(np.linalg.norm(found.forces, axis=1)))
+        ms = None if found.readout_time is None else 1e3 * found.readout_time
+        assert found.rate == pytest.approx(rate, rel=0.12)
+        assert ms == (None if readout is None else pytest.approx(readout, abs=1e-3))
+        assert (np.argmax(down) == 1) & (pull == pytest.approx(9.8, rel=0.05)) or not upright
 
 
 @pytest.fixture

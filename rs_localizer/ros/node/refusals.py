@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What was refused: counted by reason, and logged without flooding the log."""
 
-from __future__ import annotations
-
 import re
 import threading
 import time
