@@ -272,10 +272,8 @@ def _finds_lens(args: argparse.Namespace, recording: Path) -> bool:
 def calibrate_one(args: argparse.Namespace) -> Calibration:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
-        beside = {
-            _LENS: _finds_lens(args, args.recording),
-            _MAP: args.map or args.board,
-        } | dict.fromkeys(_SHARED, args.share)
+        lens = _finds_lens(args, args.recording)
+        beside = {_LENS: lens, _MAP: args.map or args.board} | dict.fromkeys(_SHARED, args.share)
         refuse_existing(args, *(name for name, written in beside.items() if written))
     config = _config(args)
     source = _read(args, config)
