@@ -68,20 +68,20 @@ class Posterior:
     inliers: BoolArray  # (n,)
     squared_errors: Array  # (n,) px^2
     mirror: Mirror | None = None
-    shake: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k,3) rad, coefficients
+    shake: Array = field(default_factory=np.zeros((0, 3)).copy)  # (k,3) rad, coefficients
     model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
     shared: float = 0.0  # px, likewise, of all modes together
     agreement: float = 0.0  # of neighbouring rows, standard deviations
     declared: float = 0.0  # px, the part of it that the map is known to be off
     # Probabilities of the typical speeds; empty: the configured one
-    speeds: Array = field(default_factory=lambda: np.zeros(0))
+    speeds: Array = field(default_factory=np.zeros(0).copy)
     near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
-    undetected: Array = field(default_factory=lambda: np.zeros((12, 12)))
+    undetected: Array = field(default_factory=np.zeros((12, 12)).copy)
     # (n,b): of what the smooth error is a combination (see frame_fit), which other frames share, so
     # that the covariance does not have it, either
-    bend: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    bend: Array = field(default_factory=np.zeros((0, 0)).copy)
 
     @property
     def determined(self) -> bool:
