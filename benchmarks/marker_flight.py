@@ -29,7 +29,6 @@ from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.io.estimates import Motions, read_motions
 from rs_localizer.io.recording import (
     CAMERA_INFO_TOPIC,
     CORRESPONDENCES_TOPIC,
@@ -37,6 +36,7 @@ from rs_localizer.io.recording import (
     PARAMETERS,
     RAW_IMAGE_TOPIC,
 )
+from rs_localizer.io.trajectories import Motions, read_motions
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.settings import build, load_params_file
 from rs_localizer.simulation.frames import middle_stamp

@@ -17,6 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -114,9 +115,8 @@ def information(
                 parameters = base.copy()
                 parameters[:, k] += sign * step
                 model = _Model(states.rotation, states.position, parameters, middle)
-                moved.append(
-                    mounted[name].seen(model, np.arange(count), np.zeros(count), view.points)  # type: ignore[arg-type]
-                )
+                view_at = partial(mounted[name].seen, model)  # type: ignore[arg-type]
+                moved.append(view_at(np.arange(count), np.zeros(count), view.points))
             columns.append((moved[0] - moved[1]) / (2.0 * step))
         derivatives = np.stack(columns, axis=-1)  # (f,n,2,18)
         derivatives[~view.visible] = 0.0

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import rs_localizer
-from rs_localizer.pipeline.reasons import IMU_REASONS, REASONS, Meaning
+from rs_localizer.pipeline.refusal import IMU_REASONS, REASONS, Meaning
 
 PAGE = Path(__file__).with_name("api.md")
 REASONS_PAGE = Path(__file__).with_name("reasons.md")
@@ -28,7 +28,7 @@ _REASONS_INTRODUCTION = """\
 
 ## Why a frame has no pose
 
-Written by `python docs/make_api.py` from `rs_localizer/pipeline/reasons.py`. The reasons are the
+Written by `python docs/make_api.py` from `rs_localizer/pipeline/refusal.py`. The reasons are the
 same in the library (`Failure.reason`), in what `replay` prints, in the log and in `/diagnostics`.
 
 | reason | means | look at |
@@ -132,6 +132,7 @@ def _signature(item: Any) -> str:
 def _plain(text: str) -> str:
     """Without the quotes of annotations, and enumerations by their values."""
     text = re.sub(r"<\w+\.\w+: ('\w*')>", r"\1", text)
+    text = re.sub(r"ForwardRef\('([^']*)'\)", r"\1", text)  # of a NamedTuple
     return re.sub(r"(: |-> )'([^']*)'", r"\1\2", text).replace("<factory>", "...")
 
 

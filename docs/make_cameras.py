@@ -12,11 +12,10 @@ from __future__ import annotations
 import json
 import re
 import sys
-from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
 
-from rs_localizer.readout import Known, known_cameras
+from rs_localizer.readout import Known, as_json, known_cameras
 
 FOLDER = Path(__file__).with_name("cameras")
 JSON = "readout_times.json"
@@ -25,7 +24,9 @@ _INDEX = """\
 
 What others say, of modes that may not be yours: `rs_localizer calibrate` measures yours in ten
 seconds ([calibration.md](../calibration.md)), and `rs_localizer readout NAME` prints this table. As
-JSON for other programs (seconds from the first to the last row): [{json}]({json}).
+JSON: [{json}]({json}), in seconds from the first to the last row, with `odm` (OpenDroneMap's
+`--rolling-shutter-readout`) and `gyroflow` (`frame_readout_time`) in ms of all rows, and `kalibr`
+(`lineDelay`) in seconds from row to row.
 
 | camera | modes | ms |
 |---|---|---|
@@ -65,7 +66,7 @@ def write(folder: Path = FOLDER) -> None:
     cameras = {
         slug: list(entries) for slug, entries in groupby(table, lambda entry: _slug(entry.name))
     }
-    (folder / JSON).write_text(json.dumps([_as_json(entry) for entry in table], indent=1) + "\n")
+    (folder / JSON).write_text(json.dumps([as_json(entry) for entry in table], indent=1) + "\n")
     for slug, entries in cameras.items():
         (folder / f"{slug}.md").write_text(_page(entries), encoding="utf-8")
     rows = [
@@ -80,13 +81,6 @@ def write(folder: Path = FOLDER) -> None:
 
 def _slug(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
-
-
-def _as_json(entry: Known) -> dict[str, object]:
-    return {
-        name: float(f"{value:.6g}") if isinstance(value, float) else value
-        for name, value in {**asdict(entry), "upper_bound": entry.upper_bound}.items()
-    }
 
 
 def _range(entries: list[Known]) -> str:

@@ -9,7 +9,7 @@ import os
 import sys
 from contextlib import AbstractContextManager
 
-from rs_localizer.process import threads
+from rs_localizer.process import limit_threads
 from rs_localizer.process.stopping import StopSignals
 
 _PROGRAM = "rs_localizer"
@@ -26,7 +26,7 @@ def run() -> int:
     Returns:
         the exit code: 130 after Ctrl-C and 143 after SIGTERM, as of any other program.
     """
-    threads.limit()
+    limit_threads()
     with StopSignals() as signals:
 
         def importing(name: str) -> AbstractContextManager[None]:

@@ -27,34 +27,28 @@ NO_NAMES = ("",)
 def setting(
     default: Any,
     description: str,
-    *,
-    minimum: float | None = None,
-    maximum: float | None = None,
+    limits: tuple[float | None, float | None] = (None, None),
     choices: tuple[str, ...] = (),
+    *,
     read_only: bool = False,
     fixed: bool = False,
 ) -> Any:
     """A dataclass field with what a user needs to know of it.
 
     Args:
-        default: its value, which also says its type.
+        default: its value, which also says its type; a member of an enumeration: one of its texts.
         description: one line.
-        minimum, maximum: of a number; they belong to the range.
+        limits: minimum and maximum of a number, which may have these values.
         choices: of a text.
         read_only: it cannot be set while the node runs.
         fixed: it cannot be set after the node has been configured.
     """
-    return field(
-        default=default,
-        metadata={
-            "description": description,
-            "minimum": minimum,
-            "maximum": maximum,
-            "choices": choices,
-            "read_only": read_only,
-            "fixed": fixed,
-        },
-    )
+    if isinstance(default, StrEnum):
+        default, choices = default.value, tuple(item.value for item in type(default))
+    metadata: dict[str, Any] = {"description": description, "choices": choices}
+    metadata |= {"minimum": limits[0], "maximum": limits[1]}
+    metadata |= {"read_only": read_only, "fixed": fixed}
+    return field(default=default, metadata=metadata)
 
 
 def bond_setting() -> Any:
@@ -63,8 +57,7 @@ def bond_setting() -> Any:
         0.0,
         "Time between heartbeats for nav2's lifecycle manager, in s; 0: none; needs the package "
         "bond",
-        minimum=0.0,
-        maximum=2.0,
+        (0.0, 2.0),
         read_only=True,
     )
 
@@ -134,14 +127,12 @@ class VelocityPrior:
     angular: float = setting(
         6.0,
         "Standard deviation of the camera's angular velocity, in rad/s; 0: no prior",
-        minimum=0.0,
-        maximum=100.0,
+        (0.0, 100.0),
     )
     linear: float = setting(
         3.0,
         "Standard deviation of the camera's linear velocity, in m/s; 0: no prior",
-        minimum=0.0,
-        maximum=10000.0,
+        (0.0, 10000.0),
     )
 
     def __post_init__(self) -> None:
@@ -162,14 +153,10 @@ class Acceleration:
     angular: float = setting(
         10.0,
         "Standard deviation of the camera's angular acceleration, in rad/s^2",
-        minimum=0.001,
-        maximum=10000.0,
+        (0.001, 10000.0),
     )
     linear: float = setting(
-        4.0,
-        "Standard deviation of the camera's linear acceleration, in m/s^2",
-        minimum=0.001,
-        maximum=10000.0,
+        4.0, "Standard deviation of the camera's linear acceleration, in m/s^2", (0.001, 10000.0)
     )
 
     def __post_init__(self) -> None:
@@ -185,16 +172,15 @@ class CalibrationErrors:
     """
 
     principal_point: float = setting(
-        1.0, "Standard deviation of the principal point, in pixels", minimum=0.0, maximum=1000.0
+        1.0, "Standard deviation of the principal point, in pixels", (0.0, 1000.0)
     )
     focal_length: float = setting(
-        0.002, "Standard deviation of the focal length, as a share of it", minimum=0.0, maximum=1.0
+        0.002, "Standard deviation of the focal length, as a share of it", (0.0, 1.0)
     )
     distortion: float = setting(
         0.5,
         "Standard deviation of the distortion at the corners of the image, in pixels",
-        minimum=0.0,
-        maximum=1000.0,
+        (0.0, 1000.0),
     )
 
     def __post_init__(self) -> None:
@@ -208,40 +194,28 @@ class LocalizerConfig:
     solver: str = setting(
         "r6p_vcwt", "Minimal solver that generates the hypotheses", choices=tuple(SOLVERS)
     )
-    solver_iterations: int = setting(
-        5, "Iterations of the iterative linear solvers", minimum=1, maximum=100
-    )
+    solver_iterations: int = setting(5, "Iterations of the iterative linear solvers", (1, 100))
     inlier_threshold: float = setting(
-        2.0,
-        "Largest reprojection error of an inlier, in raw image pixels",
-        minimum=0.01,
-        maximum=1000.0,
+        2.0, "Largest reprojection error of an inlier, in raw image pixels", (0.01, 1000.0)
     )
     max_iterations: int = setting(
         1000,
         "Most minimal samples of a frame, for its global-shutter start and again for its motion",
-        minimum=1,
-        maximum=1_000_000,
+        (1, 1_000_000),
     )
     confidence: float = setting(
         0.99,
         "Probability of having drawn an all-inlier sample at which the search stops",
-        minimum=0.0,
-        maximum=0.999999,
+        (0.0, 0.999999),
     )
-    min_inliers: int = setting(
-        12, "Fewest inliers of a pose that is accepted", minimum=7, maximum=1_000_000
-    )
+    min_inliers: int = setting(12, "Fewest inliers of a pose that is accepted", (7, 1_000_000))
     max_orientation_deviation: float = setting(
         0.07,
         "Largest standard deviation of the orientation of a pose that is accepted, in rad, about "
         "the axis known worst, of a camera at rest; three times as much of one that may move",
-        minimum=0.001,
-        maximum=10.0,
+        (0.001, 10.0),
     )
-    seed: int = setting(
-        0, "Seed of the random samples; every frame starts from it", minimum=0, maximum=2**31 - 1
-    )
+    seed: int = setting(0, "Seed of the random samples; every frame starts from it", (0, 2**31 - 1))
     velocity_prior: VelocityPrior = field(default_factory=VelocityPrior)
     acceleration: Acceleration = field(default_factory=Acceleration)
     calibration: CalibrationErrors = field(default_factory=CalibrationErrors)
@@ -249,8 +223,7 @@ class LocalizerConfig:
         0.0,
         "How well the points of the map are known, in m (one standard deviation; neighbours are "
         "assumed to be off together); it widens covariances and gates",
-        minimum=0.0,
-        maximum=1000.0,
+        (0.0, 1000.0),
     )
 
     def __post_init__(self) -> None:
@@ -339,8 +312,7 @@ class Matching:
         0.8,
         "A match by descriptor counts if its distance is below this part of the second-best "
         "landmark's; 1: always",
-        minimum=0.01,
-        maximum=1.0,
+        (0.01, 1.0),
     )
     mutual: bool = setting(
         True, "A match by descriptor counts if no other keypoint is nearer to the landmark"
@@ -349,15 +321,13 @@ class Matching:
         20.0,
         "While tracking, only landmarks predicted within this distance of a keypoint, in px, are "
         "compared with it by descriptor (more where the prediction is less certain); 0: all",
-        minimum=0.0,
-        maximum=10000.0,
+        (0.0, 10000.0),
     )
     max_keypoints: int = setting(
         2000,
         "Most keypoints of a frame to match by descriptor: those with the best scores, or the "
         "first ones",
-        minimum=7,
-        maximum=1_000_000,
+        (7, 1_000_000),
     )
 
     def __post_init__(self) -> None:
@@ -382,19 +352,16 @@ class Imu:
         choices=tuple(use.value for use in ImuUse),
     )
     time_offset: float = setting(
-        0.0,
-        "Time to add to the stamps of the IMU to get the camera's time, in s",
-        minimum=-10.0,
-        maximum=10.0,
+        0.0, "Time to add to the stamps of the IMU to get the camera's time, in s", (-10.0, 10.0)
     )
     estimate_time_offset: bool = setting(
         True, "Estimate what is left of the time offset, from the camera's motion"
     )
     gyroscope_noise: float = setting(
-        2e-4, "Noise density of the gyroscope, in rad/s/sqrt(Hz)", minimum=1e-7, maximum=1.0
+        2e-4, "Noise density of the gyroscope, in rad/s/sqrt(Hz)", (1e-7, 1.0)
     )
     gyroscope_bias_walk: float = setting(
-        1e-4, "Random walk of the gyroscope's bias, in rad/s^2/sqrt(Hz)", minimum=0.0, maximum=1.0
+        1e-4, "Random walk of the gyroscope's bias, in rad/s^2/sqrt(Hz)", (0.0, 1.0)
     )
     gravity: bool = setting(
         False, "Use the direction of gravity that the accelerometer shows; needs gravity_in_map"
@@ -403,8 +370,7 @@ class Imu:
         0.02,
         "How long a frame waits for the messages of its exposure before it is localized without "
         "them, in s",
-        minimum=0.0,
-        maximum=1.0,
+        (0.0, 1.0),
     )
 
     def __post_init__(self) -> None:
@@ -419,8 +385,7 @@ class Rig:
         0.02,
         "Images of several cameras are one frame if the middles of their exposures lie within this "
         "time, in s; cameras that run freely need half their period",
-        minimum=0.0,
-        maximum=1.0,
+        (0.0, 1.0),
     )
     estimate_time_offsets: bool = setting(
         False,
@@ -456,14 +421,12 @@ class NodeConfig(LocalizerConfig):
         0.0,
         "Time from the first to the last row of the full sensor image, in s; "
         "0: unknown, then no twist is published",
-        minimum=0.0,
-        maximum=LONGEST_READOUT_TIME,
+        (0.0, LONGEST_READOUT_TIME),
     )
     readout_time_deviation: float = setting(
         0.0,
         "Standard deviation of readout_time, in s, as rs_localizer calibrate finds it",
-        minimum=0.0,
-        maximum=LONGEST_READOUT_TIME,
+        (0.0, LONGEST_READOUT_TIME),
     )
     estimate_readout_time: bool = setting(
         False,
@@ -478,8 +441,7 @@ class NodeConfig(LocalizerConfig):
     stamp_offset: float = setting(
         0.0,
         "Time from header.stamp to the middle of the exposure of the first row, in s",
-        minimum=-10.0,
-        maximum=10.0,
+        (-10.0, 10.0),
     )
     pose_time: str = setting(
         PoseTime.STAMP.value,
@@ -496,8 +458,7 @@ class NodeConfig(LocalizerConfig):
         20_000,
         "Most points of a frame that are used: those with the best scores, or without scores "
         "some of all parts of the image",
-        minimum=7,
-        maximum=1_000_000,
+        (7, 1_000_000),
     )
     base_frame: str = setting(
         "",
@@ -539,8 +500,7 @@ class NodeConfig(LocalizerConfig):
         0.2,
         "How long to wait for a transform that is not there yet, and how far map_to_odom is "
         "stamped into the future, in s",
-        minimum=0.0,
-        maximum=10.0,
+        (0.0, 10.0),
     )
     map_file: str = setting(
         "",
@@ -644,10 +604,7 @@ class DetectorConfig:
         "", "File of the marker map; rs_localizer markers make writes one with the prints"
     )
     min_side: float = setting(
-        10.0,
-        "Markers with a shorter side than this, in px, are left out",
-        minimum=0.0,
-        maximum=10000.0,
+        10.0, "Markers with a shorter side than this, in px, are left out", (0.0, 10000.0)
     )
     transport: str = setting(
         ImageTransport.AUTO.value,
@@ -658,8 +615,7 @@ class DetectorConfig:
     readout_time: float = setting(
         0.0,
         "Only for the debug image: time from the first to the last row, in s, as the localizer's",
-        minimum=0.0,
-        maximum=0.2,
+        (0.0, 0.2),
     )
     scan_direction: str = setting(
         ScanDirection.TOP_TO_BOTTOM.value,
@@ -670,8 +626,7 @@ class DetectorConfig:
         0.0,
         "Only for the debug image: time from header.stamp to the middle of the exposure of the "
         "first row, in s, as the localizer's",
-        minimum=-10.0,
-        maximum=10.0,
+        (-10.0, 10.0),
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
     bond_heartbeat_period: float = bond_setting()
@@ -698,10 +653,7 @@ class FeatureConfig:
         choices=tuple(kind.value for kind in FeatureKind),
     )
     max_keypoints: int = setting(
-        1000,
-        "Most keypoints of an image: the best ones of all its parts",
-        minimum=7,
-        maximum=1_000_000,
+        1000, "Most keypoints of an image: the best ones of all its parts", (7, 1_000_000)
     )
     transport: str = setting(
         ImageTransport.AUTO.value,

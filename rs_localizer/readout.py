@@ -11,7 +11,10 @@ from __future__ import annotations
 import csv
 import difflib
 import io
-from dataclasses import dataclass
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 
 from rs_localizer import data
@@ -84,27 +87,54 @@ def find_readout(name: str, mode: str = "") -> list[Known]:
     return matching
 
 
-def shared_row(
-    name: str, mode: str, readout_time: float, deviation: float, firmware: str = ""
-) -> str:
-    """A row for the table, of one recording: two lines of CSV, the first one its columns.
+def measured(
+    name: str, mode: str, values: Sequence[tuple[float, float]], firmware: str = ""
+) -> Known:
+    """An entry of the table, from recordings of one mode: their weighted mean.
+
+    Its deviation is what they claim together or, where they differ by more, what they differ by.
 
     Args:
         name: of the camera.
         mode: as ``1920x1080 30 Hz``.
-        readout_time, deviation: s.
+        values: readout time and deviation of each recording, s.
         firmware: of the camera; empty: not known.
     """
+    weights = [1.0 / deviation**2 for _, deviation in values]
+    sums = sum(weights)
+    mean = sum(w * time for w, (time, _) in zip(weights, values, strict=True)) / sums
+    apart = sum(w * (time - mean) ** 2 for w, (time, _) in zip(weights, values, strict=True))
+    deviation = math.sqrt(max(1.0, apart / max(1, len(values) - 1)) / sums)
     half = _QUARTILE * deviation
-    milliseconds = [f"{1e3 * value:.3f}" for value in (readout_time, readout_time - half)]
-    milliseconds.append(f"{1e3 * (readout_time + half):.3f}")
     about = f", firmware {firmware}" if firmware else ""
     source = f"rs_localizer calibrate (+- {1e3 * deviation:.3f} ms{about})"
+    return Known(name, mode, mean, mean - half, mean + half, len(values), source)
+
+
+def as_rows(entries: Iterable[Known]) -> str:
+    """Rows of the table, under its columns."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_COLUMNS)
-    writer.writerow([name, mode, *milliseconds, 1, source])
+    for one in entries:
+        milliseconds = [f"{1e3 * value:.3f}" for value in (one.median, one.low, one.high)]
+        writer.writerow([one.name, one.mode, *milliseconds, one.number, one.source])
     return text.getvalue()
+
+
+def as_json(entry: Known) -> dict[str, object]:
+    """An entry in s, and in the words of other programs.
+
+    ``odm`` (OpenDroneMap's ``--rolling-shutter-readout``) and ``gyroflow``
+    (``frame_readout_time``) are in ms and count all rows; ``kalibr`` (``lineDelay``) is in s, from
+    row to row, None for a mode that does not say how many there are.
+    """
+    size = re.match(r"\d+x(\d+)", entry.mode)
+    line = None if size is None else entry.median / (int(size[1]) - 1)
+    whole = 1e3 * (entry.median + (line or 0.0))
+    values = asdict(entry) | {"upper_bound": entry.upper_bound}
+    values |= {"odm": whole, "gyroflow": whole, "kalibr": line}
+    return {k: float(f"{v:.6g}") if isinstance(v, float) else v for k, v in values.items()}
 
 
 def _has(text: str, words: str) -> bool:

@@ -4,6 +4,7 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "rs_localizer"
@@ -51,6 +52,7 @@ MAY_IMPORT |= {
 }
 
 
+@cache
 def imported(source: str, inside: str) -> set[str]:
     """Absolute dotted names that a module of the package `inside` imports, late ones included."""
     names = set()
@@ -141,7 +143,6 @@ COMPILED = {"kernel", "inlined", "error_model"}
 INSTEAD_OF_KERNELS = {"solvers/r6p.py: solve_batch"}
 # What is called with keywords: declarations, and the library's own entrance for cameras and rigs.
 BY_KEYWORDS = {
-    "config.py: setting",
     "solvers/minimal.py: solve_minimal",
     "localizer.py: localize",
     "localizer.py: find",

@@ -16,8 +16,7 @@ from benchmarks.fuzzing import seeds
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.keypoints import read_keypoints, read_map
+from rs_localizer.io.clouds import make_cloud, read_keypoints, read_map
 from rs_localizer.io.maps.files import read_map_file, write_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.maps.ply import write_ply

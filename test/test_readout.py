@@ -14,11 +14,13 @@ import pytest
 from rs_localizer import data
 from rs_localizer.readout import (
     StampAt,
+    as_json,
+    as_rows,
     find_readout,
     from_all_rows,
     from_line_time,
     known_cameras,
-    shared_row,
+    measured,
     stamp_offset,
 )
 
@@ -59,8 +61,8 @@ def test_conventions():
 
 
 def test_a_shared_row_fits_the_table():
-    text = shared_row('Maker "One", 2', "1920x1080 30 Hz", 0.0206, 0.0001, "2.10")
-    (row,) = csv.DictReader(text.splitlines())
+    one = measured('Maker "One", 2', "1920x1080 30 Hz", [(0.0206, 0.0001)], "2.10")
+    (row,) = csv.DictReader(as_rows([one]).splitlines())
     with data.path("readout_times/table.csv").open(encoding="utf-8") as file:
         assert list(row) == next(csv.reader(file))
     assert (row["name"], row["mode"], row["number"]) == ('Maker "One", 2', "1920x1080 30 Hz", "1")
@@ -71,13 +73,29 @@ def test_a_shared_row_fits_the_table():
     assert row["source"] == "rs_localizer calibrate (+- 0.100 ms, firmware 2.10)"
 
 
+def test_recordings_count_by_their_deviations_and_by_what_they_differ():
+    alike = measured("One", "640x480", [(0.02, 1e-4), (0.0201, 1e-4), (0.03, 1.0)])
+    assert (alike.number, alike.median) == (3, pytest.approx(0.02005, abs=1e-9))
+    assert alike.source.endswith("(+- 0.071 ms)")  # 0.1 / sqrt(2)
+    apart = measured("One", "640x480", [(0.02, 1e-4), (0.022, 1e-4)])
+    assert apart.source.endswith("(+- 1.000 ms)")  # sample deviation 1.414, over sqrt(2)
+
+
+def test_other_programs_have_their_own_units():
+    told = as_json(measured("One", "640x480 30 Hz", [(0.0479, 1e-4)]))
+    assert (told["odm"], told["gyroflow"], told["kalibr"]) == (48.0, 48.0, 0.0001)
+    photos = as_json(measured("One", "photos", [(0.0479, 1e-4)]))
+    assert (photos["odm"], photos["kalibr"]) == (47.9, None)
+
+
 def test_every_camera_has_a_page_and_the_json_the_whole_table(tmp_path):
     docs = Path(__file__).parents[1] / "docs"
     made = runpy.run_path(str(docs / "make_cameras.py"))
     made["write"](tmp_path)
     table = known_cameras()
     told = json.loads((tmp_path / made["JSON"]).read_text())
-    assert {*told[0]} == {field.name for field in fields(table[0])} | {"upper_bound"}
+    names = {field.name for field in fields(table[0])}
+    assert {*told[0]} == names | {"upper_bound", "odm", "gyroflow", "kalibr"}
     medians = {(row["name"], row["mode"]): row["median"] for row in told}
     assert medians == pytest.approx({(known.name, known.mode): known.median for known in table})
     index = (tmp_path / "index.md").read_text()

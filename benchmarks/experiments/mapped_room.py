@@ -27,7 +27,7 @@ from tqdm import tqdm
 from rs_localizer import data
 from rs_localizer.evaluation.map_pictures import save_pictures
 from rs_localizer.evaluation.room_mapping import Errors, Piece, Room, without_refinement
-from rs_localizer.io.maps.npz import write_npz
+from rs_localizer.io.maps.files import write_npz
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.mapping.report import rows
 from rs_localizer.simulation.marker_frames import CAMERA, SENSOR

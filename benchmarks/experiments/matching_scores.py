@@ -13,7 +13,7 @@ from benchmarks.experiments.results import Claim, Context, Statement
 from rs_localizer.config import Matching
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.keypoints import Keypoints
+from rs_localizer.io.clouds import Keypoints
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher

@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from rs_localizer import data
+from rs_localizer.cli import integer, number
 from rs_localizer.core.arrays import Array
 from rs_localizer.evaluation.room_mapping import Piece, Room
 from rs_localizer.io.trajectories import read_tum
@@ -34,7 +35,6 @@ from rs_localizer.mapping.colmap import Effort
 from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.inertial_metres import inertial_metres
 from rs_localizer.mapping.refine import RefinedMap
-from rs_localizer.process.arguments import integer, number
 from rs_localizer.simulation.imu import Lever, simulate_imu
 from rs_localizer.simulation.marker_frames import CAMERA, SENSOR
 from rs_localizer.simulation.settings import ImuSettings

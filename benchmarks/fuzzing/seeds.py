@@ -24,8 +24,8 @@ from rosbags.typesys import Stores, get_typestore
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.maps.files import write_npz
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room

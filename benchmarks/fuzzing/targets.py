@@ -20,10 +20,9 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.calibration import CalibrationError, read_calibration
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.clouds import read_correspondences, read_keypoints, read_map
 from rs_localizer.io.images import read_compressed_image, read_image
 from rs_localizer.io.imu import ImuFileError, read_imu, read_imu_csv
-from rs_localizer.io.keypoints import read_keypoints, read_map
 from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError

@@ -20,7 +20,7 @@ from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
 from benchmarks.honesty.benches import Bench, Recordings, benches
 from benchmarks.honesty.text import heading, line
 from rs_localizer import data
-from rs_localizer.process.arguments import integer
+from rs_localizer.cli import integer
 
 _NAMES = ("p3p", "tags", "rendered")
 

@@ -22,16 +22,14 @@ from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC, write_frame
-from rs_localizer.io.trajectories import read_tum
+from rs_localizer.io.trajectories import read_motions, read_tum
 from rs_localizer.markers.detection import Detections, MarkerDetector
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import frame_stamps, middle_stamp
-from rs_localizer.simulation.image_sequence import in_order
 from rs_localizer.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC, write_truth
-from rs_localizer.simulation.renderer import Renderer
+from rs_localizer.simulation.renderer import Renderer, in_order
 from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.simulation.walls import three_walls

@@ -30,13 +30,13 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from benchmarks.hand_held import CAMERA, hand_motion
 from benchmarks.load.measuring import cpu_time, running
+from rs_localizer.cli import integer, number
 from rs_localizer.core.arrays import Array
 from rs_localizer.io import topics
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import make_camera_info, make_correspondences
 from rs_localizer.io.rigs import RIG_FRAME, RigParts, optical_frame
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.process.arguments import integer, number
 from rs_localizer.ros.node.conversion import copy_message, make_message, message_class
 from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.settings import NODE_NAME, write_parameters

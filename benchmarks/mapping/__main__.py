@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from benchmarks.mapping.refining import bend, bound, large
 from benchmarks.mapping.surveying import coverage, rendered, rigs, surveys
 from benchmarks.mapping.weighing import weighing
-from rs_localizer.process.arguments import integer
+from rs_localizer.cli import integer
 
 _PARTS: dict[str, Callable[[int], Iterator[str]]] = {
     "bend": bend, "bound": bound, "large": large, "surveys": surveys,

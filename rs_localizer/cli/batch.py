@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import csv
 import fcntl
 import importlib.util
+import io
 import os
 import shutil
 import time
@@ -15,30 +17,31 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rs_localizer.cli import WORKING, UsageError
-from rs_localizer.process.arguments import integer
+from rs_localizer.cli import WORKING, UsageError, integer
 
 if WORKING:
     from tqdm import tqdm
 
-    from rs_localizer.io.atomic_files import write_errors
+    from rs_localizer.io.atomic_files import atomic_files, write_errors
     from rs_localizer.io.remote import Location, is_url
     from rs_localizer.offline.fleet.cluster import Where, perform_all
-    from rs_localizer.offline.fleet.identity import folder_names, identity, program, read_marker
-    from rs_localizer.offline.fleet.summary import (
-        CSV,
-        DONE,
-        FAILED,
-        MARKDOWN,
-        OPEN,
-        PICTURE,
-        Row,
-        counted,
-        write_summary,
+    from rs_localizer.offline.fleet.task import (
+        PARTIAL,
+        Figures,
+        Kind,
+        Task,
+        finished,
+        folder_names,
+        identity,
+        program,
+        read_marker,
+        readable,
     )
-    from rs_localizer.offline.fleet.task import PARTIAL, Kind, Outcome, Task, finished, readable
+
+if TYPE_CHECKING:  # half a second of importing, which workers do not need
+    from matplotlib.figure import Figure
 
 # Arguments that say what to do with which recordings, and nothing of a result.
 _OF_THE_FLEET = ("recordings", "out", "workers", "scheduler", "overwrite")
@@ -100,7 +103,10 @@ def run_batch(args: Namespace, plan: Plan) -> None:
         raise UsageError("many recordings need --out DIR, for a folder of each")
     if args.workers is not None and args.scheduler is not None:
         raise UsageError("--workers are of this machine; give it or --scheduler")
-    _need_dask()
+    if importlib.util.find_spec("distributed") is None:
+        raise ValueError(
+            "many recordings need Dask, which is not installed: pip install 'rs_localizer[fleet]'"
+        )
     out = args.out.resolve()
     tasks = _tasks(args, plan, out)
     _check(tasks, plan)
@@ -119,13 +125,6 @@ def run_batch(args: Namespace, plan: Plan) -> None:
     print(f"written to {args.out}: {CSV}, {MARKDOWN}, {PICTURE}")
     if failed := sum(row.state == FAILED for row in rows.values()):
         raise ValueError(f"{failed} of {len(rows)} recordings failed; {args.out / CSV} says why")
-
-
-def _need_dask() -> None:
-    if importlib.util.find_spec("distributed") is None:
-        raise ValueError(
-            "many recordings need Dask, which is not installed: pip install 'rs_localizer[fleet]'"
-        )
 
 
 def _tasks(args: Namespace, plan: Plan, out: Path) -> list[Task]:
@@ -194,7 +193,10 @@ def _work(tasks: list[Task], where: Where, rows: dict[str, Row]) -> None:
     bar = tqdm(total=len(tasks), initial=before, unit="recording", disable=None)
     with bar, contextlib.closing(perform_all(open_tasks, where)) as outcomes:
         for outcome in outcomes:
-            rows[outcome.name] = row = _row(rows[outcome.name].recording, outcome)
+            state = FAILED if outcome.figures is None else DONE
+            recording, figures = rows[outcome.name].recording, outcome.figures or {}
+            row = Row(recording, outcome.name, state, figures, outcome.reason)
+            rows[outcome.name] = row
             busy += outcome.seconds
             bar.update()
             bar.write(f"{row.folder}: {_said(row)}")
@@ -215,11 +217,6 @@ def _find_finished(tasks: list[Task], rows: dict[str, Row]) -> list[Task]:
         else:
             rows[task.name] = Row(task.recording, task.name, DONE, figures)
     return open_tasks
-
-
-def _row(recording: Location, outcome: Outcome) -> Row:
-    state = FAILED if outcome.figures is None else DONE
-    return Row(recording, outcome.name, state, outcome.figures or {}, outcome.reason)
 
 
 def _said(row: Row) -> str:
@@ -248,3 +245,110 @@ def folder_name(option: str, folder: Path | None) -> str | None:
 
 def inputs(*files: Location | None) -> list[Location]:
     return [file if is_url(file) else Path(file) for file in files if file]
+
+
+CSV, MARKDOWN, PICTURE = "summary.csv", "summary.md", "summary.png"
+
+DONE, FAILED, OPEN = "done", "failed", "not done"
+"""States of a recording; not done: the work was interrupted before."""
+
+_FIRST, _LAST = ("recording", "folder", "state"), ("reason",)
+_BAR = "\\|"  # in a cell
+_MOST_PANELS = 5
+_WIDTH, _PANEL = 8.0, 1.7  # inches
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What the summary says of a recording."""
+
+    recording: Location
+    folder: str
+    state: str
+    figures: Figures
+    reason: str = ""
+
+    def cells(self, columns: Sequence[str]) -> list[str]:
+        """The texts of these columns of figures, what is known of all before and behind."""
+        figures = [_text(self.figures.get(name, "")) for name in columns]
+        return [str(self.recording), self.folder, self.state, *figures, self.reason]
+
+
+def write_summary(out: Path, command: str, rows: Sequence[Row]) -> None:
+    """Write :data:`CSV`, :data:`MARKDOWN` and :data:`PICTURE`, each at once.
+
+    They say the same whoever did the work, in whatever order it was done.
+    """
+    columns = list(dict.fromkeys(name for row in rows for name in row.figures))
+    with atomic_files(*(out / name for name in (CSV, MARKDOWN, PICTURE))) as (table, text, picture):
+        table.write_bytes(_as_csv(rows, columns))
+        text.write_bytes(_as_markdown(command, rows, columns))
+        # Without the version of Matplotlib, which would change the bytes.
+        _draw(rows, columns).savefig(picture, dpi=110, metadata={"Software": None})
+
+
+def counted(rows: Sequence[Row]) -> str:
+    """How many of each state."""
+    states = [row.state for row in rows]
+    some = [f"{states.count(state)} {state}" for state in (DONE, FAILED, OPEN) if state in states]
+    return f"{len(rows)} recordings: {', '.join(some)}"
+
+
+def _as_csv(rows: Sequence[Row], columns: Sequence[str]) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*_FIRST, *columns, *_LAST])
+    writer.writerows(map(_plain, row.cells(columns)) for row in rows)
+    return text.getvalue().encode()
+
+
+def _as_markdown(command: str, rows: Sequence[Row], columns: Sequence[str]) -> bytes:
+    names = [*_FIRST, *columns, *_LAST]
+    cells = [row.cells(columns) for row in rows]
+    lines = [
+        f"# {command}: {counted(rows)}",
+        "",
+        f"| {' | '.join(names)} |",
+        f"|{'---|' * len(names)}",
+        *(f"| {' | '.join(cell.replace('|', _BAR) for cell in row)} |" for row in cells),
+    ]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _plain(cell: str) -> str:
+    """Text that a spreadsheet does not take for a formula."""
+    with contextlib.suppress(ValueError):
+        float(cell)
+        return cell
+    return f"'{cell}" if cell.startswith(("=", "+", "-", "@", "\t", "\r")) else cell
+
+
+def _text(value: float | int | str) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _draw(rows: Sequence[Row], columns: Sequence[str]) -> Figure:
+    """The first figures that are numbers, recording by recording; what failed is marked below."""
+    from matplotlib.figure import Figure
+
+    numbers = [name for name in columns if any(_is_number(row, name) for row in rows)]
+    shown = numbers[:_MOST_PANELS] or [""]
+    figure = Figure((_WIDTH, 0.6 + _PANEL * len(shown)), layout="constrained")
+    panels = figure.subplots(len(shown), sharex=True, squeeze=False)[:, 0]
+    without = [k for k, row in enumerate(rows) if row.state != DONE]
+    for panel, name in zip(panels, shown, strict=True):
+        known = [k for k, row in enumerate(rows) if _is_number(row, name)]
+        panel.plot(known, [float(rows[k].figures[name]) for k in known], "o", ms=3, color="#0072b2")
+        bottom = panel.get_xaxis_transform()
+        panel.plot(without, [0.04] * len(without), "x", color="#d55e00", transform=bottom)
+        panel.set_ylabel(name, fontsize=8)
+        panel.tick_params(labelsize=8)
+        panel.grid(alpha=0.3)
+    figure.suptitle(counted(rows), fontsize=9)
+    panels[-1].set_xlabel(f"recording, in the order of {CSV}; x: without a result", fontsize=8)
+    return figure
+
+
+def _is_number(row: Row, name: str) -> bool:
+    value = row.figures.get(name)
+    return isinstance(value, (int, float)) and not isinstance(value, bool)

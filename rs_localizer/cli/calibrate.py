@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, add_overwrite, refuse_existing
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, number, refuse_existing
 from rs_localizer.cli.batch import (
     Plan,
     add_batch_arguments,
@@ -37,7 +38,6 @@ from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.rig_input import cameras_of, mounting_lines, numbers
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.io.topics import IMU
-from rs_localizer.process.arguments import number
 
 if WORKING:
     import numpy as np
@@ -74,7 +74,7 @@ if WORKING:
     )
     from rs_localizer.offline.replay import find_topics, has_frames
     from rs_localizer.pipeline.images import FrameDetector
-    from rs_localizer.readout import shared_row
+    from rs_localizer.readout import Known, as_json, as_rows, measured
     from rs_localizer.settings import write_parameters
     from rs_localizer.trajectory import verdict
     from rs_localizer.trajectory.calibration import Calibration, calibrate
@@ -164,7 +164,7 @@ def imu_parameters(found: Calibration, config: NodeConfig) -> str:
 _LENS, _MAP = "camera_info.yaml", "map.yaml"
 _TRANSFORMS, _CAMCHAIN = "transforms.launch.xml", "camchain.yaml"
 # Of each result of many.
-_SHUTTER = "shutter.yaml"
+_SHUTTER, _SHARED = "shutter.yaml", ("share.csv", "share.json")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -234,7 +234,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--share",
         metavar="CAMERA",
         help="also write a row of this camera for the table of readout times, to send as a pull "
-        "request: FILE_share.csv beside --out",
+        "request: FILE_share.csv beside --out, and FILE_share.json for other programs; of many "
+        "recordings, share.csv and share.json with what they say together",
     )
     parser.add_argument("--firmware", default="", metavar="TEXT", help="for --share: the camera's")
     add_batch_arguments(parser)
@@ -264,11 +265,15 @@ def run(args: argparse.Namespace) -> Figures | None:
     return None
 
 
+def _finds_lens(args: argparse.Namespace, recording: Path) -> bool:
+    return args.intrinsics or (args.calibration is None and not is_bag(recording))
+
+
 def calibrate_one(args: argparse.Namespace) -> Calibration:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
-        lens = args.intrinsics or (args.calibration is None and not is_bag(args.recording))
-        beside = {_LENS: lens, _MAP: args.map or args.board, "share.csv": args.share}
+        lens = _finds_lens(args, args.recording)
+        beside = {_LENS: lens, _MAP: args.map or args.board} | dict.fromkeys(_SHARED, args.share)
         refuse_existing(args, *(name for name, written in beside.items() if written))
     config = _config(args)
     source = _read(args, config)
@@ -329,11 +334,36 @@ def _share(args: argparse.Namespace, found: Calibration) -> None:
     """The row of the table that this recording gives."""
     width, height = found.fit.camera.size
     mode = f"{width}x{height} {1.0 / found.stamps.interval:.4g} Hz"
-    row = shared_row(args.share, mode, verdict.readout_time(found), found.deviation, args.firmware)
-    path = args.out.with_name(f"{args.out.stem}_share.csv")
-    with atomic_files(path) as (part,):
-        part.write_text(row, encoding="utf-8")
-    print(f"written: {path}, a row for rs_localizer/data/readout_times/table.csv: send it to us")
+    values = [(verdict.readout_time(found), found.deviation)]
+    _write_shared(
+        args.out.with_name(f"{args.out.stem}_share"),
+        [measured(args.share, mode, values, args.firmware)],
+        deviation=found.deviation,
+        scan_direction=str(verdict.scan_direction(found)),
+    )
+
+
+def share_all(args: argparse.Namespace, folders: Sequence[Path]) -> None:
+    """The rows that many recordings give together, one for each mode."""
+    modes: dict[str, list[tuple[float, float]]] = {}
+    for folder in folders:
+        (one,) = json.loads((folder / f"shutter_{_SHARED[1]}").read_text(encoding="utf-8"))
+        modes.setdefault(one["mode"], []).append((one["median"], one["deviation"]))
+    entries = [measured(args.share, *each, args.firmware) for each in modes.items()]
+    if entries:
+        _write_shared(args.out / "share", entries)
+
+
+def _write_shared(path: Path, entries: Sequence[Known], **more: float | str) -> None:
+    files = path.with_name(f"{path.name}.csv"), path.with_name(f"{path.name}.json")
+    told = json.dumps([as_json(entry) | more for entry in entries], indent=1) + "\n"
+    with atomic_files(*files) as parts:
+        for part, text in zip(parts, (as_rows(entries), told), strict=True):
+            part.write_text(text, encoding="utf-8")
+    print(
+        f"written: {files[0]}, for rs_localizer/data/readout_times/table.csv: send it to us; and "
+        f"{files[1].name}, for other programs"
+    )
 
 
 def _config(args: argparse.Namespace) -> NodeConfig:
@@ -550,12 +580,13 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
     for name in ("imu", "share", "workers", "scheduler"):
         if getattr(args, name) is not None:
             raise UsageError(f"--{name} is for one camera: leave it out with --rig")
-    if args.out is not None:
-        refuse_existing(args, _TRANSFORMS, _CAMCHAIN)
     # Cameras by name need a readout time; what it is does not matter where it is estimated.
     args.assignments = ["readout_time:=0.03", *args.assignments]
     config, recordings, maps = _config(args), dict[str, Recording](), list[MarkerMap]()
     cameras = cameras_of(args, config)
+    if args.out is not None:
+        found = cameras if _finds_lens(args, args.recordings[0]) else ()
+        refuse_existing(args, _TRANSFORMS, _CAMCHAIN, *(f"{name}_{_LENS}" for name in found))
     intrinsics = args.intrinsics
     for name, own in cameras.items():
         print(f"{name}:")
@@ -662,7 +693,7 @@ def _write_rig(
         del writers[chain]
         print(f"no camchain: {error}")
     for name, camera in parts.cameras.items() if intrinsics else ():
-        lens = path.with_name(f"{path.stem}_{name}_camera_info.yaml")
+        lens = path.with_name(f"{path.stem}_{name}_{_LENS}")
         writers[lens] = partial(write_calibration, camera=camera)
 
     def write_values(part: Path) -> None:
@@ -698,7 +729,9 @@ def _calibrate_batch(args: argparse.Namespace) -> None:
     kind = Kind("calibrate", _calibrate_of_many, " ".join(["calibrate", *given]), _calibrate_warm)
     run_batch(
         argparse.Namespace(**vars(args) | {"plots": plots}),
-        Plan(kind, lambda _: files, args.overwrite),
+        Plan(
+            kind, lambda _: files, args.overwrite, partial(share_all, args) if args.share else None
+        ),
     )
 
 

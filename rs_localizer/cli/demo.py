@@ -45,11 +45,10 @@ if WORKING:
     )
     from rs_localizer.evaluation.room_mapping import Piece, Room, without_refinement
     from rs_localizer.io.bags import BagWriter
-    from rs_localizer.io.estimates import Motions
-    from rs_localizer.io.maps.npz import write_npz
+    from rs_localizer.io.maps.files import write_npz
     from rs_localizer.io.recording import make_camera_info, write_frame
     from rs_localizer.io.topics import KEYPOINTS
-    from rs_localizer.io.trajectories import Trajectory, Twists, read_tum
+    from rs_localizer.io.trajectories import Motions, Trajectory, Twists, read_tum
     from rs_localizer.io.video import Image
     from rs_localizer.mapping.colmap import Effort, require
     from rs_localizer.process.missing import explain

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, integer, number, replaced
 from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
 from rs_localizer.cli.image_input import (
     Source,
@@ -29,7 +29,6 @@ from rs_localizer.cli.rig_input import cameras_of
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
 from rs_localizer.io.bags import STORAGES, BagWriter, is_bag
 from rs_localizer.io.image_clock import DEFAULT_START_NS
-from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import build, settings
 
 if WORKING:
@@ -42,8 +41,7 @@ if WORKING:
     from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
     from rs_localizer.offline.fleet.task import Figures, Kind
     from rs_localizer.offline.image_sources import Carried, Shot
-    from rs_localizer.pipeline.images import FrameDetector
-    from rs_localizer.pipeline.keypoints import FrameExtractor
+    from rs_localizer.pipeline.images import FrameDetector, FrameExtractor
 
 # Options of markers and boards.
 _OF_MARKERS = ("map", "board", "pattern", "square", "min_side")
@@ -106,7 +104,7 @@ def detect_one(args: argparse.Namespace) -> list[Recorded]:
     """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
     marker_map = find_map(args)
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
-    told = []
+    recordings = []
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
         with BagWriter(out, args.storage) as bag:
             for name, own in _cameras(args, bag).items():
@@ -115,16 +113,16 @@ def detect_one(args: argparse.Namespace) -> list[Recorded]:
                 detector.warm_up()
                 with opened(own, args.images, args.start) as source:
                     recorded = _record(own, name, source, detector, bag)
-                told.append((name, recorded, notices, detector.seconds, source.clock))
+                recordings.append((name, recorded, notices, detector.seconds, source.clock))
         write_shutter(args, out, marker_map.settings)
-    for name, recorded, notices, seconds, clock in told:
+    for name, recorded, notices, seconds, clock in recordings:
         _tell(f"{args.out}{f', {name}' if name else ''}", recorded, notices)
         for fault in (*recorded.faults, *time_faults(args, clock, recorded.period, name)):
             print(f"warning: {fault}")
         if args.timing:
             _tell_times(recorded.images, *seconds)
     tell_telemetry(args)
-    return [recorded for _, recorded, *_ in told]
+    return [recorded for _, recorded, *_ in recordings]
 
 
 def _cameras(args: argparse.Namespace, bag: BagWriter) -> dict[str, argparse.Namespace]:

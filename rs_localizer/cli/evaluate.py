@@ -7,9 +7,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError
+from rs_localizer.cli import WORKING, UsageError, number
 from rs_localizer.cli.batch import Plan, add_batch_arguments, folder_name, run_batch
-from rs_localizer.process.arguments import number
 
 if WORKING:
     import numpy as np
@@ -32,9 +31,8 @@ if WORKING:
     )
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import BagError, open_bag
-    from rs_localizer.io.estimates import Motions, read_motions
     from rs_localizer.io.recording import CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC
-    from rs_localizer.io.trajectories import Trajectory, Twists, read_twists
+    from rs_localizer.io.trajectories import Motions, Trajectory, Twists, read_motions, read_twists
     from rs_localizer.offline.fleet.task import Figures, Kind
 
 _AUTO = "auto"

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import WORKING, UsageError, read_counts
-from rs_localizer.process.arguments import number
+from rs_localizer.cli import WORKING, UsageError, number, read_counts
 
 if WORKING:
     from rs_localizer.markers.consistency import other_units

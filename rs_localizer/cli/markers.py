@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import WORKING, UsageError, add_common, read_counts
+from rs_localizer.cli import WORKING, UsageError, add_common, integer, number, read_counts
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.printing import PAGES, page_files, plan, write_pages
-from rs_localizer.process.arguments import integer, number
 
 if WORKING:
     from rs_localizer.io.atomic_files import atomic_files

@@ -5,9 +5,8 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 
-from rs_localizer.readout import find_readout
+from rs_localizer.readout import as_json, find_readout
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,4 +29,4 @@ def run(args: argparse.Namespace) -> list[dict[str, object]]:
             f"{entry.number:6}  {entry.source}{note if entry.upper_bound else ''}"
         )
     print("Published values, perhaps of other modes: rs_localizer calibrate measures yours.")
-    return [asdict(entry) for entry in entries]
+    return [as_json(entry) for entry in entries]

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from rs_localizer.cli import WORKING, UsageError, detect, import_ros
 from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
-from rs_localizer.cli.image_input import add_telemetry
+from rs_localizer.cli.image_input import add_telemetry, telemetry_of
 from rs_localizer.cli.replay_result import (
     BRIDGED,
     POSES,
@@ -225,6 +225,8 @@ def _replay_one(
         alone = argparse.Namespace(**vars(args))
         alone.params, alone.assignments = own if own.exists() else None, []
         alone.map = None if by_markers else _map_file(Path(args.map))
+        telemetry = telemetry_of(Path(recording), args)
+        alone.exposure = None if telemetry is None else telemetry.exposure
         return _replay_matches(alone, matches, recording, out, timed)
 
 
@@ -554,7 +556,8 @@ def _play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) -
     """
     player = import_ros("player", "--ros")
     images = image_topics(bag)
-    inputs = images + (_of_type(bag, INFO_TYPE) if topics is None else list(topics.names))
+    infos = sorted(topic for topic, kind in bag.topics.items() if kind == INFO_TYPE)
+    inputs = images + (infos if topics is None else list(topics.names))
     if not images and topics is None:
         raise BagError(f"{bag.path} has nothing to play: no matches, keypoints or images")
     names = tuple(dict.fromkeys((*_transforms(bag), *imus, *inputs)))
@@ -574,10 +577,6 @@ def _play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) -
         print(f"{count} poses received on {topic}")
     if not played.poses:
         print(f"no node {NODE_NAME} was there to publish poses")
-
-
-def _of_type(bag: BagReader, type_name: str) -> list[str]:
-    return sorted(topic for topic, kind in bag.topics.items() if kind == type_name)
 
 
 def _transforms(bag: BagReader) -> list[str]:

@@ -45,18 +45,16 @@ if WORKING:
     from rs_localizer.io.topics import TF
     from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
     from rs_localizer.io.transforms import TransformError, make_transform
-    from rs_localizer.offline.fleet.identity import MARKER
-    from rs_localizer.offline.fleet.task import LOG, Figures
+    from rs_localizer.offline.fleet.task import LOG, MARKER, Figures
     from rs_localizer.offline.image_sources import IMAGE_TYPES
     from rs_localizer.offline.replay import TF_TYPE
     from rs_localizer.offline.smoothed import SmoothedFrames
     from rs_localizer.offline.table import FrameTable
-    from rs_localizer.pipeline.broadcasts import broadcast
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.pipeline.imu import ImuState
     from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
-    from rs_localizer.pipeline.reasons import explained
-    from rs_localizer.pipeline.refusal import Refusal
+    from rs_localizer.pipeline.published import broadcast
+    from rs_localizer.pipeline.refusal import Refusal, explained
     from rs_localizer.settings import NODE_NAME
     from rs_localizer.solvers.table import find_solver
 
@@ -178,7 +176,8 @@ class Exports:
     """What other programs want of each frame, as it comes.
 
     Args:
-        args: of :func:`add_export_arguments`; ``smooth`` among them.
+        args: of :func:`add_export_arguments`; ``smooth`` among them, and ``exposure`` (s) where a
+            video says it.
         localizer: that makes the frames; it has their camera.
         out: directory of the result.
     """
@@ -190,6 +189,7 @@ class Exports:
         self._gsplat: Path | None = args.gsplat
         self._ncore: Path | None = args.ncore
         self._smoothed: bool = args.smooth
+        self._exposure: float = getattr(args, "exposure", None) or 0.0
         self._rows = {name: Track() for name in self._named}
         self._views: dict[int, View] = {}
         self._rolling: dict[int, Array] = {}  # (3,4,4) at the first, middle and last row
@@ -284,7 +284,7 @@ class Exports:
             replace(view, file=files.get(stamp, view.file))
             for stamp, view in sorted(self._views.items())
         ]
-        text = json.dumps(transforms(self._camera, views), indent=1)
+        text = json.dumps(transforms(self._camera, views, self._exposure), indent=1)
         (self._out / TRANSFORMS).write_text(text, encoding="utf-8")
         if missing := len(views) - len(files):
             print(

@@ -11,9 +11,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, UsageError
+from rs_localizer.cli import WORKING, UsageError, number
 from rs_localizer.cli.image_input import lenses_of
-from rs_localizer.process.arguments import number
 
 if WORKING:
     import numpy as np
@@ -125,15 +124,13 @@ class MapCamera:
 
 def add_mounting_argument(parser: argparse.ArgumentParser) -> None:
     """For :func:`map_cameras`."""
-    turn, place, offset = DETERMINED
     parser.add_argument(
         "--mounting",
         type=number(0.0, above=True),
         nargs=3,
         metavar=("DEG", "M", "S"),
-        default=[float(np.degrees(turn)), place, offset],
         help="standard deviations of a rig's extrinsics and clocks as they are given, which are "
-        "estimated as well (default: what calibrate --rig finds is known to, %(default)s)",
+        "estimated as well (default: the largest with which calibrate --rig accepts them)",
     )
 
 
@@ -171,14 +168,15 @@ def map_cameras(args: argparse.Namespace, config: NodeConfig) -> list[MapCamera]
     if lacking := [name for name in sources if not shutters[name].readout_time > 0.0]:
         raise UsageError(f"no readout_time of {', '.join(lacking)}: calibrate --rig finds it")
     first = given[next(iter(sources))].inverse()
+    known = DETERMINED  # rad, m, s
+    if args.mounting is not None:
+        known = tuple(np.multiply(args.mounting, [np.radians(1.0), 1.0, 1.0]))
     cameras = list[MapCamera]()
     for name, own in sources.items():
         pose, mounting = given[name] @ first, None
         if cameras:
             extrinsics = Extrinsics(pose.rotation, -pose.rotation.T @ pose.translation, 0.0)
-            turn, place, offset = args.mounting
-            deviations = np.repeat([np.radians(turn), place, offset], [3, 3, 1])
-            mounting = Mounting(extrinsics, deviations)
+            mounting = Mounting(extrinsics, np.repeat(known, [3, 3, 1]))
         shutter = {each.name: getattr(shutters[name], each.name) for each in fields(CameraSettings)}
         cameras.append(MapCamera(name, own.args, replace(config, **shutter), mounting))
     return cameras
@@ -191,7 +189,7 @@ def _by_tf(sources: Mapping[str, OfRig]) -> dict[str, Transform]:
     if not is_bag(path):
         return {}
     with open_bag(path) as bag:
-        found = {
+        poses = {
             name: transform_between(bag, own.frame, first.frame) for name, own in sources.items()
         }
-    return {name: pose for name, pose in found.items() if pose is not None}
+    return {name: pose for name, pose in poses.items() if pose is not None}

@@ -9,12 +9,11 @@ import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, integer, number, replaced
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import STORAGES, BagWriter
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
-from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import settings, write_parameters
 from rs_localizer.simulation.settings import (
     BODY_FROM_CAMERA,
@@ -40,10 +39,9 @@ if WORKING:
     from rs_localizer.io.trajectories import read_tum
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
-    from rs_localizer.simulation.image_sequence import rendered_frames
     from rs_localizer.simulation.imu import ImuBagWriter, Lever, simulate_imu
     from rs_localizer.simulation.recording import write_rendered, write_simulated
-    from rs_localizer.simulation.renderer import Renderer
+    from rs_localizer.simulation.renderer import Renderer, rendered_frames
     from rs_localizer.simulation.rig import (
         Frame,
         camera_stamps,
@@ -417,11 +415,11 @@ def _write_rig(args: argparse.Namespace) -> dict[str, object]:
             return rendered_frames(renderers[name], mounted, stamps[name], encoding, seed)
     else:
         landmarks = described(room(_positions(motion), rng), MAP_FRAME, rng)
-        seen = FrameSettings(args.points, args.noise, args.outliers, args.rate)
+        settings = FrameSettings(args.points, args.noise, args.outliers, args.rate)
 
         def see(name: str, mounted: TrueMotion, place: int) -> Iterator[Frame]:
             return simulate_frames(
-                parts.cameras[name], mounted, landmarks.points, seen, stamps_ns=stamps[name],
+                parts.cameras[name], mounted, landmarks.points, settings, stamps_ns=stamps[name],
                 seed=args.seed + place,
             )  # fmt: skip
 
@@ -444,12 +442,12 @@ def _write_rig(args: argparse.Namespace) -> dict[str, object]:
         if scene is not None and scene.marker_map is not None:
             write_marker_map(built / MARKER_MAP, scene.marker_map)
     said = f"{args.out}: {total} images of {', '.join(parts.cameras)}"
-    told: dict[str, object] = {"images": total, "cameras": list(parts.cameras)}
+    figures: dict[str, object] = {"images": total, "cameras": list(parts.cameras)}
     if scene is not None:
-        return told | _tell_scene(args, said, scene)
+        return figures | _tell_scene(args, said, scene)
     print(f"{said}, {counts / total:.0f} points each")
     _tell_next(args)
-    return told | {"points_per_image": counts / total}
+    return figures | {"points_per_image": counts / total}
 
 
 def _write_points(args: argparse.Namespace) -> dict[str, object]:

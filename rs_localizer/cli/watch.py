@@ -8,8 +8,7 @@ import argparse
 import re
 import sys
 
-from rs_localizer.cli import import_ros
-from rs_localizer.process.arguments import number
+from rs_localizer.cli import import_ros, number
 from rs_localizer.settings import NODE_NAME
 
 # As ROS has it for topics, which begin with the name of the node.

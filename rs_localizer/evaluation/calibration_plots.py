@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of a calibration: likelihood, parts of the recording, residuals by row and by speed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

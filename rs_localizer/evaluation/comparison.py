@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two methods on the same recording: answers, how far they are from the truth, and a table."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,10 +18,9 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.evaluation.metrics import Errors, Stamps, associate, pose_errors, twist_errors
 from rs_localizer.io.bags import open_bag
-from rs_localizer.io.estimates import Motions, read_motions
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC, IMAGE_TOPIC
-from rs_localizer.io.trajectories import Trajectory, Twists
+from rs_localizer.io.trajectories import Motions, Trajectory, Twists, read_motions
 from rs_localizer.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC
 
 # Truth and estimate are meant for the very same moment; a nanosecond may go in rounding.

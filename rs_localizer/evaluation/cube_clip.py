@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cube in a few seconds of a shaking hand, drawn by P3P and by the localizer: an animation."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

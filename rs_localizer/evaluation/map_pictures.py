@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of a map that was built: landmarks and cameras, residuals before and after."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

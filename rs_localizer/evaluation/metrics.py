@@ -9,8 +9,6 @@ milliseconds, however far apart the clocks are. Around it, the poses themselves 
 as far as they are given in the same frame.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A rendered room that is mapped from one walk, and flights that are localized in the map."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,11 +26,10 @@ from rs_localizer.mapping.colmap import Effort, Stage
 from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.views import Looker, View
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
+from rs_localizer.pipeline.images import FrameExtractor, keypoints
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import frame_stamps, middle_stamp
-from rs_localizer.simulation.image_sequence import in_order
-from rs_localizer.simulation.renderer import Renderer
+from rs_localizer.simulation.renderer import Renderer, in_order
 from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.simulation.walls import marked_room

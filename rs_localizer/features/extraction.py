@@ -5,8 +5,6 @@
 A pose is as certain as the points are spread; the best keypoints alone lie where most texture is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

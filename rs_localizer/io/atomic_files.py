@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results that appear whole or not at all, however their making ends."""
 
-from __future__ import annotations
-
 import contextlib
 import secrets
 import shutil

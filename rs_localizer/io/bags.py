@@ -6,8 +6,6 @@ Messages come out as rosbags' plain objects with the attribute names of ROS 2, w
 recording was; the readers of this package take them and rclpy's messages alike.
 """
 
-from __future__ import annotations
-
 import bz2
 import contextlib
 import importlib

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """sensor_msgs/CameraInfo -> Camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """When the images of a file were taken: what is known of it, and what is assumed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 DEFAULT_START_NS = 1_000_000_000

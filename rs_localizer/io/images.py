@@ -6,8 +6,6 @@
 its header says is held against a limit before anything is decoded.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from dataclasses import dataclass

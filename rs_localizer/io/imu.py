@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """sensor_msgs/Imu -> what a gyroscope and an accelerometer have measured."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -6,8 +6,6 @@ Messages are taken by their attributes, so that those of rclpy and those of rosb
 only in their containers, are read by the same code.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is published of a localized frame, and its messages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import cache

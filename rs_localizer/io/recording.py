@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the package records: topics, and an image or its correspondences as messages of a bag."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

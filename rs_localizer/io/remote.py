@@ -5,8 +5,6 @@
 A reader of bags jumps about in its file: what is elsewhere is fetched whole before it is read.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import tempfile

@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import csv
 import functools
+import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -27,7 +29,9 @@ CAMERA_FROM_SENSOR = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1
 # What announces telemetry in the first or the last bytes of a file: GoPro, DJI, Sony, Insta360.
 _MARKS = (b"gpmd", b"djmd", b"rtmd", b"8db42d694ccc418790edff439fe026bf")
 _LOOKED_AT = 2**18  # bytes
-# Readout times in ms: of GoPro (SROT), Sony and Canon, and those that add it themselves.
+_MOST_TRACKS = 2**26  # bytes, for a file that lies: a day at 60 Hz
+# Readout times in ms: of GoPro (SROT; of HERO7 for each image), Sony and Canon, and those that add
+# it themselves.
 _READOUT_NAMES = ("0x53524f54", "FrameReadoutTime", "frame_readout_time")
 _STABILIZED, _STABILIZER = "0x45495345", "0x45495341"  # GoPro: EISE, whether, and EISA, how
 _OFF = ("", "N", "N/A", "OFF")
@@ -66,10 +70,23 @@ def has_telemetry(path: Path) -> bool:
     """Whether a file looks as if it had any, without reading it."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(_LOOKED_AT)
+        looked_at = file.read(_LOOKED_AT)
         file.seek(max(0, size - _LOOKED_AT))
-        ends = head + file.read(_LOOKED_AT)
-    return any(mark in ends for mark in _MARKS)
+        looked_at += file.read(_LOOKED_AT) + _tracks(file)
+    return any(mark in looked_at for mark in _MARKS)
+
+
+def _tracks(file: BinaryIO) -> bytes:
+    """The box of an MP4 that lists its tracks: megabytes, of long videos; empty: none."""
+    at = file.seek(0)
+    while len(start := file.read(16)) >= 8:
+        size, kind = struct.unpack(">I4s", start[:8])
+        if size == 1:
+            size = int.from_bytes(start[8:], "big")
+        if kind == b"moov" or size < 8:
+            return start + file.read(min(size, _MOST_TRACKS)) if kind == b"moov" else b""
+        at = file.seek(at + size)
+    return b""
 
 
 @functools.lru_cache(maxsize=1)
@@ -87,12 +104,18 @@ def read_telemetry(path: Path) -> Telemetry | None:
         samples = parser.normalized_imu()
         tags = parser.telemetry(False)
     except Exception as error:  # the library's own, of any kind
-        raise TelemetryError(f"{path}: its telemetry cannot be read: {error}") from error
+        raise TelemetryError(
+            f"{path}: its telemetry cannot be read, --no-telemetry goes on without: {error}"
+        ) from error
     turning = [sample for sample in samples if sample["gyro"] is not None]
-    if len(turning) < 2:
+    if turning:
+        times = np.array([sample["timestamp_ms"] for sample in turning]) * 1e-3
+        read = np.radians(np.array([sample["gyro"] for sample in turning], float))
+        rates = read @ CAMERA_FROM_SENSOR.T
+    else:
+        times, rates = from_orientations(tags)
+    if len(times) < 2:
         return None
-    times = np.array([sample["timestamp_ms"] for sample in turning]) * 1e-3
-    rates = np.radians(np.array([sample["gyro"] for sample in turning], float))
     forces = np.array([sample["accl"] for sample in samples if sample["accl"] is not None], float)
     found = _values(tags)
     exposures = [
@@ -108,7 +131,7 @@ def read_telemetry(path: Path) -> Telemetry | None:
     return Telemetry(
         " ".join(dict.fromkeys(f"{parser.camera} {parser.model or ''}".split())),
         times,
-        rates @ CAMERA_FROM_SENSOR.T,
+        rates,
         _spread(forces, times) @ CAMERA_FROM_SENSOR.T,
         None if readout is None or not float(readout) > 0.0 else 1e-3 * float(readout),
         float(np.median(exposures)) if exposures else None,
@@ -116,6 +139,22 @@ def read_telemetry(path: Path) -> Telemetry | None:
         _lens(found, tags),
         _profile(tags),
     )
+
+
+def from_orientations(tags: list[dict[str, Any]]) -> tuple[Array, Array]:
+    """Times (n,) s and rates (n,3) rad/s of a camera that writes how it is turned instead (DJI).
+
+    The library has orientations of a camera with x right, y up and z back. GoPros write both: rates
+    from their orientations are those of the gyroscope, by scales of 1.00 +- 0.01 about each axis.
+    """
+    rows = [row for group in tags for row in group.get("Quaternion", {}).get("Data", [])]
+    rows = sorted({1e-3 * row["t"]: row["v"] for row in rows}.items(), key=lambda item: item[0])
+    if len(rows) < 2:
+        return np.zeros(0), np.zeros((0, 3))
+    times = np.array([time for time, _ in rows])
+    turns = Rotation.from_quat([[value[axis] for axis in "xyzw"] for _, value in rows])
+    steps = (turns[:-1].inv() * turns[1:]).as_rotvec() / np.diff(times)[:, None]
+    return 0.5 * (times[1:] + times[:-1]), steps * [1.0, -1.0, -1.0]
 
 
 def _lens(values: dict[str, Any], tags: list[dict[str, Any]]) -> str:
@@ -200,13 +239,14 @@ def _spread(forces: Array, times: Array) -> Array:
 
 
 def _values(tags: list[dict[str, Any]]) -> dict[str, Any]:
-    """Single values by name, whatever group they stand in; of one name, the first."""
+    """Values by name, whatever group they stand in; of one name, and of a list, the first."""
     found: dict[str, Any] = {}
     for part in reversed([part for groups in tags for part in groups.values()]):
         if isinstance(part, dict):
             nested = [item for item in part.values() if isinstance(item, dict)]
             for items in (*nested, part):
-                found |= {k: v for k, v in items.items() if isinstance(v, (str, int, float))}
+                first = {k: v[0] if isinstance(v, list) and v else v for k, v in items.items()}
+                found |= {k: v for k, v in first.items() if isinstance(v, (str, int, float))}
     return found
 
 

@@ -5,8 +5,6 @@
 What the inputs are: :mod:`rs_localizer.pipeline.inputs`; the outputs: :mod:`.outputs`.
 """
 
-from __future__ import annotations
-
 # Inputs of the localizer.
 CORRESPONDENCES = "correspondences"  # which the marker detector publishes
 KEYPOINTS = "keypoints"

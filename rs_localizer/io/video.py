@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos as JPEG images with their presentation times."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import mmap

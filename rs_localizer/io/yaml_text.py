@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """YAML that people write: small, and a tree."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import yaml

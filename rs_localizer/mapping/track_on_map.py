@@ -18,7 +18,7 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.io.keypoints import Keypoints
+from rs_localizer.io.clouds import Keypoints
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.localizer import Localizer
 from rs_localizer.mapping.colmap import Structure

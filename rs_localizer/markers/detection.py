@@ -5,8 +5,6 @@
 The node and the offline command run this one class, so the same images give the same corners.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from functools import lru_cache

@@ -8,8 +8,6 @@ corners from the bottom right one on. Here, upright is what the family's own aut
 pattern of id 0 is known, and by it every dictionary is turned.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from functools import lru_cache
 from typing import Any

@@ -9,8 +9,6 @@ Unlike the search for a corner's own gradients this has no bias: blur rounds a c
 no edge. Two rounds: the first finds how much the edges are blurred, and gets near.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

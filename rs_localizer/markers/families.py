@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The dictionaries of markers that OpenCV knows, by the names that users write."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from dataclasses import dataclass

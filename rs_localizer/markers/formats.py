@@ -33,8 +33,6 @@ What is missing of a pose is that of the origin. Standalone tags have no place::
           - {id: 0, size: 0.16, x: 0, y: 0, z: 0, qw: 1, qx: 0, qy: 0, qz: 0}
 """
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass
@@ -46,9 +44,8 @@ import yaml
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.yaml_text import YamlError, check_tree, load_yaml
-from rs_localizer.markers.entries import Entry
 from rs_localizer.markers.families import FAMILIES, Family, family
-from rs_localizer.markers.map_files import read_marker_map, write_marker_map
+from rs_localizer.markers.map_files import Entry, read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose, quaternion_of_rotation, rotation_of_quaternion
 from rs_localizer.markers.prints import Marker

@@ -6,8 +6,6 @@ Every point of a cube is drawn where the row that sees it, at its own time, has 
 right pose, twist and readout time the cubes stand on their markers, however fast the camera moves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

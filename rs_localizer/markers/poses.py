@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a print is in the map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -8,8 +8,6 @@ Corners of a marker are in OpenCV's order: top left, top right, bottom right, bo
 upright print seen from its front. Corners of boards go row by row from the top left one.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Self
 

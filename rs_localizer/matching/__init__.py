@@ -24,8 +24,7 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.io.clouds import Correspondences
-from rs_localizer.io.keypoints import Keypoints
+from rs_localizer.io.clouds import Correspondences, Keypoints
 from rs_localizer.io.maps.landmarks import Descriptors, Ids, Map
 from rs_localizer.matching.kernels import (
     Best,

@@ -6,8 +6,6 @@ Binary descriptors come as rows of 64-bit words, four or a multiple of four of t
 written into distances (q,2), infinite before, and indices (q,2), -1 before.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

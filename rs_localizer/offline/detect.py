@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Offline detection: images -> a recording of correspondences or keypoints, as the nodes do."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -30,8 +28,13 @@ from rs_localizer.markers.detection import recognized
 from rs_localizer.markers.map_check import LeaveOneOut, Predict, rms, still_errors, still_pose
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
-from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
+from rs_localizer.pipeline.images import (
+    Detected,
+    FrameDetector,
+    FrameExtractor,
+    correspondences,
+    keypoints,
+)
 from rs_localizer.pipeline.refusal import Refusal
 
 # Fewer corners than this say nothing about how well a pose fits.
@@ -172,9 +175,9 @@ class _Tally:
         if self._others:
             names = ", ".join(name for name, _ in self._others.most_common(5))
             return f"{text}; they show {names}, which the map does not have"
-        seen = self.instead()
-        if seen:
-            return f"{text}; {'others' if self.counts else 'they'} show {'; '.join(seen)}"
+        boards = self.instead()
+        if boards:
+            return f"{text}; {'others' if self.counts else 'they'} show {'; '.join(boards)}"
         if self._empty:
             text += "; nor any other marker or chessboard that OpenCV knows"
         return text

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where images come from, offline: a video, a folder of files, a bag."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

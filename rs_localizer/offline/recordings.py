@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """All correspondences, or the whole IMU, of a recording at once: for estimators of many images."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -15,9 +13,8 @@ from rs_localizer import matching
 from rs_localizer.config import Matching
 from rs_localizer.io.bags import BagReader
 from rs_localizer.io.camera_info import Calibration, read_camera_info
-from rs_localizer.io.clouds import Correspondences, read_correspondences
+from rs_localizer.io.clouds import Correspondences, read_correspondences, read_keypoints, read_map
 from rs_localizer.io.imu import read_imu
-from rs_localizer.io.keypoints import read_keypoints, read_map
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS

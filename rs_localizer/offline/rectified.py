@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whole images as a global shutter would have taken them, from the poses of two rows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

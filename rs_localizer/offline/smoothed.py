@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``replay --smooth``: the frames of a recording, and one motion through all of them."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Iterator

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of a replay -> a recording of the Rerun viewer, or the viewer itself."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -20,9 +18,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagReader
-from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.clouds import read_correspondences, read_keypoints
 from rs_localizer.io.images import Gray, read_any_image
-from rs_localizer.io.keypoints import read_keypoints
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.remote import is_url, url_name

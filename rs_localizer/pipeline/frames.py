@@ -25,10 +25,11 @@ from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import (
     Correspondences,
     EmptyCloudError,
+    Keypoints,
     read_correspondences,
+    read_keypoints,
     thinned,
 )
-from rs_localizer.io.keypoints import Keypoints, read_keypoints
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.messages import MessageError

@@ -7,8 +7,6 @@ localizes. What a frame gets depends on stamps alone, not on when a reading came
 recording gives the same poses live and offline.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import Counter, deque
@@ -28,8 +26,7 @@ from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.watch import Alone, InertialStatus
 from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.transforms import TransformError, Transforms
-from rs_localizer.pipeline.reasons import IMU_REASONS
-from rs_localizer.pipeline.refusal import Notify
+from rs_localizer.pipeline.refusal import IMU_REASONS, Notify
 from rs_localizer.tracking import Tracker
 
 # Beside the exposure: the spline through the readings wants neighbours, and the tracker those since

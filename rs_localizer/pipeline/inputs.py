@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any, Union
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io import topics
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import EmptyCloudError
+from rs_localizer.io.clouds import EmptyCloudError, read_map
 from rs_localizer.io.detections import APRILTAG_TYPE, ISAAC_TYPE
 from rs_localizer.io.imu import read_imu
-from rs_localizer.io.keypoints import read_map
 from rs_localizer.io.messages import MessageError
 from rs_localizer.pipeline.refusal import Refusal
 

@@ -28,8 +28,6 @@ alone knows the angular velocity of that moment better than motion and turn toge
 time offset leaves the motion beside the turn to the points, its own is published.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -16,13 +16,11 @@ head: of its origin in camera axes, and its turn in base axes. TF carries no cov
 extrinsics are treated as exact.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rs_localizer.config import NodeConfig, OrientationCovariance
+from rs_localizer.config import NodeConfig, OrientationCovariance, PublishTf
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -238,4 +236,36 @@ def _mounted(
         body_frame=base,
         pose=base_pose(localized.pose, mounting),
         twist=base_twist(localized.twist, mounting) if localized.twist else None,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Broadcast:
+    """One transform for TF."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    parent_from_child: Transform
+
+
+def broadcast(frame: Localized, config: NodeConfig, transforms: Transforms) -> Broadcast | None:
+    """The transform to publish of a frame; None when ``publish_tf`` is ``none``.
+
+    Raises:
+        TransformError: when the frame says nothing of its time, or odometry says nothing for it.
+    """
+    if config.publish_tf == PublishTf.NONE:
+        return None
+    if frame.input_stamp_ns == 0:
+        raise TransformError("header.stamp of the input is zero: the pose has no time for TF")
+    map_from_body = Transform(frame.pose.rotation, frame.pose.position)
+    if config.publish_tf == PublishTf.MAP_TO_CAMERA:
+        return Broadcast(frame.stamp_ns, frame.map_frame, frame.body_frame, map_from_body)
+    body_from_odom = transforms.lookup(frame.body_frame, config.odom_frame, frame.stamp_ns)
+    return Broadcast(
+        frame.stamp_ns + round(config.transform_tolerance * 1e9),
+        frame.map_frame,
+        config.odom_frame,
+        map_from_body @ body_from_odom,
     )

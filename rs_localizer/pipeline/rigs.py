@@ -28,10 +28,10 @@ from rs_localizer.io.clouds import (
     Correspondences,
     EmptyCloudError,
     read_correspondences,
+    read_keypoints,
     select_inliers,
     thinned,
 )
-from rs_localizer.io.keypoints import read_keypoints
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import CameraShare, Localized
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tags that other detectors have found become correspondences by a map of markers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

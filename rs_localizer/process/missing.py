@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What to say of a package that is not installed: one sentence with the command that brings it."""
 
-from __future__ import annotations
-
 # By the name that is imported: Ubuntu's package, and pip's where Ubuntu 24.04 has none.
 _UBUNTU = {
     "PIL": "python3-pil",

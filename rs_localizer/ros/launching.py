@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the launch files share: arguments that are settings, and checks before anything starts."""
 
-from __future__ import annotations
-
 import difflib
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence

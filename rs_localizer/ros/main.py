@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 import rs_localizer
-from rs_localizer.process import threads
+from rs_localizer.process import limit_threads
 from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import StopRequest
 
@@ -103,7 +103,7 @@ Run = Callable[[StopRequest, list[str] | None], int]
 
 
 def _guarded(name: str, load: Callable[[str], Run], args: list[str] | None) -> int:
-    threads.limit()
+    limit_threads()
     with StopRequest() as stop:
         try:
             with stop.at_once():

@@ -7,8 +7,6 @@ at the IMU's own place, ``a`` by the difference of the true velocities around th
 of it is made of what the estimators assume.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of the augmented-reality experiment: marker walls, rendered and detected; the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -18,8 +16,7 @@ from rs_localizer.io.video import Image
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.prints import Marker
 from rs_localizer.simulation.frames import frame_stamps, middle_stamp, true_poses_at
-from rs_localizer.simulation.image_sequence import in_order
-from rs_localizer.simulation.renderer import Renderer
+from rs_localizer.simulation.renderer import Renderer, in_order
 from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.simulation.walls import three_walls

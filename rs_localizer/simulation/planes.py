@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Textured planes: what a rendered scene is made of, and how the renderer keeps them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

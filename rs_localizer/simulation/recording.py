@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated frames and their truth as messages of a recording."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -26,7 +24,7 @@ from rs_localizer.io.recording import (
     write_image,
 )
 from rs_localizer.simulation.frames import SimulatedFrame
-from rs_localizer.simulation.image_sequence import RenderedFrame
+from rs_localizer.simulation.renderer import RenderedFrame
 from rs_localizer.simulation.true_motion import TrueState
 
 TRUE_POSE_TOPIC = "/truth/pose"

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenes: fixed maps of 3D points around the path of a simulated camera."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

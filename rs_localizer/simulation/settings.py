@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What simulations can be asked for. Imports nothing that takes time: commands show it as help."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ A true motion knows its pose and its velocities at every instant; nothing of it 
 model that the estimators fit.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any, Protocol

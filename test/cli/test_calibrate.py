@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """``rs_localizer calibrate``, ``readout`` and ``replay --smooth``: the real recording, faults."""
 
+import argparse
 import csv
+import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -12,6 +15,7 @@ from recorded import imu, tf
 from scipy.spatial.transform import Rotation
 
 from rs_localizer import data
+from rs_localizer.cli.calibrate import share_all
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.calibration import read_calibration
@@ -62,6 +66,21 @@ def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path):
     assert float(row["median_ms"]) == pytest.approx(1e3 * values["readout_time"], abs=6e-4)
     assert row["source"].endswith(" ms, firmware 2.10)")
     assert abs(values["readout_time"] - 0.02) < 4.0 * values["readout_time_deviation"]
+    (told,) = json.loads((tmp_path / "camera_share.json").read_text())
+    assert told["median"] == pytest.approx(values["readout_time"], rel=1e-5)
+    assert told["gyroflow"] == pytest.approx(1e3 * told["median"] * 480 / 479, rel=1e-5)
+    assert told["scan_direction"] == "top_to_bottom"
+    # Of many recordings, what they say together: of a copy nothing but how many there are.
+    folders = [tmp_path / name for name in "ab"]
+    for folder in folders:
+        folder.mkdir()
+        shutil.copy(tmp_path / "camera_share.json", folder / "shutter_share.json")
+    args = argparse.Namespace(share="Maker One", firmware="2.10", out=tmp_path)
+    share_all(args, folders)
+    (both,) = json.loads((tmp_path / "share.json").read_text())
+    assert (both["number"], both["mode"]) == (2, told["mode"])
+    assert both["median"] == pytest.approx(told["median"], rel=1e-5)
+    assert (tmp_path / "share.csv").read_text().count("\n") == 2
 
 
 @pytest.fixture(scope="module")

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
-from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import make_camera_info
+from rs_localizer.io.trajectories import read_motions
 from rs_localizer.offline import detect as detecting
 
 K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])

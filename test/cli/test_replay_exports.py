@@ -15,7 +15,7 @@ from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.io.neural_reconstruction import NerfstudioError, transforms
+from rs_localizer.io.neural_reconstruction import NerfstudioError, sequence, transforms
 from rs_localizer.io.trajectories import read_tum
 
 READOUT = 0.03
@@ -179,6 +179,28 @@ def test_both_ends_of_the_shutter_explain_every_pixel(
 def test_what_the_format_cannot_say_is_told(changes, text):
     with pytest.raises(NerfstudioError, match=text):
         transforms(Camera(640, 480, K, **changes), [])
+
+
+def test_the_whole_lens_goes_to_ncore():
+    """Twelve coefficients were once cut to eight; a fisheye whose corners are dark had no angle."""
+    D = np.arange(1.0, 13.0) / 1000
+    stamps = np.zeros((0, 2), int)
+    told = sequence(
+        Camera(640, 480, K, D, "rational_polynomial"), [], stamps, np.zeros((0, 2, 4, 4))
+    )
+    lens = told["camera_model_parameters"]
+    # k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 of OpenCV.
+    assert lens["radial_coeffs"] == (np.array([1, 2, 5, 6, 7, 8]) / 1000).tolist()
+    assert lens["tangential_coeffs"] == [0.003, 0.004]
+    assert lens["thin_prism_coeffs"] == (np.array([9, 10, 11, 12]) / 1000).tolist()
+    tilted = Camera(640, 480, K, [*D, 0.1, 0.0], "rational_polynomial")
+    with pytest.raises(ValueError, match="have no lens rational_polynomial of 14 coeff"):
+        sequence(tilted, [], stamps, np.zeros((0, 2, 4, 4)))
+    f = 240 / np.radians(100)  # 200 degrees from top to bottom
+    wide = Camera(640, 480, [[f, 0, 319.5], [0, f, 239.5], [0, 0, 1]], np.zeros(4), "equidistant")
+    told = sequence(wide, [], stamps, np.zeros((0, 2, 4, 4)))
+    angle = told["camera_model_parameters"]["max_angle"]
+    assert np.radians(100) <= angle <= np.pi
 
 
 def test_a_part_of_the_sensor(tmp_path):

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,20 @@ def test_poses_are_those_of_detect_and_replay(kind: str, walls: Path, tmp_path: 
     names = (splat / "names.txt").read_text().split()
     assert len(names) > 5
     assert all((splat / name).is_file() for name in names)
+
+
+def test_what_a_phones_log_says_is_exported(walls: Path, tmp_path: Path) -> None:
+    video = shutil.copy(walls.parent / "walls.mp4", tmp_path)
+    (tmp_path / "gyro_accel.csv").write_text("".join(f"{k}000000,0,0,0,0,0,9.8\n" for k in (0, 9)))
+    heading = "Timestamp[nanosec],Exposure time[nanosec],Frame readout time[nanosec]\n"
+    (tmp_path / "movie_metadata.csv").write_text(heading + 2 * f"0,4000000,{1e9 * READOUT:.0f}\n")
+    words = ["--calibration", str(walls.parent / "camera.json"), "--nerfstudio", "--no-imu"]
+    words += ["--map", str(walls / "marker_map.yaml"), "--out", str(tmp_path / "scene")]
+    assert main(["replay", str(video), *words]) == 0
+    told = json.loads((tmp_path / "scene" / "transforms.json").read_text())
+    assert told["exposure_time"] == pytest.approx(0.004)
+    height = told["h"]
+    assert told["rolling_shutter_time"] == pytest.approx(READOUT * height / (height - 1))
 
 
 def test_what_is_missing_is_said(walls: Path, tmp_path: Path, capsys: Any) -> None:

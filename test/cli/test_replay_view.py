@@ -11,9 +11,9 @@ import pytest
 
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, open_bag
-from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import IMAGE_TOPIC, write_image
+from rs_localizer.io.trajectories import read_motions
 from rs_localizer.offline import viewing as paths
 
 chunk = pytest.importorskip("rerun.chunk", reason="needs the Rerun SDK")

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.trajectories import read_motions
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.settings import load_params_file
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.io.bags import make_message
-from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.keypoints import read_keypoints, read_map
+from rs_localizer.io.clouds import make_cloud, read_keypoints, read_map
 from rs_localizer.io.messages import MessageError
 
 COUNT = 6

@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import os
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("telemetry_parser", reason="needs telemetry-parser (rs_localizer[video])")
 
@@ -24,7 +27,13 @@ from rs_localizer.cli.map import build
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.telemetry import Telemetry, TelemetryError, has_telemetry, read_telemetry
+from rs_localizer.io.telemetry import (
+    Telemetry,
+    TelemetryError,
+    from_orientations,
+    has_telemetry,
+    read_telemetry,
+)
 from rs_localizer.settings import load_params_file
 
 RATE = 200.0
@@ -104,6 +113,37 @@ def test_lens_profiles(log: Path, monkeypatch: Any, model: dict[str, str], known
         np.testing.assert_allclose(found.profile.project(points[0]), pixels[0], atol=1e-9)
 
 
+def test_orientations_take_the_place_of_a_gyroscope(monkeypatch: Any) -> None:
+    """As of DJI; a camera that turns to the right and then lifts its view."""
+    import telemetry_parser
+
+    times = 0.01 * np.arange(40)
+    turns = [Rotation.from_rotvec([0.0, -0.5 * min(t, 0.2), 0.0]) for t in times]  # y is up
+    turns = [
+        turn * Rotation.from_rotvec([0.3 * max(0.0, t - 0.2), 0.0, 0.0])
+        for t, turn in zip(times, turns, strict=True)
+    ]
+    rows = [
+        {"t": 1e3 * t, "v": dict(zip("xyzw", turn.as_quat(), strict=True))}
+        for t, turn in zip(times, turns, strict=True)
+    ]
+    lens = {"Data": PROFILE | {"frame_readout_time": 9.0}}
+    tags = [{"Quaternion": {"Data": rows[:20]}, "Lens": lens}, {"Quaternion": {"Data": rows[19:]}}]
+    parser = SimpleNamespace(camera="DJI", model="Action 4", normalized_imu=list)
+    parser.telemetry = lambda readable: tags
+    monkeypatch.setattr(telemetry_parser, "Parser", lambda path: parser)
+    read_telemetry.cache_clear()
+    found = read_telemetry(Path("DJI_0001.MP4"))
+    read_telemetry.cache_clear()
+    assert found is not None
+    np.testing.assert_allclose(found.times, times[:-1] + 0.005, atol=1e-9)
+    np.testing.assert_allclose(found.rates[:20], np.tile([0.0, 0.5, 0.0], (20, 1)), atol=1e-9)
+    np.testing.assert_allclose(found.rates[20:], np.tile([0.3, 0.0, 0.0], (19, 1)), atol=1e-9)
+    assert np.isnan(found.forces).all()
+    assert found.readout_time == pytest.approx(0.009)
+    assert found.profile is not None
+
+
 # As a GO 3 has them: xi, fx, fy, cx, cy, three angles, three of a place, k1, k2, k3, p1, p2, size.
 MEI = {"xi": 2.0, "f": 2870.0, "centre": (1280.0, 1290.0), "k": (0.05, -0.1, 0.1), "size": 2560}
 
@@ -166,6 +206,144 @@ def test_a_file_of_insta360(tmp_path: Path) -> None:
     assert inside.sum() > 150
     seen = found.profile.project(bearings)
     np.testing.assert_allclose(seen[inside], pixels[inside], atol=0.1)
+
+
+def box(kind: str, *parts: bytes) -> bytes:
+    """A box of MP4."""
+    return struct.pack(">I4s", 8 + sum(map(len, parts)), kind.encode()) + b"".join(parts)
+
+
+def klv(key: str, kind: str, values: Any, width: int = 1) -> bytes:
+    """An item of GPMF: what it is, its type, the size of a value, how many, the values."""
+    kinds = {"L": ">u4", "f": ">f4", "s": ">i2"}
+    data = values.encode() if kind == "c" else np.asarray(values, kinds[kind]).tobytes()
+    size = width * (1 if kind == "c" else np.dtype(kinds[kind]).itemsize)
+    head = key.encode() + struct.pack(">cBH", kind.encode(), size, len(data) // size)
+    return head + data + bytes(-len(data) % 4)
+
+
+def nest(key: str, *items: bytes) -> bytes:
+    data = b"".join(items)
+    return key.encode() + struct.pack(">BBH", 0, 1, len(data)) + data
+
+
+def of_gopro(payloads: list[bytes], *settings: bytes, padding: int = 0) -> bytes:
+    """An MP4 with a track of GPMF, a payload a second, and the settings of the camera."""
+    count, first = len(payloads), box("ftyp", b"mp41")
+    places = len(first) + 8 + np.cumsum([0, *map(len, payloads)])[:-1]
+    length = struct.pack(">4I", 0, 0, 1000, 1001 * count)
+    tables = box(
+        "stbl",
+        box("stsd", struct.pack(">2I", 0, 1), box("gpmd", bytes(7), b"\1")),
+        box("stts", struct.pack(">4I", 0, 1, count, 1001)),
+        box("stsc", struct.pack(">5I", 0, 1, 1, 1, 1)),
+        box("stsz", struct.pack(f">{3 + count}I", 0, 0, count, *map(len, payloads))),
+        box("stco", struct.pack(f">{2 + count}I", 0, count, *places.tolist())),
+    )
+    track = box(
+        "trak",
+        box("tkhd", struct.pack(">6I", 15, 0, 0, 1, 0, 1001 * count), bytes(60)),
+        box("mdia", box("mdhd", bytes(4), length, bytes(4)),
+            box("hdlr", bytes(8), b"meta", bytes(12), b"GoPro MET\0"), box("minf", tables)),
+    )  # fmt: skip
+    about = box("udta", box("GPMF", nest("DEVC", klv("DVID", "L", 1), *settings)))
+    content = box("mvhd", bytes(4), length, bytes(80)), about, box("free", bytes(padding)), track
+    return first + box("mdat", *payloads) + box("moov", *content, box("free", bytes(padding)))
+
+
+def test_a_file_of_gopro(tmp_path: Path) -> None:
+    """As GPMF's documentation has it: up, right to left, forward to back; a HERO7's readout times
+    stand in a stream of their own.
+    """
+    rates, forces = np.tile([500, 0, 100], (200, 1)), np.tile([4096, 0, 0], (200, 1))
+    payload = nest(
+        "DEVC", klv("DVID", "L", 1), klv("DVNM", "c", "Hero7 Black"),
+        nest("STRM", klv("SIUN", "c", "m/s2"), klv("SCAL", "s", 418), klv("ACCL", "s", forces, 3)),
+        nest("STRM", klv("SIUN", "c", "rad/s"), klv("SCAL", "s", 1000), klv("GYRO", "s", rates, 3)),
+        nest("STRM", klv("SHUT", "f", np.full(30, 0.002))),
+        nest("STRM", klv("STNM", "c", "Sensor read out time"), klv("SROT", "f", [8.744] * 30)),
+    )  # fmt: skip
+    settings = klv("MINF", "c", "HERO7 Black"), klv("VFOV", "c", "W"), klv("EISE", "c", "N")
+    path = tmp_path / "GX010001.MP4"
+    # As of half an hour: what the track is called is far from both ends.
+    path.write_bytes(of_gopro(3 * [payload], *settings, padding=2**19))
+    assert has_telemetry(path)
+    found = read_telemetry(path)
+    assert found is not None
+    assert (found.camera, found.lens, found.stabilizer) == (
+        "GoPro HERO7 Black", "field of view W", ""
+    )  # fmt: skip
+    assert found.readout_time == pytest.approx(0.008744)
+    assert found.exposure == pytest.approx(0.002)
+    assert found.rate == pytest.approx(200.0, rel=2e-3)
+    np.testing.assert_allclose(found.rates, np.tile([0.0, -0.5, -0.1], (600, 1)), atol=1e-6)
+    np.testing.assert_allclose(found.forces[0], [0.0, -4096 / 418, 0.0], atol=1e-6)
+    path.write_bytes(of_gopro([payload], *settings[:2], klv("EISE", "c", "Y"), padding=0))
+    read_telemetry.cache_clear()
+    stabilized = read_telemetry(path)
+    assert stabilized is not None
+    assert stabilized.stabilizer == "electronic stabilization"
+
+
+# Of gopro/gpmf-parser and JuanIrache/gopro-telemetry: Hz as GoPro documents them, ms, whether the
+# camera stands upright; payloads alone (.raw) become a file.
+SAMPLES = {
+    "karma.mp4": (400, None, True), "max-heromode.mp4": (200, 20.601, True),
+    "hero5.raw": (400, None, True), "hero6.raw": (200, None, True),
+    "hero6+ble.raw": (200, None, False), "Fusion.raw": (3200, None, False),
+    "karma.raw": (400, None, True), "hero7.raw": (200, 8.015, False),
+    "consecutive1.raw": (200, 8.744, True), "hero11.raw": (200, None, True),
+}  # fmt: skip
+
+
+def orientations(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The rates of what a GoPro writes of its orientation (CORI), by the library's signs."""
+    import telemetry_parser
+
+    tags = telemetry_parser.Parser(str(path)).telemetry(False)
+    data = [row for group in tags for row in group.get("CameraOrientation", {}).get("Data", [])]
+    signs = {"w": 1, "x": -1, "y": 1, "z": 1}
+    rows = [
+        {"t": 1e3 * k / 29.97, "v": {axis: sign * row[axis] for axis, sign in signs.items()}}
+        for k, row in enumerate(data)
+    ]
+    return from_orientations([{"Quaternion": {"Data": rows}}])
+
+
+@pytest.mark.skipif("GOPRO_SAMPLES" not in os.environ, reason="GOPRO_SAMPLES=FOLDER has them")
+def test_real_samples(tmp_path: Path) -> None:
+    for sample in sorted(Path(os.environ["GOPRO_SAMPLES"]).iterdir()):
+        if sample.name not in SAMPLES:
+            continue
+        rate, readout, upright = SAMPLES[sample.name]
+        path = sample
+        if sample.suffix == ".raw":
+            data = sample.read_bytes()
+            starts = [k for k in range(len(data)) if data.startswith(b"DEVC", k)]
+            first = data[starts[0] + 8 : starts[0] + 20]
+            begins = [k for k in starts if data.startswith(first, k + 8)]
+            payloads = [data[a:b] for a, b in itertools.pairwise([*begins, len(data)])]
+            path = tmp_path / f"{sample.name}.mp4"
+            path.write_bytes(of_gopro(payloads))
+        found = read_telemetry(path)
+        assert found is not None, sample
+        down = -np.mean(found.forces, axis=0)
+        pull = float(np.median(np.linalg.norm(found.forces, axis=1)))
+        ms = None if found.readout_time is None else 1e3 * found.readout_time
+        assert found.rate == pytest.approx(rate, rel=0.12)
+        assert ms == (None if readout is None else pytest.approx(readout, abs=1e-3))
+        if sample.name == "max-heromode.mp4":
+            times, rates = orientations(path)
+            C = np.cumsum(found.rates, axis=0) / found.rate
+            # The first image is taken 20 ms after the gyroscope's first reading.
+            step = 0.5 / 29.97
+            ends = [
+                np.stack([np.interp(times + 0.02 + d, found.times, c) for c in C.T], axis=1)
+                for d in (-step, step)
+            ]
+            apart = (ends[1] - ends[0]) / (2.0 * step) - rates
+            assert np.sqrt(np.mean(apart**2)) < 0.1 * np.sqrt(np.mean(rates**2))
+        assert (np.argmax(down) == 1) & (pull == pytest.approx(9.8, rel=0.05)) or not upright
 
 
 @pytest.fixture

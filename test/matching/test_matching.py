@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.config import Matching
-from rs_localizer.io.keypoints import Keypoints
+from rs_localizer.io.clouds import Keypoints
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.matching import Matcher, Visible, make_index
 

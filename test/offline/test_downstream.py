@@ -24,8 +24,8 @@ from rs_localizer.io.outputs import Localized, messages
 from rs_localizer.io.recording import CAMERA_FRAME, write_frame
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.offline.replay import TF_TYPE, find_topics, find_transforms, replay
-from rs_localizer.pipeline.broadcasts import broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.published import broadcast
 from rs_localizer.pipeline.px4 import Jumps, vehicle_odometry
 from rs_localizer.settings import build, load_params_file
 

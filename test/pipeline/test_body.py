@@ -25,8 +25,8 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized, messages
 from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.published import Broadcast, broadcast
 from rs_localizer.pipeline.refusal import Refusal
 
 READOUT_TIME = 0.03

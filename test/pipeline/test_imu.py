@@ -21,10 +21,10 @@ from rs_localizer.core.reasons import ImuReason
 from rs_localizer.inertial.buffer import Readings
 from rs_localizer.io.bags import make_message, open_bag
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
+from rs_localizer.io.trajectories import read_motions
 from rs_localizer.io.transforms import Transform, TransformError, TransformTree, make_transform
 from rs_localizer.offline.replay import imu_first
 from rs_localizer.pipeline.frames import FrameLocalizer, Refusal

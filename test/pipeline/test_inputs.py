@@ -20,8 +20,7 @@ from rs_localizer.io.clouds import Correspondences, EmptyCloudError
 from rs_localizer.offline.replay import NO_FRAMES, find_topics
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import INPUTS, Input, Role
-from rs_localizer.pipeline.reasons import IMU_REASONS, REASONS, explained
-from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.refusal import IMU_REASONS, REASONS, Refusal, explained
 
 ROOT = Path(__file__).parents[2]
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"

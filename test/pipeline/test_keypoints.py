@@ -12,8 +12,7 @@ from rs_localizer.config import Matching, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.keypoints import read_map
+from rs_localizer.io.clouds import make_cloud, read_map
 from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized

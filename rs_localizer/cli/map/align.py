@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rs_localizer.cli import WORKING, UsageError
+from rs_localizer.cli import WORKING, UsageError, number
 from rs_localizer.cli.map import either
 from rs_localizer.core.arrays import Array
-from rs_localizer.process.arguments import number
 
 if WORKING:
     from rs_localizer.io.maps.landmarks import Map

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced, stage
+from rs_localizer.cli import WORKING, UsageError, add_overwrite, integer, number, replaced, stage
 from rs_localizer.cli.image_input import (
     add_source_arguments,
     opened,
@@ -23,7 +23,6 @@ from rs_localizer.cli.image_input import (
     video_imu,
 )
 from rs_localizer.config import FeatureConfig
-from rs_localizer.process.arguments import integer, number
 
 if WORKING:
     import numpy as np
@@ -38,7 +37,7 @@ if WORKING:
     from rs_localizer.io.image_clock import DEFAULT_START_NS
     from rs_localizer.io.images import Image
     from rs_localizer.io.imu import read_imu_csv
-    from rs_localizer.io.maps.npz import write_npz
+    from rs_localizer.io.maps.files import write_npz
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
     from rs_localizer.io.topics import IMU
     from rs_localizer.io.trajectories import Trajectory, write_tum

@@ -8,7 +8,7 @@ import argparse
 from collections import Counter
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, refuse_existing
+from rs_localizer.cli import WORKING, UsageError, number, refuse_existing
 from rs_localizer.io.maps.files import WRITERS, read_map_file
 from rs_localizer.markers.formats import (
     FORMATS,
@@ -20,7 +20,6 @@ from rs_localizer.markers.formats import (
     read_any,
     write_any,
 )
-from rs_localizer.process.arguments import number
 
 if WORKING:
     import numpy as np

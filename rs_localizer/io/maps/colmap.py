@@ -7,8 +7,6 @@ others. pycolmap, which reads whole models, is no help here: it takes a count in
 its word and allocates for it, and there is none for ARM, on which robots run.
 """
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 import time

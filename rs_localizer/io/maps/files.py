@@ -1,16 +1,120 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files that hold maps: which there are, and how they are read and written."""
+"""Files that hold maps: which there are, and how they are read and written.
 
-from __future__ import annotations
+NumPy archives hold ``points`` (n,3) and what else is known: ``ids`` (n,), ``descriptors`` (n,d)
+and ``covariances`` (n,3,3; m^2, NaN: not known). Nothing in them is ever unpickled, and nothing is
+allocated before the headers of the arrays, the sizes in the archive and the size of the file agree.
+"""
 
+import struct
+import tokenize
+import warnings
+import zipfile
+import zlib
 from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rs_localizer.io.maps.colmap import read_colmap
-from rs_localizer.io.maps.landmarks import Map, MapError
-from rs_localizer.io.maps.npz import read_npz, write_npz
+from rs_localizer.io.maps.landmarks import Map, MapError, make_map
 from rs_localizer.io.maps.ply import read_ply, write_ply
 from rs_localizer.io.remote import Location, local_copy
+
+_ARRAYS = ("points", "ids", "descriptors", "covariances")
+# Of all arrays together, unpacked: ten million landmarks with 128 bytes each, say.
+_MOST_BYTES = 2 * 2**30
+# Deflate packs no better than this.
+_BEST_PACKING = 1032
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_LONGEST_HEADER = 10_000
+# What zipfile, zlib and NumPy raise for damaged files.
+_DAMAGES = (
+    zipfile.BadZipFile, zlib.error, struct.error, EOFError, NotImplementedError, RuntimeError,
+    ValueError, KeyError, OverflowError, SyntaxError, TypeError, OSError, tokenize.TokenError,
+)  # fmt: skip
+
+
+def read_npz(path: Path, frame: str) -> Map:
+    """Read a map; raises MapError for anything that is none, OSError as any file."""
+    with path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # NumPy warns of old headers
+        arrays = _arrays(file)
+    return make_map(
+        arrays["points"], arrays.get("ids"), arrays.get("descriptors"), frame,
+        arrays.get("covariances"),
+    )  # fmt: skip
+
+
+def _arrays(file: IO[bytes]) -> dict[str, NDArray[Any]]:
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = {info.filename: info for info in archive.infolist()}
+            wanted = [members[f"{name}.npy"] for name in _ARRAYS if f"{name}.npy" in members]
+            if "points.npy" not in members:
+                names = ", ".join(sorted(members)[:10]) or "none"
+                raise MapError(f"the archive has no array 'points'; found {names}")
+            if sum(info.file_size for info in wanted) > _MOST_BYTES:
+                raise MapError(f"the arrays are larger than {_MOST_BYTES // 2**30} GiB")
+            return {info.filename[:-4]: _read(archive, info) for info in wanted}
+    except MapError:
+        raise
+    except _DAMAGES as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise MapError(f"no readable NumPy archive: {reason}") from error
+
+
+def write_npz(path: Path, landmarks: Map) -> None:
+    """Write a map; what is read back is the same to the last bit."""
+    arrays: dict[str, Any] = {"points": landmarks.points}
+    if landmarks.ids is not None:
+        arrays["ids"] = landmarks.ids
+    if landmarks.descriptors is not None:
+        arrays["descriptors"] = landmarks.descriptors
+    if landmarks.covariances is not None:
+        arrays["covariances"] = landmarks.covariances
+    with path.open("wb") as file:  # given a name, NumPy would append a suffix
+        np.savez(file, **arrays)
+
+
+def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+    name = info.filename
+    if info.compress_type not in _COMPRESSIONS:
+        raise MapError(f"{name} is packed by method {info.compress_type}, which NumPy never uses")
+    if info.file_size > _BEST_PACKING * max(info.compress_size, 1):
+        raise MapError(f"{name}: {info.compress_size} bytes cannot unpack to {info.file_size}")
+    with archive.open(info) as file:
+        expected = _size(file, name)
+    if expected != info.file_size:
+        raise MapError(f"{name}: its shape takes {expected} bytes, found {info.file_size}")
+    with archive.open(info) as file:
+        array: NDArray[Any] = np.lib.format.read_array(
+            file, allow_pickle=False, max_header_size=_LONGEST_HEADER
+        )
+    return array
+
+
+def _size(file: IO[bytes], name: str) -> int:
+    """Bytes of the whole member by its header: how much NumPy would allocate, and the header."""
+    version = np.lib.format.read_magic(file)
+    readers = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    if version not in readers:
+        raise MapError(f"{name} has version {version[0]}.{version[1]} of the format")
+    shape, _, kind = readers[version](file, max_header_size=_LONGEST_HEADER)
+    if kind.hasobject or kind.kind not in "fiu":
+        raise MapError(f"{name} must hold numbers, found {kind}")
+    count = 1
+    for length in shape:  # Python integers: these products do not overflow
+        if length < 0:
+            raise MapError(f"{name} has the shape {shape}")
+        count *= int(length)
+    return file.tell() + count * kind.itemsize
+
 
 _READERS = {".npz": read_npz, ".ply": read_ply}
 WRITERS = {".npz": write_npz, ".ply": write_ply}

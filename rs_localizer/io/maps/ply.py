@@ -6,8 +6,6 @@ Descriptors are lists of ``uchar`` or ``float``, equally long at all vertices. O
 colors and normals, are skipped.
 """
 
-from __future__ import annotations
-
 import array
 import math
 from dataclasses import dataclass, field

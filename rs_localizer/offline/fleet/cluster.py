@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tasks by Dask: on a cluster of this machine, or by a scheduler that runs already."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

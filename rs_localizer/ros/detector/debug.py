@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The debug pictures of the marker detector: drawn when the localizer's answer has come."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``marker_detector``: images in; correspondences with a marker map out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plays recordings through live localizer nodes, one per method, and hears their answers."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plays the messages of a recording into the ROS graph, with /clock."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Listens to a localizer node and writes how it is, again and again."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the numbers mean for a user: a level, one sentence, and the numbers by readable names."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +11,7 @@ import numpy as np
 from rs_localizer.io.outputs import CameraShare, Localized
 from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.inputs import Role, input_named, said
-from rs_localizer.pipeline.reasons import IMU_REASONS
+from rs_localizer.pipeline.refusal import IMU_REASONS
 from rs_localizer.ros.node.health import (
     SOME,
     Health,

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``rs_localizer``: correspondences and camera_info in; pose, twist and inliers out."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import time

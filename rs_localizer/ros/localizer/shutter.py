@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The output ``~/image_rect_shutter``: images as a global shutter would have taken them."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass
 from typing import Any, TypeVar

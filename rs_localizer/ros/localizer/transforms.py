@@ -7,8 +7,6 @@ Transforms are taken in a thread of their own. Nobody waits in here for those th
 yet: frames are kept until they are, while others are localized.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import importlib
@@ -37,7 +35,7 @@ from rs_localizer.io.transforms import (
     make_transform,
     read_transform,
 )
-from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
+from rs_localizer.pipeline.published import Broadcast, broadcast
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.ros.node.refusals import Refusals

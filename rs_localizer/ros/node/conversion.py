@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """rclpy messages, made by type name or copied from those of a recording, and their publishers."""
 
-from __future__ import annotations
-
 import array
 import importlib
 from functools import cache

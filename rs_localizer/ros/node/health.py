@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every node says of itself: a level, a state, one sentence, and numbers by readable names."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The subscriptions of a node."""
 
-from __future__ import annotations
-
 import functools
 import threading
 import time

@@ -6,8 +6,6 @@ Three threads: the executor's answers services, changes parameters and the life 
 diagnostics; that of the inputs takes messages; the worker's does the work and publishes.
 """
 
-from __future__ import annotations
-
 import functools
 import gc
 import os

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS parameters, declared by walking the settings of :mod:`rs_localizer.config`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 from rcl_interfaces.msg import (

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What became of the frames: totals since the start, and how things are now."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter, deque

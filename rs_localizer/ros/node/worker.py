@@ -6,8 +6,6 @@ The kernels release the GIL: meanwhile the executor takes messages, answers serv
 parameters and publishes diagnostics.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -22,8 +22,7 @@ from killing import kill
 
 from rs_localizer.offline.fleet import cluster
 from rs_localizer.offline.fleet.cluster import ClusterError, Where, perform_all
-from rs_localizer.offline.fleet.identity import program
-from rs_localizer.offline.fleet.task import PARTIAL, Kind, Outcome, Task
+from rs_localizer.offline.fleet.task import PARTIAL, Kind, Outcome, Task, program
 
 
 def tasks(tmp_path: Path, **contents: str) -> list[Task]:

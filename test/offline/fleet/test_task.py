@@ -15,10 +15,21 @@ from pathlib import Path
 import killing
 import pytest
 
+from rs_localizer.cli.batch import CSV, DONE, FAILED, Row, write_summary
 from rs_localizer.offline.fleet import task as first
-from rs_localizer.offline.fleet.identity import MARKER, folder_names, identity, program
-from rs_localizer.offline.fleet.summary import CSV, DONE, FAILED, Row, write_summary
-from rs_localizer.offline.fleet.task import LOG, PARTIAL, Figures, Kind, Task, finished, perform
+from rs_localizer.offline.fleet.task import (
+    LOG,
+    MARKER,
+    PARTIAL,
+    Figures,
+    Kind,
+    Task,
+    finished,
+    folder_names,
+    identity,
+    perform,
+    program,
+)
 
 
 @pytest.fixture(autouse=True)
