@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-from typing import NamedTuple
+from collections import namedtuple
 
 import pytest
 
@@ -61,7 +61,7 @@ def test_no_interrupt_is_lost(tmp_path, number, body):
 
 def test_named_tuples_are_not_interrupted_halfway():
     """Numba has them made, and returns a result beside the exception."""
-    pair, calls = NamedTuple("pair", [("one", int)]), []
+    pair, calls = namedtuple("pair", ["one"]), []
     sys.setprofile(lambda frame, *_: calls.append((frame.f_code.co_name, _is_fragile(frame))))
     pair(1)
     sys.setprofile(None)
