@@ -363,7 +363,8 @@ class Localizer:
         observations = relinearized(
             sighted.exposure, observed.observations, best.state, sighted.turn
         )
-        return frame_posterior(observations, best.state, terms, gate, assumed)
+        one_lens = sighted.exposure.alone
+        return frame_posterior(observations, best.state, terms, gate, assumed, one_lens)
 
     def _gate(self, observed: Observed, state: Array) -> float:
         """Inlier threshold (px) with room for what the map is known to be off."""

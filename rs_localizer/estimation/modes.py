@@ -30,7 +30,7 @@ from rs_localizer.core.blocks import write
 from rs_localizer.core.scales import SPEEDS
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
-from rs_localizer.core.state import MOVE, PARAMETERS, STATE_SIZE, TURN, step_between
+from rs_localizer.core.state import PARAMETERS, STATE_SIZE, TURN, step_between
 from rs_localizer.estimation.frame_fit import (
     fit_frame,
     log_determinant_of_inverse,
@@ -92,27 +92,30 @@ _NO_PART = 1e-5
 
 
 @kernel
-def along_arcs(covariance: Array, centre: Array) -> Array:
+def along_arcs(
+    covariance: Array, centre: Array, weights: Array, offsets: Array, covariances: Array
+) -> Array:
     """The covariance with the second order of the move; that of the turn has none.
 
-    The mean stays where the points fit best, so that the mean of the second order counts, too: for
-    ``s_i = y^T H_i y`` of Gaussians ``y`` with covariance ``C``, ``E[s_i s_j]`` is
-    ``tr(H_i C) tr(H_j C) + 2 tr(H_i C H_j C)``.
+    A mixture's is not that of one Gaussian: who turned by three deviations moved nine times as far
+    off the tangent as who turned by one. The mean stays where the points fit best, so that the mean
+    of the second order counts, too: for ``s_i = y^T H_i y`` of Gaussians ``y`` with mean ``m`` and
+    covariance ``C``, ``E[s_i] = tr(H_i C) + m^T H_i m``, ``E[s_i s_j]`` is ``E[s_i] E[s_j] +
+    2 tr(H_i C H_j C) + 4 m^T H_i C H_j m``, and ``E[y s_i] = m E[s_i] + 2 C H_i m``.
 
     Args:
         covariance: (18,18), or more, of a step.
         centre: (3,) of the points, in camera axes.
+        weights: (k,) of Gaussians whose mixture it is.
+        offsets: (k,18) of their means (:func:`offset_between`).
+        covariances: (k,18,18) of the offsets.
     """
     # y = (phi, d): d = -rho + [p]x phi.
-    by_step = np.zeros((6, 6))
+    by_step, forms = np.zeros((6, PARAMETERS)), np.zeros((3, 6, 6))
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         by_step[i, i], by_step[3 + i, 3 + i] = 1.0, -1.0
         by_step[3 + j, i], by_step[3 + k, i] = centre[k], -centre[j]
-    both = by_step @ np.ascontiguousarray(covariance[:6, :6]) @ by_step.T
-    forms = np.zeros((3, 6, 6))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
         # (phi x (phi x p))_i = phi_i (phi . p) - p_i (phi . phi)
         for m in range(3):
             forms[i, i, m] -= 0.25 * centre[m]
@@ -120,26 +123,36 @@ def along_arcs(covariance: Array, centre: Array) -> Array:
             forms[i, m, m] += 0.5 * centre[i]
         forms[i, j, 3 + k] = forms[i, 3 + k, j] = -0.5
         forms[i, k, 3 + j] = forms[i, 3 + j, k] = 0.5
-    products = np.empty((3, 6, 6))
-    for i in range(3):
-        products[i] = forms[i] @ both
-    farther = covariance.copy()
-    for i in range(3):
-        for j in range(3):
-            second = np.trace(products[i]) * np.trace(products[j])
-            second += 2.0 * np.sum(products[i] * products[j].T)
-            farther[MOVE, MOVE][i, j] += second
+    farther, products, pulls = covariance.copy(), np.empty((3, 6, 6)), np.empty((3, 6))
+    means = np.empty(3)
+    for part in range(len(weights)):
+        if weights[part] < _NO_PART:
+            continue
+        weight, offset = weights[part], offsets[part]
+        mean, crossed = by_step @ offset, covariances[part] @ by_step.T
+        both = by_step @ crossed
+        for i in range(3):
+            products[i], pulls[i] = forms[i] @ both, forms[i] @ mean
+            means[i] = np.trace(products[i]) + np.sum(mean * pulls[i])
+        for i in range(3):
+            pulled = both @ pulls[i]
+            for j in range(3):
+                second = means[i] * means[j] + 2.0 * np.sum(products[i] * products[j].T)
+                farther[3 + i, 3 + j] += weight * (second + 4.0 * np.sum(pulls[j] * pulled))
+            first = weight * (means[i] * offset + 2.0 * crossed @ pulls[i])
+            farther[3 + i, :PARAMETERS] += first
+            farther[:PARAMETERS, 3 + i] += first
     return farther
 
 
 @kernel
 def averaged(
     states: Array, covariances: Array, best: int, counting: Array, possible: Array
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array]:
     """Mean (24,) of Gaussians by the ones probabilities (k,), covariance (18,18) by the others.
 
     Both about the middle of the points, where arcs are straight (:func:`offset_between`). And the
-    offsets (k,18) from the best one to all.
+    offsets (k,18) from the best one to all, from the mean to all, and their covariances (k,18,18).
     """
     count, first = len(states), states[best]
     steps, mean = np.empty((count, PARAMETERS)), np.zeros(PARAMETERS)
@@ -154,13 +167,15 @@ def averaged(
         middle[i] += first[9 + j] * mean[k] - first[9 + k] * mean[j]
     state[9:12] = middle
     covariance = np.zeros((PARAMETERS, PARAMETERS))
+    offsets, abouts = np.zeros((count, PARAMETERS)), np.zeros((count, PARAMETERS, PARAMETERS))
     for k in range(count):
         if possible[k] > 0.0:
-            offset, by_turn = offset_between(state, states[k], middle)
-            covariance += possible[k] * np.outer(offset, offset)
+            offsets[k], by_turn = offset_between(state, states[k], middle)
+            covariance += possible[k] * np.outer(offsets[k], offsets[k])
             if possible[k] > _NO_PART:
-                covariance += possible[k] * _about_pivot(covariances[k], by_turn)
-    return state, covariance, steps
+                abouts[k] = _about_pivot(covariances[k], by_turn)
+                covariance += possible[k] * abouts[k]
+    return state, covariance, steps, offsets, abouts
 
 
 @inlined
@@ -207,6 +222,7 @@ class Mixture(NamedTuple):
 
     state: Array  # (24,) their mean
     covariance: Array  # (18,18)
+    arched: Array  # (18,18) of steps, see along_arcs
     evidence: float  # logarithm of the sum
     speeds: Array  # (5,) weights of the typical speeds in the covariance
     log_likelihoods: Array  # (5,) of the typical speeds
@@ -271,14 +287,17 @@ def mixture_of(
         total = _log_sum(total, evidences[k])
     if total == -np.inf:
         return Mixture(
-            start, modes.covariances[0], total, weights, weights, 0.0, 0.0, evidences, modes.costs,
-            np.zeros((count, PARAMETERS)),
+            start, modes.covariances[0], modes.covariances[0], total, weights, weights, 0.0, 0.0,
+            evidences, modes.costs, np.zeros((count, PARAMETERS)),
         )  # fmt: skip
     first = int(np.argmax(probable))
     probable = np.exp(probable - probable[first])
     possible = probable**TEMPER
     probable, possible = probable / np.sum(probable), possible / np.sum(possible)
-    state, covariance, steps = averaged(modes.states, modes.covariances, first, probable, possible)
+    state, covariance, steps, offsets, abouts = averaged(
+        modes.states, modes.covariances, first, probable, possible
+    )
+    arched = along_arcs(covariance, state[9:12], possible, offsets, abouts)
     for k in range(count):
         weights[modes.speeds[k]] += possible[k]
     shared = 0.0
@@ -286,7 +305,7 @@ def mixture_of(
         shared += possible[k] * modes.smooths[k] ** 2
     log_likelihoods = np.maximum(log_likelihoods - np.max(log_likelihoods), _LEAST_LIKELY)
     return Mixture(
-        state, covariance, total, weights, log_likelihoods, modes.smooths[count - 1],
+        state, covariance, arched, total, weights, log_likelihoods, modes.smooths[count - 1],
         math.sqrt(shared), evidences, modes.costs, steps,
     )  # fmt: skip
 
@@ -570,7 +589,7 @@ def _over_leans(
         return mode, False
     probable = np.exp(evidences[:last] - best)
     total = np.sum(probable)
-    state, covariance, _ = averaged(
+    state, covariance, _, _, _ = averaged(
         states[:last], covariances[:last], int(np.argmax(probable)), probable / total,
         probable / total,
     )  # fmt: skip

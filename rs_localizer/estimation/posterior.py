@@ -77,6 +77,8 @@ class Posterior:
     speeds: Array = field(default_factory=np.zeros(0).copy)
     near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
+    # (18,18) with the second order of arcs, of a mixture; None: of the covariance as a Gaussian's
+    arched: Array | None = None
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
     undetected: Array = field(default_factory=np.zeros((12, 12)).copy)
     # (n,b): of what the smooth error is a combination (see frame_fit), which other frames share, so

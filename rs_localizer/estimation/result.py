@@ -154,7 +154,11 @@ def estimate_of(
     rate, change = state[STATE_ANGULAR], state[STATE_ANGULAR_ACCELERATION]
     covariance = posterior.covariance
     # The noise of this frame is an estimate, and what is on an arc leaves its tangent.
-    beside = along_arcs(posterior.inflation * covariance, state[STATE_TRANSLATION]) - covariance
+    arched = posterior.arched
+    if arched is None:
+        alone = np.zeros((1, PARAMETERS)), covariance[None, :PARAMETERS, :PARAMETERS].copy()
+        arched = along_arcs(covariance, state[STATE_TRANSLATION], np.ones(1), *alone)
+    beside = posterior.inflation * arched - covariance
     delay = _NO_DELAY
     if turn is not None:
         rate, change = rate + turn.rate, change + turn.change

@@ -97,14 +97,16 @@ def _repaired(smooth: Gray, board: Chessboard, corners: Array, window: int) -> A
 def _no_saddles(smooth: Gray, board: Chessboard, corners: Array) -> NDArray[np.bool_]:
     """Corners (n,) around which opposite squares are not alike and neighbouring ones different."""
     grid = corners.reshape(board.rows, board.columns, 2)
-    along, down = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
-    sides = [
-        cv2.remap(smooth, (grid + _BESIDE * (i * along + j * down)).astype(np.float32), None,
-                  cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
-        for i, j in ((1, 1), (-1, -1), (1, -1), (-1, 1))
-    ]  # fmt: skip
+    along, down = (np.asarray(np.gradient(grid, axis=axis)) for axis in (1, 0))
+
+    def beside(i: int, j: int) -> Array:
+        x, y = np.moveaxis(grid + _BESIDE * (i * along + j * down), -1, 0).astype(np.float32)
+        values = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(values, np.float64)
+
     row, column = np.indices(grid.shape[:2])
-    contrast = (-1.0) ** (row + column) * (sides[0] + sides[1] - sides[2] - sides[3])
+    opposite, other = beside(1, 1) + beside(-1, -1), beside(1, -1) + beside(-1, 1)
+    contrast = (-1.0) ** (row + column) * (opposite - other)
     typical = np.median(contrast)
     return np.asarray(contrast * np.sign(typical) < _LEAST_CONTRAST * abs(typical)).ravel()
 

@@ -32,7 +32,7 @@ def offset(state, other):
 def test_mean_and_covariance_are_those_of_the_mixture():
     states, covariances = gaussians()
     weights = np.array([0.5, 0.3, 0.2])
-    mean, covariance, steps = averaged(states, covariances, 0, weights, weights)
+    mean, covariance, steps, *_ = averaged(states, covariances, 0, weights, weights)
     expected = np.array([offset(states[0], state) for state in states])
     np.testing.assert_allclose(steps, expected, atol=1e-15)
     centre = weights @ expected
@@ -51,7 +51,7 @@ def test_cameras_on_an_arc_about_the_points_are_as_far_away_as_each_of_them():
     for state, angle in zip(states, (-0.5, 0.5), strict=True):
         state[:9] = Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix().ravel()
     weights = np.array([0.5, 0.5])
-    mean, covariance, _ = averaged(states, np.zeros((2, 18, 18)), 0, weights, weights)
+    mean, covariance, *_ = averaged(states, np.zeros((2, 18, 18)), 0, weights, weights)
     np.testing.assert_allclose(mean, STATE, atol=1e-12)
     # Turns about x move the camera along y, which is all that is open.
     arc = np.zeros(PARAMETERS)
@@ -62,7 +62,7 @@ def test_cameras_on_an_arc_about_the_points_are_as_far_away_as_each_of_them():
 def test_one_alone_stays_as_it_is():
     states, covariances = gaussians()
     alone = np.array([0.0, 1.0, 0.0])
-    mean, covariance, _ = averaged(states, covariances, 1, alone, alone)
+    mean, covariance, *_ = averaged(states, covariances, 1, alone, alone)
     np.testing.assert_allclose(mean, states[1], atol=1e-15)
     np.testing.assert_allclose(covariance, covariances[1], atol=1e-18)
 

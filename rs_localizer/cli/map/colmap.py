@@ -16,7 +16,7 @@ if WORKING:
     import numpy as np
     from tqdm import tqdm
 
-    from rs_localizer.cli.map import check_readout
+    from rs_localizer.cli.map import check_readout, print_step
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.calibration import read_calibration
     from rs_localizer.io.maps.colmap import read_camera, read_images, read_model, write_model
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
         if missing:
             raise ValueError(f"{args.images} has no {missing[0]}, an image of the model")
     with atomic_directory(args.out, replaced(args, _LIST)) as out:
-        result = undo_shutter(camera, model, images, stamps, _known(args), _print_step)
+        result = undo_shutter(camera, model, images, stamps, _known(args), print_step)
         check_readout(args, result.refined.readout_check, "see --shutter estimated")
         out.mkdir()
         write_model(out, result.camera, result.images, result.points)
@@ -96,10 +96,6 @@ def run(args: argparse.Namespace) -> None:
     _tell(args, result, len(images), len(model.points))
     if share is not None:
         print(f"{args.out / _IMAGES}: {1 - share:.1%} of the pixels are left black: not known")
-
-
-def _print_step(step: str) -> None:
-    print(f"adjusted: {step}", flush=True)
 
 
 def _known(args: argparse.Namespace) -> Shutter:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, UsageError, number, refuse_existing
-from rs_localizer.cli.map import add_readout_argument, check_readout, colmap
+from rs_localizer.cli.map import add_readout_argument, check_readout, colmap, print_step
 from rs_localizer.cli.rig_input import (
     MapCamera,
     add_mounting_argument,
@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> None:
     localized = _localized([one.camera for one in rig], clouds, landmarks)
     deviations = _deviations(args, localized.landmarks, config.map_deviation)
     freedom = MapFreedom(shutter == _ESTIMATED, args.intrinsics, deviations)
-    refined = refine_rig(rig, localized.seen, localized.start, freedom, done=_print_step)
+    refined = refine_rig(rig, localized.seen, localized.start, freedom, done=print_step)
     _tell(localized, refined, [of.name for of in cameras])
     for of, result in zip(cameras, refined.cameras, strict=True):
         check_readout(args, result.readout_check, "see --shutter estimated", of.name)
@@ -136,10 +136,6 @@ def _recorded(
         lens = read_calibration(args.calibration)
         camera = replace(lens, readout_time=readout_time, scan_direction=config.scan_direction)
     return RigCamera(camera, config.stamp_offset, of.mounting), recorded.clouds
-
-
-def _print_step(step: str) -> None:
-    print(f"adjusted: {step}", flush=True)
 
 
 def _localized(

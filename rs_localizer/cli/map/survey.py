@@ -29,7 +29,7 @@ if WORKING:
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.camera_info import Calibration, read_camera_info
     from rs_localizer.io.images import Image
-    from rs_localizer.mapping.survey import Survey, survey_rig
+    from rs_localizer.mapping.survey import MISFIT, Survey, survey_rig
     from rs_localizer.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
     from rs_localizer.markers.consistency import problems
     from rs_localizer.markers.map_files import write_marker_map
@@ -65,8 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--size",
         action="append",
         required=True,
-        metavar="[ID:]M",
-        help="side of the black square, m: of all markers, and of single ids that differ",
+        metavar="[ID[-ID]:]M",
+        help="side of the black square, m: of all markers, and of ids that differ",
     )
     parser.add_argument(
         "--origin", type=int, metavar="ID",
@@ -138,19 +138,20 @@ def _markers(args: argparse.Namespace) -> tuple[Marker, ...]:
     kinds = [one.kind for one in families]
     if len(set(kinds)) < len(kinds):
         raise UsageError("--family: families of one kind share their patterns; give the largest")
-    size, sizes = 0.0, {}
+    size, sizes = 0.0, dict[int, float]()
     for text in args.size:
-        number_of, _, metres = text.rpartition(":")
+        ids, _, metres = text.rpartition(":")
         try:
             value = float(metres)
             if not 0.0 < value < np.inf:
                 raise ValueError
-            if number_of:
-                sizes[int(number_of)] = value
+            if ids:
+                first, _, last = ids.partition("-")
+                sizes |= dict.fromkeys(range(int(first), int(last or first) + 1), value)
             else:
                 size = value
         except ValueError:
-            raise UsageError(f"--size must be metres, or ID:metres, got {text!r}") from None
+            raise UsageError(f"--size must be metres, or ID[-ID]:metres, got {text!r}") from None
     if not size:
         raise UsageError("--size needs the size of all other markers, too")
     return every_marker(families, size, sizes)
@@ -234,6 +235,8 @@ def _tell(
         print(
             f"not connected: {_listed(part)}: no image shows one of them together with those above"
         )
+    if surveyed_map.misfits:
+        print(f"left out: {_listed(surveyed_map.misfits)}: corners do not fit the others: {MISFIT}")
     if surveyed_map.rare:
         print(
             f"left out: {_listed(surveyed_map.rare)}: too few images show them, or not enough to "
