@@ -79,6 +79,8 @@ setup(
         "mapping": ["pycolmap", "matplotlib"],
         "plots": ["matplotlib", "Pillow>=9.1"],
         "table": ["fsspec", "pyarrow"],
+        "s3": ["pyarrow", "s3fs"],
+        "gs": ["gcsfs", "pyarrow"],
         # Of telemetry-parser there is no wheel for 3.13, and a build needs Rust. PyAV reads the
         # second stream of files of two lenses, which OpenCV does not.
         "video": ["av", "telemetry-parser; python_version < '3.13'"],

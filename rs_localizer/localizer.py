@@ -363,7 +363,8 @@ class Localizer:
         observations = relinearized(
             sighted.exposure, observed.observations, best.state, sighted.turn
         )
-        return frame_posterior(observations, best.state, terms, gate, assumed)
+        one_lens = sighted.exposure.alone
+        return frame_posterior(observations, best.state, terms, gate, assumed, one_lens)
 
     def _gate(self, observed: Observed, state: Array) -> float:
         """Inlier threshold (px) with room for what the map is known to be off."""
@@ -401,11 +402,12 @@ class Localizer:
         known = math.hypot(posterior.declared, effect.residual)  # px, of map and calibration
         failure = refusal(
             observed.observations,
-            replace(posterior, declared=known),
+            posterior,
             best.samples,
             min_inliers=self.config.min_inliers,
             threshold=self._gate(observed, posterior.state),
             rolling=self._solver.rolling_shutter,
+            declared=known,
         )
         if failure is not None:
             return failure
@@ -414,11 +416,4 @@ class Localizer:
         asked = observed.lens is not None or observed.asks_lens
         if asked and observed.sighted.exposure.alone:
             posterior, lens = told_of_lens(observed, posterior)
-        estimate = estimate_of(observed, posterior, still, best.samples)
-        return replace(
-            estimate,
-            calibration_covariance=effect.covariance,
-            still_deviation=effect.still_deviation,
-            lens=observed.lens,
-            of_lens=lens,
-        )
+        return estimate_of(observed, posterior, still, best.samples, effect, lens)

@@ -4,6 +4,7 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "rs_localizer"
@@ -51,6 +52,7 @@ MAY_IMPORT |= {
 }
 
 
+@cache
 def imported(source: str, inside: str) -> set[str]:
     """Absolute dotted names that a module of the package `inside` imports, late ones included."""
     names = set()

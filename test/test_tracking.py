@@ -287,6 +287,22 @@ def test_turn_rates_of_a_shaken_camera_are_covered():
     assert np.mean(np.array(lengths[3:]) < 7.8) > 0.85  # 95 % of three degrees of freedom
 
 
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: Tracker(CAMERA), "localizer must be an rs_localizer.Localizer, got Camera"),
+        (lambda: rsl.Localizer("left"), "camera must be an rs_localizer.Camera, got str"),
+        (
+            lambda: rsl.camera_state(rsl.Localizer(CAMERA).localize([[0, 0, 1]], [[1, 2]]), CAMERA),
+            "got Failure .too_few_points: 1 usable",
+        ),
+    ],
+)
+def test_what_was_given_instead_is_named(call, said):
+    with pytest.raises(ValueError, match=said):
+        call()
+
+
 @pytest.mark.parametrize("unit", [1.0, 1e3])
 def test_times_in_other_units_are_refused(unit):
     tracker = Tracker(rsl.Localizer(CAMERA))

@@ -31,7 +31,6 @@ if WORKING:
         PARTIAL,
         Figures,
         Kind,
-        Outcome,
         Task,
         finished,
         folder_names,
@@ -104,7 +103,10 @@ def run_batch(args: Namespace, plan: Plan) -> None:
         raise UsageError("many recordings need --out DIR, for a folder of each")
     if args.workers is not None and args.scheduler is not None:
         raise UsageError("--workers are of this machine; give it or --scheduler")
-    _need_dask()
+    if importlib.util.find_spec("distributed") is None:
+        raise ValueError(
+            "many recordings need Dask, which is not installed: pip install 'rs_localizer[fleet]'"
+        )
     out = args.out.resolve()
     tasks = _tasks(args, plan, out)
     _check(tasks, plan)
@@ -123,13 +125,6 @@ def run_batch(args: Namespace, plan: Plan) -> None:
     print(f"written to {args.out}: {CSV}, {MARKDOWN}, {PICTURE}")
     if failed := sum(row.state == FAILED for row in rows.values()):
         raise ValueError(f"{failed} of {len(rows)} recordings failed; {args.out / CSV} says why")
-
-
-def _need_dask() -> None:
-    if importlib.util.find_spec("distributed") is None:
-        raise ValueError(
-            "many recordings need Dask, which is not installed: pip install 'rs_localizer[fleet]'"
-        )
 
 
 def _tasks(args: Namespace, plan: Plan, out: Path) -> list[Task]:
@@ -198,7 +193,10 @@ def _work(tasks: list[Task], where: Where, rows: dict[str, Row]) -> None:
     bar = tqdm(total=len(tasks), initial=before, unit="recording", disable=None)
     with bar, contextlib.closing(perform_all(open_tasks, where)) as outcomes:
         for outcome in outcomes:
-            rows[outcome.name] = row = _row(rows[outcome.name].recording, outcome)
+            state = FAILED if outcome.figures is None else DONE
+            recording, figures = rows[outcome.name].recording, outcome.figures or {}
+            row = Row(recording, outcome.name, state, figures, outcome.reason)
+            rows[outcome.name] = row
             busy += outcome.seconds
             bar.update()
             bar.write(f"{row.folder}: {_said(row)}")
@@ -219,11 +217,6 @@ def _find_finished(tasks: list[Task], rows: dict[str, Row]) -> list[Task]:
         else:
             rows[task.name] = Row(task.recording, task.name, DONE, figures)
     return open_tasks
-
-
-def _row(recording: Location, outcome: Outcome) -> Row:
-    state = FAILED if outcome.figures is None else DONE
-    return Row(recording, outcome.name, state, outcome.figures or {}, outcome.reason)
 
 
 def _said(row: Row) -> str:
@@ -260,6 +253,7 @@ DONE, FAILED, OPEN = "done", "failed", "not done"
 """States of a recording; not done: the work was interrupted before."""
 
 _FIRST, _LAST = ("recording", "folder", "state"), ("reason",)
+_BAR = "\\|"  # in a cell
 _MOST_PANELS = 5
 _WIDTH, _PANEL = 8.0, 1.7  # inches
 
@@ -310,12 +304,13 @@ def _as_csv(rows: Sequence[Row], columns: Sequence[str]) -> bytes:
 
 def _as_markdown(command: str, rows: Sequence[Row], columns: Sequence[str]) -> bytes:
     names = [*_FIRST, *columns, *_LAST]
+    cells = [row.cells(columns) for row in rows]
     lines = [
         f"# {command}: {counted(rows)}",
         "",
         f"| {' | '.join(names)} |",
         f"|{'---|' * len(names)}",
-        *(f"| {' | '.join(map(_escaped, row.cells(columns)))} |" for row in rows),
+        *(f"| {' | '.join(cell.replace('|', _BAR) for cell in row)} |" for row in cells),
     ]
     return ("\n".join(lines) + "\n").encode()
 
@@ -326,10 +321,6 @@ def _plain(cell: str) -> str:
         float(cell)
         return cell
     return f"'{cell}" if cell.startswith(("=", "+", "-", "@", "\t", "\r")) else cell
-
-
-def _escaped(cell: str) -> str:
-    return cell.replace("|", "\\|")
 
 
 def _text(value: float | int | str) -> str:

@@ -265,10 +265,14 @@ def run(args: argparse.Namespace) -> Figures | None:
     return None
 
 
+def _finds_lens(args: argparse.Namespace, recording: Path) -> bool:
+    return args.intrinsics or (args.calibration is None and not is_bag(recording))
+
+
 def calibrate_one(args: argparse.Namespace) -> Calibration:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
-        lens = args.intrinsics or (args.calibration is None and not is_bag(args.recording))
+        lens = _finds_lens(args, args.recording)
         beside = {_LENS: lens, _MAP: args.map or args.board} | dict.fromkeys(_SHARED, args.share)
         refuse_existing(args, *(name for name, written in beside.items() if written))
     config = _config(args)
@@ -576,12 +580,13 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
     for name in ("imu", "share", "workers", "scheduler"):
         if getattr(args, name) is not None:
             raise UsageError(f"--{name} is for one camera: leave it out with --rig")
-    if args.out is not None:
-        refuse_existing(args, _TRANSFORMS, _CAMCHAIN)
     # Cameras by name need a readout time; what it is does not matter where it is estimated.
     args.assignments = ["readout_time:=0.03", *args.assignments]
     config, recordings, maps = _config(args), dict[str, Recording](), list[MarkerMap]()
     cameras = cameras_of(args, config)
+    if args.out is not None:
+        found = cameras if _finds_lens(args, args.recordings[0]) else ()
+        refuse_existing(args, _TRANSFORMS, _CAMCHAIN, *(f"{name}_{_LENS}" for name in found))
     intrinsics = args.intrinsics
     for name, own in cameras.items():
         print(f"{name}:")
@@ -688,7 +693,7 @@ def _write_rig(
         del writers[chain]
         print(f"no camchain: {error}")
     for name, camera in parts.cameras.items() if intrinsics else ():
-        lens = path.with_name(f"{path.stem}_{name}_camera_info.yaml")
+        lens = path.with_name(f"{path.stem}_{name}_{_LENS}")
         writers[lens] = partial(write_calibration, camera=camera)
 
     def write_values(part: Path) -> None:

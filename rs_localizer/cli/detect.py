@@ -104,7 +104,7 @@ def detect_one(args: argparse.Namespace) -> list[Recorded]:
     """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
     marker_map = find_map(args)
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
-    told = []
+    recordings = []
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
         with BagWriter(out, args.storage) as bag:
             for name, own in _cameras(args, bag).items():
@@ -113,16 +113,16 @@ def detect_one(args: argparse.Namespace) -> list[Recorded]:
                 detector.warm_up()
                 with opened(own, args.images, args.start) as source:
                     recorded = _record(own, name, source, detector, bag)
-                told.append((name, recorded, notices, detector.seconds, source.clock))
+                recordings.append((name, recorded, notices, detector.seconds, source.clock))
         write_shutter(args, out, marker_map.settings)
-    for name, recorded, notices, seconds, clock in told:
+    for name, recorded, notices, seconds, clock in recordings:
         _tell(f"{args.out}{f', {name}' if name else ''}", recorded, notices)
         for fault in (*recorded.faults, *time_faults(args, clock, recorded.period, name)):
             print(f"warning: {fault}")
         if args.timing:
             _tell_times(recorded.images, *seconds)
     tell_telemetry(args)
-    return [recorded for _, recorded, *_ in told]
+    return [recorded for _, recorded, *_ in recordings]
 
 
 def _cameras(args: argparse.Namespace, bag: BagWriter) -> dict[str, argparse.Namespace]:

@@ -119,8 +119,8 @@ def telemetry_of(path: Path, args: argparse.Namespace) -> Telemetry | None:
     Raises:
         ValueError: for telemetry that cannot be read.
     """
-    found = None if getattr(args, "no_telemetry", True) else _telemetry(path)
-    return None if found is None or found.stabilizer else found
+    telemetry = None if getattr(args, "no_telemetry", True) else _telemetry(path)
+    return None if telemetry is None or telemetry.stabilizer else telemetry
 
 
 def _telemetry(path: Path) -> Telemetry | None:
@@ -166,31 +166,31 @@ def tell_telemetry(
         names = lenses_of(path)
         if len(names) > 1 and measured is None and not is_rig:
             print(f"note: of {', '.join(names)} the first one is used; calibrate --rig takes all")
-    found = _telemetry(path)
-    if found is None:
+    telemetry = _telemetry(path)
+    if telemetry is None:
         missing = importlib.util.find_spec("telemetry_parser") is None
         if missing and path.is_file() and not is_bag(path) and has_telemetry(path):
             print("note: the video has a gyroscope; to use it: pip install 'rs_localizer[video]'")
         return
-    if found.stabilizer:
+    if telemetry.stabilizer:
         print(
-            f"warning: {found.camera} has stabilized this video ({found.stabilizer}): its rows are "
-            "not what the shutter saw, and poses are wrong; switch it off. Its gyroscope and "
-            "readout time are not used"
+            f"warning: {telemetry.camera} has stabilized this video ({telemetry.stabilizer}): its "
+            "rows are not what the shutter saw, and poses are wrong; switch it off. Its gyroscope "
+            "and readout time are not used"
         )
         return
-    said = [f"gyroscope at {found.rate:.0f} Hz" + (" (not used of a rig)" if is_rig else "")]
-    if found.readout_time is not None:
-        said.append(f"readout time {1e3 * found.readout_time:.2f} ms")
+    said = [f"gyroscope at {telemetry.rate:.0f} Hz" + (" (not used of a rig)" if is_rig else "")]
+    if telemetry.readout_time is not None:
+        said.append(f"readout time {1e3 * telemetry.readout_time:.2f} ms")
         how = "given" if used is None else "measured"
         used = build(shutter_values(args)).readout_time if used is None else used
-        if abs(used / found.readout_time - 1.0) > _SAME:
+        if abs(used / telemetry.readout_time - 1.0) > _SAME:
             said[-1] += f" (not used: {1e3 * used:.2f} ms was {how})"
-    if found.exposure is not None:
-        said.append(f"exposure {1e3 * found.exposure:.2f} ms (median)")
-    if found.lens:
-        said.append(found.lens)
-        if (profile := found.profile) is not None:
+    if telemetry.exposure is not None:
+        said.append(f"exposure {1e3 * telemetry.exposure:.2f} ms (median)")
+    if telemetry.lens:
+        said.append(telemetry.lens)
+        if (profile := telemetry.profile) is not None:
             used_one = lens and args.calibration is None
             said[-1] += ", used" if used_one else ", not used"
             if measured is not None:
@@ -200,7 +200,7 @@ def tell_telemetry(
                         f" (its focal length is {profile.K[0, 0]:.0f} px, {focal:.0f} px was "
                         "measured: of another mode?)"
                     )
-    print(f"{found.camera}: {', '.join(said)}; --no-telemetry ignores them")
+    print(f"{telemetry.camera}: {', '.join(said)}; --no-telemetry ignores them")
 
 
 def write_shutter(

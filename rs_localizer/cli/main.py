@@ -233,9 +233,10 @@ def _common_options(words: Sequence[str]) -> tuple[set[str], list[str]]:
 
 def _command_parser(name: str) -> argparse.ArgumentParser:
     command = COMMANDS[name]
+    summary = command.summary
     parser = argparse.ArgumentParser(
         prog=f"rs_localizer {name}",
-        description=_sentence(command.summary),
+        description=f"{summary[0].upper()}{summary[1:]}.",
         epilog=f"example:\n  {command.example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
@@ -355,7 +356,3 @@ def _command(name: str) -> str:
         hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(COMMANDS)}"
         raise argparse.ArgumentTypeError(f"invalid choice: {name!r}; {hint}")
     return name
-
-
-def _sentence(text: str) -> str:
-    return f"{text[0].upper()}{text[1:]}."

@@ -556,7 +556,8 @@ def _play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) -
     """
     player = import_ros("player", "--ros")
     images = image_topics(bag)
-    inputs = images + (_of_type(bag, INFO_TYPE) if topics is None else list(topics.names))
+    infos = sorted(topic for topic, kind in bag.topics.items() if kind == INFO_TYPE)
+    inputs = images + (infos if topics is None else list(topics.names))
     if not images and topics is None:
         raise BagError(f"{bag.path} has nothing to play: no matches, keypoints or images")
     names = tuple(dict.fromkeys((*_transforms(bag), *imus, *inputs)))
@@ -576,10 +577,6 @@ def _play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) -
         print(f"{count} poses received on {topic}")
     if not played.poses:
         print(f"no node {NODE_NAME} was there to publish poses")
-
-
-def _of_type(bag: BagReader, type_name: str) -> list[str]:
-    return sorted(topic for topic, kind in bag.topics.items() if kind == type_name)
 
 
 def _transforms(bag: BagReader) -> list[str]:

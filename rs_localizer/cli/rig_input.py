@@ -189,7 +189,7 @@ def _by_tf(sources: Mapping[str, OfRig]) -> dict[str, Transform]:
     if not is_bag(path):
         return {}
     with open_bag(path) as bag:
-        found = {
+        poses = {
             name: transform_between(bag, own.frame, first.frame) for name, own in sources.items()
         }
-    return {name: pose for name, pose in found.items() if pose is not None}
+    return {name: pose for name, pose in poses.items() if pose is not None}

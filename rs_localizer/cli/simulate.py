@@ -415,11 +415,11 @@ def _write_rig(args: argparse.Namespace) -> dict[str, object]:
             return rendered_frames(renderers[name], mounted, stamps[name], encoding, seed)
     else:
         landmarks = described(room(_positions(motion), rng), MAP_FRAME, rng)
-        seen = FrameSettings(args.points, args.noise, args.outliers, args.rate)
+        settings = FrameSettings(args.points, args.noise, args.outliers, args.rate)
 
         def see(name: str, mounted: TrueMotion, place: int) -> Iterator[Frame]:
             return simulate_frames(
-                parts.cameras[name], mounted, landmarks.points, seen, stamps_ns=stamps[name],
+                parts.cameras[name], mounted, landmarks.points, settings, stamps_ns=stamps[name],
                 seed=args.seed + place,
             )  # fmt: skip
 
@@ -442,12 +442,12 @@ def _write_rig(args: argparse.Namespace) -> dict[str, object]:
         if scene is not None and scene.marker_map is not None:
             write_marker_map(built / MARKER_MAP, scene.marker_map)
     said = f"{args.out}: {total} images of {', '.join(parts.cameras)}"
-    told: dict[str, object] = {"images": total, "cameras": list(parts.cameras)}
+    figures: dict[str, object] = {"images": total, "cameras": list(parts.cameras)}
     if scene is not None:
-        return told | _tell_scene(args, said, scene)
+        return figures | _tell_scene(args, said, scene)
     print(f"{said}, {counts / total:.0f} points each")
     _tell_next(args)
-    return told | {"points_per_image": counts / total}
+    return figures | {"points_per_image": counts / total}
 
 
 def _write_points(args: argparse.Namespace) -> dict[str, object]:

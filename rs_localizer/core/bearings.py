@@ -9,6 +9,8 @@ have no such bearing, and other lenses, are left to :meth:`Camera.rays_and_jacob
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
@@ -41,6 +43,7 @@ def bearings(camera: Camera, pixels: Array) -> tuple[Array, Array]:
     return rays, by_ray
 
 
+@lru_cache(64)  # of the cameras of a rig, and lenses that are tried
 def _pinhole(camera: Camera) -> tuple[Array, Array]:
     """Focal lengths (2,) and centre (2,) of the image, in delivered pixels."""
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()

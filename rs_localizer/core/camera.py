@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import lru_cache
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -203,15 +204,13 @@ class Camera:
 
     def row_time(self, pixels: Array) -> Array:
         """Row times (n,) of raw pixels (n,2): -0.5 at the first exposed row, 0.5 at the last."""
-        return self._row_time_of_first_pixel() + np.asarray(pixels, float) @ self.row_time_gradient
+        first, gradient = _rows_of(self)
+        return first + np.asarray(pixels, float) @ gradient
 
     @property
     def row_time_gradient(self) -> Array:
         """Derivative (2,) of the row time by the raw pixel, per delivered pixel."""
-        axis, sign, size = self._scan()
-        gradient = np.zeros(2)
-        gradient[axis] = sign * self.binning[axis] / (size - 1)
-        return gradient
+        return _rows_of(self)[1]
 
     @property
     def first_row_time(self) -> float:
@@ -225,10 +224,6 @@ class Camera:
         )[axis]
         first = offset if sign > 0 else offset + extent - 1
         return float(sign * (first - 0.5 * (size - 1)) / (size - 1))
-
-    def _row_time_of_first_pixel(self) -> float:
-        axis, sign, size = self._scan()
-        return float(sign * (self._offset()[axis] - 0.5 * (size - 1)) / (size - 1))
 
     def _scan(self) -> tuple[int, int, int]:
         """Pixel axis along which the shutter moves, its sign, and the sensor's size there."""
@@ -354,3 +349,13 @@ class Camera:
             sensor, jacobian, *_ = self.law.project(rays, self.K, self.D)
         pixels: Array = (sensor - self._offset()) / self.binning
         return pixels, np.ascontiguousarray(jacobian / np.array(self.binning)[:, None])
+
+
+@lru_cache(64)  # of the cameras of a rig, and lenses that are tried
+def _rows_of(camera: Camera) -> tuple[float, Array]:
+    """Row time of the first pixel, and its derivative (2,) by the pixel."""
+    axis, sign, size = camera._scan()
+    gradient = np.zeros(2)
+    gradient[axis] = sign * camera.binning[axis] / (size - 1)
+    gradient.flags.writeable = False
+    return float(sign * (camera._offset()[axis] - 0.5 * (size - 1)) / (size - 1)), gradient

@@ -13,6 +13,7 @@ coefficients of all cameras are of one size.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from rs_localizer.core.lens_laws import LensLaw
 # No model has fewer coefficients; k1, k2 stand first in all, and p1, p2 behind them.
 _FEWEST = 4
 _OF_MATRIX = 4  # focal lengths and centre
+# What is the same for all frames of a camera; of the cameras of a rig, and lenses that are tried.
+_remembered = lru_cache(64)
 _RADII = np.linspace(0.0, 1.0, 21)
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
 
@@ -54,6 +57,7 @@ class LensError:
         return float(self.corner * np.hypot(along, down).max())
 
 
+@_remembered
 def corner_of(camera: Camera) -> float:
     """Distance of the image's corners from its middle, in focal lengths.
 
@@ -67,6 +71,7 @@ def corner_of(camera: Camera) -> float:
     return float(np.hypot(np.abs(across).max() / K[0, 0], np.abs(down).max() / K[1, 1]))
 
 
+@_remembered
 def coefficients_of(camera: Camera) -> int:
     """How many coefficients may be off."""
     return _distorting(camera) + _OF_MATRIX
@@ -95,10 +100,12 @@ def by_lens(camera: Camera, towards: Array) -> Array:
     return scaled
 
 
+@_remembered
 def _distorting(camera: Camera) -> int:
     return len(_law_of(camera).correctable)
 
 
+@_remembered
 def _law_of(camera: Camera) -> LensLaw:
     return DistortionModel(_model_of(camera)).law
 
@@ -112,6 +119,7 @@ def _distortion_of(camera: Camera) -> Array:
     return camera.D.copy() if len(camera.D) else np.zeros(_FEWEST)
 
 
+@_remembered
 def _scales_of(camera: Camera) -> Array:
     """What OpenCV's parameters change by one of the coefficients (k,)."""
     corner = corner_of(camera)

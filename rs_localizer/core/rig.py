@@ -302,6 +302,8 @@ class Exposure:
 
         NaN where it has none; (n,2,2) of the pixels by the rays; (n,) of which side they are.
         """
+        if len(self.sides) == len(self.cameras):  # one for each
+            return *bearings(self.cameras[place], pixels), np.full(len(pixels), place)
         own = [i for i, side in enumerate(self.sides) if side.place == place]
         if len(own) == 1:
             return *bearings(self.cameras[place], pixels), np.full(len(pixels), own[0])

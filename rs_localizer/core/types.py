@@ -40,16 +40,16 @@ class Estimate(Motion):
     iterations: int  # minimal samples drawn
     # (12,12) of what calibration and declared map may be off, a part of ``covariance``
     calibration_covariance: Array = field(
-        default_factory=lambda: np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
+        default_factory=np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)).copy
     )
     # (12,12) of vibration that hides in the noise of this frame, which is an estimate, and of arcs
     # about what is seen, which leave their tangents; likewise
     undetected_covariance: Array = field(
-        default_factory=lambda: np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
+        default_factory=np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)).copy
     )
     still_deviation: float = math.inf  # rad, orientation_deviation if the motion were known
     # (k,3) rad: what the camera turns beside the motion (rs_localizer.core.shake): vibration
-    shake: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    shake: Array = field(default_factory=np.zeros((0, 3)).copy)
     model_error: float = 0.0  # px, rms of what map, lens and motion leave beside the noise
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
     tracked: bool = False  # found near a prior motion, without a search

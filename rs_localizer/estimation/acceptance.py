@@ -51,6 +51,7 @@ def refusal(
     min_inliers: int,
     threshold: float,
     rolling: bool,
+    declared: float = 0.0,
 ) -> Failure | None:
     """What is wrong with an estimate, or None.
 
@@ -58,6 +59,7 @@ def refusal(
         samples: minimal samples drawn, for the message.
         min_inliers, threshold: of the configuration.
         rolling: whether velocities were estimated.
+        declared: px, what map and calibration are known to be off.
     """
     state = posterior.state
     found, needed = int(np.count_nonzero(posterior.inliers)), min_inliers
@@ -93,9 +95,7 @@ def refusal(
             "too small for the noise",
         )
     shared = rolling and posterior.agreement > _MOST_AGREEMENT
-    if shared and posterior.noise > max(
-        _LEAST_MODEL_ERROR * threshold, _ALLOWED * posterior.declared
-    ):
+    if shared and posterior.noise > max(_LEAST_MODEL_ERROR * threshold, _ALLOWED * declared):
         return Failure(
             Reason.MODEL_ERROR,
             f"neighbouring rows share errors that no motion explains ({posterior.agreement:.1f} "
@@ -109,7 +109,7 @@ def refusal(
             "unmodelled vibration, or a second motion",
         )
     if rolling and posterior.model_error > math.hypot(
-        _MOST_MODEL_ERROR * threshold, _MOST_DECLARED * posterior.declared
+        _MOST_MODEL_ERROR * threshold, _MOST_DECLARED * declared
     ):
         return Failure(
             Reason.MODEL_ERROR,

@@ -22,9 +22,11 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.scales import SPEEDS
 from rs_localizer.core.shake import shake_at
-from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, TURN
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE
 from rs_localizer.estimation.frame_fit import SMOOTH_TERMS, smooth_terms
 from rs_localizer.estimation.lens import rays_of_lens
+from rs_localizer.estimation.mirror import longest_axis
 from rs_localizer.estimation.observations import Observed
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import PriorTerms, add_prior, terms_at
@@ -60,7 +62,7 @@ def calibration_effect(
     """
     observations, chosen = observed.observations, posterior.inliers
     lines = linearized(
-        observations.packed, len(observations), posterior.state,
+        observations.packed, observations.count, posterior.state,
         shake_at(observations.tau, posterior.shake),
     )  # fmt: skip
     rays = rays_of_lens(observed.sighted, observations.tau[chosen], lines.image[chosen])
@@ -71,41 +73,59 @@ def calibration_effect(
         if np.any(here):
             towards = side.towards(rays[here])
             columns[here, :, first : first + _ERRORS] = _columns(side.camera, towards, deviation)
-    smooth = _smooth_columns(posterior, lines, chosen)
-    pixels = columns.reshape(-1, columns.shape[2])
-    by_motion = np.ascontiguousarray(lines.by_motion[chosen].reshape(-1, PARAMETERS))
-    by_all = np.hstack([by_motion, smooth.reshape(len(by_motion), -1)])
-    products, crossed = by_all.T @ by_all, by_all.T @ pixels
-    variance = posterior.noise**2
-    of_pose = posterior.inflation * variance * inverted(np.ascontiguousarray(products[POSE, POSE]))
-    determined = bool(np.all(np.isfinite(of_pose)))
-    still = np.sqrt(np.linalg.eigvalsh(of_pose[TURN, TURN])[-1]) if determined else np.inf
-    count = len(products) - PARAMETERS
-    pull = np.zeros((len(products), crossed.shape[1] + count))
-    taken = np.zeros((PARAMETERS, crossed.shape[1]))
+    smooth, variance = _smooth_columns(posterior, lines, chosen), posterior.noise**2
+    rows = np.concatenate([lines.by_motion[chosen], smooth, columns], axis=2)
+    size, rows = PARAMETERS + smooth.shape[2], rows.reshape(-1, rows.shape[2])
+    every = rows.T @ rows
+    of_pose = posterior.inflation * variance * inverted(np.ascontiguousarray(every[POSE, POSE]))
+    still = longest_axis(of_pose) if np.all(np.isfinite(of_pose)) else np.inf
+    products = np.ascontiguousarray(every[:size, :size])
+    crossed = np.hstack([every[:size, size:], variance * np.eye(size)[:, PARAMETERS:]])
     parts = posterior.speeds if len(posterior.speeds) else _CONFIGURED
-    for speed, part in zip(SPEEDS, parts, strict=True):
-        if part < _NO_PART:
+    pull, taken, finite = _effect(
+        products, crossed, posterior.state, terms, parts, observed.sighted.turn is not None,
+        variance,
+    )  # fmt: skip
+    if not finite:
+        return NO_EFFECT._replace(still_deviation=still)
+    taken = taken[:, : columns.shape[2]]
+    beside = every[:PARAMETERS, :PARAMETERS] @ taken - 2.0 * every[:PARAMETERS, size:]
+    left = np.trace(every[size:, size:]) + np.sum(taken * beside)
+    residual = np.sqrt(max(left, 0.0) / max(len(rows), 1))
+    return CalibrationEffect(pull @ pull.T, float(residual), still)
+
+
+@kernel
+def _effect(
+    products: Array, crossed: Array, state: Array, terms: PriorTerms, parts: Array,
+    turn_known: bool, variance: float,
+) -> tuple[Array, Array, bool]:  # fmt: skip
+    """How errors (k) move pose and velocities (12,k), and the motion alone (18,k); whether they do.
+
+    Args:
+        products: (m,m) of the columns of motion and smooth error.
+        crossed: (m,k) and of these with what the errors move.
+        parts: (5,) of the typical speeds.
+        variance: of the noise, px^2.
+    """
+    pull, alone = np.zeros((MOTION_PARAMETERS, crossed.shape[1])), crossed[:PARAMETERS] * 0.0
+    for k in range(len(parts)):
+        if parts[k] < _NO_PART:
             continue
-        information, slope = products + variance * np.diag(_unit_of(count)), np.zeros(PARAMETERS)
-        of_motion = products[:PARAMETERS, :PARAMETERS].copy()
-        of_speed = terms_at(terms, speed, observed.sighted.turn is not None)
-        add_prior(of_speed, posterior.state, variance, of_motion, slope)
-        information[:PARAMETERS, :PARAMETERS] = of_motion
+        of_motion, slope = products[:PARAMETERS, :PARAMETERS].copy(), np.zeros(PARAMETERS)
+        add_prior(terms_at(terms, SPEEDS[k], turn_known), state, variance, of_motion, slope)
+        information = products.copy()
+        for i in range(PARAMETERS):
+            for j in range(PARAMETERS):
+                information[i, j] = of_motion[i, j]
+        for i in range(PARAMETERS, len(products)):
+            information[i, i] += variance
         inverse = inverted(information)
         if not np.all(np.isfinite(inverse)):
-            return NO_EFFECT._replace(still_deviation=float(still))
-        pull -= part * np.hstack([inverse @ crossed, variance * inverse[:, PARAMETERS:]])
-        taken += part * (inverted(of_motion) @ crossed[:PARAMETERS])
-    left = pixels - by_motion @ taken
-    residual = float(np.sqrt(np.square(left).sum() / max(len(pixels), 1)))
-    pulled = pull[:MOTION_PARAMETERS]
-    return CalibrationEffect(pulled @ pulled.T, residual, float(still))
-
-
-def _unit_of(count: int) -> Array:
-    """(18 + count,) zeros for the motion, and ones."""
-    return np.concatenate([np.zeros(PARAMETERS), np.ones(count)])
+            return pull, alone, False
+        pull -= parts[k] * (inverse[:MOTION_PARAMETERS] @ crossed)
+        alone += parts[k] * (inverted(of_motion) @ crossed[:PARAMETERS])
+    return pull, alone, True
 
 
 def _smooth_columns(posterior: Posterior, lines: Lines, chosen: BoolArray) -> Array:

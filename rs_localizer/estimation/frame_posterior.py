@@ -121,8 +121,9 @@ class _Frame(NamedTuple):
 
 
 def frame_posterior(
-    observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed
-) -> Posterior:
+    observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed,
+    one_lens: bool = True,
+) -> Posterior:  # fmt: skip
     """What the points leave possible, near a first motion.
 
     Args:
@@ -131,9 +132,12 @@ def frame_posterior(
         terms: what is known of the motion beside the points.
         threshold: px, of inliers.
         assumed: of the camera.
+        one_lens: one camera sees all of them. Lenses are not off alike: one smooth error of all
+            images would take a pixel between two of them for twenty at their borders.
     """
     if observations.count > _MOST_POINTS:
-        part = _of_points(observations.thinned(_MOST_POINTS), start, terms, threshold, assumed)
+        thinned = observations.thinned(_MOST_POINTS)
+        part = _of_points(thinned, start, terms, threshold, assumed, one_lens)
         gate = np.sqrt(part.squared_errors[part.inliers].max(initial=0.0))
         errors = observations.squared_errors(part.state)
         inliers = errors <= gate**2
@@ -142,12 +146,13 @@ def frame_posterior(
             depth = max(observations.median_depth(part.state, inliers), _NEAREST)
             bend = _bend(observations.points, inliers, depth / assumed.focal_length)
         return replace(part, squared_errors=errors, inliers=inliers, bend=bend)
-    return _of_points(observations, start, terms, threshold, assumed)
+    return _of_points(observations, start, terms, threshold, assumed, one_lens)
 
 
 def _of_points(
-    observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed
-) -> Posterior:
+    observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed,
+    one_lens: bool,
+) -> Posterior:  # fmt: skip
     best = maximum_a_posteriori(observations, start, terms, threshold)
     if not best.determined:
         return best
@@ -178,7 +183,8 @@ def _of_points(
     turns = assumed.rolling and (wide or hidden)
     # What a gyroscope that comes too late leaves is smooth, too.
     shows = excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED
-    smooth = bool(best.inliers.any() and (declared > 0.0 or (assumed.turn is None and shows)))
+    shows = one_lens and assumed.turn is None and shows
+    smooth = bool(best.inliers.any() and (declared > 0.0 or shows))
     best = replace(best, agreement=agreement, near_outliers=near, declared=declared)
     # What turns within the frame would explain, errors of map and lens may explain as well.
     frame = _Frame(

@@ -162,14 +162,16 @@ def near_image(pixels: Array, width: float, height: float) -> BoolArray:
 
 
 @kernel
-def _extent(pixels: Array, chosen: IntArray) -> float:
-    """Width or height of what the chosen pixels fill, whichever is the larger."""
+def _extent(pixels: Array, chosen: IntArray, camera: IntArray, cameras: int) -> float:
+    """Width or height of what the chosen pixels of a camera fill, whichever is the largest."""
     largest = 0.0
-    for axis in range(2):
-        low, high = np.inf, -np.inf
-        for i in chosen:
-            low, high = min(low, pixels[i, axis]), max(high, pixels[i, axis])
-        largest = max(largest, high - low)
+    for place in range(cameras):
+        for axis in range(2):
+            low, high = np.inf, -np.inf
+            for i in chosen:
+                if camera[i] == place:
+                    low, high = min(low, pixels[i, axis]), max(high, pixels[i, axis])
+            largest = max(largest, high - low)
     return largest
 
 
@@ -190,10 +192,7 @@ def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Fai
             Reason.TOO_FEW_POINTS,
             f"{len(indices)} usable points of {len(pixels)}, {needed} are needed{hint}",
         )
-    of_camera = usable.camera[indices]
-    extent = max(
-        _extent(pixels, indices[of_camera == place]) for place in range(len(exposure.sides))
-    )
+    extent = _extent(pixels, indices, usable.camera, len(exposure.sides))
     if extent < _LEAST_EXTENT:
         return Failure(
             Reason.DEGENERATE,
@@ -309,6 +308,11 @@ class Observations:
         errors: Array = squared_errors(self.packed, self.count, state)
         return errors
 
+    def within(self, state: Array, distance: float) -> BoolArray:
+        """Which points (n,) are reprojected to within a distance (px)."""
+        near: BoolArray = squared_errors(self.packed, self.count, state) < distance**2
+        return near
+
     def row_paces(self, state: Array) -> Array:
         """How much faster than the image points the rows move (n,): 1 at rest, 0 in step."""
         paces: Array = row_paces(self.packed, self.count, state)
@@ -346,8 +350,7 @@ def relinearized(
         fewest: points that are not few.
     """
     count = observations.count
-    bends = any(len(camera.D) > 0 for camera in exposure.cameras)
-    if count < fewest or not (bends or turn is not None):
+    if count < fewest or (turn is None and all(len(each.D) == 0 for each in exposure.cameras)):
         return observations
     lines = linearized(observations.packed, count, state, np.zeros((count, 6)))
     near = np.abs(lines.errors).max(axis=1) < _NEAR  # NaN compares false

@@ -15,7 +15,7 @@ from rs_localizer.core.scales import Scales
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations, weighted
-from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.refine import (
     EXPECTED_NOISE,
     LEAST_NOISE,
@@ -68,22 +68,22 @@ class Posterior:
     inliers: BoolArray  # (n,)
     squared_errors: Array  # (n,) px^2
     mirror: Mirror | None = None
-    shake: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k,3) rad, coefficients
+    shake: Array = field(default_factory=np.zeros((0, 3)).copy)  # (k,3) rad, coefficients
     model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
     shared: float = 0.0  # px, likewise, of all modes together
     agreement: float = 0.0  # of neighbouring rows, standard deviations
     declared: float = 0.0  # px, the part of it that the map is known to be off
     # Probabilities of the typical speeds; empty: the configured one
-    speeds: Array = field(default_factory=lambda: np.zeros(0))
+    speeds: Array = field(default_factory=np.zeros(0).copy)
     near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
     # (18,18) with the second order of arcs, of a mixture; None: of the covariance as a Gaussian's
     arched: Array | None = None
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
-    undetected: Array = field(default_factory=lambda: np.zeros((12, 12)))
+    undetected: Array = field(default_factory=np.zeros((12, 12)).copy)
     # (n,b): of what the smooth error is a combination (see frame_fit), which other frames share, so
     # that the covariance does not have it, either
-    bend: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    bend: Array = field(default_factory=np.zeros((0, 0)).copy)
 
     @property
     def determined(self) -> bool:
@@ -181,7 +181,6 @@ def _rounds(
     """Refine, measure the noise, choose the inliers, and again."""
     # From the wide side: a start that fits few points well would see little noise and keep few.
     state, gate, noise, freedom = start, WIDEST_GATE * threshold, EXPECTED_NOISE * threshold, 0.0
-    cost = 0.0
     errors = squared_errors(data, count, state)
     weights = np.empty(count)
     information = np.empty((PARAMETERS, PARAMETERS))
@@ -189,7 +188,7 @@ def _rounds(
     for turn in range(_ROUNDS):
         for i in range(count):
             weights[i] = 1.0 if errors[i] < gate * gate else 0.0
-        state, information, cost, _ = refine(
+        state, information, _, _ = refine(
             weighted(data, weights),
             state,
             _NO_SCALE,
@@ -207,6 +206,9 @@ def _rounds(
         noise = noise_deviation(errors, gate, freedom)
         gate = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
     inliers = errors < gate * gate
+    # Of all of these: a start that is far off may have been fitted to few of them.
+    cost = add_prior(prior, state, noise * noise, information.copy(), np.zeros(PARAMETERS))
+    cost += np.sum(errors[inliers])
     return _Best(
         state, cost, noise * noise * inverse, noise, 2.0 * np.sum(inliers) - freedom,
         _least_eigenvalue(information, inverse), inliers, errors,

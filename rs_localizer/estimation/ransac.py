@@ -275,11 +275,11 @@ def search(
     are optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). The samples of ``start`` count: a
     search goes on from where another stopped.
     """
-    size, count, gate = hypotheses.sample_size, observations.count, hypotheses.final_scale**2
+    size, count = hypotheses.sample_size, observations.count
     usable = [pool for pool in draws.pools if len(pool.points) >= size]
     best, inliers = start, np.zeros(count, dtype=np.bool_)
     if start.found:
-        inliers = observations.squared_errors(start.state) < gate
+        inliers = observations.within(start.state, hypotheses.final_scale)
     drawn, blocks = [start.samples // max(len(usable), 1)] * len(usable), 0
     no_fit, best_gain = count * hypotheses.score_scale**2, 0.0
     while usable and (left := draws.most - sum(drawn)) > 0:
@@ -305,7 +305,7 @@ def search(
         )  # fmt: skip
         if cost < best.cost:
             best = Candidate(state, cost)
-            inliers = observations.squared_errors(state) < gate
+            inliers = observations.within(state, hypotheses.final_scale)
         if _missed(inliers, usable, drawn, size) < 1.0 - draws.confidence:
             break
     return Candidate(best.state, best.cost, sum(drawn))
@@ -320,11 +320,11 @@ def _draw(
 ) -> None:
     """Fill the samples from all pools by their shares, and count what each has given."""
     count, size = samples.shape
-    total, share = sum(pool.share for pool in pools), 0.0
+    ends = np.cumsum([pool.share for pool in pools])
     first = 0
     for index, pool in enumerate(pools):
-        share += pool.share
-        part = samples[first : count if index == len(pools) - 1 else int(share * count / total)]
+        last = index == len(pools) - 1
+        part = samples[first : count if last else int(ends[index] * count / ends[-1])]
         if pool.ranked:
             prefixes = pool.prefix_sizes(drawn[index], len(part), size)
         else:

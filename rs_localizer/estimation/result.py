@@ -22,6 +22,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.gyro_rotation import GyroRotation
+from rs_localizer.core.lens import LensError
 from rs_localizer.core.rate_spline import multiplied
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import log
@@ -36,6 +37,7 @@ from rs_localizer.core.state import (
     rotation_of,
 )
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.calibration import CalibrationEffect
 from rs_localizer.estimation.modes import along_arcs
 from rs_localizer.estimation.observations import Observations, Observed
 from rs_localizer.estimation.posterior import Posterior
@@ -131,12 +133,17 @@ def _turned(errors: Array, by_turn: Array, shown: Array, rotations: Array, middl
 _NO_DELAY = (0.0, math.inf)
 
 
-def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: int) -> Estimate:
+def estimate_of(
+    observed: Observed, posterior: Posterior, still: int, samples: int, effect: CalibrationEffect,
+    of_lens: LensError | None,
+) -> Estimate:  # fmt: skip
     """The estimate of an accepted posterior, in the map frame and for all given points.
 
     Args:
         still: how many points a global shutter would explain.
         samples: minimal samples drawn.
+        effect: of what map and calibration are off.
+        of_lens: what the frame says of its lens.
     """
     state, turn = posterior.state, observed.sighted.turn
     rotation = rotation_of(state)
@@ -175,4 +182,8 @@ def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: i
         turn=turn,
         delay=delay,
         span=observed.sighted.exposure.span,
+        calibration_covariance=effect.covariance,
+        still_deviation=effect.still_deviation,
+        lens=observed.lens,
+        of_lens=of_lens,
     )

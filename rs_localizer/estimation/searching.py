@@ -78,8 +78,10 @@ class MotionSearch:
         self, observed: Observed, start: Candidate, best: Candidate
     ) -> tuple[Candidate, Candidate]:
         """The start and the motion after more samples, where the first ones may not be enough."""
-        most, inliers = self._config.max_iterations, self._inliers(observed, best)
-        if start.samples >= _FIRST_SAMPLES and self._missed(inliers, start.samples):
+        most = self._config.max_iterations
+        if start.samples >= _FIRST_SAMPLES and self._missed(
+            inliers := self._inliers(observed, best), start.samples
+        ):
             later = self._global_shutter(observed, np.arange(len(inliers)), most, start)
             if not np.any(inliers) or np.mean(self._near(observed, later)[inliers]) < _SAME_GROUP:
                 rival = self._motion(observed, later, most)
@@ -94,9 +96,7 @@ class MotionSearch:
     def _inliers(self, observed: Observed, best: Candidate) -> BoolArray:
         if not best.found:
             return np.zeros(observed.observations.count, dtype=np.bool_)
-        errors = observed.observations.squared_errors(best.state)
-        inliers: BoolArray = errors < self._config.inlier_threshold**2
-        return inliers
+        return observed.observations.within(best.state, self._config.inlier_threshold)
 
     def _missed(self, inliers: BoolArray, samples: int) -> bool:
         """Whether every sample of the global-shutter start may have held an outlier.
@@ -121,7 +121,7 @@ class MotionSearch:
         others = np.flatnonzero(~self._near(observed, start))
         # At the widest gate of the final estimate, so that noise hides none of them.
         gate = WIDEST_GATE * self._config.inlier_threshold
-        inliers = observed.observations.squared_errors(best.state) < gate**2
+        inliers = observed.observations.within(best.state, gate)
         if not self._solver.rolling_shutter or len(others) <= np.count_nonzero(inliers):
             return start, best
         second = self._global_shutter(observed, others, _SECOND_LOOK_SAMPLES)
@@ -134,9 +134,7 @@ class MotionSearch:
 
     def _near(self, observed: Observed, start: Candidate) -> BoolArray:
         """Which points may belong to a motion whose global-shutter pose this is."""
-        errors = observed.observations.squared_errors(start.state)
-        near: BoolArray = errors < (_POOL_SCALE * self._focal_length) ** 2
-        return near
+        return observed.observations.within(start.state, _POOL_SCALE * self._focal_length)
 
     def _global_shutter(
         self, observed: Observed, among: IntArray, most: int, before: Candidate = NOTHING
@@ -222,9 +220,7 @@ class MotionSearch:
         pose = self.optimize(
             observed, at_rest(start.state), 2.0 * _SCORE_SCALE * threshold, held_terms()
         )
-        return int(
-            np.count_nonzero(observed.observations.squared_errors(pose.state) < threshold**2)
-        )
+        return int(np.count_nonzero(observed.observations.within(pose.state, threshold)))
 
 
 def _pools(observed: Observed, among: IntArray) -> list[Pool]:

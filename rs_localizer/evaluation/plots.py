@@ -19,7 +19,6 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from numpy.lib.stride_tricks import sliding_window_view
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.evaluation.comparison import (
     Recording,
@@ -366,15 +365,15 @@ def residual_picture(
     ):
         if stamp not in recording.images or any(stamp not in r.answers for r in results.values()):
             continue
-        camera = _camera(info, readout_time)
+        camera = read_camera_info(info).camera(readout_time, ScanDirection.TOP_TO_BOTTOM)
         correspondences = read_correspondences(cloud)
         predicted = {
             name: predicted_pixels(camera, result.answers[stamp], correspondences.points)
             for name, result in results.items()
         }
-        worst, *others = sorted(
-            (_rms(p - correspondences.pixels) for p in predicted.values()), reverse=True
-        )
+        offsets = (p - correspondences.pixels for p in predicted.values())
+        rms = [float(np.sqrt(np.mean(np.sum(offset**2, axis=1)))) for offset in offsets]
+        worst, *others = sorted(rms, reverse=True)
         difference = worst - min(others, default=0.0)
         if best is None or difference > best[0]:
             data = np.frombuffer(recording.images[stamp].data, np.uint8)
@@ -394,11 +393,3 @@ def _truth_during(recording: Recording) -> Trajectory | None:
     poses = recording.truth.poses
     first, last = recording.stamps_ns[0], recording.stamps_ns[-1]
     return poses.part((poses.stamps_ns >= first) & (poses.stamps_ns <= last))
-
-
-def _camera(info: object, readout_time: float) -> Camera:
-    return read_camera_info(info).camera(readout_time, ScanDirection.TOP_TO_BOTTOM)
-
-
-def _rms(offsets: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(offsets**2, axis=1))))

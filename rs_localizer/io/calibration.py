@@ -7,6 +7,8 @@ Kalibr's camchain, COLMAP's ``cameras.txt``, and JSON (or plain YAML) with the u
 file of several cameras, the wanted one's name stands behind a ``#``: ``camchain.yaml#cam1``.
 """
 
+from __future__ import annotations
+
 import json
 import re
 from collections.abc import Callable, Mapping

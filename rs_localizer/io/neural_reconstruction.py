@@ -11,7 +11,8 @@ after the moment of ``transform_matrix``, which is the middle of the image.
 
 gsplat: ``viewmats.npy`` and ``viewmats_rs.npy`` (n,4,4) are ``camera_from_world`` at the first and
 at the last exposed row of the image (``rasterization`` interpolates between them), ``Ks.npy``
-(n,3,3) the intrinsics with the corner of the first pixel at 0, 0, ``names.txt`` the images,
+(n,3,3) the intrinsics with the corner of the first pixel at 0, 0, of a lens with distortion
+``radial_coeffs.npy`` and so on, by the names of ``rasterization``, ``names.txt`` the images,
 ``shutter.txt`` the name of ``RollingShutterType``. Beside it the same as a text model of COLMAP,
 with the lens and the poses of the middle row.
 
@@ -158,6 +159,8 @@ def write_gsplat(
     np.save(folder / "viewmats.npy", views[:, 0])
     np.save(folder / "viewmats_rs.npy", views[:, 2])
     np.save(folder / "Ks.npy", np.broadcast_to(K, (len(names), 3, 3)))
+    for name, values in (_coefficients(camera) if np.any(camera.D) else {}).items():
+        np.save(folder / f"{name}.npy", np.tile(values, (len(names), 1)))
     nothing = np.zeros((0, 2)), np.zeros(0, np.int64)
     images = {
         name: ModelImage(number, 1, view[:3, :3], view[:3, 3], *nothing)
@@ -172,6 +175,27 @@ def write_gsplat(
 
 
 _COEFFICIENTS = 12  # of OpenCV's polynomials: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4
+
+
+def _coefficients(camera: Camera) -> dict[str, list[float]]:
+    """Of the lens, as gsplat and NCore have them.
+
+    Raises:
+        ValueError: for a lens that they do not have.
+    """
+    if camera.distortion_model == DistortionModel.EQUIDISTANT:
+        return {"radial_coeffs": [*camera.D.tolist(), *[0.0] * 4][:4]}
+    if not camera.law.is_polynomial or np.any(camera.D[_COEFFICIENTS:]):
+        raise ValueError(
+            f"gsplat and NCore have no lens {camera.distortion_model} of {len(camera.D)} "
+            "coefficients"
+        )
+    D = [*camera.D.tolist(), *[0.0] * _COEFFICIENTS][:_COEFFICIENTS]
+    return {
+        "radial_coeffs": [*D[:2], *D[4:8]],
+        "tangential_coeffs": D[2:4],
+        "thin_prism_coeffs": D[8:],
+    }
 
 
 def sequence(camera: Camera, names: list[str], stamps_ns: IntArray, poses: Array) -> dict[str, Any]:
@@ -191,24 +215,15 @@ def sequence(camera: Camera, names: list[str], stamps_ns: IntArray, poses: Array
         "principal_point": centre.tolist(),
         "focal_length": focal.tolist(),
     }
-    D = [*camera.D.tolist(), *[0.0] * _COEFFICIENTS][:_COEFFICIENTS]
     if camera.distortion_model == DistortionModel.EQUIDISTANT:
-        model |= {"camera_model_type": "opencv-fisheye", "radial_coeffs": D[:4]}
         # All over the image: its corners may show nothing.
         places = np.meshgrid(*(np.linspace(0.0, size - 1.0, 99) for size in camera.size))
         ahead = camera.bearings(np.column_stack([each.ravel() for each in places]))[:, 2]
+        model |= {"camera_model_type": "opencv-fisheye"}
         model["max_angle"] = float(np.arccos(np.nanmin(ahead)))
-    elif not camera.law.is_polynomial or np.any(camera.D[_COEFFICIENTS:]):
-        raise ValueError(
-            f"ncore.json has no lens {camera.distortion_model} of {len(camera.D)} coefficients"
-        )
     else:
-        model |= {
-            "camera_model_type": "opencv-pinhole",
-            "radial_coeffs": [D[0], D[1], *D[4:8]],
-            "tangential_coeffs": D[2:4],
-            "thin_prism_coeffs": D[8:],
-        }
+        model |= {"camera_model_type": "opencv-pinhole"}
+    model |= _coefficients(camera)
     frames = [
         {
             "file_path": name,

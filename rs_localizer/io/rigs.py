@@ -12,6 +12,8 @@ other; besides what Kalibr writes, each may have ``readout_time`` (s) and ``scan
 =====================  =================================================================
 """
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

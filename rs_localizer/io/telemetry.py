@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -107,10 +108,14 @@ def read_telemetry(path: Path) -> Telemetry | None:
             f"{path}: its telemetry cannot be read, --no-telemetry goes on without: {error}"
         ) from error
     turning = [sample for sample in samples if sample["gyro"] is not None]
-    if len(turning) < 2:
+    if turning:
+        times = np.array([sample["timestamp_ms"] for sample in turning]) * 1e-3
+        read = np.radians(np.array([sample["gyro"] for sample in turning], float))
+        rates = read @ CAMERA_FROM_SENSOR.T
+    else:
+        times, rates = from_orientations(tags)
+    if len(times) < 2:
         return None
-    times = np.array([sample["timestamp_ms"] for sample in turning]) * 1e-3
-    rates = np.radians(np.array([sample["gyro"] for sample in turning], float))
     forces = np.array([sample["accl"] for sample in samples if sample["accl"] is not None], float)
     found = _values(tags)
     exposures = [
@@ -126,7 +131,7 @@ def read_telemetry(path: Path) -> Telemetry | None:
     return Telemetry(
         " ".join(dict.fromkeys(f"{parser.camera} {parser.model or ''}".split())),
         times,
-        rates @ CAMERA_FROM_SENSOR.T,
+        rates,
         _spread(forces, times) @ CAMERA_FROM_SENSOR.T,
         None if readout is None or not float(readout) > 0.0 else 1e-3 * float(readout),
         float(np.median(exposures)) if exposures else None,
@@ -134,6 +139,22 @@ def read_telemetry(path: Path) -> Telemetry | None:
         _lens(found, tags),
         _profile(tags),
     )
+
+
+def from_orientations(tags: list[dict[str, Any]]) -> tuple[Array, Array]:
+    """Times (n,) s and rates (n,3) rad/s of a camera that writes how it is turned instead (DJI).
+
+    The library has orientations of a camera with x right, y up and z back. GoPros write both: rates
+    from their orientations are those of the gyroscope, by scales of 1.00 +- 0.01 about each axis.
+    """
+    rows = [row for group in tags for row in group.get("Quaternion", {}).get("Data", [])]
+    rows = sorted({1e-3 * row["t"]: row["v"] for row in rows}.items(), key=lambda item: item[0])
+    if len(rows) < 2:
+        return np.zeros(0), np.zeros((0, 3))
+    times = np.array([time for time, _ in rows])
+    turns = Rotation.from_quat([[value[axis] for axis in "xyzw"] for _, value in rows])
+    steps = (turns[:-1].inv() * turns[1:]).as_rotvec() / np.diff(times)[:, None]
+    return 0.5 * (times[1:] + times[:-1]), steps * [1.0, -1.0, -1.0]
 
 
 def _lens(values: dict[str, Any], tags: list[dict[str, Any]]) -> str:

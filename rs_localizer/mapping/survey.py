@@ -18,6 +18,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
@@ -197,6 +199,8 @@ _LEAST_NOISE = 0.05
 _LEAST_FIT = 0.8
 # A place that is known worse than to this part of a marker's size is worth little.
 _POOR = 0.1
+MISFIT = "is their size right, and each id used once?"
+"""What is asked of markers whose corners do not fit."""
 # Markers that were turned over may hide others.
 _MOST_TURNS = 3
 
@@ -214,6 +218,7 @@ class Survey:
     apart: tuple[tuple[Marker, ...], ...]  # not connected with these, part by part
     # Connected, but too few images show them, or do not tell which of two ways they are turned.
     rare: tuple[Marker, ...]
+    misfits: tuple[Marker, ...]  # whose corners do not fit those of the others, left out
     fit: Fit
     cameras: tuple[Adjusted, ...]
     images: tuple[int, ...]  # of each camera, that show markers of the map
@@ -260,7 +265,7 @@ def survey_rig(
         origin: place of the marker whose frame is the map's; None: the first one.
 
     Raises:
-        ValueError: when the images say too little, with what was found.
+        ValueError: when the images say too little, or markers fit no others, with what was found.
     """
     filmed = [
         replace(one, spotted=[image for image in one.spotted if len(image.markers)])
@@ -278,9 +283,19 @@ def survey_rig(
             "marker: there is nothing to survey"
         )
     try:
-        return _adjusted(filmed, times, frames, markers, chained)
+        done = _adjusted(filmed, times, frames, markers, chained)
     except Undetermined as error:
         raise ValueError(f"the images do not determine the markers' poses: {error}") from error
+    if isinstance(done, Survey):
+        return done
+    # What they say of the motion is wrong, too.
+    lost = tuple(markers[m] for m in done)
+    if origin in done or len(chained.markers) - len(lost) < 2:
+        names = ", ".join(marker.name for marker in lost)
+        raise ValueError(f"{names}: the corners do not fit those of other markers: {MISFIT}")
+    rest = [replace(one, spotted=[image.without(done) for image in one.spotted]) for one in filmed]
+    found = survey_rig(rest, markers, origin=origin)
+    return replace(found, misfits=lost + found.misfits)
 
 
 def _check(images: list[Spotted], markers: Sequence[Marker], origin: int | None) -> None:
@@ -295,7 +310,8 @@ def _check(images: list[Spotted], markers: Sequence[Marker], origin: int | None)
 def _adjusted(
     filmed: Sequence[Filmed], times: Sequence[Array], frames: Sequence[Frame],
     markers: Sequence[Marker], chained: Chained,
-) -> Survey:  # fmt: skip
+) -> Survey | list[int]:  # fmt: skip
+    """The survey, or the markers that do not fit the others."""
     posed = [frames[k] for k in chained.frames]
     shown = [sorted(image for frame in posed for camera, image in frame.images if camera == place)
              for place in range(len(filmed))]  # fmt: skip
@@ -321,6 +337,9 @@ def _adjusted(
     fitted, doubtful = _right_side_up(given, fitted)
     fitted = _less_noise(given, fitted)
     _check_fit(fitted)
+    fits, misfits = _fitting(posed, seen, fitted.inliers, len(own))
+    if misfits.any():
+        return [own[k] for k in np.flatnonzero(misfits)]
     fitted = cluster_robust(given.problem(fitted.state, fitted.freedom), fitted)
     corners = fitted.state.landmarks.reshape(-1, 4, 3)
     placed = [
@@ -328,8 +347,8 @@ def _adjusted(
     ]
     points = np.concatenate([each.points for each in seen])[fitted.inliers]
     counts = np.bincount(points // 4, minlength=len(own)) // 4
-    known = [k for k in range(1, len(own)) if counts[k] >= _LEAST_SIGHTS and not doubtful[k]]
-    order = [0, *sorted(known, key=lambda k: own[k])]
+    known = np.flatnonzero(fits & (counts >= _LEAST_SIGHTS) & ~doubtful)
+    order = [0, *sorted(known[known > 0].tolist(), key=lambda k: own[k])]
     covariance = _covariance(fitted, order)
     done = Survey(
         tuple(placed[k] for k in order),
@@ -338,6 +357,7 @@ def _adjusted(
         tuple(int(counts[k]) for k in order),
         tuple(tuple(markers[m] for m in part) for part in chained.apart),
         tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}),
+        (),
         fitted,
         tuple(_cameras(given, fitted)),
         tuple(map(len, shown)),
@@ -397,12 +417,38 @@ def _covariance(fitted: Fit, order: list[int]) -> Array:
     return covariance
 
 
+def _fitting(
+    posed: Sequence[Frame], seen: Sequence[Observations], inliers: BoolArray, count: int
+) -> tuple[BoolArray, BoolArray]:
+    """Which markers (m,) hang together by frames in which they fit, and which others do not fit.
+
+    Two walls of which each fits by itself, and no image that shows both, are not one map.
+    """
+    number = {image: k for k, frame in enumerate(posed) for image in frame.images}
+    pairs = [(camera, k) for camera, each in enumerate(seen) for k in each.frames.tolist()]
+    markers = np.concatenate([each.points for each in seen]) // 4
+    cells = len(posed) * markers + np.array([number[pair] for pair in pairs], np.int64)
+    corners, fit = (
+        np.bincount(cells, weights, count * len(posed)).reshape(count, -1)
+        for weights in (None, inliers)
+    )
+    shown, whole = corners > 0, (corners > 0) & (fit == corners)
+    most = 2 * whole.sum(axis=1) > shown.sum(axis=1)
+    whole &= most[:, None]
+    together = whole.astype(float) @ whole.T
+    labels = connected_components(csr_array(together), directed=False)[1]
+    fits = most & (labels == np.argmax(np.bincount(labels)))
+    often = (shown & ~whole).sum(axis=1) >= _LEAST_SIGHTS
+    often[0] = True  # all others are in the frame of the origin
+    return fits, ~fits & often
+
+
 def _check_fit(fitted: Fit) -> None:
     share = float(np.mean(fitted.inliers))
     if share < _LEAST_FIT:
         raise ValueError(
             f"{100 * share:.0f} % of the corners fit the survey, {100 * _LEAST_FIT:.0f} % should: "
-            "check the readout time, the calibration, and that each id is used once"
+            f"check the readout time and the calibration; {MISFIT}"
         )
 
 

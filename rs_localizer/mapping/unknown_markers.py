@@ -39,6 +39,11 @@ class Spotted:
     markers: IntArray  # (m,) places in the list of all markers
     quads: Array  # (m,4,2) raw pixels: top left, top right, bottom right, bottom left
 
+    def without(self, markers: Sequence[int]) -> Spotted:
+        """The others."""
+        others = ~np.isin(self.markers, markers)
+        return Spotted(self.stamp_ns, self.markers[others], self.quads[others])
+
 
 def every_marker(
     families: Sequence[Family], size: float, sizes: Mapping[int, float]

@@ -20,6 +20,11 @@ from rs_localizer.markers.prints import Charuco, Chessboard, CircleGrid
 _WINDOW_SHARE = 0.45
 _WINDOW_RANGE = (2, 15)
 _SMOOTHING = 1.0  # px
+# So far from a corner, in parts of the way to the next, the squares around it are looked at; by the
+# median of all, the contrast of 57 false corners of two public videos is below 0.37, of 13,500 true
+# ones above 0.65; behind a reflection true ones have 0.38.
+_BESIDE, _LEAST_CONTRAST = 0.12, 0.5
+_SAME = 1.0  # px; the sub-pixel search ends at a saddle to a hundredth of this
 # A chessboard is looked for in an image whose longer side is this (px) or less: where there is
 # none, the search takes 50 ms in 640x480, and its time grows with more than the area.
 # (cv2.checkChessboard and the flag for it are fast, and overlook small boards.)
@@ -56,12 +61,54 @@ def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = Non
     grid = corners.reshape(board.rows, board.columns, 2)
     gaps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
     window = int(np.clip(_WINDOW_SHARE * min(gaps), *_WINDOW_RANGE))
-    refined = _refine(_smooth(image), grid, window)
+    smooth = _smooth(image)
+    refined = _repaired(smooth, board, _refine(smooth, grid, window), window)
+    if refined is None:
+        return None
     return ordered(
         refined.reshape(board.rows, board.columns, 2),
         previous,
         lambda candidate: _starts_black(candidate, image),
     )
+
+
+def _repaired(smooth: Gray, board: Chessboard, corners: Array, window: int) -> Array | None:
+    """The same, but corners that lie inside of squares, where OpenCV puts some, looked for again.
+
+    The others say where; None: there are none.
+    """
+    strayed = _no_saddles(smooth, board, corners)
+    if not strayed.any():
+        return corners
+    places = np.indices((board.columns, board.rows), np.float32).T.reshape(-1, 2)
+    to_image, _ = cv2.findHomography(places[~strayed], corners[~strayed])
+    if to_image is None:
+        return None
+    predicted = cv2.perspectiveTransform(places[None], to_image)[0]
+    if not all(_inside(smooth, pixel, 0) for pixel in predicted[strayed]):
+        return None
+    repaired = corners.copy()
+    repaired[strayed] = _refine(smooth, predicted[strayed], window)
+    # Those in a shadow or a reflection are where they were.
+    moved = np.linalg.norm(repaired - corners, axis=1) > _SAME
+    return None if np.any(moved & _no_saddles(smooth, board, repaired)) else repaired
+
+
+def _no_saddles(smooth: Gray, board: Chessboard, corners: Array) -> NDArray[np.bool_]:
+    """Corners (n,) around which opposite squares are not alike and neighbouring ones different."""
+    grid = corners.reshape(board.rows, board.columns, 2)
+    along, down = (np.asarray(np.gradient(grid, axis=axis)) for axis in (1, 0))
+
+    def beside(i: int, j: int) -> Array:
+        x, y = np.moveaxis(grid + _BESIDE * (i * along + j * down), -1, 0).astype(np.float32)
+        values = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(values, np.float64)
+
+    row, column = np.indices(grid.shape[:2])
+    opposite, other = beside(1, 1) + beside(-1, -1), beside(1, -1) + beside(-1, 1)
+    contrast = (-1.0) ** (row + column) * (opposite - other)
+    typical = np.median(contrast)
+    return np.asarray(contrast * np.sign(typical) < _LEAST_CONTRAST * abs(typical)).ravel()
 
 
 class BoardSizes:

@@ -23,10 +23,8 @@ _LARGEST_SQUARE = 2.0
 
 def problems(marker_map: MarkerMap) -> list[str]:
     """What is wrong with a map that could be read; empty if nothing is."""
-    return [
-        *other_units(marker_map),
-        *(text for a, b in _near(_plates(marker_map)) for text in _pair(a, b)),
-    ]
+    plates = [_Plate(item) for item in (*marker_map.markers, *marker_map.boards)]
+    return [*other_units(marker_map), *(text for a, b in _near(plates) for text in _pair(a, b))]
 
 
 class _Plate:
@@ -45,10 +43,6 @@ class _Plate:
         # What :func:`_pair` looks at is within the reaches of both.
         self.reach = float(np.hypot(x, y)) + 2.0 * self.side
         self.corners = self.pose(np.array([[-x, y, 0], [x, y, 0], [x, -y, 0], [-x, -y, 0]]))
-
-
-def _plates(marker_map: MarkerMap) -> list[_Plate]:
-    return [_Plate(item) for item in (*marker_map.markers, *marker_map.boards)]
 
 
 def _near(plates: list[_Plate]) -> Iterator[tuple[_Plate, _Plate]]:

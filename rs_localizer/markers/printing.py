@@ -373,8 +373,8 @@ def _foot(axes: Any, page: Page, number: str) -> None:
     for k in range(11):
         x = MARGIN + 0.1 * _BAR * k
         axes.plot([x, x], [y, y + (2.0 if k % 5 else 3.0)], color="black", linewidth=0.5)
-    told = f"print at 100 % (actual size): this bar is {_BAR:.0f} mm long"
-    axes.text(MARGIN, y + 4.0, told, fontsize=_FONT)
+    note = f"print at 100 % (actual size): this bar is {_BAR:.0f} mm long"
+    axes.text(MARGIN, y + 4.0, note, fontsize=_FONT)
     right = "; ".join(text for text in (page.note, number) if text)
     # Above the bar, which it must not cover.
     axes.text(page.width - MARGIN, y + 8.0, right, fontsize=0.8 * _FONT, ha="right")

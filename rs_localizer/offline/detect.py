@@ -175,9 +175,9 @@ class _Tally:
         if self._others:
             names = ", ".join(name for name, _ in self._others.most_common(5))
             return f"{text}; they show {names}, which the map does not have"
-        seen = self.instead()
-        if seen:
-            return f"{text}; {'others' if self.counts else 'they'} show {'; '.join(seen)}"
+        boards = self.instead()
+        if boards:
+            return f"{text}; {'others' if self.counts else 'they'} show {'; '.join(boards)}"
         if self._empty:
             text += "; nor any other marker or chessboard that OpenCV knows"
         return text

@@ -126,7 +126,7 @@ def _matched(
     reference: Reference, query: str, images: list[str], matches: H5File, count: int
 ) -> tuple[IntArray, IntArray, Array]:
     """Keypoints (m,), points (m,), and how many images say so (m,); each pair once."""
-    found = [np.zeros((0, 2), np.int64)]
+    matched = [np.zeros((0, 2), np.int64)]
     for image in images:
         pairs = matches.matches(query, image)
         if pairs.min(initial=0) < 0:
@@ -141,8 +141,8 @@ def _matched(
             )
         points = reference.points_of(image, pairs[:, 1])
         known = points >= 0
-        found.append(np.column_stack([pairs[known, 0], points[known]]))
-    unique, votes = np.unique(np.concatenate(found), axis=0, return_counts=True)
+        matched.append(np.column_stack([pairs[known, 0], points[known]]))
+    unique, votes = np.unique(np.concatenate(matched), axis=0, return_counts=True)
     return unique[:, 0], unique[:, 1], votes.astype(np.float64)
 
 

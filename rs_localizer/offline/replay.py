@@ -281,8 +281,8 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
     ends = [*wanted.values(), *([] if imu is None else [imu])]
     if not ends or camera is None:
         return tree
-    found = tf_topics(bag, TF_TYPE, _OLD_TF_TYPE)
-    for topic in found:
+    tf = tf_topics(bag, TF_TYPE, _OLD_TF_TYPE)
+    for topic in tf:
         for _, _, message in bag.messages((topic,)):
             tree.add(message, static=topic == TF_STATIC)
         if topic == TF_STATIC and all(_connected(tree, frame, camera) for frame in ends):
@@ -291,7 +291,7 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
         try:
             tree.moves(frame, camera)
         except TransformError as error:
-            where = " and ".join(found) or "no topic /tf_static or /tf"
+            where = " and ".join(tf) or "no topic /tf_static or /tf"
             raise BagError(
                 f"{bag.path} does not say where the camera {camera!r} is in {name} {frame!r}: "
                 f"{error} (found {where})"

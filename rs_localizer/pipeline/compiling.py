@@ -16,12 +16,19 @@ from rs_localizer.core.simd import shipped
 from rs_localizer.core.simd.jit import PARTS, cache_directory, digest
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-# ``warm``, until the end of its input says that the process that waits for it has ended.
+# Until the end of its input says that the process that waits for it has ended. Collections of
+# garbage would look through all that the compiler keeps.
 _PROGRAM = """
-import os, sys, threading
+import gc, os, sys, threading, warnings
 threading.Thread(target=lambda: os._exit(sys.stdin.read() == ""), daemon=True).start()
-from rs_localizer.__main__ import run
-sys.exit(run())
+gc.disable()
+warnings.filterwarnings("error", "cache of kernels .* at the next start", RuntimeWarning)
+from rs_localizer.config import NodeConfig
+from rs_localizer.pipeline.compiling import note_compiled
+from rs_localizer.pipeline.frames import FrameLocalizer
+solver = sys.argv[1]
+FrameLocalizer(NodeConfig(solver=solver, readout_time=0.03)).warm_up()
+note_compiled(solver)
 """
 
 # Mappings of LLVM's library: where, what may be done there, and kB that are no longer the file's.
@@ -49,13 +56,13 @@ def note_compiled(solver: str) -> None:
 
 
 def compile_in_child(solver: str) -> None:
-    """Compile what is not on disk yet, as ``rs_localizer warm --solver SOLVER``.
+    """Compile what frames by a solver need and is not on disk yet.
 
     What fails there is compiled in this process, which then says why.
     """
     if is_compiled(solver):
         return
-    program = [sys.executable, "-c", _PROGRAM, "warm", "--solver", solver]
+    program = [sys.executable, "-c", _PROGRAM, solver]
     with subprocess.Popen(
         program, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as child:

@@ -59,7 +59,8 @@ def vehicle_odometry(frame: Localized, world: str, resets: int, now_ns: int) -> 
         "position_variance": _variances(pose.covariance[_LINEAR, _LINEAR], world_from_map),
         "orientation_variance": _variances(pose.covariance[_ANGULAR, _ANGULAR], body_from_map),
         "reset_counter": resets % 256,
-        "quality": _quality(frame),
+        # Percent of the points that fit the pose, at least 1: PX4 takes 0 for invalid.
+        "quality": max(1, round(100.0 * float(np.mean(frame.estimate.inliers)))),
         **_velocities(frame.twist),
     }
 
@@ -74,11 +75,6 @@ def _velocities(twist: Twist | None) -> dict[str, Any]:
         "angular_velocity": _floats(_FLIP @ twist.angular),
         "velocity_variance": _variances(twist.covariance[_LINEAR, _LINEAR], _FLIP),
     }
-
-
-def _quality(frame: Localized) -> int:
-    """Percent of the points that fit the pose, at least 1: PX4 takes 0 for invalid."""
-    return max(1, round(100.0 * float(np.mean(frame.estimate.inliers))))
 
 
 def _variances(covariance: Array, rotation: Array) -> Any:

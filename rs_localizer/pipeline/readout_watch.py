@@ -398,8 +398,9 @@ class ReadoutWatch:
             abs(measured.readout_time), _GLOBAL * config.readout_time, measured.deviation
         )
         self.error = 0.0 if wrong is None else off * max(shorter, 1.0)
-        may_be = _may_be_none(config, measured)
-        self.far_off = may_be and (self.far_off or wrong is not None)
+        # A global shutter may be no worse.
+        short = measured.readout_time < _FAR_OFF * config.readout_time
+        self.far_off = short and (self.far_off or wrong is not None)
         self.global_shutter = self.far_off and (
             self.global_shutter if wrong is None else sure or wrong is _Kind.GLOBAL
         )
@@ -452,11 +453,6 @@ class ReadoutWatch:
             readout_time_deviation=min(measured.deviation, LONGEST_READOUT_TIME),
             scan_direction=direction.value,
         )
-
-
-def _may_be_none(config: NodeConfig, measured: MeasuredReadout) -> bool:
-    """Whether the readout time may be so far off that a global shutter is no worse."""
-    return measured.readout_time < _FAR_OFF * config.readout_time
 
 
 def _is_some(config: NodeConfig, measured: MeasuredReadout | None) -> bool:

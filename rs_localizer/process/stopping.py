@@ -118,12 +118,13 @@ class StopSignals(StopRequest):
         self._interrupt(frame)
 
     def _interrupt(self, frame: FrameType | None) -> None:
-        fragile = _is_fragile(frame)
+        handled = _is_handled(sys.exception())
+        fragile = not handled and _is_fragile(frame)
         signal.setitimer(signal.ITIMER_REAL, _PERIOD if fragile else _LOST)
         if fragile:
             if time.monotonic() > self._deadline:
                 self._leave(None, self.last_words)
-        elif not _is_handled(sys.exception()):
+        elif not handled:
             raise KeyboardInterrupt
 
 

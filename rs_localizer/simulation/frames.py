@@ -160,10 +160,8 @@ def _visible(
     size = np.array(camera.size)
     rotations, translations = poses_at(np.zeros(1))
     local = map_points @ rotations[0].T + translations
-    ahead = np.flatnonzero(local[:, 2] > 0.0)
-    rough = camera.project(local[ahead])
-    near_view = np.all(np.abs(rough - 0.5 * size) < (0.5 + _VIEW_MARGIN) * size, axis=1)
-    candidates = rng.permutation(ahead[near_view])
+    near_view = np.abs(camera.project(local) - 0.5 * size) < (0.5 + _VIEW_MARGIN) * size
+    candidates = rng.permutation(np.flatnonzero(near_view.all(axis=1)))
     border = min(_BORDER_SIGMAS * settings.noise, 0.25 * float(size.min()))
     ids = np.zeros(0, dtype=np.int64)
     pixels = np.zeros((0, 2))
@@ -177,7 +175,8 @@ def _visible(
         block, projected, tau = block[inside], projected[inside], tau[inside]
         rotations, translations = poses_at(tau)
         local = np.einsum("nij,nj->ni", rotations, map_points[block]) + translations
-        folded = np.abs(camera.rays(projected) - local[:, :2] / local[:, 2:]).max(axis=1)
-        kept = (local[:, 2] > _NEAREST) & (folded < _FOLD_TOLERANCE)
+        distances = np.linalg.norm(local, axis=1)
+        folded = np.abs(camera.bearings(projected) - local / distances[:, None]).max(axis=1)
+        kept = (distances > _NEAREST) & (folded < _FOLD_TOLERANCE)
         ids, pixels = np.concatenate([ids, block[kept]]), np.concatenate([pixels, projected[kept]])
     return ids[: settings.points], pixels[: settings.points]

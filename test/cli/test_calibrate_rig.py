@@ -100,6 +100,14 @@ def test_cameras_are_chosen_with_an_axis_of_their_own(rig, tmp_path):
     assert front.stamp_offset == pytest.approx(0.5 - OFFSET, abs=1e-3)
 
 
+def test_what_lies_beside_the_parameters_is_not_replaced(pair, tmp_path, capsys):
+    lens = tmp_path / "rig_rear_camera_info.yaml"
+    lens.touch()
+    out = ["--out", str(tmp_path / "rig.yaml")]
+    assert main(["calibrate", "--rig", pair, "--intrinsics", *out]) == 1
+    assert f"{lens} exists" in capsys.readouterr().err
+
+
 def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
     words = "--duration 2 --points 40 --angular-velocity 0 0 0 --linear-velocity 0 0 0".split()
     pair = record(tmp_path, rig, *words)

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Many recordings by one command: the same bytes by one and two workers, and nothing in the way."""
+"""Many recordings by one command: the bytes of one process, and nothing in the way."""
 
 import csv
 import filecmp
@@ -48,39 +48,32 @@ def differing(one: filecmp.dircmp[str]) -> list[str]:
     return [*one.left_only, *one.right_only, *other, *unreadable, *below]
 
 
-def test_bytes_are_the_same_by_one_and_two_workers_and_of_one_recording(
-    recordings, tmp_path, capsys
-):
-    words = ["replay", *recordings, *SHUTTER]
-    for workers in ("1", "2"):
-        out = str(tmp_path / workers)
-        assert main([*words, "--out", out, "--workers", workers]) == 1
-        said = capsys.readouterr()
-        assert said.err == (
-            f"rs_localizer replay: 1 of 3 recordings failed; {out}/summary.csv says why\n"
-        )
-        assert "notes: failed: " in said.out
-        assert "3 recordings: 2 done, 1 failed\n" in said.out
-    assert differing(filecmp.dircmp(tmp_path / "1", tmp_path / "2")) == []
-    found = rows(tmp_path / "1")
-    assert {name: row["state"] for name, row in found.items()} == {
+def test_two_workers_write_the_bytes_of_one_process(recordings, tmp_path, capsys):
+    words, out = ["replay", *recordings, *SHUTTER, "--workers", "2"], tmp_path / "out"
+    assert main([*words, "--out", str(out)]) == 1
+    said = capsys.readouterr()
+    assert said.err == (
+        f"rs_localizer replay: 1 of 3 recordings failed; {out}/summary.csv says why\n"
+    )
+    assert "notes: failed: " in said.out
+    assert "3 recordings: 2 done, 1 failed\n" in said.out
+    table = rows(out)
+    assert {name: row["state"] for name, row in table.items()} == {
         "a_flight": "done", "b_flight": "done", "notes": "failed"
     }  # fmt: skip
-    assert found["a_flight"]["frames"] == found["a_flight"]["localized"] == "7"
-    assert found["notes"]["reason"].startswith(f"{recordings[2]} cannot be read as a recording")
-    assert (tmp_path / "1" / "summary.png").read_bytes().startswith(b"\x89PNG")
-    assert "# replay: 3 recordings: 2 done, 1 failed\n" in (tmp_path / "1/summary.md").read_text()
-    # Alone, as ever:
+    assert table["a_flight"]["frames"] == table["a_flight"]["localized"] == "7"
+    assert table["notes"]["reason"].startswith(f"{recordings[2]} cannot be read as a recording")
+    assert (out / "summary.png").read_bytes().startswith(b"\x89PNG")
+    assert "# replay: 3 recordings: 2 done, 1 failed\n" in (out / "summary.md").read_text()
     # In a process of its own: what other tests have compiled in this one may round differently.
     replay = ["replay", recordings[0], *SHUTTER, "--out", str(tmp_path / "alone")]
     subprocess.run([sys.executable, "-m", "rs_localizer", *replay], check=True, capture_output=True)
-    alone = filecmp.dircmp(tmp_path / "alone", tmp_path / "1" / "a_flight")
+    alone = filecmp.dircmp(tmp_path / "alone", out / "a_flight")
     assert sorted(differing(alone)) == ["fleet.json", "log.txt"]
     # What is done is not done again.
-    result = tmp_path / "1" / "a_flight" / "poses.txt"
+    result = out / "a_flight" / "poses.txt"
     before = result.stat()
-    capsys.readouterr()
-    assert main([*words[:3], *SHUTTER, "--out", str(tmp_path / "1")]) == 0
+    assert main([*words[:3], *SHUTTER, "--out", str(out)]) == 0
     assert "2 of 2 recordings have been done before\n" in capsys.readouterr().out
     assert result.stat() == before
 
@@ -181,15 +174,16 @@ def test_evaluate_finds_the_truth_of_each_by_its_name(recordings, tmp_path):
     assert not (tmp_path / "out" / "two").exists()
 
 
-def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(recordings, tmp_path):
+@pytest.mark.usefixtures("in_process")
+def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(recordings, tmp_path, capsys):
     """As from a terminal: every process of the group gets the signal."""
     bags = [str(tmp_path / "in" / str(k)) for k in range(3)]
     for bag in bags:
         shutil.copytree(recordings[0], bag)
     out = tmp_path / "out"
-    words = [sys.executable, "-m", "rs_localizer", "replay", *bags, *SHUTTER, "--out", str(out)]
+    words = ["replay", *bags, *SHUTTER, "--out", str(out), "--workers", "1"]
     running = subprocess.Popen(
-        [*words, "--workers", "1"],
+        [sys.executable, "-m", "rs_localizer", *words],
         start_new_session=True,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -201,12 +195,12 @@ def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(recordings, t
     os.killpg(running.pid, signal.SIGINT)
     _, errors = running.communicate(timeout=60)
     assert (running.returncode, errors) == (130, "rs_localizer replay: interrupted\n")
-    found = rows(out)
-    done = {name for name, row in found.items() if row["state"] == "done"}
+    states = {name: row["state"] for name, row in rows(out).items()}
+    done = {name for name, state in states.items() if state == "done"}
     assert {"0"} <= done
     assert {path.name for path in out.iterdir() if path.is_dir()} == done
     assert all((out / name / "fleet.json").is_file() for name in done)
-    assert {row["state"] for row in found.values()} <= {"done", "not done"}
-    again = subprocess.run([*words, "--workers", "1"], capture_output=True, text=True, check=True)
-    assert f"{len(done)} of 3 recordings have been done before\n" in again.stdout
+    assert set(states.values()) <= {"done", "not done"}
+    assert main(words) == 0
+    assert f"{len(done)} of 3 recordings have been done before\n" in capsys.readouterr().out
     assert {row["state"] for row in rows(out).values()} == {"done"}

@@ -194,7 +194,7 @@ def test_the_whole_lens_goes_to_ncore():
     assert lens["tangential_coeffs"] == [0.003, 0.004]
     assert lens["thin_prism_coeffs"] == (np.array([9, 10, 11, 12]) / 1000).tolist()
     tilted = Camera(640, 480, K, [*D, 0.1, 0.0], "rational_polynomial")
-    with pytest.raises(ValueError, match="no lens rational_polynomial of 14 coefficients"):
+    with pytest.raises(ValueError, match="have no lens rational_polynomial of 14 coeff"):
         sequence(tilted, [], stamps, np.zeros((0, 2, 4, 4)))
     f = 240 / np.radians(100)  # 200 degrees from top to bottom
     wide = Camera(640, 480, [[f, 0, 319.5], [0, f, 239.5], [0, 0, 1]], np.zeros(4), "equidistant")

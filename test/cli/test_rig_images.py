@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rendered images of a pair: through a detector of each camera to poses."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,12 @@ from scipy.stats import chi2
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
+from rs_localizer.io.maps.files import read_map_file, write_map_file
 from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.recording import MARKER_MAP
 from rs_localizer.io.rigs import RigParts, write_camchain
 from rs_localizer.io.trajectories import read_motions
+from rs_localizer.markers.map_files import read_marker_map
 
 K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
 # The second camera is upside down, 10 cm beside the first.
@@ -60,6 +64,51 @@ def test_poses_of_a_detector_of_each_camera(pair, tmp_path, capsys):
     assert count > 20
     # Of the 99 % that a region claims, nine in ten at least: frames share errors of the detector.
     assert np.mean(inside) > 0.9
+
+
+def off_the_truth(points: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Distances (n,) of points (n,3) that are laid over the true ones as one body."""
+    ours, theirs = points - points.mean(axis=0), true - true.mean(axis=0)
+    return np.linalg.norm(Rotation.align_vectors(theirs, ours)[0].apply(ours) - theirs, axis=1)
+
+
+def test_markers_surveyed_with_both_cameras(pair, tmp_path, capsys):
+    images, wall = str(pair / "images"), tmp_path / "wall.yaml"
+    truth = {marker.id: marker for marker in read_marker_map(Path(images, MARKER_MAP)).markers}
+    size = truth[0].size
+    sizes = [word for marker in truth.values() for word in ("--size", f"{marker.id}:{marker.size}")]
+    words = ["--family", truth[0].family.name, "--size", str(size), *sizes]
+    words += ["--params", f"{images}/parameters.yaml", "--out", str(wall)]
+    assert main(["map", "survey", images, *words]) == 0
+    said = capsys.readouterr().out
+    assert "up: images with a marker" in said
+    assert "down <- up" in said
+    found = read_marker_map(wall).markers
+    assert len(found) > 10
+    ours, true = (np.concatenate([of.corners for of in each])
+                  for each in (found, [truth[marker.id] for marker in found]))  # fmt: skip
+    assert np.sqrt(np.mean(off_the_truth(ours, true) ** 2)) < 0.05 * size
+
+
+def test_a_map_refined_with_both_cameras(pair, tmp_path, capsys):
+    flight, out = tmp_path / "flight", tmp_path / "refined.npz"
+    words = ["--trajectory", "tum_vi_room5", "--duration", "1", "--points", "60"]
+    rig = ["--rig", str(pair / "chain.yaml"), "--keypoints", "--noise", "0.3"]
+    assert main(["simulate", str(flight), *rig, *words]) == 0
+    true = read_map_file(flight / "map.npz", "map")
+    off = np.random.default_rng(0).normal(0.0, 0.02, true.points.shape)
+    write_map_file(tmp_path / "off.npz", replace(true, points=true.points + off))
+    capsys.readouterr()
+    words = ["--params", str(flight / "parameters.yaml"), "--map", str(tmp_path / "off.npz")]
+    more = ["--out", str(out), "-p", "map_deviation:=0.02"]
+    assert main(["map", "refine", str(flight), *words, *more]) == 0
+    said = capsys.readouterr().out
+    assert "down <- up" in said
+    found = read_map_file(out, "map")
+    known = np.isfinite(found.covariances[:, 0, 0])
+    assert np.count_nonzero(known) > 30
+    errors = off_the_truth(found.points[known], true.points[known])
+    assert np.median(errors) < 0.7 * np.median(np.linalg.norm(off, axis=1)[known])
 
 
 def test_a_rig_that_nobody_mounted(pair, tmp_path, capsys):

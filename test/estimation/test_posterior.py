@@ -52,6 +52,15 @@ def test_inliers_are_those_within_the_noise_even_beyond_the_threshold(scene):
     assert posterior.noise == pytest.approx(1.0, rel=0.1)
 
 
+def test_the_cost_is_that_of_the_inliers(scene):
+    """Also of a start that is so far off that the fit began with few of them."""
+    observations, start = observe(scene, 0.1, 0.5, 200, 0)
+    start[9:12] += [0.02, -0.01, 0.03]
+    nothing = motion_terms((0.0, 0.0), (0.0, 0.0))
+    posterior = maximum_a_posteriori(observations, start, nothing, 1.0)
+    assert posterior.cost == pytest.approx(posterior.squared_errors[posterior.inliers].sum())
+
+
 def information(seed=0, points=1.0):
     factor = np.random.default_rng(seed).normal(size=(18, 40))
     return points * factor @ factor.T

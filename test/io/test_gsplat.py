@@ -4,6 +4,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
@@ -31,14 +32,37 @@ def seen_by_gsplat(folder: Path, point: np.ndarray, shutter: str) -> np.ndarray:
             "ROLLING_RIGHT_TO_LEFT": 1.0 - (pixel[0] - 0.5) / (WIDTH - 1),
         }[shutter]
         moved = (1.0 - time) * start[:3, 3] + time * end[:3, 3]
-        x, y, z = K @ (slerp(time).apply(point) + moved)
-        pixel = np.array([x / z, y / z])
+        pixel = through_the_lens(folder, slerp(time).apply(point) + moved, K)
     return pixel
 
 
+def through_the_lens(folder: Path, point: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """By OpenCV, whose coefficients those of gsplat are."""
+    names = ("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs")
+    parts = [np.load(path)[0] for name in names if (path := folder / f"{name}.npy").exists()]
+    nothing = np.zeros(3)
+    if len(parts) == 1:
+        return cv2.fisheye.projectPoints(point[None, None], nothing, nothing, K, parts[0])[
+            0
+        ].ravel()
+    D = None
+    if parts:
+        radial, tangential, thin = parts
+        D = np.concatenate([radial[:2], tangential, radial[2:], thin])
+    return cv2.projectPoints(point, nothing, nothing, K, D)[0].ravel()
+
+
+@pytest.mark.parametrize(
+    ("model", "D"),
+    [
+        ("plumb_bob", []), ("plumb_bob", [0.1, -0.05, 0.001, 0.002, 0.03]),
+        ("rational_polynomial", [0.1, -0.05, 0.001, 0.002, 0.03, 0.02, 0.01, -0.01]),
+        ("equidistant", [0.02, -0.01, 0.003, 0.001]),
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("direction", list(ScanDirection))
-def test_projection(tmp_path, direction):
-    camera = Camera(WIDTH, HEIGHT, K, readout_time=0.03, scan_direction=direction)
+def test_projection(tmp_path, direction, model, D):
+    camera = Camera(WIDTH, HEIGHT, K, D, model, readout_time=0.03, scan_direction=direction)
     motion = Motion(
         Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.1, -0.2, 0.3]),
         np.array([0.006, -0.008, 0.005]), np.array([0.01, 0.006, -0.004]),

@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("telemetry_parser", reason="needs telemetry-parser (rs_localizer[video])")
 
@@ -26,7 +27,13 @@ from rs_localizer.cli.map import build
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.telemetry import Telemetry, TelemetryError, has_telemetry, read_telemetry
+from rs_localizer.io.telemetry import (
+    Telemetry,
+    TelemetryError,
+    from_orientations,
+    has_telemetry,
+    read_telemetry,
+)
 from rs_localizer.settings import load_params_file
 
 RATE = 200.0
@@ -104,6 +111,37 @@ def test_lens_profiles(log: Path, monkeypatch: Any, model: dict[str, str], known
         )
         pixels, _ = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, D)
         np.testing.assert_allclose(found.profile.project(points[0]), pixels[0], atol=1e-9)
+
+
+def test_orientations_take_the_place_of_a_gyroscope(monkeypatch: Any) -> None:
+    """As of DJI; a camera that turns to the right and then lifts its view."""
+    import telemetry_parser
+
+    times = 0.01 * np.arange(40)
+    turns = [Rotation.from_rotvec([0.0, -0.5 * min(t, 0.2), 0.0]) for t in times]  # y is up
+    turns = [
+        turn * Rotation.from_rotvec([0.3 * max(0.0, t - 0.2), 0.0, 0.0])
+        for t, turn in zip(times, turns, strict=True)
+    ]
+    rows = [
+        {"t": 1e3 * t, "v": dict(zip("xyzw", turn.as_quat(), strict=True))}
+        for t, turn in zip(times, turns, strict=True)
+    ]
+    lens = {"Data": PROFILE | {"frame_readout_time": 9.0}}
+    tags = [{"Quaternion": {"Data": rows[:20]}, "Lens": lens}, {"Quaternion": {"Data": rows[19:]}}]
+    parser = SimpleNamespace(camera="DJI", model="Action 4", normalized_imu=list)
+    parser.telemetry = lambda readable: tags
+    monkeypatch.setattr(telemetry_parser, "Parser", lambda path: parser)
+    read_telemetry.cache_clear()
+    found = read_telemetry(Path("DJI_0001.MP4"))
+    read_telemetry.cache_clear()
+    assert found is not None
+    np.testing.assert_allclose(found.times, times[:-1] + 0.005, atol=1e-9)
+    np.testing.assert_allclose(found.rates[:20], np.tile([0.0, 0.5, 0.0], (20, 1)), atol=1e-9)
+    np.testing.assert_allclose(found.rates[20:], np.tile([0.3, 0.0, 0.0], (19, 1)), atol=1e-9)
+    assert np.isnan(found.forces).all()
+    assert found.readout_time == pytest.approx(0.009)
+    assert found.profile is not None
 
 
 # As a GO 3 has them: xi, fx, fy, cx, cy, three angles, three of a place, k1, k2, k3, p1, p2, size.
@@ -258,6 +296,20 @@ SAMPLES = {
 }  # fmt: skip
 
 
+def orientations(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The rates of what a GoPro writes of its orientation (CORI), by the library's signs."""
+    import telemetry_parser
+
+    tags = telemetry_parser.Parser(str(path)).telemetry(False)
+    data = [row for group in tags for row in group.get("CameraOrientation", {}).get("Data", [])]
+    signs = {"w": 1, "x": -1, "y": 1, "z": 1}
+    rows = [
+        {"t": 1e3 * k / 29.97, "v": {axis: sign * row[axis] for axis, sign in signs.items()}}
+        for k, row in enumerate(data)
+    ]
+    return from_orientations([{"Quaternion": {"Data": rows}}])
+
+
 @pytest.mark.skipif("GOPRO_SAMPLES" not in os.environ, reason="GOPRO_SAMPLES=FOLDER has them")
 def test_real_samples(tmp_path: Path) -> None:
     for sample in sorted(Path(os.environ["GOPRO_SAMPLES"]).iterdir()):
@@ -280,6 +332,17 @@ def test_real_samples(tmp_path: Path) -> None:
         ms = None if found.readout_time is None else 1e3 * found.readout_time
         assert found.rate == pytest.approx(rate, rel=0.12)
         assert ms == (None if readout is None else pytest.approx(readout, abs=1e-3))
+        if sample.name == "max-heromode.mp4":
+            times, rates = orientations(path)
+            C = np.cumsum(found.rates, axis=0) / found.rate
+            # The first image is taken 20 ms after the gyroscope's first reading.
+            step = 0.5 / 29.97
+            ends = [
+                np.stack([np.interp(times + 0.02 + d, found.times, c) for c in C.T], axis=1)
+                for d in (-step, step)
+            ]
+            apart = (ends[1] - ends[0]) / (2.0 * step) - rates
+            assert np.sqrt(np.mean(apart**2)) < 0.1 * np.sqrt(np.mean(rates**2))
         assert (np.argmax(down) == 1) & (pull == pytest.approx(9.8, rel=0.05)) or not upright
 
 

@@ -99,6 +99,16 @@ def test_a_survey_that_few_corners_fit_is_refused(spotted):
         survey(camera(0.3 * READOUT), spotted, MARKERS)
 
 
+def test_a_marker_of_another_size_is_named_and_left_out(spotted, poses):
+    markers = every_marker([family("4x4_50")], SIZE, {4: 1.2 * SIZE})
+    found = survey(camera(), spotted, markers)
+    assert [marker.id for marker in found.misfits] == [4]
+    assert [marker.id for marker in found.markers] == [0, 1, 2, 3]
+    check(found, poses, 0.03)
+    with pytest.raises(ValueError, match=r"marker 4x4_50 4: .* do not fit .*is their size right"):
+        survey(camera(), spotted, markers, origin=4)
+
+
 def turned_over(chained: Chained, marker: int) -> Chained:
     """The first guess with a marker turned over as its images see it."""
     own = chained.markers[marker]

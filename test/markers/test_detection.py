@@ -156,6 +156,22 @@ def test_chessboard_corners_are_where_they_were_rendered(
         assert np.abs(errors.mean(axis=0)).max() < 0.02
 
 
+def test_corners_inside_of_squares_are_looked_for_again(
+    render, look, project, chessboard_cells, rectangle, monkeypatch
+):
+    board, find = Chessboard(6, 4, 0.03), cv2.findChessboardCorners
+    image = board_image(6, 4, look(25.0), render, chessboard_cells, rectangle)
+
+    def mistaken(image, size):
+        complete, corners = find(image, size)
+        corners[[0, 9, 22], 0] += 0.35 * (corners[7, 0] - corners[0, 0])
+        return complete, corners
+
+    monkeypatch.setattr(cv2, "findChessboardCorners", mistaken)
+    (found,) = detect_board(board, image)
+    np.testing.assert_allclose(found.pixels, project(board.points, look(25.0)), atol=0.12)
+
+
 def test_large_images_are_searched_in_a_small_one(chessboard_cells):
     # 50 megapixels; squares of 300 px, the first inner corner between pixels 1299 and 1300.
     image = np.full((6144, 8192), 200, np.uint8)

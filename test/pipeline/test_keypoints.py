@@ -13,11 +13,11 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud, read_map
-from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.matching import Matcher
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.frames import FrameLocalizer, read_landmarks
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
@@ -99,6 +99,12 @@ def test_the_true_pose(frames, make_camera_info, names, tracking):
             assert [inlier[name] for name in "xyz"] == point.astype(np.float32).tolist()
             assert inlier["u"] in frame.pixels[:, 0].astype(np.float32)
         assert result.estimate.tracked == (tracking and frame is not frames[0])
+
+
+def test_a_map_file_that_is_not_there_is_named(tmp_path):
+    said = r"map_file: .*nowhere\.npz cannot be read: No such file or directory"
+    with pytest.raises(MapError, match=said):
+        read_landmarks(str(tmp_path / "nowhere.npz"), "map")
 
 
 def test_a_map_that_is_missing_and_comes_late(frames, make_camera_info):

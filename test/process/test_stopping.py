@@ -57,16 +57,24 @@ def test_no_interrupt_is_lost(tmp_path, number, body):
     assert ended.returncode == 0
 
 
-def test_who_compiles_for_long_is_ended(tmp_path):
-    (tmp_path / "numba.py").write_text("import time\ntime.sleep(60)\n")
-    body = (
-        "import threading; threading.Timer(0.5, os.kill, (os.getpid(), 15)).start(); import numba"
-    )
+LATER = "import threading; threading.Timer(0.2, os.kill, (os.getpid(), 15)).start(); import numba"
+CLEAN_UP = "try: os.kill(os.getpid(), 15); time.sleep(9)\n        finally: import numba"
+
+
+@pytest.mark.parametrize(
+    ("body", "ended"),
+    [(LATER, (143, "", "interrupted\n")), (CLEAN_UP, (0, "interrupted\n", ""))],
+)
+def test_who_compiles_for_long_is_ended_unless_to_clean_up(tmp_path, body, ended):
+    (tmp_path / "numba.py").write_text("import time\ntime.sleep(1)\n")
     program = PROGRAM.format(folder=f"{tmp_path}", number=15, body=body)
-    ended = subprocess.run(
+    program = program.replace(
+        "class", "StopSignals._interrupt.__globals__['_PATIENCE'] = 0.1\nclass"
+    )
+    done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False
     )
-    assert (ended.returncode, ended.stdout, ended.stderr) == (143, "", "interrupted\n")
+    assert (done.returncode, done.stdout, done.stderr) == ended
 
 
 # How many threads each OpenBLAS that this process has loaded would use, by its own word.

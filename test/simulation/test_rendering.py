@@ -52,15 +52,16 @@ def cast(camera: Camera, planes: list[TexturedPlane], motion: ConstantVelocity, 
     """Ray by ray: the grey level that each pixel's middle sees, and how deep (NaN: nothing)."""
     width, height = camera.size
     image, nearest = np.full((height, width), 60.0), np.full((height, width), np.nan)
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(float)
+    rays = camera.rays(pixels.reshape(-1, 2)).reshape(height, width, 2)
+    since = (camera.row_time(pixels.reshape(-1, 2)) - camera.first_row_time) * camera.readout_time
+    seconds = 1e-9 * (stamp_ns - motion.start_ns) + since.reshape(height, width)
     for row in range(height):
         for column in range(width):
-            pixel = np.array([[column, row]], float)
-            tau = camera.row_time(pixel)
-            time = stamp_ns - motion.start_ns
-            seconds = 1e-9 * time + (tau - camera.first_row_time) * camera.readout_time
-            rotation = motion.rotation @ so3.exp(seconds[0] * motion.angular_velocity)
-            centre = motion.position + seconds[0] * motion.rotation @ motion.linear_velocity
-            ray = rotation @ [*camera.rays(pixel)[0], 1.0]
+            elapsed = seconds[row, column]
+            rotation = motion.rotation @ so3.exp(elapsed * motion.angular_velocity)
+            centre = motion.position + elapsed * motion.rotation @ motion.linear_velocity
+            ray = rotation @ [*rays[row, column], 1.0]
             for plane in planes:
                 normal = np.cross(plane.right, plane.down)
                 depth = normal @ (plane.corner - centre) / (normal @ ray)

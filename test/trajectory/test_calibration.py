@@ -68,6 +68,11 @@ def says_what_it_holds(found: Calibration) -> None:
     )
     assert held.held == 500
     assert any("map's 500 points" in remark for remark in verdict.remarks(held))
+    above = seen.subset(seen.pixels[:, 1] < projector.HEIGHT / 2)
+    part = replace(found, posed=replace(found.posed, observations=above))
+    share, *regions = verdict.uncovered(part)
+    assert {"bottom left", "bottom", "bottom right"} <= set(regions)
+    assert any(f"never showed the map: {share}" in remark for remark in verdict.remarks(part))
 
 
 def test_a_global_shutter_is_one():

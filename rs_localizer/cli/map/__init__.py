@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+from functools import partial
 
 from rs_localizer.cli import WORKING, LateParser, add_common
 
@@ -36,6 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> object:
     return importlib.import_module(f"{__name__}.{args.action}").run(args)
 
+
+print_step = partial(print, "adjusted:", flush=True)
+"""What an adjustment calls after each of its steps."""
 
 _KEEP = "--keep-readout-time"
 

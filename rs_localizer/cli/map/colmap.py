@@ -16,7 +16,7 @@ if WORKING:
     import numpy as np
     from tqdm import tqdm
 
-    from rs_localizer.cli.map import check_readout
+    from rs_localizer.cli.map import check_readout, print_step
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.calibration import read_calibration
     from rs_localizer.io.maps.colmap import read_camera, read_images, read_model, write_model
@@ -88,18 +88,14 @@ def run(args: argparse.Namespace) -> None:
         if missing:
             raise ValueError(f"{args.images} has no {missing[0]}, an image of the model")
     with atomic_directory(args.out, replaced(args, _LIST)) as out:
-        found = undo_shutter(camera, model, images, stamps, _known(args), _print_step)
-        check_readout(args, found.refined.readout_check, "see --shutter estimated")
+        result = undo_shutter(camera, model, images, stamps, _known(args), print_step)
+        check_readout(args, result.refined.readout_check, "see --shutter estimated")
         out.mkdir()
-        write_model(out, found.camera, found.images, found.points)
-        share = None if args.images is None else _write_images(args, found, out / _IMAGES)
-    _tell(args, found, len(images), len(model.points))
+        write_model(out, result.camera, result.images, result.points)
+        share = None if args.images is None else _write_images(args, result, out / _IMAGES)
+    _tell(args, result, len(images), len(model.points))
     if share is not None:
         print(f"{args.out / _IMAGES}: {1 - share:.1%} of the pixels are left black: not known")
-
-
-def _print_step(step: str) -> None:
-    print(f"adjusted: {step}", flush=True)
 
 
 def _known(args: argparse.Namespace) -> Shutter:
@@ -136,22 +132,22 @@ def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:
     return stamps
 
 
-def _write_images(args: argparse.Namespace, found: GlobalShutterModel, folder: Path) -> float:
+def _write_images(args: argparse.Namespace, result: GlobalShutterModel, folder: Path) -> float:
     """The images of the model; the share of their pixels that is known."""
-    depths = map_depths(found.points.points)
+    depths = map_depths(result.points.points)
     shares = []
-    for name, ends in tqdm(found.ends.items(), unit="image", desc="rectify", disable=None):
+    for name, ends in tqdm(result.ends.items(), unit="image", desc="rectify", disable=None):
         image = cv2.imread(
             str(args.images / name), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
         )
         size = None if image is None else (image.shape[1], image.shape[0])
-        if image is None or image.dtype != np.uint8 or size != found.camera.size:
+        if image is None or image.dtype != np.uint8 or size != result.camera.size:
             raise ValueError(
                 f"{args.images / name} is no image of 8 bits and of the model's "
-                f"{found.camera.size[0]}x{found.camera.size[1]} pixels"
+                f"{result.camera.size[0]}x{result.camera.size[1]} pixels"
             )
         pixels = np.asarray(image, np.uint8)
-        made, known = rectified(found.camera, pixels, motion_between(*ends), depths, args.row)
+        made, known = rectified(result.camera, pixels, motion_between(*ends), depths, args.row)
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(cv2.imencode(file.suffix, made)[1].tobytes())
@@ -159,23 +155,23 @@ def _write_images(args: argparse.Namespace, found: GlobalShutterModel, folder: P
     return float(np.mean(shares))
 
 
-def _tell(args: argparse.Namespace, found: GlobalShutterModel, images: int, points: int) -> None:
-    kept = sum(len(image.points) for image in found.images.values())
-    shutter = found.camera
+def _tell(args: argparse.Namespace, result: GlobalShutterModel, images: int, points: int) -> None:
+    kept = sum(len(image.points) for image in result.images.values())
+    shutter = result.camera
     rows = [
-        ("images with a pose", f"{len(found.images)} of {images}"),
-        ("points", f"{len(found.points.ids)} of {points}"),
-        ("keypoints that fit", f"{kept} of {found.keypoints}"),
+        ("images with a pose", f"{len(result.images)} of {images}"),
+        ("points", f"{len(result.points.ids)} of {points}"),
+        ("keypoints that fit", f"{kept} of {result.keypoints}"),
         (
             "error with a global shutter",
-            f"{found.before:.3f} px rms before, {found.after:.3f} after",
+            f"{result.before:.3f} px rms before, {result.after:.3f} after",
         ),
-        ("noise of u and of v", f"{found.refined.deviation:.3f} px"),
+        ("noise of u and of v", f"{result.refined.deviation:.3f} px"),
         ("readout time", f"{1e3 * shutter.readout_time:.3f} ms {shutter.scan_direction}"),
     ]
     for name, text in rows:
         print(f"{name:28} {text}")
-    fit = found.shutter
+    fit = result.shutter
     if fit is not None and not fit.visible:
         print(
             f"warning: the images show no rolling shutter ({1e3 * fit.readout_time:.1f} +- "

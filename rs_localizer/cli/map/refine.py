@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, UsageError, number, refuse_existing
-from rs_localizer.cli.map import add_readout_argument, check_readout, colmap
+from rs_localizer.cli.map import add_readout_argument, check_readout, colmap, print_step
 from rs_localizer.cli.rig_input import (
     MapCamera,
     add_mounting_argument,
@@ -115,10 +115,10 @@ def run(args: argparse.Namespace) -> None:
     localized = _localized([one.camera for one in rig], clouds, landmarks)
     deviations = _deviations(args, localized.landmarks, config.map_deviation)
     freedom = MapFreedom(shutter == _ESTIMATED, args.intrinsics, deviations)
-    refined = refine_rig(rig, localized.seen, localized.start, freedom, done=_print_step)
+    refined = refine_rig(rig, localized.seen, localized.start, freedom, done=print_step)
     _tell(localized, refined, [of.name for of in cameras])
-    for of, found in zip(cameras, refined.cameras, strict=True):
-        check_readout(args, found.readout_check, "see --shutter estimated", of.name)
+    for of, result in zip(cameras, refined.cameras, strict=True):
+        check_readout(args, result.readout_check, "see --shutter estimated", of.name)
     _write(args, localized.landmarks, refined, [of.name for of in cameras])
 
 
@@ -136,10 +136,6 @@ def _recorded(
         lens = read_calibration(args.calibration)
         camera = replace(lens, readout_time=readout_time, scan_direction=config.scan_direction)
     return RigCamera(camera, config.stamp_offset, of.mounting), recorded.clouds
-
-
-def _print_step(step: str) -> None:
-    print(f"adjusted: {step}", flush=True)
 
 
 def _localized(
@@ -183,18 +179,18 @@ def _tell(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> 
             ),
             ("deviation of a landmark", f"{1e3 * np.median(spread):.1f} mm (median)"),
         ]
-    for of, found in zip(names, refined.cameras, strict=True):
-        deviation = found.readout_time_deviation
+    for of, camera in zip(names, refined.cameras, strict=True):
+        deviation = camera.readout_time_deviation
         spread_text = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
         name = f"{of}: readout time" if of else "readout time"
-        rows.append((name, f"{1e3 * found.readout_time:.3f}{spread_text} ms"))
+        rows.append((name, f"{1e3 * camera.readout_time:.3f}{spread_text} ms"))
     for name, text in rows:
         print(f"{name:26} {text}")
-    for of, found in zip(names, refined.cameras, strict=True):
-        if found.deviations.any():
-            lines = mounting_lines(of, names[0], found.extrinsics, found.deviations)
+    for of, camera in zip(names, refined.cameras, strict=True):
+        if camera.deviations.any():
+            lines = mounting_lines(of, names[0], camera.extrinsics, camera.deviations)
             print("\n".join([*lines[:-1], f"{lines[-1]} besides what is set"]))
-        if found.readout_time < 0.0:
+        if camera.readout_time < 0.0:
             whose = f"the readout time of {of}" if of else "the readout time"
             print(f"{whose} is negative: the scan direction is the reverse of what was set")
 
@@ -213,8 +209,8 @@ def _write(
         files.append(args.out.with_name(f"{of}_camera_info.yaml"))
     with atomic_files(*files) as (part, *lenses):
         WRITERS[args.out.suffix](part, refined)
-        for lens, found in zip(lenses, result.cameras, strict=False):
-            write_calibration(lens, found.camera)
+        for lens, camera in zip(lenses, result.cameras, strict=False):
+            write_calibration(lens, camera.camera)
     print(f"written: {', '.join(map(str, files))}")
     unchanged = np.count_nonzero(~result.refined)
     if unchanged:

@@ -29,7 +29,7 @@ if WORKING:
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.camera_info import Calibration, read_camera_info
     from rs_localizer.io.images import Image
-    from rs_localizer.mapping.survey import Survey, survey_rig
+    from rs_localizer.mapping.survey import MISFIT, Survey, survey_rig
     from rs_localizer.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
     from rs_localizer.markers.consistency import problems
     from rs_localizer.markers.map_files import write_marker_map
@@ -65,8 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--size",
         action="append",
         required=True,
-        metavar="[ID:]M",
-        help="side of the black square, m: of all markers, and of single ids that differ",
+        metavar="[ID[-ID]:]M",
+        help="side of the black square, m: of all markers, and of ids that differ",
     )
     parser.add_argument(
         "--origin", type=int, metavar="ID",
@@ -114,9 +114,9 @@ def run(args: argparse.Namespace) -> None:
         surveyed_map.deviations_of_shape if args.deviations == _SHAPE else surveyed_map.deviations
     )
     _tell(surveyed_map, every, cameras, filmed)
-    for camera, found in zip(cameras, surveyed_map.cameras, strict=True):
+    for camera, result in zip(cameras, surveyed_map.cameras, strict=True):
         instead = "calibrate --rig finds it" if camera.name else "without one it is found"
-        check_readout(args, found.readout_check, instead, camera.name)
+        check_readout(args, result.readout_check, instead, camera.name)
     surveyed = tuple(
         replace(marker, deviations=deviations)
         for marker, deviations in zip(surveyed_map.markers, every, strict=True)
@@ -138,19 +138,20 @@ def _markers(args: argparse.Namespace) -> tuple[Marker, ...]:
     kinds = [one.kind for one in families]
     if len(set(kinds)) < len(kinds):
         raise UsageError("--family: families of one kind share their patterns; give the largest")
-    size, sizes = 0.0, {}
+    size, sizes = 0.0, dict[int, float]()
     for text in args.size:
-        number_of, _, metres = text.rpartition(":")
+        ids, _, metres = text.rpartition(":")
         try:
             value = float(metres)
             if not 0.0 < value < np.inf:
                 raise ValueError
-            if number_of:
-                sizes[int(number_of)] = value
+            if ids:
+                first, _, last = ids.partition("-")
+                sizes |= dict.fromkeys(range(int(first), int(last or first) + 1), value)
             else:
                 size = value
         except ValueError:
-            raise UsageError(f"--size must be metres, or ID:metres, got {text!r}") from None
+            raise UsageError(f"--size must be metres, or ID[-ID]:metres, got {text!r}") from None
     if not size:
         raise UsageError("--size needs the size of all other markers, too")
     return every_marker(families, size, sizes)
@@ -199,19 +200,21 @@ def _tell(
     """The table of the markers, with their deviations (m,6)."""
     fit = surveyed_map.fit
     print(f"noise of the corners     {fit.deviation:.3f} px, {np.mean(fit.inliers):.1%} fit")
-    for given, images, found, count in zip(
+    for given, images, result, count in zip(
         cameras, filmed, surveyed_map.cameras, surveyed_map.images, strict=True
     ):
         of = f"{given.name}: " if given.name else ""
         print(f"{f'{of}images with a marker':24} {count} of {len(images.spotted)}")
-        deviation = found.readout_time_deviation
+        deviation = result.readout_time_deviation
         spread = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
-        print(f"{f'{of}readout time':24} {1e3 * found.readout_time:.3f}{spread} ms")
+        print(f"{f'{of}readout time':24} {1e3 * result.readout_time:.3f}{spread} ms")
         if images.mounting is not None:
             mounted = replace(
-                found.extrinsics, offset=images.stamp_offset + found.extrinsics.offset
+                result.extrinsics, offset=images.stamp_offset + result.extrinsics.offset
             )
-            print("\n".join(mounting_lines(given.name, cameras[0].name, mounted, found.deviations)))
+            print(
+                "\n".join(mounting_lines(given.name, cameras[0].name, mounted, result.deviations))
+            )
     print(
         f"{'marker':26} {'images':>6} {'x':>9} {'y':>9} {'z (m)':>9} {'+- (mm)':>8} {'+- (deg)':>8}"
     )
@@ -232,6 +235,8 @@ def _tell(
         print(
             f"not connected: {_listed(part)}: no image shows one of them together with those above"
         )
+    if surveyed_map.misfits:
+        print(f"left out: {_listed(surveyed_map.misfits)}: corners do not fit the others: {MISFIT}")
     if surveyed_map.rare:
         print(
             f"left out: {_listed(surveyed_map.rare)}: too few images show them, or not enough to "

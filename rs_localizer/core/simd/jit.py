@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import hashlib
+import importlib
 import importlib.util
 import os
 import pickle
@@ -18,7 +20,7 @@ import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Self, TypeVar, cast
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 import llvmlite.binding
 import numba
@@ -41,6 +43,10 @@ _PACKAGE = Path(__file__).resolve().parents[2]
 # What reading a file that was cut off, overwritten or written by another program may raise.
 _DAMAGE = (EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError)
 _CHECKSUM_BYTES = 4
+# A kernel whose object file is larger than this (bytes) is called where it is. Copied into its
+# callers, as Numba does with all, it would be optimized and translated once more for each.
+# Kernels of the default solver: 111 s without this, 94 s with; frames take as long.
+_LARGE = 8192
 # A module without a function.
 _NOTHING = llvmlite.binding.parse_assembly("").as_bitcode()
 _said: set[str] = set()
@@ -140,9 +146,28 @@ def _compiled(function: F, inline: str) -> F:
         tuple(map(numba.types.unliteral, positional)),
         {name: numba.types.unliteral(kind) for name, kind in named.items()},
     )
+    compiled.compile = _uncollected(compiled.compile)
     if Path(function.__code__.co_filename).is_file():  # not what was typed at a prompt
         compiled._cache = _Cache(function)
     return cast(F, compiled)
+
+
+def _uncollected(compiler: Callable[..., Any]) -> Callable[..., Any]:
+    """The same without collections of garbage, which look through all of what compilers keep.
+
+    They took 13 s of 94 for the kernels of the default solver.
+    """
+
+    def compiled(signature: Any) -> Any:
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return compiler(signature)
+        finally:
+            if collects:
+                gc.enable()
+
+    return compiled
 
 
 class _Locator:
@@ -195,11 +220,39 @@ class _Implementation(CompileResultCacheImpl):
                 kept = (name, "object", (code, _NOTHING)), described, *rest
                 target.codegen()._engine._defined_symbols.add(described.llvm_cpython_wrapper_name)
                 rebuilt = super().rebuild(target, kept)
+                rebuilt.library._reload_init.update(rebuilt.reload_init)
+                if intermediate == _NOTHING:
+                    _call_where_it_is(rebuilt)
+                    return rebuilt
                 rebuilt.library._get_module_for_linking = functools.cache(
                     functools.partial(_intermediate, target.codegen(), intermediate)
                 )
                 return rebuilt
         return super().rebuild(target, stored)
+
+
+class _Called(NamedTuple):
+    """A kernel that is called where it is: it has to be loaded before who calls it."""
+
+    module: str
+    name: str
+    arguments: tuple[Any, ...]  # types
+    symbol: str
+
+    def __call__(self) -> None:
+        kernel = getattr(importlib.import_module(self.module), self.name)
+        kernel.compile(self.arguments)
+        if kernel.overloads[self.arguments].fndesc.llvm_func_name != self.symbol:
+            raise ValueError(f"{self.name} has been compiled anew")
+
+
+def _call_where_it_is(compiled: Any) -> None:
+    """Let those who call a kernel refer to its code, and load it before theirs."""
+    about, library = compiled.fndesc, compiled.library
+    library._get_module_for_linking = functools.partial(llvmlite.binding.parse_bitcode, _NOTHING)
+    library._reload_init.add(
+        _Called(about.modname, about.qualname, compiled.signature.args, about.llvm_func_name)
+    )
 
 
 def _intermediate(codegen: Any, bitcode: bytes) -> Any:
@@ -238,6 +291,8 @@ class _Cache(FunctionCache):
     def __init__(self, function: Any) -> None:
         super().__init__(function)
         locator = self._impl.locator
+        # One that is made within a function cannot be looked up where its callers are loaded.
+        self._is_global = "<locals>" not in function.__qualname__
         name, stamp = self._impl.filename_base, locator.get_source_stamp()
         self._cache_file: _File = _File(self._cache_path, name, stamp)
         self._shipped = _File(str(shipped.FOLDER / locator.folder), name, stamp)
@@ -285,6 +340,8 @@ class _Cache(FunctionCache):
         return intruded is None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
+        if self._is_global and len(compiled.library._get_compiled_object()) > _LARGE:
+            _call_where_it_is(compiled)
         if not self._is_own():
             return
         try:

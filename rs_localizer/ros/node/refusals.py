@@ -78,7 +78,7 @@ class Refusals:
         if last is not None and now - last.when < _PERIOD:
             last.silent += 1
             return None
-        more = "" if last is None else _more(last.silent)
+        more = f" ({last.silent} more since the last report)" if last and last.silent else ""
         kinds[kind] = _Logged(now)
         return f"{reason}: {detail}{more}"
 
@@ -90,10 +90,6 @@ def _room_for(kind: str, kinds: dict[str, _Logged], now: float) -> str:
     for old in [k for k, logged in kinds.items() if now - logged.when >= _PERIOD and k != _OTHERS]:
         del kinds[old]
     return kind if len(kinds) < _MOST_KINDS else _OTHERS
-
-
-def _more(silent: int) -> str:
-    return f" ({silent} more since the last report)" if silent else ""
 
 
 def describe(error: Exception) -> str:

@@ -140,6 +140,33 @@ def test_a_kernel_is_compiled_with_one_that_comes_from_the_cache(load, cache):
     assert "8doubling6double" not in "".join(line for line in code.splitlines() if " call " in line)
 
 
+def test_a_large_kernel_is_called_where_it_is(load, cache, monkeypatch):
+    monkeypatch.setattr(jit, "_LARGE", 0)
+
+    def quadruple() -> Any:
+        load()
+        return sys.modules["doubling"].quadruple
+
+    one = quadruple()
+    assert one(1.5) == 6.0
+    (code,) = one.inspect_llvm().values()
+    assert "8doubling6double" in "".join(line for line in code.splitlines() if " call " in line)
+    again = quadruple()
+    assert again(1.5) == 6.0
+    assert hits(again) == hits(sys.modules["doubling"].double) == 1
+    # What it would call is no longer there.
+    for file in files(cache, ".nb?"):
+        if ".double-" in file.name:
+            file.unlink()
+    anew = quadruple()
+    with pytest.warns(RuntimeWarning, match="damaged files are compiled anew"):
+        assert anew(1.5) == 6.0
+    assert hits(anew) == 0
+    last = quadruple()
+    assert last(1.5) == 6.0
+    assert hits(last) == 1
+
+
 @pytest.mark.parametrize("shared", ["cache", "rs_localizer", "digest", "kernels"])
 def test_a_cache_that_others_can_write_is_not_used(load, monkeypatch, shared):
     """Numba unpickles what is there: whoever writes it runs code in this process."""

@@ -36,6 +36,12 @@ def recording(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def alone(recording, tmp_path_factory) -> dict[str, dict[int, bytes]]:
+    """What replay says without the IMU."""
+    return replayed(recording, tmp_path_factory.mktemp("alone") / "out", *SHUTTER, "--no-imu")
+
+
+@pytest.fixture(scope="module")
 def items(recording) -> list[Item]:
     with open_bag(recording) as bag:
         return [
@@ -112,7 +118,7 @@ def at_frames(items: list[Item], late: float) -> list[list[Item]]:
     return parts
 
 
-def test_node_and_replay_say_the_same(recording, items, tmp_path, start_node, robot):
+def test_node_and_replay_say_the_same(recording, items, alone, tmp_path, start_node, robot):
     start_node(*SHUTTER, *RELIABLE, "-p", "imu.wait:=1.0", **ENVIRONMENT)
     robot.connect()
     robot.mount(recording)
@@ -122,7 +128,6 @@ def test_node_and_replay_say_the_same(recording, items, tmp_path, start_node, ro
     used = (robot.values["IMU"], robot.values["IMU used (share of the last frames)"])
     assert used == ("used", "100%"), robot.values
     both = replayed(recording, tmp_path / "both", *SHUTTER)
-    alone = replayed(recording, tmp_path / "alone", *SHUTTER, "--no-imu")
     for name in TYPES:
         assert len(both[name]) == FRAMES
         assert robot.answered(name) == both[name]
@@ -132,14 +137,13 @@ def test_node_and_replay_say_the_same(recording, items, tmp_path, start_node, ro
     assert re.match(r"-?\d+\.\d+ \+- ", robot.values["IMU time offset (ms)"])
 
 
-def test_an_imu_that_is_late_is_not_waited_for(recording, items, tmp_path, start_node, robot):
+def test_an_imu_that_is_late_is_not_waited_for(recording, items, alone, start_node, robot):
     node = start_node(*SHUTTER, *RELIABLE, **ENVIRONMENT)
     robot.connect()
     robot.mount(recording)
     robot.greet(items)
     for part in at_frames(items, 0.1):
         robot.play(part)
-    alone = replayed(recording, tmp_path / "alone", *SHUTTER, "--no-imu")
     for name in TYPES:
         assert robot.answered(name) == alone[name]
     node.wait_for_log("imu_late: the IMU is not used: IMU messages arrive later than imu.wait")

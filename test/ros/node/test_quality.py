@@ -4,13 +4,14 @@
 
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, PointCloud2
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from rs_localizer.ros.node.inputs import best
+from rs_localizer.ros.node.inputs import Inputs, best
 
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 VOLATILE, LATCHED = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
@@ -31,6 +32,25 @@ WHOLE = QoSProfile(depth=1, reliability=RELIABLE, durability=LATCHED)
 )
 def test_the_best_that_all_offer(wished, offers, expected):
     assert best(wished, offers) == expected
+
+
+@pytest.mark.parametrize(
+    ("kind", "quality", "large"),
+    [(Image, BEST_EFFORT, True), (Image, RELIABLE, False), (CameraInfo, BEST_EFFORT, False)],
+)
+def test_why_large_messages_are_lost_is_said(kind, quality, large):
+    profile = QoSProfile(depth=1, reliability=quality)
+    name = f"sensor_msgs/msg/{kind.__name__}"
+    camera = SimpleNamespace(
+        topic_type=name, node_namespace="/", node_name="camera", qos_profile=profile
+    )
+    node: Any = SimpleNamespace(
+        _node=SimpleNamespace(get_publishers_info_by_topic=lambda topic: [camera])
+    )
+    topic: Any = SimpleNamespace(msg_type=kind, topic_name="/image", qos_profile=profile)
+    cause, mismatch = Inputs._cause(node, topic)
+    assert cause.startswith("it has 1 publisher, but no message comes")
+    assert ("above half a megabyte are lost" in cause, mismatch) == (large, False)
 
 
 def heard_with(peer: Any, topic: str) -> Callable[[], set[ReliabilityPolicy]]:
