@@ -221,7 +221,7 @@ class _Implementation(CompileResultCacheImpl):
                 target.codegen()._engine._defined_symbols.add(described.llvm_cpython_wrapper_name)
                 rebuilt = super().rebuild(target, kept)
                 rebuilt.library._reload_init.update(rebuilt.reload_init)
-                if _is_nothing(intermediate):
+                if intermediate == _NOTHING:
                     _call_where_it_is(rebuilt)
                     return rebuilt
                 rebuilt.library._get_module_for_linking = functools.cache(
@@ -229,13 +229,6 @@ class _Implementation(CompileResultCacheImpl):
                 )
                 return rebuilt
         return super().rebuild(target, stored)
-
-
-def _is_nothing(bitcode: bytes) -> bool:
-    """Whether it is of :data:`_NOTHING`, whose bytes LLVM writes otherwise once it has compiled."""
-    if len(bitcode) > 2 * len(_NOTHING):  # that of a function is longer, and takes time to read
-        return False
-    return not any(True for _ in llvmlite.binding.parse_bitcode(bitcode).functions)
 
 
 class _Called(NamedTuple):

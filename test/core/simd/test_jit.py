@@ -167,18 +167,6 @@ def test_a_large_kernel_is_called_where_it_is(load, cache, monkeypatch):
     assert hits(last) == 1
 
 
-def test_a_large_kernel_from_the_cache_is_loaded_with_its_caller(load, monkeypatch):
-    """Its caller, compiled by another process, once referred to code that nobody loads: LLVM ends
-    the process then.
-    """
-    monkeypatch.setattr(jit, "_LARGE", 0)
-    assert load()(1.5) == 3.0
-    for _ in range(2):  # compiled with one that comes from the cache; then both come from it
-        load()
-        assert sys.modules["doubling"].quadruple(1.5) == 6.0
-        assert hits(sys.modules["doubling"].double) == 1
-
-
 @pytest.mark.parametrize("shared", ["cache", "rs_localizer", "digest", "kernels"])
 def test_a_cache_that_others_can_write_is_not_used(load, monkeypatch, shared):
     """Numba unpickles what is there: whoever writes it runs code in this process."""
