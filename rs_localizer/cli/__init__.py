@@ -17,8 +17,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-# Bars are shown by one process. tqdm's own lock for several is a semaphore, of which Python 3.14 says
-# that it leaked when a signal ends the command.
+# Bars are shown by one process. tqdm's own lock for several is a semaphore, of which Python 3.14
+# says that it leaked when a signal ends the command.
 tqdm.set_lock(threading.RLock())
 
 WORKING = True

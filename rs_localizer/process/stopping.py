@@ -24,6 +24,9 @@ INTERRUPTED = _SIGNALLED + signal.SIGINT
 # SystemError, or leaves machine code half loaded (SIGSEGV, 11 of 147 random signals). An import
 # that breaks off leaves half a module.
 _FRAGILE = ("numba", "llvmlite", "importlib", "_frozen_importlib")
+# So is the module that the constructor of a named tuple believes to be in: machine code calls it
+# for its results (a SystemError, 1 of 194 random signals).
+_NAMED_TUPLE = "namedtuple_"
 # s: how often it is tried to interrupt them; so long compiling may take, of which nothing stays.
 _PERIOD, _PATIENCE = 0.02, 2.0
 # s until an exception that nobody handles counts as lost, as in a finalizer; unwinding takes less.
@@ -130,7 +133,8 @@ class StopSignals(StopRequest):
 
 def _is_fragile(frame: FrameType | None) -> bool:
     while frame is not None:
-        if str(frame.f_globals.get("__name__")).partition(".")[0] in _FRAGILE:
+        name = str(frame.f_globals.get("__name__"))
+        if name.partition(".")[0] in _FRAGILE or name.startswith(_NAMED_TUPLE):
             return True
         frame = frame.f_back
     return False

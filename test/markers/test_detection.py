@@ -391,3 +391,25 @@ def test_the_sides_of_a_slanted_marker_keep_clear_of_each_other():
         image = 220.0 - 190.0 * (inside & ~hole).reshape(80, 8, 80, 8).mean(axis=(1, 3))
         truth = corner + np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ along
         assert moved(image, truth, cells=6) < 0.2
+
+
+def test_the_sides_of_a_fisheyes_marker_are_curves():
+    """Equidistant, f = 260 px: straight lines through sides of 35 px meet too far outside."""
+    focal, side, outward = 260.0, 46.0, []
+    fine = (np.arange(640) + 0.5) / 8.0 - 0.5
+    pixels = np.stack(np.meshgrid(fine, fine), -1)
+    for shift in np.linspace(0.0, 0.9, 4):
+        middle = np.array([-120.0 + shift, -60.0 - 0.7 * shift])
+        about = pixels - middle
+        away = np.linalg.norm(about, axis=-1, keepdims=True)
+        plane = focal * np.tan(away / focal) * about / away
+        a, b = np.moveaxis((plane - plane[320, 320]) / side, -1, 0)
+        inside = np.maximum(abs(a), abs(b)) < 1 / 2
+        image = 220.0 - 190.0 * inside.reshape(80, 8, 80, 8).mean(axis=(1, 3))
+        corners = plane[320, 320] + side * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
+        far = np.linalg.norm(corners, axis=1, keepdims=True)
+        truth = middle + focal * np.arctan(far / focal) * corners / far
+        quads = truth[None] + 0.3
+        assert refine(np.rint(image).astype(np.uint8), quads, np.array([6])).all()
+        outward.append(np.sum((quads[0] - truth) * (truth - middle), axis=1) / far[:, 0])
+    assert abs(np.mean(outward)) < 0.03

@@ -6,10 +6,12 @@ import os
 import signal
 import subprocess
 import sys
+from typing import NamedTuple
 
 import pytest
 
 from benchmarks.signals import campaign
+from rs_localizer.process.stopping import _is_fragile
 
 # What is interrupted in the middle of code that Numba calls, or in a finalizer.
 PROGRAM = """
@@ -55,6 +57,16 @@ def test_no_interrupt_is_lost(tmp_path, number, body):
     expected = ["whole", "interrupted"] if "numba" in body else ["interrupted"]
     assert ended.stdout.split() == expected
     assert ended.returncode == 0
+
+
+def test_named_tuples_are_not_interrupted_halfway():
+    """Numba has them made, and returns a result beside the exception."""
+    pair, calls = NamedTuple("pair", [("one", int)]), []
+    sys.setprofile(lambda frame, *_: calls.append((frame.f_code.co_name, _is_fragile(frame))))
+    pair(1)
+    sys.setprofile(None)
+    assert calls[0] == ("<lambda>", True)
+    assert calls[-1] == (sys._getframe().f_code.co_name, False)
 
 
 LATER = "import threading; threading.Timer(0.2, os.kill, (os.getpid(), 15)).start(); import numba"
