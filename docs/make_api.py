@@ -132,6 +132,7 @@ def _signature(item: Any) -> str:
 def _plain(text: str) -> str:
     """Without the quotes of annotations, and enumerations by their values."""
     text = re.sub(r"<\w+\.\w+: ('\w*')>", r"\1", text)
+    text = re.sub(r"ForwardRef\('([^']*)'\)", r"\1", text)  # of a NamedTuple
     return re.sub(r"(: |-> )'([^']*)'", r"\1\2", text).replace("<factory>", "...")
 
 

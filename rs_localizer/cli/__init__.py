@@ -9,12 +9,17 @@ import importlib
 import math
 import os
 import shutil
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
+
+# Bars are shown by one process. tqdm's own lock for several is a semaphore, of which Python 3.14 says
+# that it leaked when a signal ends the command.
+tqdm.set_lock(threading.RLock())
 
 WORKING = True
 """Whether commands work: where one only shows or completes its arguments, its module imports no
