@@ -209,6 +209,14 @@ class _Implementation(CompileResultCacheImpl):
         self._locator_classes = [_Locator]
         super().__init__(function)
 
+    def reduce(self, compiled: Any) -> Any:
+        """What is kept of a function."""
+        (name, kind, (code, intermediate)), *rest = super().reduce(compiled)
+        # A module that has been read is written with other bytes, which rebuild would not know.
+        if compiled.library._get_module_for_linking is _nothing:
+            intermediate = _NOTHING
+        return ((name, kind, (code, intermediate)), *rest)
+
     def rebuild(self, target: Any, stored: Any) -> Any:
         """A function as it was kept.
 
@@ -249,10 +257,14 @@ class _Called(NamedTuple):
 def _call_where_it_is(compiled: Any) -> None:
     """Let those who call a kernel refer to its code, and load it before theirs."""
     about, library = compiled.fndesc, compiled.library
-    library._get_module_for_linking = functools.partial(llvmlite.binding.parse_bitcode, _NOTHING)
+    library._get_module_for_linking = _nothing
     library._reload_init.add(
         _Called(about.modname, about.qualname, compiled.signature.args, about.llvm_func_name)
     )
+
+
+def _nothing() -> Any:
+    return llvmlite.binding.parse_bitcode(_NOTHING)
 
 
 def _intermediate(codegen: Any, bitcode: bytes) -> Any:

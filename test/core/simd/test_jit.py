@@ -154,6 +154,14 @@ def test_a_large_kernel_is_called_where_it_is(load, cache, monkeypatch):
     again = quadruple()
     assert again(1.5) == 6.0
     assert hits(again) == hits(sys.modules["doubling"].double) == 1
+    # Compiled anew with one that comes from the cache, it has that loaded before it, too.
+    for file in files(cache, ".nb?"):
+        if ".quadruple-" in file.name:
+            file.unlink()
+    anew = quadruple()
+    assert anew(1.5) == 6.0
+    (overload,) = anew.overloads.values()
+    assert [called.name for called in overload.reload_init] == ["double"]
     # What it would call is no longer there.
     for file in files(cache, ".nb?"):
         if ".double-" in file.name:
