@@ -55,6 +55,7 @@ def refusal(
     """What is wrong with an estimate, or None.
 
     Args:
+        posterior: ``declared`` is all that map and calibration are known to be off.
         samples: minimal samples drawn, for the message.
         min_inliers, threshold: of the configuration.
         rolling: whether velocities were estimated.
