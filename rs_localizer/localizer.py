@@ -402,12 +402,11 @@ class Localizer:
         known = math.hypot(posterior.declared, effect.residual)  # px, of map and calibration
         failure = refusal(
             observed.observations,
-            posterior,
+            replace(posterior, declared=known),
             best.samples,
             min_inliers=self.config.min_inliers,
             threshold=self._gate(observed, posterior.state),
             rolling=self._solver.rolling_shutter,
-            declared=known,
         )
         if failure is not None:
             return failure

@@ -6,8 +6,11 @@ import copy
 import pickle
 from dataclasses import fields, replace
 
+import cv2
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from benchmarks.independent.cameras import Camera as TrueCamera
@@ -15,6 +18,7 @@ from benchmarks.independent.cameras import Scan
 from benchmarks.independent.motions import hand, steady
 from benchmarks.independent.rigs import Mounted, Scene, middle_of, views
 from benchmarks.independent.rotations import exponential, logarithm
+from rs_localizer.config import CalibrationErrors
 from rs_localizer.core.types import Estimate
 from rs_localizer.inertial.settings import InertialSettings
 
@@ -112,6 +116,45 @@ def test_exact_points_of_askew_cameras_give_the_motion(scan):
     wrong = rig_of(pair(ASKEW, -BESIDE, 0.012, scan=scan, readout_time=0.02))
     result = rsl.Localizer(wrong).localize(made[0], stamps=stamps)
     assert not result or errors(result, motions, 0, middle_of(mounted))[1] > 0.01
+
+
+def test_the_estimate_is_that_of_plain_least_squares():
+    """By SciPy and OpenCV, from the equation of docs/rigs.md and what is known of motions."""
+    mounted = pair(ASKEW, BESIDE, 0.012, scan=Scan.UP, readout_time=0.02)
+    config, middle = rsl.LocalizerConfig(calibration=CalibrationErrors(0.0, 0.0, 0.0)), 0.016
+    speed, change = config.velocity_prior, config.acceleration
+    known = np.repeat([speed.angular, speed.linear, change.angular, change.linear], 3)
+    for parts in frames(mounted, fast, 3, noise=0.5)[0]:
+        result = rsl.Localizer(rig_of(mounted), config).localize(parts, stamps=stamps_of(mounted))
+        assert result, result
+        first = Rotation.from_matrix(result.rotation.T)
+
+        def errors_of(x, parts=parts, first=first, near=result.position):
+            turn, move, rate, velocity, twist, push = x.reshape(6, 3)
+            of = [x[6:] / known]
+            for name, (points, pixels) in parts.items():
+                camera = mounted[name].camera
+                down = pixels[:, 1] / (camera.height - 1)
+                rows = 1.0 - down if camera.scan == Scan.UP else down
+                t = (mounted[name].start + camera.readout_time * rows - middle)[:, None]
+                turned = first * Rotation.from_rotvec(turn)
+                there = near + move + turned.apply(velocity * t + 0.5 * push * t**2)
+                now = turned * Rotation.from_rotvec(rate * t + 0.5 * twist * t**2)
+                local = now.inv().apply(points - there) @ mounted[name].rotation.T
+                local += mounted[name].translation
+                seen = cv2.projectPoints(
+                    local, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion)
+                )[0]
+                of.append((seen.reshape(-1, 2) - pixels).ravel() / 0.5)
+            return np.concatenate(of)
+
+        best = least_squares(errors_of, np.zeros(18)).x
+        velocities = np.concatenate([result.angular_velocity, result.linear_velocity])
+        apart = np.concatenate([
+            best[:3], result.rotation @ best[3:6], best[6:12] * result.span - velocities
+        ])  # fmt: skip
+        # A tenth of a deviation of each: of a chi-squared of 12, one in a hundred.
+        assert apart @ np.linalg.solve(result.covariance, apart) < 0.12
 
 
 @pytest.mark.parametrize(("turned", "scene"), [(TURNED, Scene.RICH), (UPRIGHT, Scene.WALL)])

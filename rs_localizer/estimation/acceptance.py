@@ -51,15 +51,14 @@ def refusal(
     min_inliers: int,
     threshold: float,
     rolling: bool,
-    declared: float = 0.0,
 ) -> Failure | None:
     """What is wrong with an estimate, or None.
 
     Args:
+        posterior: ``declared`` is all that map and calibration are known to be off.
         samples: minimal samples drawn, for the message.
         min_inliers, threshold: of the configuration.
         rolling: whether velocities were estimated.
-        declared: px, what map and calibration are known to be off.
     """
     state = posterior.state
     found, needed = int(np.count_nonzero(posterior.inliers)), min_inliers
@@ -95,7 +94,9 @@ def refusal(
             "too small for the noise",
         )
     shared = rolling and posterior.agreement > _MOST_AGREEMENT
-    if shared and posterior.noise > max(_LEAST_MODEL_ERROR * threshold, _ALLOWED * declared):
+    if shared and posterior.noise > max(
+        _LEAST_MODEL_ERROR * threshold, _ALLOWED * posterior.declared
+    ):
         return Failure(
             Reason.MODEL_ERROR,
             f"neighbouring rows share errors that no motion explains ({posterior.agreement:.1f} "
@@ -109,7 +110,7 @@ def refusal(
             "unmodelled vibration, or a second motion",
         )
     if rolling and posterior.model_error > math.hypot(
-        _MOST_MODEL_ERROR * threshold, _MOST_DECLARED * declared
+        _MOST_MODEL_ERROR * threshold, _MOST_DECLARED * posterior.declared
     ):
         return Failure(
             Reason.MODEL_ERROR,

@@ -71,7 +71,7 @@ _RIDGE = 1.0 + 1e-13
 _CLOSING = 0.6
 # A last step this short, in squared standard deviations: the next one is its square.
 _SHORT = 1e-3
-# A step that raises the cost is halved, up to a thirtieth.
+# A step that raises the cost is halved, up to a thirtieth: two hold small planes, none loses them.
 _HALVINGS = 6
 # Fewer inliers determine nothing.
 _FEWEST = 6

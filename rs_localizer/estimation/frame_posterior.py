@@ -132,8 +132,7 @@ def frame_posterior(
         terms: what is known of the motion beside the points.
         threshold: px, of inliers.
         assumed: of the camera.
-        one_lens: one camera sees all of them. Lenses are not off alike: one smooth error of all
-            images would take a pixel between two of them for twenty at their borders.
+        one_lens: one camera sees them all; of two lenses a smooth error is not one polynomial.
     """
     if observations.count > _MOST_POINTS:
         thinned = observations.thinned(_MOST_POINTS)
@@ -182,9 +181,8 @@ def _of_points(
     hidden = assumed.turn is None and bool(most > _ASKS_TURNS or known)
     turns = assumed.rolling and (wide or hidden)
     # What a gyroscope that comes too late leaves is smooth, too.
-    shows = excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED
-    shows = one_lens and assumed.turn is None and shows
-    smooth = bool(best.inliers.any() and (declared > 0.0 or shows))
+    shows = one_lens and (excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED)
+    smooth = bool(best.inliers.any() and (declared > 0.0 or (assumed.turn is None and shows)))
     best = replace(best, agreement=agreement, near_outliers=near, declared=declared)
     # What turns within the frame would explain, errors of map and lens may explain as well.
     frame = _Frame(

@@ -323,8 +323,7 @@ def _draw(
     ends = np.cumsum([pool.share for pool in pools])
     first = 0
     for index, pool in enumerate(pools):
-        last = index == len(pools) - 1
-        part = samples[first : count if last else int(ends[index] * count / ends[-1])]
+        part = samples[first : count if pool is pools[-1] else int(ends[index] * count / ends[-1])]
         if pool.ranked:
             prefixes = pool.prefix_sizes(drawn[index], len(part), size)
         else:

@@ -6,8 +6,6 @@ Both feed their messages to a :class:`FrameLocalizer` and publish what
 :func:`rs_localizer.io.outputs.messages` makes of the result, so that both say the same.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -90,11 +90,13 @@ def test_results_of_other_settings_are_in_the_way(recordings, tmp_path, capsys):
     words = ["replay", *recordings, "--out", str(out), *SHUTTER]
     (out / "a_flight").mkdir(parents=True)
     (out / "a_flight" / "mine").write_text("")
-    assert main([*words, "--overwrite"]) == 1
-    assert f"{out}/a_flight exists and is no result of replay; choose" in capsys.readouterr().err
-    (out / "a_flight" / "fleet.json").write_text(
-        '{"identity": "another", "command": "replay", "figures": {}}'
-    )
+    marker = '{"identity": "another", "command": "COMMAND", "figures": {}}'
+    # As ``replay out/*/ --out out --overwrite`` would replace what it reads.
+    for text in ("no marker", marker.replace("COMMAND", "detect")):
+        (out / "a_flight" / "fleet.json").write_text(text)
+        assert main([*words, "--overwrite"]) == 1
+        assert f"{out}/a_flight exists and is no result of replay" in capsys.readouterr().err
+    (out / "a_flight" / "fleet.json").write_text(marker.replace("COMMAND", "replay"))
     assert main(words) == 1
     assert "a_flight is a result of other settings, another recording or another version; " in (
         capsys.readouterr().err
@@ -102,17 +104,6 @@ def test_results_of_other_settings_are_in_the_way(recordings, tmp_path, capsys):
     assert main([*words, "--overwrite"]) == 0
     assert (out / "a_flight" / "mine").exists()  # until there is a better one
     assert rows(out)["b_flight"]["state"] == "not done"
-
-
-@pytest.mark.usefixtures("undone")
-def test_results_of_another_command_stay_whatever_may_be_overwritten(recordings, tmp_path, capsys):
-    """As ``replay seen/*/ --out seen --overwrite`` would replace what it reads."""
-    made = tmp_path / "seen" / "flight"
-    shutil.copytree(recordings[0], made)
-    (made / "fleet.json").write_text('{"identity": "x", "command": "detect", "figures": {}}')
-    words = ["replay", str(made), *SHUTTER, "--workers", "1", "--out", str(made.parent)]
-    assert main([*words, "--overwrite"]) == 1
-    assert f"{made} exists and is no result of replay; choose" in capsys.readouterr().err
 
 
 def test_without_dask_one_sentence_says_what_to_install(monkeypatch, tmp_path, capsys):

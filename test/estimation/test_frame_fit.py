@@ -30,7 +30,7 @@ from rs_localizer.estimation.prior import add_prior, motion_terms
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.estimation.residuals import Lines, linearized
 
-from .frames import PRIOR, distance, frame
+from .frames import PRIOR, distance, frame, observe
 from .projection import gradient, jacobian_of, pixels_of, project, row_time, scene, shake, waves
 
 COUNT, NOISE = 60, 0.3  # px
@@ -349,6 +349,25 @@ def test_without_anything_to_explain_the_fit_is_the_plain_one():
             fit.covariance[:18, :18] / np.outer(scale, scale),
             plain.covariance / np.outer(scale, scale), atol=0.03,
         )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_small_plane_is_fitted_from_another_lean(seed):
+    """The valley of lean and velocities bends: full steps leave it, and lose all points."""
+    rng = np.random.default_rng(seed)
+    points = np.append(rng.uniform(-0.1, 0.1, (40, 2)), np.zeros((40, 1)), axis=1)
+    tilted = Rotation.from_rotvec([0.3, 0.1, 0.0])
+    state = np.concatenate([tilted.as_matrix().ravel(), [0.0, 0.0, 2.0], np.zeros(12)])
+    state[12:18] = 0.05 * rng.normal(size=6)
+    observations = observe(state, points, 1.0, rng)
+    start = state.copy()
+    axis = rng.normal(size=2)
+    lean = Rotation.from_rotvec([*(0.35 * axis / np.linalg.norm(axis)), 0.0])
+    start[:9], start[12:] = (lean * tilted).as_matrix().ravel(), 0.0
+    fit = fitted(observations, start, turns=False, smooth=False)
+    assert fit.finite
+    assert fit.inliers.all()
+    assert np.sum(fit.squared_errors) < np.sum(observations.squared_errors(state))
 
 
 def test_more_than_a_motion_is_chosen_by_the_evidence_only_if_there_is_more():

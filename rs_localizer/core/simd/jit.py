@@ -221,7 +221,7 @@ class _Implementation(CompileResultCacheImpl):
                 target.codegen()._engine._defined_symbols.add(described.llvm_cpython_wrapper_name)
                 rebuilt = super().rebuild(target, kept)
                 rebuilt.library._reload_init.update(rebuilt.reload_init)
-                if intermediate == _NOTHING:
+                if not intermediate:
                     _call_where_it_is(rebuilt)
                     return rebuilt
                 rebuilt.library._get_module_for_linking = functools.cache(
@@ -250,6 +250,11 @@ def _call_where_it_is(compiled: Any) -> None:
     """Let those who call a kernel refer to its code, and load it before theirs."""
     about, library = compiled.fndesc, compiled.library
     library._get_module_for_linking = functools.partial(llvmlite.binding.parse_bitcode, _NOTHING)
+    library.serialize_using_object_code = lambda: (
+        library.name,
+        "object",
+        (library._get_compiled_object(), b""),
+    )
     library._reload_init.add(
         _Called(about.modname, about.qualname, compiled.signature.args, about.llvm_func_name)
     )

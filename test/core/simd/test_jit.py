@@ -147,8 +147,10 @@ def test_a_large_kernel_is_called_where_it_is(load, cache, monkeypatch):
         load()
         return sys.modules["doubling"].quadruple
 
-    one = quadruple()
+    load()(1.5)
+    one = quadruple()  # with one that comes from the cache
     assert one(1.5) == 6.0
+    assert hits(sys.modules["doubling"].double) == 1
     (code,) = one.inspect_llvm().values()
     assert "8doubling6double" in "".join(line for line in code.splitlines() if " call " in line)
     again = quadruple()
