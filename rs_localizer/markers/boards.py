@@ -21,8 +21,8 @@ _WINDOW_SHARE = 0.45
 _WINDOW_RANGE = (2, 15)
 _SMOOTHING = 1.0  # px
 # So far from a corner, in parts of the way to the next, the squares around it are looked at; by the
-# median of all, the contrast of 57 false corners of two public videos is below 0.37, of 13,500 true
-# ones above 0.65; behind a reflection true ones have 0.38.
+# median of all, the contrast of 57 false corners of two public videos is below 0.37, of the others
+# above 0.65; behind a reflection true ones have 0.38.
 _BESIDE, _LEAST_CONTRAST = 0.12, 0.5
 _SAME = 1.0  # px; the sub-pixel search ends at a saddle to a hundredth of this
 # A chessboard is looked for in an image whose longer side is this (px) or less: where there is

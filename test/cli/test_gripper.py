@@ -79,7 +79,6 @@ def places(filmed: SimpleNamespace, rows: list[dict], which: int) -> tuple[np.nd
     return np.array(found), np.array(true)
 
 
-@pytest.mark.bench  # half a minute of a core
 def test_demonstrations_become_trajectories(filmed, tmp_path, capsys):
     import zarr
 
