@@ -25,7 +25,7 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.images import FrameExtractor, keypoints
+from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.simulation.frames import frame_stamps
 from rs_localizer.simulation.planes import TexturedPlane
 from rs_localizer.simulation.renderer import Renderer

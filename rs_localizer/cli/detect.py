@@ -41,7 +41,8 @@ if WORKING:
     from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
     from rs_localizer.offline.fleet.task import Figures, Kind
     from rs_localizer.offline.image_sources import Carried, Shot
-    from rs_localizer.pipeline.images import FrameDetector, FrameExtractor
+    from rs_localizer.pipeline.images import FrameDetector
+    from rs_localizer.pipeline.keypoints import FrameExtractor
 
 # Options of markers and boards.
 _OF_MARKERS = ("map", "board", "pattern", "square", "min_side")

@@ -171,10 +171,10 @@ def averaged(
     for k in range(count):
         if possible[k] > 0.0:
             offsets[k], by_turn = offset_between(state, states[k], middle)
-            covariance += possible[k] * np.outer(offsets[k], offsets[k])
+            covariance = covariance + possible[k] * np.outer(offsets[k], offsets[k])
             if possible[k] > _NO_PART:
                 abouts[k] = _about_pivot(covariances[k], by_turn)
-                covariance += possible[k] * abouts[k]
+                covariance = covariance + possible[k] * abouts[k]
     return state, covariance, steps, offsets, abouts
 
 

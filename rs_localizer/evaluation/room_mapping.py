@@ -26,7 +26,7 @@ from rs_localizer.mapping.colmap import Effort, Stage
 from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.views import Looker, View
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.images import FrameExtractor, keypoints
+from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import frame_stamps, middle_stamp
 from rs_localizer.simulation.renderer import Renderer, in_order

@@ -28,13 +28,8 @@ from rs_localizer.markers.detection import recognized
 from rs_localizer.markers.map_check import LeaveOneOut, Predict, rms, still_errors, still_pose
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
-from rs_localizer.pipeline.images import (
-    Detected,
-    FrameDetector,
-    FrameExtractor,
-    correspondences,
-    keypoints,
-)
+from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
+from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.refusal import Refusal
 
 # Fewer corners than this say nothing about how well a pose fits.

@@ -17,7 +17,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.clouds import read_keypoints
 from rs_localizer.io.recording import make_camera_info
-from rs_localizer.pipeline.images import FrameExtractor, keypoints
+from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 
 K = np.array([[200.0, 0.0, 79.5], [0.0, 200.0, 59.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(160, 120, K)

@@ -9,7 +9,7 @@ from rs_localizer.config import FeatureConfig
 from rs_localizer.features.extraction import draw_features
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import KEYPOINTS
-from rs_localizer.pipeline.images import Extracted, FrameExtractor, keypoints
+from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
 from rs_localizer.ros.detector.node import Drawing, Finder, ImageNode, Show, Work
 from rs_localizer.ros.node.worker import Worker
 from rs_localizer.settings import FEATURES_NAME

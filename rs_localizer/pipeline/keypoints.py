@@ -1,0 +1,72 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of images -> keypoints with descriptors: all of the feature detector but ROS.
+
+The node and the offline ``rs_localizer detect --features`` run this one class.
+"""
+
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from rs_localizer.config import FeatureConfig
+from rs_localizer.core.reasons import Reason
+from rs_localizer.features.extraction import FeatureExtractor, Features
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.images import Image, read_any_image
+from rs_localizer.io.messages import Make
+from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extracted:
+    """An image and its keypoints; true in a condition."""
+
+    image: Image
+    features: Features
+
+    def __bool__(self) -> Literal[True]:
+        return True
+
+
+def keypoints(extracted: Extracted, make: Make) -> Any:
+    """The sensor_msgs/PointCloud2 of an image: the same for node and bag."""
+    features = extracted.features
+    width = features.descriptors.shape[1]
+    numbers = [(name, "<f4") for name in ("u", "v", "score")]
+    rows = np.empty(len(features), np.dtype([*numbers, ("descriptor", "u1", (width,))]))
+    rows["u"], rows["v"] = features.pixels.T
+    rows["score"], rows["descriptor"] = features.scores, features.descriptors
+    return make_cloud(make, extracted.image.stamp_ns, extracted.image.frame, rows)
+
+
+class FrameExtractor:
+    """Finds keypoints in images.
+
+    Args:
+        config: its settings.
+
+    Raises:
+        FeatureError: for features that this OpenCV does not have.
+    """
+
+    def __init__(self, config: FeatureConfig) -> None:
+        self._extractor = FeatureExtractor(config.features, config.max_keypoints)
+        self.seconds = 0.0  # spent so far
+
+    def warm_up(self) -> None:
+        """Nothing is compiled: OpenCV does the work."""
+
+    def take(self, message: Any) -> Extracted | Refusal:
+        """Look for keypoints in a sensor_msgs/Image or CompressedImage."""
+        image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
+        return image if isinstance(image, Refusal) else self.extract(image)
+
+    def extract(self, image: Image) -> Extracted:
+        """Look for keypoints in an image."""
+        start = time.perf_counter()
+        features = self._extractor.extract(image.pixels)
+        self.seconds += time.perf_counter() - start
+        return Extracted(image, features)
