@@ -310,11 +310,11 @@ class RigWatch:
     def _follow_clock(self, name: str, time_ns: int) -> None:
         """Notice a jump of a clock, and follow it as far as the order of images tells."""
         clock = self._clocks[name]
-        latest_ns = max(
-            (o.last_ns + o.applied_ns for n, o in self._clocks.items()
-             if n != name and o.last_ns is not None and o.behind is None),
-            default=None,
-        )  # fmt: skip
+        others = [
+            (o.behind is None, o.last_ns + o.applied_ns)
+            for n, o in self._clocks.items() if n != name and o.last_ns is not None
+        ]  # fmt: skip
+        latest_ns = max(others)[1] if others else None  # of those that are in doubt if all are
         last_ns, clock.last_ns = clock.last_ns, time_ns
         step_ns = 0 if last_ns is None else time_ns - last_ns
         far_ns = self._far_ns(clock)
@@ -330,8 +330,10 @@ class RigWatch:
             clock.behind.append(0)
         else:
             clock.behind.append(latest_ns - time_ns - clock.applied_ns)
+            if abs(clock.behind[-1]) < far_ns:  # both made a pause, or its images were lost
+                clock.behind = None
         clock.others_ns = latest_ns
-        if len(clock.behind) < _JUMPED:
+        if clock.behind is None or len(clock.behind) < _JUMPED:
             return
         behind_ns, clock.behind = float(np.median(clock.behind)), None
         if abs(behind_ns) < far_ns:

@@ -167,6 +167,22 @@ def test_clocks_are_estimated_and_followed(tmp_path, jump):
         assert Counter(name for name, _ in notices)["clock"] == 1
 
 
+@pytest.mark.parametrize("names", [("left", "right"), ("right",)])
+def test_a_pause_is_no_jump_of_a_clock(tmp_path, names):
+    motion = hand(5.0, 1.5)
+    half_ns = motion.intervals_ns[0][0] + 750_000_000
+
+    def keep(image):
+        return image.name not in names or not 0 < image.frame.stamp_ns - half_ns < 140_000_000
+
+    record(tmp_path / "bag", motion=motion, points=rich(motion), keep=keep)
+    frames, refused, _ = localize(tmp_path / "bag", **{"rig.estimate_time_offsets": True})
+    after = [frame for frame in frames if 140_000_000 < frame.stamp_ns - half_ns < 440_000_000]
+    assert len(after) >= 9
+    assert not refused
+    assert sum(len(frame.cameras) == 2 for frame in after) >= 8
+
+
 def test_one_camera_gives_the_same_bytes_by_name(tmp_path):
     """As a rig of one, and without ``cameras``: poses, twists, covariances and inliers."""
     path = tmp_path / "bag"
