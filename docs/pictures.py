@@ -278,7 +278,7 @@ def coverage() -> str:
         if not line.startswith("|"):
             break
         cells = dict(zip(head, (cell.strip() for cell in line.strip("| ").split("|")), strict=True))
-        rows.append((cells["bench"].strip("`"), [cells[name].strip(" %") for name in shown]))
+        rows.append((cells["bench"].strip("`"), [cells[name].split(",")[0] for name in shown]))
     sheet = Drawing(820, 80 + 26 * len(rows))
     left, wide, bottom = 110.0, 6.4, 50 + 26 * len(rows)
     sheet.text(left, 24, "truths inside their 95 % regions (%)", size=15)
