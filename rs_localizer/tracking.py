@@ -247,6 +247,11 @@ class Tracker:
 
         if self._aid is None:
             result, prior = localized(None)
+            if not result and self._track is not None and self._memory is Memory.MAP_AND_LENS:
+                # What other frames said may no longer hold: a hand bent the board, and let it go.
+                alone = self.localizer.find(points, pixels, scores, stamps=stamps)
+                if alone:
+                    result, prior, self._track = alone, None, None
         else:
             result, prior = self._aid.localize(
                 imu, time_ns, lambda: self._before(time_ns), localized

@@ -84,7 +84,7 @@ def test_a_global_shutter_stays_one(messages, p3p, name):
     found = f"jitter {median:.3f} and {most:.3f} deg, {np.mean(still):.1%} insignificant"
     # Who remembers finds out that map and lens are a little off, and which readout time is wrong,
     # that after a second or two. Frames that stand alone are wrong now and then.
-    allowed = {"default": 1.001, "20 ms, tracked": 1.05, "20 ms, single": 1.08}[name]
+    allowed = {"default": 1.01, "20 ms, tracked": 1.05, "20 ms, single": 1.08}[name]
     assert median <= allowed * p3p[0], found
     assert most <= allowed * p3p[1], found
     assert np.mean(still) >= (0.93 if name == "20 ms, single" else 0.99), found

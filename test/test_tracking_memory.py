@@ -20,31 +20,48 @@ SAID = Scales.nothing()._replace(means=np.full(SCALES, -6.0), precisions=np.ones
 CAMERA = rsl.Camera(width=640, height=480, K=np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
 
 
+class Answering(rsl.Localizer):
+    """Remembers the priors that it is asked with."""
+
+    def __init__(self, answers: list[Any]) -> None:
+        super().__init__(CAMERA)
+        self.priors, self.answers = list[Any](), iter(answers)
+
+    def find(self, *arguments: Any, **_: Any) -> Any:
+        self.priors.append(arguments[3] if len(arguments) > 3 else None)
+        return next(self.answers)
+
+    def accepted(self, result: Any) -> Any:
+        return result
+
+
+LOCALIZED = SimpleNamespace(scales=SAID, lens=None, of_lens=None)
+REFUSED = Failure(Reason.NO_HYPOTHESIS, "")
+
+
 def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset():
-    priors: list[Any] = []
-    said = {"scales": SAID, "lens": None, "of_lens": None}
-    results: list[Any] = [SimpleNamespace(**said)] * 3
-    results.insert(1, Failure(Reason.NO_HYPOTHESIS, ""))
-
-    class Answering(rsl.Localizer):
-        def find(self, points: Any, pixels: Any, scores: Any, prior: Any, *_: Any) -> Any:
-            priors.append(prior)
-            return results[len(priors) - 1]
-
-        def accepted(self, result: Any) -> Any:
-            return result
-
-    frames = Tracker(Answering(CAMERA), memory=Memory.MAP_AND_LENS)
+    """One that is refused is also looked at without, here twice in vain."""
+    localizer = Answering([LOCALIZED, REFUSED, REFUSED, LOCALIZED, LOCALIZED])
+    frames = Tracker(localizer, memory=Memory.MAP_AND_LENS)
     for _ in range(3):
         frames.localize(0, [], [])
-    assert priors[0] is None
-    for prior in priors[1:]:
+    assert [prior is None for prior in localizer.priors] == [True, False, True, False]
+    for prior in localizer.priors[1::2]:
         assert prior.motion is None
         np.testing.assert_allclose(prior.scales.means, -6.0)
         assert prior.scales.precisions.min() >= 1.0
     frames.reset()
     frames.localize(0, [], [])
-    assert priors[3] is None
+    assert localizer.priors[4] is None
+
+
+def test_what_was_learned_is_forgotten_where_a_frame_fits_only_without():
+    """A hand bends a board, and lets it go: no frame after it may be refused for that."""
+    other = SimpleNamespace(**vars(LOCALIZED) | {"scales": SAID._replace(means=0.0 * SAID.means)})
+    localizer = Answering([LOCALIZED, REFUSED, other, LOCALIZED])
+    frames = Tracker(localizer, memory=Memory.MAP_AND_LENS)
+    assert all(frames.localize(0, [], []) for _ in range(3))
+    np.testing.assert_allclose(localizer.priors[-1].scales.means, 0.0)
 
 
 @pytest.mark.parametrize(

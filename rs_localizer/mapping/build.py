@@ -39,7 +39,7 @@ from rs_localizer.mapping.inertial_metres import (
 from rs_localizer.mapping.initial_trajectory import usual_accelerations
 from rs_localizer.mapping.observations import MapObservations, Start, most_observed
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
-from rs_localizer.mapping.shutter_fit import ShutterFit, fit_shutter, likely_axes
+from rs_localizer.mapping.shutter_fit import LEAST_FIT, ShutterFit, fit_shutter, likely_axes
 from rs_localizer.mapping.track_on_map import Tracked, track_on_map
 from rs_localizer.mapping.triangulation import Sights, Triangulated, triangulate
 from rs_localizer.mapping.views import View, blurred
@@ -55,8 +55,6 @@ _LEAST_PARALLAX = 0.01
 # COLMAP gets all views of a short recording and so many a second of a long one: at a turn of 60
 # degrees a second, neighbours have three quarters of a picture of 60 degrees in common.
 _KEYFRAMES, _KEYFRAMES_PER_SECOND = 60, 4.0
-# Share of the keypoints that fit a good map: nine in ten do.
-_LEAST_FIT = 0.8
 # Share of the keyframes that must hang together.
 _LEAST_PART = 0.5
 # A landmark counts when so many views agree, and it is known to this part of its usual distance.
@@ -170,7 +168,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
         tracked = track_on_map(inputs.views, structure, camera, lambda: step(1))
     refined, shutter, rows = _refined(inputs, tracked, structure, camera, work)
     estimated = None if inputs.camera is not None else structure.camera.focal_length
-    check_fit(float(np.mean(refined.inliers)), estimated)
+    check_fit(refined.fit_share, estimated)
     motion = Motion(rows, refined.times, refined)
     shown = motion.sights(tracked.views[tracked.images], tracked.points, tracked.pixels)
     triangulated = triangulate(refined.camera, shown, len(structure.points))
@@ -336,7 +334,7 @@ def check_fit(share: float, focal_length: float | None) -> None:
     Raises:
         MappingError: saying what to do.
     """
-    if share >= _LEAST_FIT:
+    if share >= LEAST_FIT:
         return
     lens = "" if focal_length is None else (
         f"; COLMAP found a focal length of {focal_length:.0f} px, which a flat scene does not "
@@ -344,7 +342,7 @@ def check_fit(share: float, focal_length: float | None) -> None:
     )  # fmt: skip
     raise MappingError(
         f"after the refinement {100 * share:.0f} % of the keypoints fit the map, "
-        f"{100 * _LEAST_FIT:.0f} % should: use more images per second, film more slowly, or "
+        f"{100 * LEAST_FIT:.0f} % should: use more images per second, film more slowly, or "
         f"check the readout time and the calibration{lens}"
     )
 

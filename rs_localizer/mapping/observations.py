@@ -155,6 +155,7 @@ class MapFreedom:
     linear_acceleration: float = 10.0  # m/s^2
     # Standard deviations of the lens: focal lengths and centre by focal length, distortion.
     lens_deviations: tuple[float, float] = (0.02, 0.1)
+    apart: bool = False  # nothing is known of the motion between images, of a global shutter
 
 
 def shared_landmarks(observations: MapObservations) -> BoolArray:

@@ -22,6 +22,7 @@ from rs_localizer.mapping.initial_trajectory import (
     ANGULAR_VELOCITY,
     LINEAR_VELOCITY,
     acceleration_prior,
+    following,
     initial_trajectory,
 )
 from rs_localizer.mapping.observations import (
@@ -69,6 +70,8 @@ class Preparation:
         self.start_ns = int(seen.stamps_ns.min())
         delays = np.array([one.delay for one in rig])[seen.of_cameras]
         self.times = np.asarray(1e-9 * (seen.stamps_ns - self.start_ns) + delays, np.float64)
+        if freedom.apart:  # each alone
+            self.times = np.arange(len(delays), dtype=np.float64)
         self.size = float(np.linalg.norm(np.ptp(start.points, axis=0)))
         self.deviations, self.floating = self._known()
         self.used = self._usable()
@@ -123,7 +126,8 @@ class Preparation:
         centres = np.array([one.centre for one in extrinsics])
         positions = self.start.positions[best] - np.einsum("gij,gj->gi", rotations, centres)
         longest = max(one.camera.readout_time for one in self.rig) + 2.0 * float(beyond)
-        return initial_trajectory(self.times[best], rotations, positions, longest)
+        follow = following(self.times[best], rotations)
+        return initial_trajectory(self.times[best], rotations, positions, longest, follow)
 
     def _check_stretches(self) -> None:
         """Raise ValueError when the readout time cannot be found."""
@@ -218,6 +222,12 @@ class RefinedMap:
     start_ns: int
     times: Array  # (g,) s, of the images' middle rows
     tells_readout: bool  # images follow each other closely enough to tell the readout time
+    apart: bool = False  # each image has a pose of its own, of no common motion
+
+    @property
+    def fit_share(self) -> float:
+        """Share of the keypoints that fit."""
+        return float(np.mean(self.inliers))
 
     @property
     def camera(self) -> Camera:
@@ -343,7 +353,7 @@ class _Refinement:
         squared = problem.errors(state)
         inliers = squared < (LIMIT * deviation) ** 2
         sights, images = sights_of(seen, inliers)
-        used = _freedoms(state.spline, seen.frames) + 3 * int(np.count_nonzero(images))
+        used = self._freedoms(state.spline) + 3 * int(np.count_nonzero(images))
         inflation = inflation_of(squared[inliers], deviation, used + problem.motion.border)
         inflation = self._cluster_robust(problem, deviation, inflation)
         placed = apply_similarity(problem, state, deviation, images > 1)
@@ -372,6 +382,7 @@ class _Refinement:
             start_ns=prepared.start_ns,
             times=prepared.times,
             tells_readout=prepared.tells_readout,
+            apart=prepared.freedom.apart,
         )
 
     def _cluster_robust(self, problem: MapProblem, deviation: float, independent: float) -> float:
@@ -381,8 +392,20 @@ class _Refinement:
         inside = squared[squared < (LIMIT * deviation) ** 2]
         pull = pull_at_landmarks(rows.values[..., -4:], seen.points, seen.times, rows.precisions)
         own = steepness(inside, deviation) ** 2
-        own *= left_over(len(inside), _freedoms(self.state.spline, seen.frames))
+        own *= left_over(len(inside), self._freedoms(self.state.spline))
         return Pull(own * pull.measured, pull.expected).inflation(independent)
+
+    def _freedoms(self, spline: Spline) -> int:
+        """How many numbers of the motion the images determine: a pose each, and an end.
+
+        Those of a global shutter say nothing of what lies between them.
+        """
+        images = sum(len(np.unique(own.frames)) for own in self.seen)
+        rolling = self.freedom.readout_time or any(
+            one.camera.readout_time > 0.0 for one in self.prepared.rig
+        )
+        ends = len(spline.layout.starts) if rolling else 0
+        return CONTROL * min(images + ends, len(spline.positions))
 
     def _cameras(
         self, problem: MapProblem, deviation: float, inflation: float, shared: Array
@@ -422,9 +445,3 @@ class _Refinement:
             return none
         grown = [replace(one, deviation=math.sqrt(inflation) * one.deviation) for one in asked]
         return [one if given else None for one, given in zip(grown, known, strict=True)]
-
-
-def _freedoms(spline: Spline, frames: IntArray) -> int:
-    """How many numbers of the motion the images determine: a pose each, and an end."""
-    stretches = len(spline.layout.starts)
-    return CONTROL * min(len(np.unique(frames)) + stretches, len(spline.positions))

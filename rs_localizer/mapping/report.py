@@ -64,7 +64,9 @@ def advice(built: Built, views: Sequence[View]) -> list[str]:
             f"{sum(built.structure.parts[1:])} keyframes are not connected with the others: film "
             "what lies between, and come back to where you began"
         )
-    if built.shutter is not None and not (built.shutter.visible and built.shutter.axis_known):
+    shutter = built.shutter
+    known = shutter.visible and shutter.axis_known if shutter else not built.refined.apart
+    if not known:
         said.append(
             "for the readout time, film at the camera's own rate (no time lapse, no stabilisation) "
             "and turn the camera briskly, sideways and up and down, for some seconds"
@@ -84,7 +86,10 @@ def written(built: Built, images: int, views: Sequence[View]) -> str:
 def _of_shutter(built: Built) -> list[tuple[str, str]]:
     fit, known = built.shutter, built.camera.readout_time
     if fit is None:
-        return [("readout time", f"{1e3 * known:.2f} ms (given)" if known else "unknown, or none")]
+        text = f"{1e3 * known:.2f} ms (given)" if known else "unknown, or none"
+        if built.refined.apart:
+            text = "invisible: no smooth motion joins the images, each has a pose of its own"
+        return [("readout time", text)]
     best = f"{1e3 * fit.readout_time:.2f} +- {1e3 * fit.deviation:.2f} ms, {fit.direction}"
     axis = "" if fit.axis_known else ", or along the other axis: the images fit both alike"
     why = "" if fit.possible else f", longer than {1e3 * fit.interval:.1f} ms between images"

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.mapping.observations import MapFreedom, MapObservations, Start
 from rs_localizer.mapping.refine import RefinedMap, refine
-from rs_localizer.trajectory.problem import LIMIT
+from rs_localizer.trajectory.problem import LIMIT, noise_of
 
 # A readout time is believed beyond so many deviations: two axes with two directions each are tried,
 # four chances together one in 8,000, and deviations, which few seconds tell, may be too small by a
@@ -23,6 +24,8 @@ _SIGNIFICANT = 4.0
 # And where the images' gains are so by chance less often than this: a wrong model that absorbs
 # something else helps some images and harms others.
 _CHANCE = 0.01
+LEAST_FIT = 0.8
+"""Share of the keypoints that fit a good map: nine in ten do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +80,8 @@ def fit_shutter(
     """The map refined with the shutter that explains the images best.
 
     A shutter that does not explain them significantly better than a global one is not believed.
+    Where no smooth motion fits them, or as well as the first guess (a time lapse, cuts), each image
+    has a pose of its own, as COLMAP has it, and the shutter stays unknown.
 
     Args:
         camera: its lens; the shutter does not matter.
@@ -85,12 +90,42 @@ def fit_shutter(
         done: called with each part of the work that is done.
 
     Returns:
-        the map, and what the shutter was found to be; None: too few images follow each other.
+        the map, and what the shutter was found to be; None: too few images follow each other, or
+        they are ``apart``.
 
     Raises:
         ValueError: as :func:`refine`.
     """
     camera = replace(camera, readout_time=0.0, scan_direction=directions[0])
+    smooth = None
+    with suppress(ValueError):  # what is wrong with the images is raised below
+        smooth = _of_one_motion(camera, observations, start, freedom, directions, done)
+        best = smooth[0]
+        if best.fit_share >= LEAST_FIT and best.after <= _noise(camera, observations, start):
+            return smooth
+    try:
+        apart = refine(camera, observations, start, replace(freedom, apart=True))
+    except ValueError:
+        if smooth is None:
+            raise
+        return smooth
+    return smooth if smooth and apart.fit_share < LEAST_FIT else (apart, None)
+
+
+def _noise(camera: Camera, observations: MapObservations, start: Start) -> float:
+    """Standard deviation (px) of what the first guess leaves."""
+    images = observations.images
+    away = start.points[observations.landmarks] - start.positions[images]
+    local = np.einsum("nji,nj->ni", start.rotations[images], away)
+    errors = np.sum((camera.project(local) - observations.pixels) ** 2, axis=1)
+    return noise_of(errors[np.isfinite(errors)], np.inf)
+
+
+def _of_one_motion(
+    camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
+    directions: Sequence[ScanDirection], done: Callable[[str], object],
+) -> tuple[RefinedMap, ShutterFit | None]:  # fmt: skip
+    """As :func:`fit_shutter`, with one smooth motion through images that follow each other."""
     still = refine(camera, observations, start, freedom, done=done)
     if not still.tells_readout:
         return still, None

@@ -13,6 +13,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.trajectory.lens import lens_prior, lens_values
 from rs_localizer.trajectory.observe import Observed
 
 _MOST_IMAGES, _LEAST_IMAGES = 30, 4
@@ -86,7 +87,7 @@ def _of_simplest_model(size: tuple[int, int], images: list[Observed]) -> Camera:
     best, least = None, np.inf
     for candidate in _CANDIDATES:
         lens = _calibrated(size, images, candidate)
-        if lens is not None and best is not None and _folds(lens):
+        if lens is not None and best is not None and (_folds(lens) or _cancels(lens, images)):
             continue
         error = np.inf if lens is None else _unseen_error(lens, images, candidate)
         if error < least:
@@ -282,6 +283,17 @@ def _folds(lens: Camera) -> bool:
         return False
     rim = np.array([(x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0)]) * lens.size
     return not np.isfinite(lens.rays(rim)).all()
+
+
+def _cancels(lens: Camera, images: list[Observed]) -> bool:
+    """Whether numbers beyond those of any lens make up for each other, which nothing holds there.
+
+    Under the prior of lenses they cost more than all that the points can tell.
+    """
+    prior = lens_prior(lens, None)
+    off = (lens_values(lens) - prior.mean)[4:]
+    equations = 2 * sum(len(image.points) for image in images)
+    return bool(off @ prior.information[4:, 4:] @ off > equations)
 
 
 def _slow(images: list[Observed]) -> list[Observed]:

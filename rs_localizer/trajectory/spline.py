@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
@@ -60,15 +60,17 @@ def spline_through(
     all_rotations, all_positions = [], []
     for k, part in enumerate(parts):
         own = controls[layout.firsts[k] : layout.firsts[k + 1]]
-        inside = np.clip(own, times[part[0]], times[part[-1]])
         if len(part) == 1:
             all_rotations.append(np.repeat(rotations[part], len(own), axis=0))
-        else:
-            turns = Slerp(times[part], Rotation.from_matrix(rotations[part]))
-            all_rotations.append(turns(inside).as_matrix())
-        all_positions.append(
-            np.column_stack([np.interp(inside, times[part], positions[part, i]) for i in range(3)])
-        )
+            all_positions.append(np.repeat(positions[part], len(own), axis=0))
+            continue
+        # Beyond the ends it goes on as it came: a fast one that stops there is an outlier.
+        after = np.clip(np.searchsorted(times[part], own), 1, len(part) - 1)
+        first, second = part[after - 1], part[after]
+        share = ((own - times[first]) / (times[second] - times[first]))[:, None]
+        turns = Rotation.from_matrix(np.swapaxes(rotations[first], 1, 2) @ rotations[second])
+        all_rotations.append(rotations[first] @ so3.exp_many(share * turns.as_rotvec()))
+        all_positions.append(positions[first] + share * (positions[second] - positions[first]))
     return Spline(layout, np.concatenate(all_rotations), np.concatenate(all_positions))
 
 

@@ -38,6 +38,19 @@ def hand(rng: np.random.Generator, slow: float = 0.5, stamps: int = 2) -> projec
 
 
 @dataclass(frozen=True)
+class Flown:
+    """Half a turn about the line of sight from one line to the next."""
+
+    body: projector.Motion
+    line: float  # s
+
+    def pose(self, t):
+        rotations, positions = self.body.pose(t)
+        turns = np.outer(np.pi * (np.asarray(t) // self.line), [0.0, 0.0, 1.0])
+        return rotations @ Rotation.from_rotvec(turns).as_matrix(), positions
+
+
+@dataclass(frozen=True)
 class Walk:
     """What is refined, and the truth."""
 
@@ -48,10 +61,10 @@ class Walk:
 
 def walk(
     rng: np.random.Generator, stamps: np.ndarray, *, points: int = 150, count: int = 60,
-    noise: float = 0.3, off: float = 0.02, readout: float = READOUT,
+    noise: float = 0.3, off: float = 0.02, readout: float = READOUT, line: float = np.inf,
 ) -> Walk:  # fmt: skip
-    """A map that is ``off`` (m), seen at stamps (g,), s."""
-    motion, room = hand(rng), projector.room(rng, points)
+    """A map that is ``off`` (m), seen at stamps (g,), s; turned over after each ``line`` (s)."""
+    motion, room = Flown(hand(rng), line), projector.room(rng, points)
     images, landmarks, pixels = [], [], []
     for g, stamp in enumerate(stamps):
         exposed = projector.expose(motion, float(stamp), readout, room)

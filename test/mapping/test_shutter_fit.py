@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which shutter images show where nobody knows it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import READOUT, camera, walk
 
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.mapping.observations import MapFreedom
-from rs_localizer.mapping.refine import RefinedMap
+from rs_localizer.mapping.refine import RefinedMap, refine
 from rs_localizer.mapping.shutter_fit import ShutterFit, fit_shutter, likely_axes
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
@@ -38,6 +40,27 @@ def test_a_global_shutter_is_left_alone():
     assert shutter is not None
     assert not shutter.visible
     assert refined.readout_time == 0.0
+
+
+def test_a_motion_is_cut_where_a_camera_turns_over():
+    scene = walk(np.random.default_rng(1), VIDEO, line=0.4)
+    refined = refine(camera(), scene.seen, scene.start)
+    assert refined.fit_share > 0.95
+    assert refined.deviation == pytest.approx(0.3, rel=0.1)
+
+
+def test_images_that_no_smooth_motion_joins_have_poses_of_their_own():
+    """As those of a time lapse, whose stamps are nearer than its images were, some by much."""
+    scene = walk(np.random.default_rng(1), np.arange(0.0, 12.0, 1.0), readout=0.0)
+    stamps = scene.seen.stamps_ns[0] + np.cumsum(np.tile([5, 50, 50], 4)) * 10**6
+    seen = replace(scene.seen, stamps_ns=stamps)
+    refined, shutter = fit_shutter(
+        camera(0.0), seen, scene.start, MapFreedom(), BOTH, lambda text: None
+    )
+    assert shutter is None
+    assert refined.apart
+    assert refined.fit_share > 0.95
+    assert refined.deviation == pytest.approx(0.3, rel=0.15)
 
 
 def test_images_on_their_own_tell_no_readout_time():

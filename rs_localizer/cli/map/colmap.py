@@ -178,5 +178,8 @@ def _tell(args: argparse.Namespace, result: GlobalShutterModel, images: int, poi
             f"{1e3 * fit.deviation:.1f} ms fits best): the model is that of a global one"
         )
     elif args.shutter != "given" and fit is None and not shutter.readout_time:
-        print("warning: too few images follow each other to show a rolling shutter: give it")
+        why = "too few images follow each other"
+        if result.refined.apart:
+            why = "no smooth motion joins the images, each has a pose of its own: too little"
+        print(f"warning: {why} to show a rolling shutter: give it")
     print(f"written: {args.out}")
