@@ -73,13 +73,17 @@ def add_overwrite(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier result")
 
 
-def replaced(args: argparse.Namespace, mark: str) -> Callable[[Path], None] | None:
-    """What removes an earlier result (it has a file ``mark``) from ``--out``, where wanted.
+def replaced(
+    args: argparse.Namespace, mark: str, place: Path | None = None
+) -> Callable[[Path], None] | None:
+    """What removes an earlier result (it has a file ``mark``) from a place, where wanted.
+
+    The place is ``--out`` where none is given.
 
     Raises:
         ValueError: when what is there is something else.
     """
-    out: Path = args.out
+    out: Path = place or args.out
     if not args.overwrite or not out.is_dir() or not any(out.iterdir()):
         return None
     if not (out / mark).is_file():

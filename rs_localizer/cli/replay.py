@@ -28,6 +28,7 @@ from rs_localizer.cli.replay_result import (
     Exports,
     Tally,
     add_export_arguments,
+    check_places,
     figures,
     fresh,
     print_summary,
@@ -156,6 +157,7 @@ def run(args: argparse.Namespace) -> Figures | None:
     _check_usage(args)
     _check_view(args)
     if is_batch(args):
+        check_places(args, None)
         _replay_batch(args, _settings(args))
         return None
     recording: Location = args.recordings[0]
@@ -168,6 +170,7 @@ def run(args: argparse.Namespace) -> Figures | None:
             _play(bag, topics, args.rate or 1.0, _played_imus(bag, args))
         return None
     out = args.out or Path(f"{_name(recording)}_replay")
+    check_places(args, out)
     return {"out": str(out)} | figures(_replay_one(args, recording, out))
 
 
