@@ -37,7 +37,7 @@ from rs_localizer.cli.replay_result import (
 )
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.io.bags import STORAGES, BagError, BagReader, BagWriter, is_bag, open_bag
-from rs_localizer.io.remote import Location, is_url, location, url_name
+from rs_localizer.io.remote import Location, check_writable, is_url, location, url_name
 
 if WORKING:
     import numpy as np
@@ -520,6 +520,8 @@ def _check_view(args: argparse.Namespace) -> None:
         raise UsageError(
             f"--rerun FILE must end in {_SUFFIX}, got {args.rerun} (a recording stands before it)"
         )
+    if args.rerun is not None and args.rerun is not _BESIDE_POSES:
+        check_writable(args.rerun)
     if importlib.util.find_spec("rerun") is None:
         raise ValueError(
             "--rerun and --view need the Rerun SDK, which is not installed: "

@@ -87,6 +87,7 @@ def test_places_are_checked_before_the_work(flight, tmp_path, capsys):
         (["--ncore", str(splat), "--overwrite"], "splat is no earlier result of --ncore"),
         (["--ncore", str(tmp_path / "other" / "ncore")], "has to be a directory beside"),
         (["--parquet", str(notes / "a.parquet")], "a.parquet cannot be written: Not a directory"),
+        (["--rerun", str(notes / "a.rrd")], "a.rrd cannot be written: Not a directory"),
         (["--parquet", "nosuch://a/b.parquet"], "b.parquet cannot be written: Protocol not known"),
     ):
         capsys.readouterr()
