@@ -47,7 +47,7 @@ if compiled.is_file() and not os.environ.get("AMENT_PREFIX_PATH"):
 setup(
     distclass=distribution,
     name=package_name,
-    version="0.1.0",
+    version="1.0.0",
     description="Pose and velocity of a rolling-shutter camera from a single image",
     maintainer="rs_localizer maintainers",
     maintainer_email="maintainers@users.noreply.h-seed-b0484be4.example",

@@ -13,7 +13,10 @@ import sys
 from pathlib import Path
 
 NOTICE = "# Copyright 2026 rs_localizer contributors\n# SPDX-License-Identifier: Apache-2.0\n"
-PATTERNS = ("*.py", ".ci/run", ".ci/wheels", "Makefile", "packaging/docker/*")
+PATTERNS = (
+    "*.py", "*.cfg", "*.toml", "*.yml", "config/*.yaml", "rosdoc2.yaml", "test/rosdep_keys.yaml",
+    ".ci/run", ".ci/wheels", "Makefile", "packaging/*",
+)  # fmt: skip
 
 
 def main() -> None:

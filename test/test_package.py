@@ -45,9 +45,12 @@ def test_versions_agree():
     # The one form that catkin_prepare_release finds and raises.
     assert re.findall(r'version="(\d+\.\d+\.\d+)",', (ROOT / "setup.py").read_text()) == [version]
     assert rs_localizer.__version__ == version
-    newest = next(iter(get_changelog_from_path(str(ROOT / "CHANGELOG.rst")).foreach_version()))
+    changes = get_changelog_from_path(str(ROOT / "CHANGELOG.rst"))
+    newest = next(iter(changes.foreach_version(reverse=True)))
     assert newest[0] == version
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    recipe = (ROOT / "packaging" / "conda" / "recipe.yaml").read_text()
+    assert f'\n  version: "{version}"' in recipe
 
 
 def build_wheel(directory: Path, **environment: str) -> Path:

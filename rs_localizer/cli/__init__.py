@@ -17,6 +17,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from rs_localizer.io.remote import check_writable
+
 # Bars are shown by one process. tqdm's own lock for several is a semaphore, of which Python 3.14
 # says that it leaked when a signal ends the command.
 tqdm.set_lock(threading.RLock())
@@ -73,13 +75,17 @@ def add_overwrite(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier result")
 
 
-def replaced(args: argparse.Namespace, mark: str) -> Callable[[Path], None] | None:
-    """What removes an earlier result (it has a file ``mark``) from ``--out``, where wanted.
+def replaced(
+    args: argparse.Namespace, mark: str, place: Path | None = None
+) -> Callable[[Path], None] | None:
+    """What removes an earlier result (it has a file ``mark``) from a place, where wanted.
+
+    The place is ``--out`` where none is given.
 
     Raises:
         ValueError: when what is there is something else.
     """
-    out: Path = args.out
+    out: Path = place or args.out
     if not args.overwrite or not out.is_dir() or not any(out.iterdir()):
         return None
     if not (out / mark).is_file():
@@ -99,11 +105,13 @@ def _clear(directory: Path) -> None:
 def refuse_existing(args: argparse.Namespace, *beside: str) -> None:
     """Raise ``ValueError`` if ``args.out`` exists and is not to be replaced, or a file beside it.
 
-    Beside ``OUT.yaml``, ``lens.yaml`` stands for ``OUT_lens.yaml``.
+    So it does if nothing can be written there. Beside ``OUT.yaml``, ``lens.yaml`` stands for
+    ``OUT_lens.yaml``.
     """
     for path in (args.out, *(args.out.with_name(f"{args.out.stem}_{name}") for name in beside)):
         if path.exists() and not args.overwrite:
             raise ValueError(f"{path} exists; choose another OUT, or --overwrite")
+    check_writable(args.out)
 
 
 def import_ros(name: str, what: str) -> Any:

@@ -28,6 +28,7 @@ from rs_localizer.cli.replay_result import (
     Exports,
     Tally,
     add_export_arguments,
+    check_places,
     figures,
     fresh,
     print_summary,
@@ -36,7 +37,7 @@ from rs_localizer.cli.replay_result import (
 )
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.io.bags import STORAGES, BagError, BagReader, BagWriter, is_bag, open_bag
-from rs_localizer.io.remote import Location, is_url, location, url_name
+from rs_localizer.io.remote import Location, check_writable, is_url, location, url_name
 
 if WORKING:
     import numpy as np
@@ -156,6 +157,7 @@ def run(args: argparse.Namespace) -> Figures | None:
     _check_usage(args)
     _check_view(args)
     if is_batch(args):
+        check_places(args, None)
         _replay_batch(args, _settings(args))
         return None
     recording: Location = args.recordings[0]
@@ -168,6 +170,7 @@ def run(args: argparse.Namespace) -> Figures | None:
             _play(bag, topics, args.rate or 1.0, _played_imus(bag, args))
         return None
     out = args.out or Path(f"{_name(recording)}_replay")
+    check_places(args, out)
     return {"out": str(out)} | figures(_replay_one(args, recording, out))
 
 
@@ -517,6 +520,8 @@ def _check_view(args: argparse.Namespace) -> None:
         raise UsageError(
             f"--rerun FILE must end in {_SUFFIX}, got {args.rerun} (a recording stands before it)"
         )
+    if args.rerun is not None and args.rerun is not _BESIDE_POSES:
+        check_writable(args.rerun)
     if importlib.util.find_spec("rerun") is None:
         raise ValueError(
             "--rerun and --view need the Rerun SDK, which is not installed: "

@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import WORKING
+from rs_localizer.cli import WORKING, replaced
 from rs_localizer.cli.settings_args import row_time
-from rs_localizer.io.remote import location
+from rs_localizer.io.remote import Location, check_writable, is_url, location
 
 if WORKING:
     from rs_localizer.config import NodeConfig, PoseTime
@@ -49,7 +49,7 @@ if WORKING:
     from rs_localizer.offline.image_sources import IMAGE_TYPES
     from rs_localizer.offline.replay import TF_TYPE
     from rs_localizer.offline.smoothed import SmoothedFrames
-    from rs_localizer.offline.table import FrameTable
+    from rs_localizer.offline.table import ZARR_MARK, FrameTable
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.pipeline.imu import ImuState
     from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
@@ -112,6 +112,40 @@ def add_export_arguments(parser: argparse._ActionsContainer) -> None:
         help="also write the localized frames as a replay buffer of robot learning, an episode a "
         "recording: poses, velocities, covariances (pip install 'rs_localizer[zarr]')",
     )
+
+
+# Directories of exports, and what an earlier one has.
+_MARKS = {"gsplat": "viewmats.npy", "ncore": NCORE}
+
+
+def check_places(args: argparse.Namespace, out: Path | None) -> None:
+    """Refuse what could not be written, before the work.
+
+    Args:
+        args: of :func:`add_export_arguments`, and ``overwrite``.
+        out: directory of the result; None: of many recordings, whose tables any run replaces.
+
+    Raises:
+        ValueError: naming the place.
+    """
+    for option, mark in (*_MARKS.items(), ("parquet", ""), ("zarr", ZARR_MARK)):
+        place: Location | None = getattr(args, option)
+        if place is None:
+            continue
+        check_writable(place)
+        path = Path(place)
+        if out and option in _MARKS and out.absolute() in (path / mark).absolute().parents:
+            raise ValueError(f"--{option} has to be a directory beside {out}, not in it")
+        if is_url(place) or not (any(path.iterdir()) if path.is_dir() else path.is_file()):
+            continue  # nothing is there, or what takes all that comes, such as /dev/stdout
+        own = (path / mark).is_file()
+        if own and option == "parquet":
+            with path.open("rb") as file:
+                own = file.read(4) == b"PAR1"
+        if not own:
+            raise ValueError(f"{path} is no earlier result of --{option}, and stays as it is")
+        if out and not args.overwrite:
+            raise ValueError(f"{path} exists; choose another --{option}, or --overwrite")
 
 
 def written_names(out: Path) -> list[Path]:
@@ -188,6 +222,7 @@ class Exports:
         self._wants_views: bool = args.nerfstudio
         self._gsplat: Path | None = args.gsplat
         self._ncore: Path | None = args.ncore
+        self._args = args
         self._smoothed: bool = args.smooth
         self._exposure: float = getattr(args, "exposure", None) or 0.0
         self._rows = {name: Track() for name in self._named}
@@ -234,20 +269,21 @@ class Exports:
         poses = np.stack([self._rolling[stamp] for stamp in images])
         if self._gsplat is not None:
             points = np.zeros((0, 3)) if landmarks is None else landmarks.points
-            with self._folder(self._gsplat, bag, images) as (folder, names):
+            with self._folder("gsplat", bag, images) as (folder, names):
                 write_gsplat(folder, self._camera, names, poses, points)
         if self._ncore is not None:
             exposed = np.array([self._exposed[stamp] for stamp in images], np.int64)
-            with self._folder(self._ncore, bag, images) as (folder, names):
+            with self._folder("ncore", bag, images) as (folder, names):
                 content = sequence(self._camera, names, exposed, poses[:, [0, 2]])
                 (folder / NCORE).write_text(json.dumps(content, indent=1), encoding="utf-8")
 
     @contextlib.contextmanager
     def _folder(
-        self, folder: Path, bag: BagReader, stamps: list[int]
+        self, option: str, bag: BagReader, stamps: list[int]
     ) -> Iterator[tuple[Path, list[str]]]:
         """Within ``with``, a new folder with the images of these stamps, and their names."""
-        with atomic_directory(folder) as built:
+        folder: Path = getattr(self._args, option)
+        with atomic_directory(folder, replaced(self._args, _MARKS[option], folder)) as built:
             built.mkdir()
             files = _write_images(bag, set(stamps), built)
             yield built, [files.get(stamp, f"{IMAGES}/{stamp}.jpg") for stamp in stamps]

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from rs_localizer.io.atomic_files import atomic_files
+from rs_localizer.io.atomic_files import atomic_files, write_errors
 
 Location = Path | str
 """A path of this machine, or a URL."""
@@ -69,6 +69,8 @@ def placed(place: Location) -> Iterator[Path]:
     """
     if not is_url(place):
         target = Path(place)
+        with write_errors(target):
+            target.parent.mkdir(parents=True, exist_ok=True)
         with atomic_files(target) as (part,):
             yield part
         return
@@ -78,6 +80,23 @@ def placed(place: Location) -> Iterator[Path]:
         with _faults(place, "written"):
             files, path = _filesystem(place)
             files.put_file(str(part), path)
+
+
+def check_writable(place: Location) -> None:
+    """Refuse a place where nothing can be written, before the work whose result it shall have.
+
+    Raises:
+        OutputError, RemoteError: what writing there would raise.
+        ImportError: without fsspec, for a URL.
+    """
+    if is_url(place):
+        with _faults(place, "written"):
+            _filesystem(place)
+        return
+    target = Path(place).absolute()
+    above = next(path for path in target.parents if path.exists())
+    with atomic_files(above / target.name):
+        pass
 
 
 @contextlib.contextmanager

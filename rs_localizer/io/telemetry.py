@@ -286,14 +286,14 @@ def read_log(video: Path) -> Telemetry | None:
     log = _find(video)
     if log is None:
         return None
-    columns = _SEPARATE if log.forces is not None else _TOGETHER
-    readings, frames = _Table.read(log.readings, columns), _Table.read(log.frames, 1)
+    columns, clock = (_SEPARATE, 3) if log.forces is not None else (_TOGETHER, 0)
+    readings, frames = _Table.read(log.readings, columns, clock), _Table.read(log.frames, 1)
     starts = frames.column("timestamp", 0) * frames.second
     exposure = _median(frames.named("exposure time"), frames.second)
     readout = _median(frames.named("frame readout time"), frames.second)
     if log.forces is not None:  # x, y, z, time
         times, rates = readings.values[:, 3] * 1e-9, readings.values[:, :3]
-        other = _Table.read(log.forces, _SEPARATE).values
+        other = _Table.read(log.forces, _SEPARATE, clock).values
         forces = np.stack([np.interp(times, other[:, 3] * 1e-9, other[:, k]) for k in range(3)], 1)
     elif readings.has("a_x"):
         times, forces, rates = np.split(readings.values[:, :7], [1, 4], axis=1)
@@ -303,6 +303,11 @@ def read_log(video: Path) -> Telemetry | None:
         times = times[:, 0] * readings.second
     if np.median(np.linalg.norm(forces, axis=1)) < _MOST_G:
         forces = -_STANDARD_GRAVITY * forces  # Core Motion has gravity, not what holds against it
+    if times[-1] < starts.min() or times[0] > starts.max():
+        raise TelemetryError(
+            f"{log.readings} and {log.frames.name} are not of one time: {times[0]:.1f} to "
+            f"{times[-1]:.1f} s, {starts.min():.1f} to {starts.max():.1f} s"
+        )
     # Stamps are of the start of the first row's exposure, as Android has them; here of its middle.
     begin = starts[0] + 0.5 * (exposure or 0.0)
     return Telemetry(
@@ -340,7 +345,8 @@ class _Table:
     values: Array  # (n,m); NaN for what is no number
 
     @staticmethod
-    def read(path: Path, columns: int) -> _Table:
+    def read(path: Path, columns: int, clock: int | None = None) -> _Table:
+        """Refuses a file whose first columns are no numbers; orders rows by the column of times."""
         try:
             text = path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
@@ -353,12 +359,17 @@ class _Table:
         width = len(rows[0]) if rows else 0
         values = [[_number(word) for word in row] for row in rows if len(row) == width]
         table = np.array(values).reshape(-1, max(width, 1))
-        usable = len(values) >= _LEAST_READINGS and width >= columns
-        if not usable or not np.isfinite(table[:, :columns]).all():
+        if len(values) < _LEAST_READINGS or width < columns:
             raise TelemetryError(
                 f"{path} has no readings: {len(values)} lines of {width} numbers, {columns} or "
                 "more are needed"
             )
+        known = np.isfinite(table[:, :columns]).all(axis=1)
+        if not known.all():
+            worst = ", ".join(rows[int(np.argmin(known))])
+            raise TelemetryError(f"{path} has {np.sum(~known)} lines without a number, as {worst}")
+        if clock is not None:
+            table = table[np.unique(table[:, clock], return_index=True)[1]]
         return _Table(path, names, table)
 
     @property

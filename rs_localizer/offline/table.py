@@ -170,7 +170,7 @@ _ARRAYS: dict[str, tuple[tuple[str, ...], tuple[int, ...]]] = {
     "angular_velocity": (("wx", "wy", "wz"), (3,)),
     "twist_covariance": (("twist_covariance",), (6, 6)),
 }
-_ZARR_MARK = ".zgroup"
+ZARR_MARK = ".zgroup"
 
 
 def write_zarr(tables: Iterable[Table], place: Path) -> int:
@@ -202,7 +202,7 @@ def write_zarr(tables: Iterable[Table], place: Path) -> int:
             kind = np.int64 if name == "stamp_ns" else np.float64
             values = [[_numbers(row[column], shape) for column in columns] for row in rows]
             parts[name].append(np.array(values, kind).reshape(len(rows), *shape))
-    earlier = (place / _ZARR_MARK).is_file()
+    earlier = (place / ZARR_MARK).is_file()
     with atomic_directory(place, _clear if earlier else None) as part:
         root = zarr.open_group(str(part), mode="w", zarr_format=2)
         data, meta = root.create_group("data"), root.create_group("meta")
@@ -222,7 +222,7 @@ def _numbers(value: Any, shape: tuple[int, ...]) -> Any:
 def _clear(directory: Path) -> None:
     for item in ("data", "meta"):
         shutil.rmtree(directory / item, ignore_errors=True)
-    for file in (_ZARR_MARK, ".zattrs", ".zmetadata"):
+    for file in (ZARR_MARK, ".zattrs", ".zmetadata"):
         (directory / file).unlink(missing_ok=True)
 
 

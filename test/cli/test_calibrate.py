@@ -135,6 +135,10 @@ def test_faults(flight, tmp_path, capsys):
     assert main(["calibrate", str(flight), "--out", str(earlier)]) == 1
     assert f"{earlier} exists; choose another OUT, or --overwrite" in capsys.readouterr().err
     assert earlier.read_text() == "mine"
+    assert main(["calibrate", str(flight), "--out", str(earlier / "a.yaml")]) == 1
+    told = capsys.readouterr()  # before the work
+    assert "a.yaml cannot be written: Not a directory" in told.err
+    assert "scan direction" not in told.out
     earlier.rename(tmp_path / "other_camera_info.yaml")
     other = ["--out", str(tmp_path / "other.yaml")]
     assert main(["calibrate", str(flight), "--intrinsics", *other]) == 1

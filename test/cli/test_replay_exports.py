@@ -72,6 +72,36 @@ def test_poses_at_rows(flight, tmp_path, more):
     assert not (out / "poses_last.txt").exists()
 
 
+def test_places_are_checked_before_the_work(flight, tmp_path, capsys):
+    """Once said after the replay, whose poses were then gone; a table replaced any file."""
+    out, splat = tmp_path / "out", tmp_path / "splat"
+    notes, table = tmp_path / "notes.txt", tmp_path / "new" / "frames.parquet"
+    notes.write_text("mine")
+    exports = ["--gsplat", str(splat), "--parquet", str(table)]
+    assert replay(flight, out, *exports) == 0
+    before = (splat / "viewmats.npy").read_bytes(), table.read_bytes()
+    for words, text in (
+        (["--gsplat", str(splat)], "splat exists; choose another --gsplat"),
+        (["--parquet", str(table)], "frames.parquet exists; choose another --parquet"),
+        (["--parquet", str(notes), "--overwrite"], "notes.txt is no earlier result of --parquet"),
+        (["--ncore", str(splat), "--overwrite"], "splat is no earlier result of --ncore"),
+        (["--ncore", str(tmp_path / "other" / "ncore")], "has to be a directory beside"),
+        (["--parquet", str(notes / "a.parquet")], "a.parquet cannot be written: Not a directory"),
+        (["--rerun", str(notes / "a.rrd")], "a.rrd cannot be written: Not a directory"),
+        (["--parquet", "nosuch://a/b.parquet"], "b.parquet cannot be written: Protocol not known"),
+    ):
+        capsys.readouterr()
+        assert replay(flight, tmp_path / "other", *words) == 1
+        told = capsys.readouterr()
+        assert text in told.err
+        assert "frames per second" not in told.out
+        assert not (tmp_path / "other").exists()
+    assert notes.read_text() == "mine"
+    (splat / "viewmats.npy").write_bytes(b"")
+    assert replay(flight, out, *exports, "--overwrite") == 0
+    assert ((splat / "viewmats.npy").read_bytes(), table.read_bytes()) == before
+
+
 def test_transforms_explain_every_pixel(flight, tmp_path):
     out = tmp_path / "out"
     assert replay(flight, out, "--nerfstudio") == 0

@@ -215,3 +215,17 @@ def test_a_log_that_is_broken_is_named(tmp_path: Path) -> None:
     csv(tmp_path / "imu.csv", "timestamp, a_x, a_y\n", [[k, 0.0, 9.8] for k in range(5)])
     with pytest.raises(TelemetryError, match="5 lines of 3 numbers, 7 or more are needed"):
         read_log(tmp_path / "rgb.mp4")
+    rows = [[BOOT + 0.01 * k, 0.0, 0.0, -1.0, 0.1 * k, 0.0, 0.0] for k in range(5)]
+    heading = "timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n"
+    csv(tmp_path / "imu.csv", heading, [*rows, [BOOT + 1.0, float("nan"), *rows[0][2:]]])
+    with pytest.raises(TelemetryError, match=r"1 lines without a number, as 81235\.5, ?nan"):
+        read_log(tmp_path / "rgb.mp4")
+    csv(tmp_path / "imu.csv", heading, [[row[0] - 100.0, *row[1:]] for row in rows])
+    with pytest.raises(TelemetryError, match=r"not of one time: 81134\.5 to 81134\.5 s, 81234\.5"):
+        read_log(tmp_path / "rgb.mp4")
+    # The order of lines does not matter: backwards was once -100 Hz.
+    csv(tmp_path / "imu.csv", heading, rows[::-1])
+    found = read_log(tmp_path / "rgb.mp4")
+    assert found is not None
+    assert found.rate == pytest.approx(100.0)
+    np.testing.assert_allclose(found.rates[:, 1], -0.1 * np.arange(5))

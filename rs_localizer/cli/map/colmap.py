@@ -118,7 +118,7 @@ def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:
         if not have_times([Path(name) for name in names]):
             raise UsageError(
                 f"the names of the images are not times in ns (such as {names[0]}): give --rate, "
-                "the images per second of the numbers in them"
+                "the images per second of the numbers in them (1e9 for ns since a video's start)"
             )
         return {name: int(Path(name).stem) for name in names}
     stamps = {}
