@@ -23,6 +23,26 @@ RATES = 2.0 * np.pi * CYCLES
 # What :func:`shake_basis` takes away of each function: its value and its rate at the middle row.
 MIDDLE_VALUES, MIDDLE_RATES = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
 MIDDLE_VALUES[::2], MIDDLE_RATES[1::2] = 1.0, RATES
+TYPICAL_SIZES = 3e-4 / np.sqrt(CYCLES)
+"""rad, of an ordinary vibration: 0.02 deg at a cycle per readout, less the faster."""
+RESOLVED = 16
+"""Combinations of the functions that one readout tells from each other: all others are smaller than
+1e-4 of their squares."""
+
+
+def _resolved() -> tuple[Array, Array]:
+    """Combinations (28,16) that an ordinary vibration contains with the size 1 each, independent of
+    each other, and what they are for each function (16,28), which is their sum.
+    """
+    tau, sizes = np.linspace(-0.5, 0.5, 401)[:, None], np.repeat(TYPICAL_SIZES, 2)
+    shown = np.empty((len(tau), FUNCTIONS))
+    shown[:, ::2] = (np.cos(RATES * tau) - 1.0) * sizes[::2]
+    shown[:, 1::2] = (np.sin(RATES * tau) - RATES * tau) * sizes[1::2]
+    _, _, parts = np.linalg.svd(shown)
+    return np.ascontiguousarray(sizes[:, None] * parts[:RESOLVED].T), parts[:RESOLVED] / sizes
+
+
+COMBINATIONS, IN_COMBINATIONS = _resolved()
 
 
 @kernel

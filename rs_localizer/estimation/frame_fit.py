@@ -22,9 +22,12 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.scales import SCALES
 from rs_localizer.core.shake import (
+    COMBINATIONS,
     FUNCTIONS,
+    IN_COMBINATIONS,
     MIDDLE_RATES,
     MIDDLE_VALUES,
+    RESOLVED,
     shake_at,
     shake_basis,
 )
@@ -738,6 +741,10 @@ class ScoreProducts(NamedTuple):
     smooth: Array  # (20,20) of the smooth error's
     smooth_by_motion: Array  # (20,18)
     smooth_along: Array  # (20,)
+    # (48,48), (48,18), (48,): the same of what the rows resolve of all frequencies (core/shake.py)
+    together: Array
+    together_by_motion: Array
+    together_along: Array
     inverse: Array  # (18,18) of the motion's, with the prior's information
 
 
@@ -765,14 +772,15 @@ def score_products(
     add_prior(prior, state, variance, information, slope)
     # By the functions of the row time: the derivatives' products with motion and errors, and with
     # themselves (the functions squared and multiplied).
-    crossed, own = np.zeros((FUNCTIONS, _OUTER)), np.zeros((6, 3 * frequencies))
+    crossed, own = np.zeros((RESOLVED, _OUTER)), np.zeros((6, RESOLVED * (RESOLVED + 1) // 2))
     # By the terms of the smooth error: the motion's derivatives and the errors; themselves.
     beside, within = (
         np.zeros((SMOOTH_TERMS, 2 * PARAMETERS + 2)),
         np.zeros((SMOOTH_TERMS, SMOOTH_TERMS)),
     )
     values, rates, terms = np.empty(FUNCTIONS), np.empty(FUNCTIONS), np.empty(SMOOTH_TERMS)
-    outer, squares, both = np.empty(_OUTER), np.empty(3 * frequencies), np.empty(2 * PARAMETERS + 2)
+    outer, both = np.empty(_OUTER), np.empty(2 * PARAMETERS + 2)
+    resolved, squares = np.empty(RESOLVED), np.empty(own.shape[1])
     low, high = extent(lines, inliers)
     for i in range(count):
         if not inliers[i] or not np.isfinite(front[i]):
@@ -788,17 +796,21 @@ def score_products(
         _add_outer(within, terms, terms)
         if turns:
             shake_basis(lines.tau[i], values, rates)
-            _turn_products(rows, by_turn, errors, values, outer, squares, own)
-            _add_outer(crossed, values, outer)
+            resolved[:] = 0.0
+            for k in range(FUNCTIONS):
+                for j in range(RESOLVED):
+                    resolved[j] += values[k] * COMBINATIONS[k, j]
+            _turn_products(rows, by_turn, errors, resolved, outer, squares, own)
+            _add_outer(crossed, resolved, outer)
     products = ScoreProducts(
         np.empty((frequencies, 6, 6)), np.empty((frequencies, 6, PARAMETERS)),
         np.empty((frequencies, 6)), np.zeros((2 * SMOOTH_TERMS, 2 * SMOOTH_TERMS)),
         np.empty((2 * SMOOTH_TERMS, PARAMETERS)), np.empty(2 * SMOOTH_TERMS),
-        inverted(information),
+        np.empty((3 * RESOLVED, 3 * RESOLVED)), np.empty((3 * RESOLVED, PARAMETERS)),
+        np.empty(3 * RESOLVED), inverted(information),
     )  # fmt: skip
-    for f in range(frequencies):
-        for i in range(6):
-            _spread_turn(products, f, i, own, crossed)
+    if turns:
+        _spread_turns(products, own, crossed)
     for i in range(2 * SMOOTH_TERMS):
         side, k = i // SMOOTH_TERMS, i % SMOOTH_TERMS
         for j in range(SMOOTH_TERMS):
@@ -829,10 +841,11 @@ def _turn_products(
         for a in range(PARAMETERS):
             outer[PARAMETERS * axis + a] = one * rows[0, a] + other * rows[1, a]
         outer[3 * PARAMETERS + axis] = one * errors[0] + other * errors[1]
-    for f in range(len(values) // 2):
-        squares[3 * f] = values[2 * f] * values[2 * f]
-        squares[3 * f + 1] = values[2 * f] * values[2 * f + 1]
-        squares[3 * f + 2] = values[2 * f + 1] * values[2 * f + 1]
+    place = 0
+    for k in range(len(values)):
+        for j in range(k + 1):
+            squares[place] = values[k] * values[j]
+            place += 1
     for axis in range(3):
         for other_axis in range(axis + 1):
             product = by_turn[0, axis] * by_turn[0, other_axis]
@@ -842,16 +855,36 @@ def _turn_products(
                 own[place, j] += product * squares[j]
 
 
-@inlined
-def _spread_turn(products: ScoreProducts, f: int, i: int, own: Array, crossed: Array) -> None:
-    """Write the products of column i (axes of the cosine, then of the sine) of a frequency."""
-    sine, axis = i // 3, i % 3
-    for j in range(6):
-        first, last = max(axis, j % 3), min(axis, j % 3)
-        products.own[f, i, j] = own[first * (first + 1) // 2 + last, 3 * f + sine + j // 3]
-    for a in range(PARAMETERS):
-        products.by_motion[f, i, a] = crossed[2 * f + sine, PARAMETERS * axis + a]
-    products.along[f, i] = -crossed[2 * f + sine, 3 * PARAMETERS + axis]
+@kernel
+def _spread_turns(products: ScoreProducts, own: Array, crossed: Array) -> None:
+    """Write the products of the resolved combinations (axes within them), and of each frequency's
+    columns (axes of the cosine, then of the sine), which are sums of these.
+    """
+    of_functions = IN_COMBINATIONS.T @ crossed
+    for axis in range(3):
+        first, last = PARAMETERS * axis, PARAMETERS * (axis + 1)
+        products.together_by_motion[axis::3] = crossed[:, first:last]
+        products.together_along[axis::3] = -crossed[:, 3 * PARAMETERS + axis]
+        for side in range(2):
+            column = 3 * side + axis
+            products.by_motion[:, column] = of_functions[side::2, first:last]
+            products.along[:, column] = -of_functions[side::2, 3 * PARAMETERS + axis]
+        for other in range(axis + 1):
+            place, both = 0, np.empty((RESOLVED, RESOLVED))
+            for k in range(RESOLVED):
+                for j in range(k + 1):
+                    both[k, j] = both[j, k] = own[axis * (axis + 1) // 2 + other, place]
+                    place += 1
+            products.together[axis::3, other::3] = both
+            products.together[other::3, axis::3] = both
+            half = both @ IN_COMBINATIONS
+            for f in range(len(products.own)):
+                for k in range(4):
+                    total, one, two = 0.0, 2 * f + k // 2, 2 * f + k % 2
+                    for i in range(RESOLVED):
+                        total += IN_COMBINATIONS[i, one] * half[i, two]
+                    row, column = 3 * (k // 2) + axis, 3 * (k % 2) + other
+                    products.own[f, row, column] = products.own[f, column, row] = total
 
 
 def warm_up() -> None:

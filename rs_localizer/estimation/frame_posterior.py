@@ -19,9 +19,9 @@ from scipy.special import ndtri
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.scales import SCALES, SPEEDS, Scales
-from rs_localizer.core.shake import CYCLES
+from rs_localizer.core.shake import CYCLES, TYPICAL_SIZES
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, step_between
+from rs_localizer.core.state import LINEAR, MOTION_PARAMETERS, PARAMETERS, VELOCITIES, step_between
 from rs_localizer.estimation.assumptions import Assumed
 from rs_localizer.estimation.frame_fit import (
     DEGREE_SIZES,
@@ -60,10 +60,10 @@ _RESTS, _NOTHING = np.array([speed == 0.0 for speed in SPEEDS], float), np.zeros
 _LARGEST_SHAKE = 0.035
 # Points just outside of the gate that are no chance: shaking may have moved them there.
 _NEAR_OUTLIERS, _NEAR_PART, _NEAR_GATE = 5, 0.2, 8.0
-# Hyperprior of the scales where no frame says more: an ordinary vibration of 0.02 deg at a cycle
-# per readout, less the faster, a decade up or down within one deviation; a map and a lens of
-# 0.03 px, to a factor of e: surveyed tags before a calibrated lens have 0.2 (two deviations).
-_TURN_SCALES = np.log(3e-4 / np.sqrt(CYCLES))
+# Hyperprior of the scales where no frame says more: an ordinary vibration, a decade up or down
+# within one deviation; a map and a lens of 0.03 px, to a factor of e: surveyed tags before a
+# calibrated lens have 0.2 (two deviations).
+_TURN_SCALES = np.log(TYPICAL_SIZES)
 _SMOOTH_SCALE, _PRECISION, _SMOOTH_PRECISION = math.log(0.03), 1.0 / 2.3**2, 1.0
 # What is declared of a map is known to a factor of e within two deviations: a motion that makes a
 # bent board look flat is less probable than one before a board that is as bent as boards are.
@@ -169,7 +169,7 @@ def _of_points(
     hyper = _hyperprior(assumed, declared)
     explained, coefficients, agreement, vibration = _look(
         observations.packed, observations.count, best.state,
-        best.inliers, terms, best.noise, best.freedom, hyper.mean, hyper.precision,
+        best.inliers, terms, best.noise, best.freedom, *_size_of_vibration(hyper),
         assumed.rolling,
     )  # fmt: skip
     excess, remembered = _standard(explained, coefficients, best.freedom), assumed.scales
@@ -291,6 +291,15 @@ def _hyperprior(assumed: Assumed, declared: float) -> Hyperprior:
     mean = (precision * mean + known.precisions * known.means) / both
     first = np.where(known.precisions > 1.0, mean, first)
     return Hyperprior(first, mean, both)
+
+
+def _size_of_vibration(hyper: Hyperprior) -> tuple[float, float]:
+    """Logarithm of a factor of all scales of the in-frame turn, and its precision: one decade, and
+    what the frames before say of each scale.
+    """
+    away = hyper.precision[:-1] * (hyper.mean[:-1] - _TURN_SCALES)
+    precision = _PRECISION + float(np.sum(hyper.precision[:-1] - _PRECISION))
+    return float(np.sum(away)) / precision, precision
 
 
 def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior, float] | None:
@@ -445,7 +454,7 @@ def _either(
 @kernel
 def _look(
     data: Array, count: int, state: Array, inliers: BoolArray, prior: PriorTerms,
-    noise: float, freedom: float, means: Array, precisions: Array, turns: bool,
+    noise: float, freedom: float, size: float, precision: float, turns: bool,
 ) -> tuple[Array, Array, float, Undetected]:  # fmt: skip
     """What each frequency of an in-frame turn, and a smooth error, would explain of the errors.
 
@@ -454,21 +463,24 @@ def _look(
     Returns:
         (15,) of the 14 frequencies and the smooth error; their degrees of freedom (15,): 6, and 20
         or, where the motion mimics some of its columns, fewer; how much neighbouring rows agree;
-        and what one frequency may do, whose scales have these ``means`` and ``precisions`` (15,).
+        and what vibration may do, of ``size`` (logarithm) times the ordinary one, known to this
+        ``precision``.
     """
     statistic, counts = np.zeros(SCALES), np.full(SCALES, 6.0)
     variance, frequencies = noise * noise, len(CYCLES)
     products, agreement = score_products(data, count, state, inliers, prior, variance, turns)
-    own, crossed, along, within, across, beside, inverse = products
-    pull = np.zeros((frequencies if turns else 0, 6, PARAMETERS))
-    for f in range(len(pull)):
-        pull[f], _ = _beside_motion(own[f], crossed[f], inverse)
-        statistic[f] = _explained(inverted(own[f]), along[f]) / variance
+    own, crossed, along, within, across, beside, every, moving, pushed, inverse = products
+    vibration = Undetected(-np.inf, np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)))
+    if turns:
+        for f in range(frequencies):
+            _beside_motion(own[f], crossed[f], inverse)
+            statistic[f] = _explained(inverted(own[f]), along[f]) / variance
+        pull, _ = _beside_motion(every, moving, inverse)
+        vibration = undetected_vibration(every, pull, pushed, variance, freedom, size, precision)
     _, ridge = _beside_motion(within, across, inverse)
     left = inverted(within)
     statistic[frequencies] = _explained(left, beside) / variance
     counts[frequencies] = max(len(ridge) - np.sum(np.diag(left) * ridge), 1.0)
-    vibration = undetected_vibration(own, pull, along, variance, freedom, means, precisions)
     return statistic, counts, agreement, vibration
 
 

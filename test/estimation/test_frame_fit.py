@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.rig import Mounts
 from rs_localizer.core.scales import SCALES
-from rs_localizer.core.shake import CYCLES, FUNCTIONS, shake_at
+from rs_localizer.core.shake import COMBINATIONS, CYCLES, FUNCTIONS, shake_at
 from rs_localizer.estimation.frame_fit import (
     SMOOTH_TERMS,
     TURNS,
@@ -20,6 +20,7 @@ from rs_localizer.estimation.frame_fit import (
     full_prior,
     log_determinant_of_inverse,
     products_of,
+    score_products,
     smooth_at,
     smooth_terms,
     with_scales,
@@ -54,6 +55,31 @@ def lines_of(seed=0, count=COUNT):
         rng.uniform(-0.5, 0.6, (count, 2)),
     )
     return lines, rng.uniform(size=count) < 0.9
+
+
+def test_scores_are_of_the_columns_of_a_fit():
+    """Of the combinations that the rows resolve exactly; of a frequency but for what they leave."""
+    observations, state = frame(0, 0.02, 0.5, 60)
+    best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
+    packed, count = observations.packed, observations.count
+    lines = linearized(packed, count, best.state, np.zeros((count, 6)))
+    whole = products_of(lines, best.inliers, lines.errors, True, False, IMAGE)
+    found, _ = score_products(packed, count, best.state, best.inliers, PRIOR, 0.25, True)
+    turns, motion = whole.products[18:, 18:], whole.products[18:, :18]
+    combined = np.kron(COMBINATIONS, np.eye(3))
+    size = np.sqrt(np.outer(*2 * [np.diag(combined.T @ turns @ combined)]))
+    np.testing.assert_allclose(found.together / size, combined.T @ turns @ combined / size, atol=1e-9)
+    np.testing.assert_allclose(found.together_by_motion, combined.T @ motion, rtol=1e-7, atol=1e-6)
+    np.testing.assert_allclose(
+        found.together_along, combined.T @ whole.with_errors[18:], rtol=1e-7, atol=1e-6
+    )
+    for f in range(len(CYCLES)):
+        one = slice(6 * f, 6 * f + 6)
+        size = np.sqrt(np.diag(turns[one, one]))
+        difference = (found.own[f] - turns[one, one]) / np.outer(size, size)
+        assert np.abs(difference).max() < 3e-2, f
+        away = (found.along[f] - whole.with_errors[18:][one]) / (size * best.noise)
+        assert np.abs(away).max() < 0.1, f
 
 
 def polynomials(rays, inliers):

@@ -344,7 +344,7 @@ def test_scores_are_chi_squared_where_there_is_nothing():
         best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
         statistic, *_ = _look(
             observations.packed, len(observations), best.state,
-            best.inliers, PRIOR, 0.5, best.freedom, np.full(SCALES, -8.0), np.ones(SCALES), True,
+            best.inliers, PRIOR, 0.5, best.freedom, 0.0, 1.0, True,
         )  # fmt: skip
         statistics.append(statistic)
     mean = np.mean(statistics, axis=0)
@@ -361,8 +361,7 @@ def test_scores_tell_the_frequency():
         best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
         statistic, *_ = _look(
             observations.packed, len(observations), best.state,
-            best.inliers, PRIOR, best.noise, best.freedom, np.full(SCALES, -8.0),
-            np.ones(SCALES), True,
+            best.inliers, PRIOR, best.noise, best.freedom, 0.0, 1.0, True,
         )  # fmt: skip
         assert CYCLES[np.argmax(statistic[:-1])] == cycles
         assert statistic[:-1].max() > 50.0

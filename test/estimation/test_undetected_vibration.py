@@ -11,43 +11,35 @@ from benchmarks.frames.judged import judge
 from benchmarks.independent.scenes import Rich
 from rs_localizer.estimation.undetected_vibration import undetected_vibration
 
-FREQUENCIES, NOISE, FREEDOM = 3, 0.5, 1e7  # so many that the noise is known
-
-
-def frame(seed, size):
-    """Products, pulls and slopes of columns that stand in 40 errors beside a motion."""
-    rng = np.random.default_rng(seed)
-    columns = 600.0 * rng.normal(size=(FREQUENCIES, 80, 6)) / np.sqrt(80)
-    errors = NOISE * rng.normal(size=80) + size * columns[1] @ rng.normal(size=6)
-    own = np.einsum("fni,fnj->fij", columns, columns)
-    along = np.einsum("fni,n->fi", columns, errors)
-    return columns, errors, own, rng.normal(size=(FREQUENCIES, 6, 18)), along
+COLUMNS, NOISE, FREEDOM = 9, 0.5, 1e7  # so many that the noise is known
 
 
 @pytest.mark.parametrize("size", [0.0, 3e-3])
 def test_evidence_and_covariance_are_those_of_dense_gaussians(size):
-    columns, errors, own, pull, along = frame(3, size)
-    means, precisions = np.log([3e-4, 5e-4, 1e-3]), np.array([0.5, 0.7, 1.0])
-    found = undetected_vibration(own, pull, along, NOISE**2, FREEDOM, means, precisions)
+    rng = np.random.default_rng(3)
+    columns = 600.0 * rng.normal(size=(80, COLUMNS)) / np.sqrt(80)
+    errors = NOISE * rng.normal(size=80) + size * columns @ rng.normal(size=COLUMNS)
+    pull, mean, precision = rng.normal(size=(COLUMNS, 18)), np.log(5e-4), 0.7
+    found = undetected_vibration(
+        columns.T @ columns, pull, columns.T @ errors, NOISE**2, FREEDOM, mean, precision
+    )
     # Twenty times as many nodes, and covariances of all errors instead of those of coefficients.
     nodes = np.linspace(-3.0, 3.0, 141)
     weights = np.exp(-0.5 * nodes**2)
-    weights /= weights.sum() * FREQUENCIES
+    weights /= weights.sum()
     total, moments = 0.0, np.zeros((12, 12))
-    for f in range(FREQUENCIES):
-        for weight, scale in zip(weights, np.exp(means[f] + nodes / precisions[f] ** 0.5),
-                                 strict=True):  # fmt: skip
-            spread = NOISE**2 * np.eye(80) + scale**2 * columns[f] @ columns[f].T
-            gain = scale**2 * columns[f].T @ np.linalg.inv(spread)
-            likelihood = weight * np.exp(
-                -0.5 * np.linalg.slogdet(spread / NOISE**2)[1]
-                - 0.5 * errors @ np.linalg.solve(spread, errors)
-                + 0.5 * errors @ errors / NOISE**2
-            )
-            mean = gain @ errors
-            second = scale**2 * (np.eye(6) - gain @ columns[f]) + np.outer(mean, mean)
-            total += likelihood
-            moments += likelihood * (pull[f].T @ second @ pull[f])[:12, :12]
+    for weight, scale in zip(weights, np.exp(mean + nodes / precision**0.5), strict=True):
+        spread = NOISE**2 * np.eye(80) + scale**2 * columns @ columns.T
+        gain = scale**2 * columns.T @ np.linalg.inv(spread)
+        likelihood = weight * np.exp(
+            -0.5 * np.linalg.slogdet(spread / NOISE**2)[1]
+            - 0.5 * errors @ np.linalg.solve(spread, errors)
+            + 0.5 * errors @ errors / NOISE**2
+        )
+        best = gain @ errors
+        second = scale**2 * (np.eye(COLUMNS) - gain @ columns) + np.outer(best, best)
+        total += likelihood
+        moments += likelihood * (pull.T @ second @ pull)[:12, :12]
     assert found.log_evidence == pytest.approx(np.log(total), abs=0.4)
     assert (found.log_evidence > 5.0) == (size > 0.0)
     ratios = np.sqrt(np.diag(found.covariance) / np.diag(moments / total))
