@@ -477,10 +477,11 @@ def _tell(found: Calibration, rate: float | None) -> None:
     ]
     for name, text in rows:
         print(f"{name:26} {text}")
+    along = 1e3 * verdict.sense(found)
     for block in found.blocks:
         print(
             f"  {block.start:6.1f} to {block.end:5.1f} s {'':5}"
-            f"{1e3 * block.readout_time:+.3f} +- {1e3 * block.deviation:.3f} ms"
+            f"{along * block.readout_time:+.3f} +- {1e3 * block.deviation:.3f} ms"
         )
     for remark in verdict.remarks(found):
         print(remark)

@@ -31,8 +31,9 @@ RESOLVED = 16
 
 
 def _resolved() -> tuple[Array, Array]:
-    """Combinations (28,16) that an ordinary vibration contains with the size 1 each, independent of
-    each other, and what they are for each function (16,28), which is their sum.
+    """Combinations (28,16) of the functions, and each function as a sum of them (16,28).
+
+    Those of an ordinary vibration are independent of each other, and of size 1.
     """
     tau, sizes = np.linspace(-0.5, 0.5, 401)[:, None], np.repeat(TYPICAL_SIZES, 2)
     shown = np.empty((len(tau), FUNCTIONS))

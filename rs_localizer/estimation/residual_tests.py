@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tests of what a model leaves of a frame: they refuse, and choose nothing."""
+"""Tests of what a model leaves of a frame: what would explain it, and what refuses it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from rs_localizer.estimation.refine import LEAST_NOISE
 
 # Points nearer than this part of the image that the points fill are neighbours in it.
 _FAR_APART = 0.15
+# No frame says more than this to the next ones (standard normal).
+_CLIPPED = 6.0
 
 
 @kernel
@@ -48,3 +50,24 @@ def neighbours_agree(errors: Array, tau: Array, rays: Array, inliers: BoolArray)
     variance = max(0.5 * squared / count, LEAST_NOISE * LEAST_NOISE)
     normalized: float = agreement / (variance * np.sqrt(2.0 * max(pairs, 1)))
     return normalized
+
+
+def standard_scores(explained: Array, own: Array, freedom: float) -> Array:
+    """How much more than chance columns explain (15,), standard normal where there is nothing.
+
+    An F test, because the noise is of the same errors (Rao 1948), by Paulson's approximation
+    (1942).
+
+    Args:
+        explained: (15,) squares in noise variances.
+        own: (15,) how many columns explain them that the motion does not mimic.
+        freedom: of the errors.
+    """
+    rest = freedom - own
+    enough = rest >= 1.0
+    rest = np.maximum(rest, 1.0)
+    left = np.maximum(freedom - explained, 1e-3 * max(freedom, 1.0))
+    ratio = explained / own * rest / left
+    cube, a, b = np.cbrt(ratio), 2.0 / (9.0 * own), 2.0 / (9.0 * rest)
+    standard = ((1.0 - b) * cube - (1.0 - a)) / np.sqrt(b * cube**2 + a)
+    return np.where(enough, np.clip(standard, -_CLIPPED, _CLIPPED), -_CLIPPED)

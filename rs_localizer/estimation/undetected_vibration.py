@@ -59,7 +59,7 @@ def undetected_vibration(
     factor, right = np.empty((size, size)), np.empty((size, moved + 1))
     for node in range(len(_NODES)):
         scale = math.exp(2.0 * (mean + _NODES[node] / math.sqrt(precision)))
-        part, volume = scale / variance, 0.0
+        part = scale / variance
         right[:, :moved], right[:, moved] = pull[:, :moved], along / variance
         # Cholesky's factor L of 1 + s^2 N, and L^-1 of the right-hand sides.
         for i in range(size):
@@ -78,10 +78,8 @@ def undetected_vibration(
                     side[k] -= row[j] * above[k]
             row[i] = 1.0 / math.sqrt(max(row[i], 1.0))  # the inverse of its diagonal
             side *= row[i]
-            volume += math.log(row[i])
-        explained = scale * np.sum(right[:, moved] ** 2)
-        explained = min(explained / freedom, _MOST_EXPLAINED)
-        log_evidence = math.log(_WEIGHTS[node]) + volume
+        explained = min(scale * np.sum(right[:, moved] ** 2) / freedom, _MOST_EXPLAINED)
+        log_evidence = math.log(_WEIGHTS[node]) + np.sum(np.log(np.diag(factor)))
         log_evidence -= 0.5 * freedom * math.log1p(-explained)
         if log_evidence > most:
             moments *= math.exp(most - log_evidence)
@@ -89,7 +87,7 @@ def undetected_vibration(
             most = log_evidence
         probable = math.exp(log_evidence - most)
         total += probable
-        spread = right[:, :moved].T @ right
+        spread = right.T @ right
         for i in range(moved):
             for j in range(moved):
                 best = scale * spread[i, moved] * spread[j, moved]

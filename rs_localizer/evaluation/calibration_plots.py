@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.calibration import Calibration, likelihood, without_readout
+from rs_localizer.trajectory.verdict import sense
 
 _BLUE, _ORANGE, _GREY = "#0b3c8c", "#f08a24", "#c9c9c9"
 _BINS = 16
@@ -35,22 +36,23 @@ def save_plots(camera: Camera, calibration: Calibration, directory: Path) -> Non
 
 def _likelihood(axes: Axes, camera: Camera, calibration: Calibration) -> None:
     values, costs = likelihood(camera, calibration)
-    middle = calibration.readout_time
-    axes.plot(1e3 * values, np.exp(-0.5 * costs), "o-", color=_BLUE, label="measured")
+    middle, along = calibration.readout_time, 1e3 * sense(calibration)
+    axes.plot(along * values, np.exp(-0.5 * costs), "o-", color=_BLUE, label="measured")
     fine = np.linspace(values[0], values[-1], 200)
     bound = np.exp(-0.5 * ((fine - middle) / calibration.formal_deviation) ** 2)
-    axes.plot(1e3 * fine, bound, color=_ORANGE, label="Cramér-Rao bound")
+    axes.plot(along * fine, bound, color=_ORANGE, label="Cramér-Rao bound")
     axes.set(xlabel="readout time (ms)", ylabel="likelihood", title="All of the recording")
     axes.legend(frameon=False)
 
 
 def _blocks(axes: Axes, calibration: Calibration) -> None:
+    along = 1e3 * sense(calibration)
     for block in calibration.blocks:
         axes.errorbar(
-            0.5 * (block.start + block.end), 1e3 * block.readout_time,
+            0.5 * (block.start + block.end), along * block.readout_time,
             2e3 * block.deviation, 0.5 * (block.end - block.start), color=_BLUE,
         )  # fmt: skip
-    value, band = 1e3 * calibration.readout_time, 2e3 * calibration.deviation
+    value, band = along * calibration.readout_time, 2e3 * calibration.deviation
     axes.axhspan(value - band, value + band, color=_GREY, alpha=0.6)
     axes.axhline(value, color=_ORANGE)
     axes.set(xlabel="time (s)", ylabel="readout time (ms)", title="Its parts (two deviations)")

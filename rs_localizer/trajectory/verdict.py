@@ -30,6 +30,11 @@ def readout_time(result: Calibration) -> float:
     return 0.0 if result.global_shutter else abs(result.readout_time)
 
 
+def sense(result: Calibration) -> float:
+    """The sign by which the readout times of parts are those along :func:`scan_direction`."""
+    return 1.0 if result.global_shutter else float(np.copysign(1.0, result.readout_time))
+
+
 def scan_direction(result: Calibration) -> ScanDirection:
     """The direction that the sign of the readout time says."""
     given = ScanDirection(result.fit.camera.scan_direction)
@@ -49,7 +54,7 @@ def lens_refusal(result: Calibration) -> str:
 
 def refusal(result: Calibration) -> str:
     """One line with the figure when lens or readout time is not determined; or ''."""
-    value = f"{1e3 * result.readout_time:.1f} +- {1e3 * result.deviation:.1f} ms"
+    value = f"{1e3 * sense(result) * result.readout_time:.1f} +- {1e3 * result.deviation:.1f} ms"
     if text := lens_refusal(result):
         return text
     if result.stabilised:
@@ -166,4 +171,4 @@ def uncovered(result: Calibration) -> list[str]:
 
 
 def _parts(result: Calibration) -> str:
-    return ", ".join(f"{1e3 * block.readout_time:.2f}" for block in result.blocks)
+    return ", ".join(f"{1e3 * sense(result) * one.readout_time:.2f}" for one in result.blocks)

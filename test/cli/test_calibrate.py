@@ -5,6 +5,7 @@
 import argparse
 import csv
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer import data
 from rs_localizer.cli.calibrate import share_all
 from rs_localizer.cli.main import main
+from rs_localizer.evaluation import calibration_plots
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.calibration import read_calibration
 from rs_localizer.io.trajectories import read_tum
@@ -54,11 +56,27 @@ def test_the_webcam(tmp_path, capsys):
     assert camera.K[0, 0] == pytest.approx(529.0, rel=0.02)
 
 
-def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path):
-    out = tmp_path / "camera.yaml"
+def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path, capsys, monkeypatch):
+    """Parts and plots have the sense of the direction that is told: positive."""
+    out, limits = tmp_path / "camera.yaml", []
+    for name in ("_blocks", "_likelihood"):
+        draw = getattr(calibration_plots, name)
+
+        def drawn(axes, *of, draw=draw):
+            draw(axes, *of)
+            limits.append(axes.dataLim)
+
+        monkeypatch.setattr(calibration_plots, name, drawn)
     words = ["-p", "scan_direction:=bottom_to_top", "--out", str(out)]
     share = ["--share", "Maker One", "--firmware", "2.10"]
-    assert main(["calibrate", str(flight), *words, *share]) == 0
+    pictures = ["--plots", str(tmp_path / "plots")]
+    assert main(["calibrate", str(flight), *words, *share, *pictures]) == 0
+    parts = re.findall(r" to +[\d.]+ s +([-+][\d.]+) \+- ", capsys.readouterr().out)
+    assert parts
+    assert all(10.0 < float(part) < 30.0 for part in parts), parts
+    likelihood, blocks = limits
+    assert 10.0 < likelihood.x0 < likelihood.x1 < 30.0
+    assert 10.0 < blocks.y0 < blocks.y1 < 30.0
     values = load_params_file(out)
     assert values["scan_direction"] == "top_to_bottom"
     (row,) = csv.DictReader((tmp_path / "camera_share.csv").read_text().splitlines())

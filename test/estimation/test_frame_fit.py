@@ -68,7 +68,9 @@ def test_scores_are_of_the_columns_of_a_fit():
     turns, motion = whole.products[18:, 18:], whole.products[18:, :18]
     combined = np.kron(COMBINATIONS, np.eye(3))
     size = np.sqrt(np.outer(*2 * [np.diag(combined.T @ turns @ combined)]))
-    np.testing.assert_allclose(found.together / size, combined.T @ turns @ combined / size, atol=1e-9)
+    np.testing.assert_allclose(
+        found.together / size, combined.T @ turns @ combined / size, atol=1e-9
+    )
     np.testing.assert_allclose(found.together_by_motion, combined.T @ motion, rtol=1e-7, atol=1e-6)
     np.testing.assert_allclose(
         found.together_along, combined.T @ whole.with_errors[18:], rtol=1e-7, atol=1e-6
