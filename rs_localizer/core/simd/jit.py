@@ -231,6 +231,10 @@ class _Implementation(CompileResultCacheImpl):
         return super().rebuild(target, stored)
 
 
+class _AnotherCallee(ValueError):
+    """What a kernel in the cache calls was compiled again since, by a process beside this one."""
+
+
 class _Called(NamedTuple):
     """A kernel that is called where it is: it has to be loaded before who calls it."""
 
@@ -243,7 +247,7 @@ class _Called(NamedTuple):
         kernel = getattr(importlib.import_module(self.module), self.name)
         kernel.compile(self.arguments)
         if kernel.overloads[self.arguments].fndesc.llvm_func_name != self.symbol:
-            raise ValueError(f"{self.name} has been compiled anew")
+            raise _AnotherCallee(f"{self.name} has been compiled anew")
 
 
 def _call_where_it_is(compiled: Any) -> None:
@@ -316,7 +320,8 @@ class _Cache(FunctionCache):
                 _mark(Path(self._cache_path).parent)
             return overload
         except (*_DAMAGE, pickle.UnpicklingError) as error:
-            _say(f"damaged files are compiled anew ({self._cache_file._index_path}: {error!r})")
+            if not isinstance(error, _AnotherCallee):
+                _say(f"damaged files are compiled anew ({self._cache_file._index_path}: {error!r})")
             with contextlib.suppress(OSError):  # saving says what is wrong with the folder
                 self._cache_file.remove()
         except OSError:

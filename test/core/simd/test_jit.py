@@ -161,8 +161,7 @@ def test_a_large_kernel_is_called_where_it_is(load, cache, monkeypatch):
         if ".double-" in file.name:
             file.unlink()
     anew = quadruple()
-    with pytest.warns(RuntimeWarning, match="damaged files are compiled anew"):
-        assert anew(1.5) == 6.0
+    assert anew(1.5) == 6.0  # and nothing is said: no file was damaged
     assert hits(anew) == 0
     last = quadruple()
     assert last(1.5) == 6.0
