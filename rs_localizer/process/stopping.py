@@ -118,7 +118,16 @@ class StopSignals(StopRequest):
     def _stop(self, frame: FrameType | None) -> None:
         self._deadline = time.monotonic() + _PATIENCE
         signal.signal(signal.SIGALRM, lambda _, frame: self._interrupt(frame))
+        sys.unraisablehook = self._repeat
         self._interrupt(frame)
+
+    @staticmethod
+    def _repeat(lost: "sys.UnraisableHookArgs") -> None:
+        """Not reported: an interrupt within a finalizer comes again."""
+        if lost.exc_type is KeyboardInterrupt:
+            signal.setitimer(signal.ITIMER_REAL, _PERIOD)
+        else:
+            sys.__unraisablehook__(lost)
 
     def _interrupt(self, frame: FrameType | None) -> None:
         handled = _is_handled(sys.exception())
