@@ -61,8 +61,8 @@ _REST_ODDS = math.log(100.0)
 FAR_LESS_PROBABLE = 9.0
 # The pose is the mean of the posterior. Its region is that of the posterior with probabilities to
 # this power, about the same mean: it holds for a camera that moves so little that rest is more
-# probable (1 would hold on average over all cameras, and not for that one). The odds against an
-# in-frame turn have no part in it.
+# probable (1 would hold on average over all cameras, and not for that one). The odds for rest and
+# those against an in-frame turn, which are choices, have no part in it.
 TEMPER = 0.25
 # Optima nearer than this part of a deviation are one.
 _SAME = 1e-2
@@ -292,7 +292,7 @@ def mixture_of(
         )  # fmt: skip
     first = int(np.argmax(probable))
     probable = np.exp(probable - probable[first])
-    possible = probable**TEMPER
+    possible = np.exp(TEMPER * (evidences - np.max(evidences)))
     probable, possible = probable / np.sum(probable), possible / np.sum(possible)
     state, covariance, steps, offsets, abouts = averaged(
         modes.states, modes.covariances, first, probable, possible
