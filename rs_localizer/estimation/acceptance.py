@@ -25,7 +25,7 @@ _MOST_AGREEMENT = 4.2
 # Standard deviations of what map and calibration are known to be off that explain an error.
 _ALLOWED = 2.0
 # Of a smooth error that is fitted, three deviations of the logarithm of what is declared.
-_MOST_DECLARED = math.exp(1.5)
+_MOST_DECLARED = math.exp(3.0)
 # An orientation that is open because the camera may move is accepted up to so many times the limit:
 # hand-held boards of 12 to 20 cm come to 1.5 times (benchmarks.real), and beyond three a covariance
 # no longer says where a pose on an arc may be.

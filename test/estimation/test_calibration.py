@@ -141,12 +141,12 @@ def test_a_declared_error_of_the_map_refuses_nothing(deviation):
     assert published >= 19
 
 
-@pytest.mark.parametrize(("depth", "least"), [(2.0, 0.9), (0.0, 0.85)], ids=["room", "wall"])
+@pytest.mark.parametrize(("depth", "least"), [(2.0, 0.9), (0.0, 0.75)], ids=["room", "wall"])
 def test_regions_hold_before_a_bent_map_that_is_declared(depth, least):
     """A map is off in metres, so by more pixels where it is near: the smooth error has a depth.
 
-    In rooms 96 %, before walls 93 % of 120 are inside: the waves are shorter than the cubic that is
-    fitted.
+    In rooms 98 %, before walls 86 % of 200 are inside (97 % with an ordinary calibration): the
+    waves are longer than what is expected of paper.
     """
     declared = rsl.Localizer(CAMERA, map_deviation=0.01, calibration=EXACT)
     assert inside(declared, depth, 30, bent) >= least
