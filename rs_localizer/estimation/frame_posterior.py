@@ -10,7 +10,6 @@ Gaussian (Laplace approximation) with its evidence; the mixture's mean and covar
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -67,14 +66,12 @@ _NEAR_OUTLIERS, _NEAR_PART, _NEAR_GATE = 5, 0.2, 8.0
 _TURN_SCALES = np.log(TYPICAL_SIZES)
 _SMOOTH_SCALE, _PRECISION, _SMOOTH_PRECISION = math.log(0.03), 1.0 / 2.3**2, 1.0
 # What is declared of a map is known to a factor of e within one deviation: thirteen printed boards
-# (benchmarks.real) are bent 0.3 to 9 times as much as the 0.2 mm per 10 cm of boards that nobody
-# measured, 1.0 of the logarithm. A motion that makes a bent board look flat is less probable than
-# one before a board that is as bent as boards are.
+# (benchmarks.real) are bent 0.3 to 9 times as much as 0.2 mm per 10 cm, 1.0 of the logarithm. A
+# motion that makes a bent board look flat is less probable than one before a bent board.
 _DECLARED_PRECISION = 1.0
-# Paper bends in finer waves than lenses: without the fourth degree the curled edge of a sheet
-# (benchmarks.real, uk2) looks like fast motion. It adds 1.7 to the logarithm of a frame's evidence
-# in the mean of eleven boards, 15 to 92 before two bent ones; with higher degrees that are larger
-# (0.25, 0.5), flat boards lose.
+# Paper bends in finer waves than lenses: to a cubic a curled edge looks like fast motion. A fourth
+# degree adds 1.7 to the log-evidence of a frame in the mean of eleven of these boards, 15 to 92
+# before two bent ones; with higher degrees that are larger (0.25, 0.5), flat boards lose.
 _BENT_SIZES = (*DEGREE_SIZES, 0.125)
 # Combinations of functions that move no point by this part of the scale are left out.
 _LEAST_BEND = 0.003
@@ -152,8 +149,8 @@ def frame_posterior(
         bend = part.bend
         if bend.shape[1]:
             depth = max(observations.median_depth(part.state, inliers), _NEAREST)
-            sizes = _BENT_SIZES if part.declared > 0.0 else DEGREE_SIZES
-            bend = _bend(observations.points, inliers, sizes, depth / assumed.focal_length)
+            size = depth / assumed.focal_length
+            bend = _bend(observations.points, inliers, part.declared, size)
         return replace(part, squared_errors=errors, inliers=inliers, bend=bend)
     return _of_points(observations, start, terms, threshold, assumed, one_lens)
 
@@ -200,8 +197,7 @@ def _of_points(
         is_plane(observations.points, best.inliers), np.zeros((len(observations), 0)),
     )  # fmt: skip
     if smooth:
-        sizes = _BENT_SIZES if declared > 0.0 else DEGREE_SIZES
-        bend = _bend(observations.points, best.inliers, sizes, depth / assumed.focal_length)
+        bend = _bend(observations.points, best.inliers, declared, depth / assumed.focal_length)
         of_map = frame._replace(bend=bend)
         # Before a plane both explain alike. In depth a bent map leaves more open: it is left out
         # only where it is far less probable.
@@ -241,11 +237,9 @@ def _near_outliers(best: Posterior, threshold: float) -> int:
     return count if count >= max(_NEAR_OUTLIERS, _NEAR_PART * inliers) else 0
 
 
-def _bend(points: Array, inliers: BoolArray, sizes: Sequence[float], size: float) -> Array:
-    """Polynomials (n,b) of the places of points, of ``sizes`` by their degrees.
-
-    ``size``: m, their root mean square over the inliers, all together.
-    """
+def _bend(points: Array, inliers: BoolArray, declared: float, size: float) -> Array:
+    """Functions (n,b) of the points' places; ``size``: m, their root mean square, all together."""
+    sizes = _BENT_SIZES if declared > 0.0 else DEGREE_SIZES
     chosen = points[inliers]
     low, high = chosen.min(axis=0), chosen.max(axis=0)
     places = (points - 0.5 * (low + high)) / max(0.5 * float(np.max(high - low)), _NEAREST)
@@ -257,7 +251,7 @@ def _bend(points: Array, inliers: BoolArray, sizes: Sequence[float], size: float
         for i in range(degree + 1)
         for j in range(degree + 1 - i)
     ])  # fmt: skip
-    # Of the functions, which repeat each other on a plane, their principal combinations.
+    # On a plane they repeat each other.
     values, axes = np.linalg.eigh(bend[inliers].T @ bend[inliers])
     total = np.sum(values)
     size *= math.sqrt(np.count_nonzero(inliers) / total)

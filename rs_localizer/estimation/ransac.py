@@ -312,12 +312,9 @@ def search(
 
 
 def _draw(
-    observations: Observations,
-    pools: Sequence[Pool],
-    drawn: list[int],
-    random: Random,
+    observations: Observations, pools: Sequence[Pool], drawn: list[int], random: Random,
     samples: IntArray,
-) -> None:
+) -> None:  # fmt: skip
     """Fill the samples from all pools by their shares, and count what each has given."""
     count, size = samples.shape
     ends = np.cumsum([pool.share for pool in pools])
