@@ -171,28 +171,22 @@ def _fisheye(size: tuple[int, int], images: list[Observed], K: Array) -> tuple[f
         ValueError: when no such lens fits.
     """
 
-    def lens(numbers: Array) -> Camera:
-        matrix = np.array([[numbers[0], 0.0, numbers[2]], [0.0, numbers[1], numbers[3]], [0, 0, 1]])
-        model = DistortionModel.EQUIDISTANT
-        width, height = size
-        return Camera(width=width, height=height, K=matrix, D=numbers[4:], distortion_model=model)
-
     def cost(numbers: Array, poses: list[tuple[Array, Array]]) -> float:
-        camera, total = lens(numbers), 0.0
+        camera, total = _equidistant(size, numbers), 0.0
         for image, pose in zip(posed, poses, strict=True):
             part = _linear(camera, image, *pose)
             total += np.inf if part is None else float(part[0] @ part[0])
         return total
 
     numbers = np.r_[K[0, 0], K[1, 1], K[0, 2], K[1, 2], np.zeros(4)]
-    first = [(image, _pose(lens(numbers), image)) for image in images]
+    first = [(image, _pose(_equidistant(size, numbers), image)) for image in images]
     posed = [image for image, pose in first if pose is not None]
     poses = [pose for _, pose in first if pose is not None]
     if len(posed) < max(_LEAST_IMAGES, len(images) // 2):
         raise ValueError("no poses by this focal length")
     least, damping = cost(numbers, poses), 1e-3
     for _ in range(_LENS_STEPS):
-        camera, parts = lens(numbers), []
+        camera, parts = _equidistant(size, numbers), []
         of_lens, slope = np.zeros((8, 8)), np.zeros(8)
         for image, pose in zip(posed, poses, strict=True):
             linear = _linear(camera, image, *pose)
@@ -221,7 +215,28 @@ def _fisheye(size: tuple[int, int], images: list[Observed], K: Array) -> tuple[f
         numbers, poses, least, damping = numbers + step, moved, left, max(0.1 * damping, 1e-9)
         if settled:
             break
-    return least * len(images) / len(posed), lens(numbers)
+    return least * len(images) / len(posed), _equidistant(size, numbers)
+
+
+def as_fisheye(lens: Camera, pixels: Array) -> Camera:
+    """The equidistant lens that is most like another one at some pixels (n,2) of the image.
+
+    Raises:
+        ValueError: when no such lens exists.
+    """
+    rays = lens.rays(pixels)
+    numbers = np.r_[lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2], np.zeros(4)]
+    for _ in range(_POSE_STEPS):
+        fisheye = _equidistant(lens.size, numbers)
+        off = (pixels - fisheye.distort(rays)[0]).ravel()
+        numbers = numbers + np.linalg.lstsq(_by_fisheye(numbers, rays), off, rcond=None)[0]
+    return _equidistant(lens.size, numbers)
+
+
+def _equidistant(size: tuple[int, int], numbers: Array) -> Camera:
+    """Of focal lengths, centre and distortion (8)."""
+    K = np.array([[numbers[0], 0.0, numbers[2]], [0.0, numbers[1], numbers[3]], [0.0, 0.0, 1.0]])
+    return Camera(*size, K=K, D=numbers[4:], distortion_model=DistortionModel.EQUIDISTANT)
 
 
 def _by_fisheye(numbers: Array, rays: Array) -> Array:

@@ -207,6 +207,31 @@ def test_the_distortion_model_is_that_of_the_lens(model, deep):
     np.testing.assert_allclose(found.distort(corner)[0], camera.distort(corner)[0], atol=1.0)
 
 
+def test_a_fisheye_that_moves_fast_is_found_where_a_plain_lens_leaves_out_its_rim(monkeypatch):
+    """A first lens, from images that move, is a plain one that fits the middle of the image."""
+    K, k = np.array([[200.0, 0.0, 320.0], [0.0, 200.0, 240.0], [0.0, 0.0, 1.0]]), (-0.012, 0.002)
+
+    def project(motion, t, points):
+        rotations, centres = motion.pose(t)
+        local = np.einsum("nji,nj->ni", rotations, points - centres)
+        angle = np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])
+        radius = angle * (1.0 + k[0] * angle**2 + k[1] * angle**4)
+        unit = local[:, :2] / np.hypot(local[:, 0], local[:, 1])[:, None]
+        return 200.0 * radius[:, None] * unit + K[:2, 2]
+
+    monkeypatch.setattr(projector, "project", project)
+    rng = np.random.default_rng(3)
+    motion, board = projector.Motion.random(rng, 0.2, 0.04), projector.board(8, 6, 0.08, 0.0)
+    board = board - board.mean(axis=0) + [0.0, 0.0, 0.22]
+    frames = projector.record(rng, motion, board, readout=0.02, seconds=1.5, noise=0.1)
+    images = [Observed(round(1e9 * f.stamp), f.points, f.pixels) for f in frames]
+    plain = Camera(projector.WIDTH, projector.HEIGHT, K, D=np.array([-0.33, 0.15, 0, 0, -0.04]))
+    found = calibrate(plain, images, intrinsics=True, other_models=True)
+    assert found.fit.camera.distortion_model == "equidistant"
+    assert found.fit.camera.D[:2] == pytest.approx(k, abs=1e-3)
+    assert abs(found.readout_time - 0.02) < 4.0 * found.deviation
+
+
 def test_stamps_of_an_even_camera_with_missing_images():
     times = np.delete(np.arange(100) / 30.0, [10, 11, 50])
     found = examine(times)
