@@ -309,8 +309,8 @@ def _calibrated(
     intrinsics = args.intrinsics or source.camera is None
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
         found = calibrate(
-            camera, source.images, intrinsics=intrinsics, other_models=source.camera is None,
-            imu=source.imu, own_stamps=source.own_stamps, done=bar.update,
+            camera, source.images, intrinsics=intrinsics, imu=source.imu,
+            own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
     _tell(found, args.rate)
     tell_telemetry(

@@ -199,7 +199,7 @@ def discrepancy(value: float, values: Array, deviations: Array) -> float:
 
 _LEAST_IMAGES = 20
 # Where a plain lens leaves out more than this part of the keypoints, a fisheye is tried, and taken
-# if most of these fit by it: 0.8 of a fisheye's rim (rendered). Of nine real boards before plain
+# if most of these fit by it: 0.88 of a fisheye's rim (rendered). Of nine real boards before plain
 # lenses seven lose up to 1 %, one 6 % (0.02 of which a fisheye fits), and 54 % where a hand bends
 # the sheet (0.44).
 _LEFT_OUT, _MOST_OF_THEM = 0.05, 0.7
@@ -356,7 +356,6 @@ def calibrate(
     images: list[Observed],
     *,
     intrinsics: bool = False,
-    other_models: bool = False,
     imu: ImuRecording | None = None,
     own_stamps: bool = True,
     done: Callable[[], object] = lambda: None,
@@ -367,8 +366,8 @@ def calibrate(
         camera: its lens, and the axis and assumed direction of its scan; not its readout time.
         images: with at least a dozen correspondences each; those that show nothing say when the
             camera took images.
-        intrinsics: the lens is to be found; otherwise it is known to a percent or two.
-        other_models: it may be a fisheye: a first lens, from images that move, does not know.
+        intrinsics: the lens is to be found, also whether it is a fisheye, which a first lens, from
+            images that move, does not tell; otherwise it is known to a percent or two.
         imu: how it goes with the camera is to be found; its turns then help to find all else.
         own_stamps: stamps are the camera's; otherwise those of a file, which are the images' own
             only where they are uneven.
@@ -385,7 +384,7 @@ def calibrate(
     posed, fitted = _fitted(camera, images, examine(taken).interval, intrinsics, done)
     every, fits = sum(len(image.points) for image in images), np.count_nonzero(fitted.inliers)
     plain = fitted.camera.distortion_model == DistortionModel.PLUMB_BOB
-    if other_models and plain and fits < (1.0 - _LEFT_OUT) * every:
+    if intrinsics and plain and fits < (1.0 - _LEFT_OUT) * every:
         seen = within(posed.observations, fitted.state.spline).subset(fitted.inliers)
         with suppress(ValueError):
             alike = as_fisheye(fitted.camera, seen.pixels)
