@@ -119,25 +119,28 @@ class StopSignals(StopRequest):
         self._deadline = time.monotonic() + _PATIENCE
         signal.signal(signal.SIGALRM, lambda _, frame: self._interrupt(frame))
         sys.unraisablehook = self._repeat
+        self._due = True
         self._interrupt(frame)
 
-    @staticmethod
-    def _repeat(lost: "sys.UnraisableHookArgs") -> None:
+    def _repeat(self, lost: "sys.UnraisableHookArgs") -> None:
         """Not reported: an interrupt within a finalizer comes again."""
         if lost.exc_type is KeyboardInterrupt:
+            self._due = True
             signal.setitimer(signal.ITIMER_REAL, _PERIOD)
         else:
             sys.__unraisablehook__(lost)
 
     def _interrupt(self, frame: FrameType | None) -> None:
+        """Raise where nobody handles an exception, twice in a row: an end takes less."""
         handled = _is_handled(sys.exception())
         fragile = not handled and _is_fragile(frame)
-        signal.setitimer(signal.ITIMER_REAL, _PERIOD if fragile else _LOST)
-        if fragile:
-            if time.monotonic() > self._deadline:
-                self._leave(None, self.last_words)
-        elif not handled:
+        raised = self._due and not handled and not fragile
+        self._due = not handled and not raised
+        signal.setitimer(signal.ITIMER_REAL, _PERIOD if self._due else _LOST)
+        if raised:
             raise KeyboardInterrupt
+        if fragile and time.monotonic() > self._deadline:
+            self._leave(None, self.last_words)
 
 
 def _is_fragile(frame: FrameType | None) -> bool:

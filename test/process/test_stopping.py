@@ -59,6 +59,18 @@ def test_no_interrupt_is_lost(tmp_path, number, body):
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
+def test_an_alarm_as_the_clean_up_ends_raises_nothing():
+    body = "os.kill(os.getpid(), 15)"
+    late = """signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])
+        time.sleep(0.6)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGALRM])"""
+    program = PROGRAM.format(folder="", number=15, body=body) + f"        {late}\n"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
+
+
 def test_named_tuples_are_not_interrupted_halfway():
     """Numba has them made, and returns a result beside the exception."""
     pair, calls = namedtuple("pair", ["one"]), []
