@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metres of maps by an IMU: errors by the deviations that are told of them."""
+"""Landmarks of maps, and their metres by an IMU: errors by the deviations that are told of them."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ _STEP = 1e-3  # s, of differences
 def weighing(seed: int, walks: int = 8) -> Iterator[str]:
     """Maps of walks, each with an IMU of its own."""
     yield "walk   scale (%)    +-     gravity (deg)   +-    offset (ms)   +-"
-    scales, tilts = [], []
+    scales, tilts, landmarks = [], [], []
     for k in range(walks):
         rng = np.random.default_rng([seed, k])
-        errors, deviations = _weighed(rng)
+        errors, deviations, of_landmarks = _weighed(rng)
+        landmarks.append(of_landmarks)
         scales.append(errors[0] / deviations[0])
         tilts.append(errors[1])
         yield (
@@ -42,10 +43,14 @@ def weighing(seed: int, walks: int = 8) -> Iterator[str]:
         )
     rms = np.sqrt(np.mean(np.square(scales)))
     yield f"errors of the scale by deviations {rms:.2f} (rms), gravity {np.median(tilts):.3f} deg"
+    inside = (100.0 * np.mean(np.concatenate(landmarks) < q) for q in (1.0, 1.96, 3.0))
+    yield "coordinates of landmarks inside 68, 95, 99.7 %: {:.1f}, {:.1f}, {:.1f}".format(*inside)
 
 
-def _weighed(rng: np.random.Generator) -> tuple[Array, Array]:
-    """Errors of scale (share), gravity (deg), offset (s), and their deviations."""
+def _weighed(rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Errors of scale (share), gravity (deg), offset (s), their deviations, and the landmarks'
+    errors by their own (n,3).
+    """
     camera, walk, points = Camera(), a_walk(rng, 0.5), walls(rng, 1500)
     film = Film(camera, walk, np.arange(0.0, _SECONDS, 1.0 / _IMAGES))
     start = film.near(points, _OFF, rng)
@@ -53,7 +58,11 @@ def _weighed(rng: np.random.Generator) -> tuple[Array, Array]:
     refined = refine(estimators_camera(camera, _READOUT), film.see(points, _NOISE, rng, 80), small)
     offset = float(rng.uniform(-0.02, 0.02))
     found = inertial_metres(refined, _imu(walk, offset, rng))
-    truth = through(refined.points[refined.refined], points[refined.refined])
+    own, true = refined.points[refined.refined], points[refined.refined]
+    truth, variances = (
+        through(own, true),
+        np.einsum("nii->ni", refined.covariances[refined.refined]),
+    )
     down = truth.rotation @ found.metric.gravity
     tilt = np.degrees(np.arctan2(np.hypot(down[0], down[2]), down[1]))
     return (
@@ -61,6 +70,7 @@ def _weighed(rng: np.random.Generator) -> tuple[Array, Array]:
         np.array([
             found.share, np.degrees(found.metric.gravity_deviation), found.mount.delay_deviation,
         ]),
+        np.abs(own - through(true, own)(true)) / np.sqrt(variances),
     )  # fmt: skip
 
 
