@@ -99,8 +99,10 @@ def told_speed(terms: PriorTerms, prior: Prior | None) -> tuple[PriorTerms, Prio
     part = max(possible, default=1.0)
     if part == 1.0:
         return terms, prior
-    scales = prior.scales._replace(speeds=np.zeros(len(SPEEDS)))
-    return terms_at(terms, max(part, _SLOWEST), False), replace(prior, scales=scales)
+    part = max(part, _SLOWEST)
+    odds = np.interp(part * np.array(SPEEDS), SPEEDS, prior.scales.speeds)
+    scales = prior.scales._replace(speeds=odds)
+    return terms_at(terms, part, False), replace(prior, scales=scales)
 
 
 def with_experience(assumed: Assumed, prior: Prior | None, turn: TurnSeen | None) -> Assumed:

@@ -32,6 +32,8 @@ from rs_localizer.estimation.frame_fit import (
 from rs_localizer.estimation.mirror import farthest, is_plane, mirrored
 from rs_localizer.estimation.modes import (
     FAR_LESS_PROBABLE,
+    LEAST_LIKELY,
+    REST_ODDS,
     STEPS,
     TEMPER,
     Inliers,
@@ -41,7 +43,7 @@ from rs_localizer.estimation.modes import (
 )
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, maximum_a_posteriori
-from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.prior import PriorTerms, terms_at
 from rs_localizer.estimation.refine import apply_step, inverted
 from rs_localizer.estimation.residual_tests import standard_scores
 from rs_localizer.estimation.undetected_vibration import Undetected, undetected_vibration
@@ -95,13 +97,6 @@ _HIDDEN_ODDS = math.log(10.0)
 # which the prior knows less than this part: typical speeds are not weighed.
 _CLEARLY_MOVING, _LITTLE_OF_THE_PRIOR = 67.0, 0.05
 _NEAREST = 1e-6  # m; points nearer than this would make any map useless
-
-
-class Asked(NamedTuple):
-    """How a frame with an in-frame turn is fitted."""
-
-    smooth: bool  # a smooth error, too
-    wide: bool  # from a gate that is as wide as shaking moves points
 
 
 class Hyperprior(NamedTuple):
@@ -205,10 +200,10 @@ def _of_points(
             not frame.planar and _evidence_of(of_map) > _evidence_of(frame) - FAR_LESS_PROBABLE
         ):
             frame = of_map
-    shaken = _shaken(frame, Asked(smooth, wide), other) if turns else None
     # A map that is known to be bent may look like motion.
     moving = declared == 0.0 and not frame.planar and _clearly_moving(best, terms, assumed)
     slowest = 0 if assumed.may_rest and not moving else len(SPEEDS) - 1
+    shaken = _shaken(frame, wide, other, slowest) if turns else None
     if frame.smooth or frame.planar or slowest == 0:
         posterior, evidence = _merged(frame, slowest)
     else:
@@ -291,23 +286,21 @@ def _size_of_vibration(hyper: Hyperprior) -> tuple[float, float]:
     return float(np.sum(away)) / precision, precision
 
 
-def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior, float] | None:
-    """The posterior of a camera that turns within the frame, and its evidence; None: no such."""
-    observations, best, terms, threshold, assumed, hyper, _, _, bend = frame
-    first, mean, precision = hyper
+def _shaken(
+    frame: _Frame, wide: bool, other: Array | None, slowest: int
+) -> tuple[Posterior, float] | None:
+    """The posterior of a camera that turns within the frame, and its evidence; None: no such.
+
+    ``wide``: from a gate that is as wide as shaking moves points.
+    """
+    best, threshold, assumed = frame.best, frame.threshold, frame.assumed
     gate, noise = min(max(threshold, GATE * best.noise), WIDEST_GATE * threshold), best.noise
-    if asked.wide:
+    if wide:
         gate = max(2.0 * WIDEST_GATE * threshold, _LARGEST_SHAKE * assumed.focal_length)
         noise = threshold
-    fits: list[FrameFit] = []
-    for state in (best.state,) if other is None else (best.state, other):
-        fit = fit_frame(
-            observations.packed, observations.count, state, terms,
-            threshold, gate, noise, first, mean, precision,
-            True, asked.smooth, bend, STEPS,
-        )  # fmt: skip
-        if fit.finite:
-            fits.append(fit)
+    starts = (best.state,) if other is None else (best.state, other)
+    fits = [_fit(frame, state, frame.terms, gate, noise, frame.hyper.first) for state in starts]
+    fits = [fit for fit in fits if fit.finite]
     if not fits:
         return None
     most = max(np.count_nonzero(fit.inliers) for fit in fits)
@@ -316,14 +309,88 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
     inliers = np.count_nonzero(fit.inliers)
     if inliers < _KEPT * np.count_nonzero(best.inliers):
         return None
-    if asked.wide and fit.freedom < inliers:
+    if wide and fit.freedom < inliers:
         return None  # every second equation went into coefficients: wrong points would, too
+    return _at_any_speed(frame, fit, slowest)
+
+
+def _fit(
+    frame: _Frame, start: Array, terms: PriorTerms, gate: float, noise: float, log_scales: Array
+) -> FrameFit:  # fmt: skip
+    """Motion and in-frame turn near a state (24,) and logarithms (15,) of scales."""
+    fit: FrameFit = fit_frame(
+        frame.observations.packed, frame.observations.count, start, terms, frame.threshold,
+        gate, noise, log_scales, frame.hyper.mean, frame.hyper.precision,
+        True, frame.smooth, frame.bend, STEPS,
+    )  # fmt: skip
+    return fit
+
+
+def _at_any_speed(frame: _Frame, fastest: FrameFit, slowest: int) -> tuple[Posterior, float]:
+    """The mixture of all typical speeds of a camera that turns within the frame; its evidence."""
+    inliers, odds, last = _inliers(frame), _odds_of_speeds(frame), len(SPEEDS) - 1
+    if slowest == last:
+        odds = np.zeros(len(SPEEDS))
+    fits: list[FrameFit] = []
+    evidences = np.full(len(SPEEDS), -math.inf)
+    for speed in range(last, slowest - 1, -1):
+        terms, fit = frame.terms, fastest
+        if fits:
+            terms, start = terms_at(terms, SPEEDS[speed], False), fits[-1].state.copy()
+            if speed == 0:
+                start[12:] = 0.0
+            gate = WIDEST_GATE * frame.threshold
+            fit = _fit(frame, start, terms, gate, fits[-1].noise, fits[-1].log_scales)
+            if not fit.finite:
+                break
+        fits.append(fit)
+        evidences[speed] = odds[speed] + log_evidence(
+            fit.log_determinant, fit.left + fit.prior_cost, terms, inliers, fit.inliers, fit.noise
+        )
+        if evidences[speed] < evidences.max() - FAR_LESS_PROBABLE / TEMPER:
+            break
+    total = float(np.logaddexp.reduce(evidences))
+    if len(fits) == 1:
+        return _of_fit(frame, fastest), total
+    own = evidences[::-1][: len(fits)]
+    probable = np.exp(own - own.max())
+    if len(fits) == len(SPEEDS):
+        probable[-1] *= math.exp(REST_ODDS)
+    possible = np.exp(TEMPER * (own - own.max()))
+    probable, possible = probable / probable.sum(), possible / possible.sum()
+    best = fits[int(probable.argmax())]
+    steps = np.array([
+        np.append(step_between(best.state, fit.state), (fit.turns - best.turns).ravel())
+        for fit in fits
+    ])  # fmt: skip
+    mean = probable @ steps
+    away = steps - mean
+    covariance = np.einsum("k,kij->ij", possible, np.array([fit.covariance for fit in fits]))
+    weights = np.zeros(len(SPEEDS))
+    weights[::-1][: len(fits)] = possible
+    own = evidences - odds
+    posterior = _of_fit(frame, best)
+    posterior = replace(
+        posterior,
+        state=apply_step(best.state, mean[:PARAMETERS]),
+        covariance=covariance + (away.T * possible) @ away,
+        shake=best.turns + mean[PARAMETERS:].reshape(-1, 3),
+        model_error=fastest.smooth,
+        shared=math.sqrt(possible @ np.array([fit.smooth for fit in fits]) ** 2),
+        speeds=weights,
+        scales=posterior.scales._replace(speeds=np.maximum(own - own.max(), LEAST_LIKELY)),
+    )
+    return posterior, total - math.log(len(SPEEDS))
+
+
+def _of_fit(frame: _Frame, fit: FrameFit) -> Posterior:
+    """The posterior of one fit with an in-frame turn."""
+    _, mean, precision = frame.hyper
     own = 2.0 * fit.decided  # precision of the frame alone
     total = fit.log_scales * (own + precision)
     said = np.where(own > 0.1, (total - precision * mean) / np.maximum(own, 0.1), 0.0)
-    scales = Scales.nothing()._replace(means=said, precisions=np.where(own > 0.1, own, 0.0))
     fitted = replace(
-        best,
+        frame.best,
         state=fit.state,
         covariance=fit.covariance,
         noise=fit.noise,
@@ -333,18 +400,18 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
         shake=fit.turns,
         model_error=fit.smooth,
         shared=fit.smooth,
-        bend=bend,
+        bend=frame.bend,
         agreement=fit.agreement,
-        scales=scales,
+        scales=Scales.nothing()._replace(means=said, precisions=np.where(own > 0.1, own, 0.0)),
         near_outliers=0,
     )
-    near = _near_outliers(fitted, threshold)
-    fitted = replace(fitted, near_outliers=near)
-    evidence = log_evidence(
-        fit.log_determinant, fit.left + fit.prior_cost, terms, _inliers(frame), fit.inliers,
-        fit.noise,
-    )  # fmt: skip
-    return fitted, evidence
+    return replace(fitted, near_outliers=_near_outliers(fitted, frame.threshold))
+
+
+def _odds_of_speeds(frame: _Frame) -> Array:
+    """Logarithms (5,) of the odds of the typical speeds before this frame."""
+    odds: Array = frame.assumed.scales.speeds + frame.assumed.of_rest * _RESTS
+    return odds
 
 
 def _clearly_moving(best: Posterior, terms: PriorTerms, assumed: Assumed) -> bool:
@@ -365,8 +432,7 @@ def _merged(frame: _Frame, slowest: int) -> tuple[Posterior, float]:
     ``slowest``: index of the first typical speed that is weighed.
     """
     best, assumed = frame.best, frame.assumed
-    odds = assumed.scales.speeds + assumed.of_rest * _RESTS
-    by_turn = np.zeros(len(SPEEDS))
+    odds, by_turn = _odds_of_speeds(frame), np.zeros(len(SPEEDS))
     if assumed.turn is not None:
         by_turn = np.array([assumed.turn.evidence(speed) for speed in SPEEDS])
     found = mixture_of(
@@ -436,7 +502,9 @@ def _either(
         arched=None,
         shake=(1.0 - probable) * shaken.shake,
         shared=shared,
-        scales=shaken.scales._replace(speeds=steady.scales.speeds),
+        scales=shaken.scales._replace(
+            speeds=weight * steady.scales.speeds + (1.0 - weight) * shaken.scales.speeds
+        ),
     )
 
 

@@ -56,7 +56,7 @@ STEPS = 25
 # Logarithm of the odds of rest against each typical speed before any frame: errors of maps that no
 # polynomial of the image follows look like motion, and a hundred to one is what surveyed tags ask
 # for (benchmarks.honesty tags).
-_REST_ODDS = math.log(100.0)
+REST_ODDS = math.log(100.0)
 # Logarithm of the odds of a typical speed beside a better one, beyond which no faster one is tried.
 FAR_LESS_PROBABLE = 9.0
 # The pose is the mean of the posterior. Its region is that of the posterior with probabilities to
@@ -69,7 +69,7 @@ _SAME = 1e-2
 # Part of the squared errors that is left at least: of a camera that shakes, noise is a tenth.
 _MOST_BETTER = 0.01
 # No frame says more than this against a typical speed.
-_LEAST_LIKELY = -10.0
+LEAST_LIKELY = -10.0
 # Gate from which a smooth error is fitted, in thresholds: what it will explain stands outside of
 # the widest one, and would stay there.
 _FIRST_GATE = 2.0 * WIDEST_GATE
@@ -281,7 +281,7 @@ def mixture_of(
     for k in range(count):
         speed = modes.speeds[k]
         if SPEEDS[speed] == 0.0:
-            probable[k] += _REST_ODDS
+            probable[k] += REST_ODDS
         own = evidences[k] - odds[speed]
         log_likelihoods[speed] = _log_sum(log_likelihoods[speed], own)
         total = _log_sum(total, evidences[k])
@@ -303,7 +303,7 @@ def mixture_of(
     shared = 0.0
     for k in range(count):
         shared += possible[k] * modes.smooths[k] ** 2
-    log_likelihoods = np.maximum(log_likelihoods - np.max(log_likelihoods), _LEAST_LIKELY)
+    log_likelihoods = np.maximum(log_likelihoods - np.max(log_likelihoods), LEAST_LIKELY)
     return Mixture(
         state, covariance, arched, total, weights, log_likelihoods, modes.smooths[count - 1],
         math.sqrt(shared), evidences, modes.costs, steps,
