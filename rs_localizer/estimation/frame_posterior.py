@@ -14,20 +14,17 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 from scipy.special import ndtri
 
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.scales import SCALES, SPEEDS, Scales
 from rs_localizer.core.shake import CYCLES, TYPICAL_SIZES
-from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import LINEAR, MOTION_PARAMETERS, PARAMETERS, VELOCITIES, step_between
+from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, step_between
 from rs_localizer.estimation.assumptions import Assumed
 from rs_localizer.estimation.frame_fit import (
-    DEGREE_SIZES,
     FrameFit,
+    bend_of,
     fit_frame,
-    score_products,
 )
 from rs_localizer.estimation.mirror import farthest, is_plane, mirrored
 from rs_localizer.estimation.modes import (
@@ -46,7 +43,7 @@ from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, maxi
 from rs_localizer.estimation.prior import PriorTerms, terms_at
 from rs_localizer.estimation.refine import apply_step, inverted
 from rs_localizer.estimation.residual_tests import standard_scores
-from rs_localizer.estimation.undetected_vibration import Undetected, undetected_vibration
+from rs_localizer.estimation.undetected_vibration import score_statistics
 
 # An in-frame turn is fitted where chance explains as much in three frames of ten, because one that
 # hides in the noise spoils regions and a fit from near by is cheap; a smooth error in one of
@@ -71,12 +68,6 @@ _SMOOTH_SCALE, _PRECISION, _SMOOTH_PRECISION = math.log(0.03), 1.0 / 2.3**2, 1.0
 # (benchmarks.real) are bent 0.3 to 9 times as much as 0.2 mm per 10 cm, 1.0 of the logarithm. A
 # motion that makes a bent board look flat is less probable than one before a bent board.
 _DECLARED_PRECISION = 1.0
-# Paper bends in finer waves than lenses: to a cubic a curled edge looks like fast motion. A fourth
-# degree adds 1.7 to the log-evidence of a frame in the mean of eleven of these boards, 15 to 92
-# before two bent ones; with higher degrees that are larger (0.25, 0.5), flat boards lose.
-_BENT_SIZES = (*DEGREE_SIZES, 0.125)
-# Combinations of functions that move no point by this part of the scale are left out.
-_LEAST_BEND = 0.003
 # Scales from which a fit starts: those that it does not need shrink fast, those that it needs grow
 # slowly.
 _FIRST_TURN, _FIRST_SMOOTH = math.log(5e-3), math.log(0.3)
@@ -145,7 +136,7 @@ def frame_posterior(
         if bend.shape[1]:
             depth = max(observations.median_depth(part.state, inliers), _NEAREST)
             size = depth / assumed.focal_length
-            bend = _bend(observations.points, inliers, part.declared, size)
+            bend = bend_of(observations.points, inliers, part.declared, size)
         return replace(part, squared_errors=errors, inliers=inliers, bend=bend)
     return _of_points(observations, start, terms, threshold, assumed, one_lens)
 
@@ -169,7 +160,7 @@ def _of_points(
     depth = max(observations.median_depth(best.state, best.inliers), _NEAREST)
     declared = assumed.map_deviation * assumed.focal_length / depth  # px
     hyper = _hyperprior(assumed, declared)
-    explained, coefficients, agreement, vibration = _look(
+    explained, coefficients, agreement, vibration = score_statistics(
         observations.packed, observations.count, best.state,
         best.inliers, terms, best.noise, best.freedom, *_size_of_vibration(hyper),
         assumed.rolling,
@@ -192,7 +183,7 @@ def _of_points(
         is_plane(observations.points, best.inliers), np.zeros((len(observations), 0)),
     )  # fmt: skip
     if smooth:
-        bend = _bend(observations.points, best.inliers, declared, depth / assumed.focal_length)
+        bend = bend_of(observations.points, best.inliers, declared, depth / assumed.focal_length)
         of_map = frame._replace(bend=bend)
         # Before a plane both explain alike. In depth a bent map leaves more open: it is left out
         # only where it is far less probable.
@@ -230,28 +221,6 @@ def _near_outliers(best: Posterior, threshold: float) -> int:
     within = best.squared_errors < (_NEAR_GATE * threshold) ** 2
     count = int(np.count_nonzero(within & ~best.inliers))
     return count if count >= max(_NEAR_OUTLIERS, _NEAR_PART * inliers) else 0
-
-
-def _bend(points: Array, inliers: BoolArray, declared: float, size: float) -> Array:
-    """Functions (n,b) of the points' places; ``size``: m, their root mean square, all together."""
-    sizes = _BENT_SIZES if declared > 0.0 else DEGREE_SIZES
-    chosen = points[inliers]
-    low, high = chosen.min(axis=0), chosen.max(axis=0)
-    places = (points - 0.5 * (low + high)) / max(0.5 * float(np.max(high - low)), _NEAREST)
-    x, y, z = (legvander(places[:, k], len(sizes) - 1) for k in range(3))
-    bend = np.column_stack([
-        of_degree * math.sqrt((2 * i + 1) * (2 * j + 1) * (2 * (degree - i - j) + 1))
-        * x[:, i] * y[:, j] * z[:, degree - i - j]
-        for degree, of_degree in enumerate(sizes)
-        for i in range(degree + 1)
-        for j in range(degree + 1 - i)
-    ])  # fmt: skip
-    # On a plane they repeat each other.
-    values, axes = np.linalg.eigh(bend[inliers].T @ bend[inliers])
-    total = np.sum(values)
-    size *= math.sqrt(np.count_nonzero(inliers) / total)
-    combined: Array = size * bend @ axes[:, values > _LEAST_BEND**2 * total]
-    return combined
 
 
 def _evidence_of(frame: _Frame) -> float:
@@ -458,6 +427,10 @@ def _merged(frame: _Frame, slowest: int) -> tuple[Posterior, float]:
             else None
         ),
     )
+    if frame.smooth:
+        posterior = replace(posterior, inliers=found.chosen, squared_errors=found.squared_errors)
+        near = _near_outliers(posterior, frame.threshold)
+        posterior = replace(posterior, near_outliers=near)
     return posterior, found.evidence - math.log(len(SPEEDS))
 
 
@@ -506,60 +479,3 @@ def _either(
             speeds=weight * steady.scales.speeds + (1.0 - weight) * shaken.scales.speeds
         ),
     )
-
-
-@kernel
-def _look(
-    data: Array, count: int, state: Array, inliers: BoolArray, prior: PriorTerms,
-    noise: float, freedom: float, size: float, precision: float, turns: bool,
-) -> tuple[Array, Array, float, Undetected]:  # fmt: skip
-    """What each frequency of an in-frame turn, and a smooth error, would explain of the errors.
-
-    Score statistics at the best motion without them, chi-squared where there is nothing (Rao 1948).
-
-    Returns:
-        (15,) of the 14 frequencies and the smooth error; their degrees of freedom (15,): 6, and 20
-        or, where the motion mimics some of its columns, fewer; how much neighbouring rows agree;
-        and what vibration may do, of ``size`` (logarithm) times the ordinary one, known to this
-        ``precision``.
-    """
-    statistic, counts = np.zeros(SCALES), np.full(SCALES, 6.0)
-    variance, frequencies = noise * noise, len(CYCLES)
-    products, agreement = score_products(data, count, state, inliers, prior, variance, turns)
-    own, crossed, along, within, across, beside, every, moving, pushed, inverse = products
-    vibration = Undetected(-np.inf, np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)))
-    if turns:
-        for f in range(frequencies):
-            _beside_motion(own[f], crossed[f], inverse)
-            statistic[f] = _explained(inverted(own[f]), along[f]) / variance
-        pull, _ = _beside_motion(every, moving, inverse)
-        vibration = undetected_vibration(every, pull, pushed, variance, freedom, size, precision)
-    _, ridge = _beside_motion(within, across, inverse)
-    left = inverted(within)
-    statistic[frequencies] = _explained(left, beside) / variance
-    counts[frequencies] = max(len(ridge) - np.sum(np.diag(left) * ridge), 1.0)
-    return statistic, counts, agreement, vibration
-
-
-@kernel
-def _beside_motion(own: Array, crossed: Array, inverse: Array) -> tuple[Array, Array]:
-    """Take the motion out of products of columns, ``N - X M^-1 X^T``; by how much they move it, and
-    what stands on the diagonal so that columns that the motion mimics wholly explain nothing.
-    """
-    pulled, ridge = crossed @ inverse, 1e-6 * np.diag(own) + 1e-12
-    for i in range(len(own)):
-        own[i, i] += ridge[i]
-        for j in range(i + 1):
-            taken = 0.0
-            for k in range(PARAMETERS):
-                taken += pulled[i, k] * crossed[j, k]
-            own[i, j] -= taken
-            own[j, i] = own[i, j]
-    return pulled, ridge
-
-
-@kernel
-def _explained(inverse: Array, along: Array) -> float:
-    """Squares that columns explain beside the motion."""
-    explained = float(np.sum(along * (inverse @ along)))
-    return explained if np.isfinite(explained) else 0.0

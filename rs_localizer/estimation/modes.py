@@ -206,6 +206,7 @@ class Mode(NamedTuple):
     cost: float  # noise variances
     smooth: float  # px, scale of the smooth error
     held: _Held
+    squared_errors: Array  # (n,) px^2, beside the smooth error; without one, none
 
 
 class _Modes(NamedTuple):
@@ -215,6 +216,8 @@ class _Modes(NamedTuple):
     costs: Array  # (k,)
     speeds: IntArray  # (k,) indices of SPEEDS
     smooths: Array  # (k,) px
+    chosen: BoolArray  # (k,n) inliers
+    squared_errors: Array  # (k,n) px^2
 
 
 class Mixture(NamedTuple):
@@ -231,6 +234,9 @@ class Mixture(NamedTuple):
     evidences: Array  # (k,) of the modes
     costs: Array  # (k,) noise variances
     steps: Array  # (k,18) to them from the most probable one
+    # Of the most probable one, beside the smooth error: where that is fitted, others are inliers
+    chosen: BoolArray  # (n,)
+    squared_errors: Array  # (n,) px^2
 
 
 class Inliers(NamedTuple):
@@ -288,7 +294,8 @@ def mixture_of(
     if total == -np.inf:
         return Mixture(
             start, modes.covariances[0], modes.covariances[0], total, weights, weights, 0.0, 0.0,
-            evidences, modes.costs, np.zeros((count, PARAMETERS)),
+            evidences, modes.costs, np.zeros((count, PARAMETERS)), inliers.chosen,
+            modes.squared_errors[0],
         )  # fmt: skip
     first = int(np.argmax(probable))
     probable = np.exp(probable - probable[first])
@@ -306,7 +313,8 @@ def mixture_of(
     log_likelihoods = np.maximum(log_likelihoods - np.max(log_likelihoods), LEAST_LIKELY)
     return Mixture(
         state, covariance, arched, total, weights, log_likelihoods, modes.smooths[count - 1],
-        math.sqrt(shared), evidences, modes.costs, steps,
+        math.sqrt(shared), evidences, modes.costs, steps, modes.chosen[first],
+        modes.squared_errors[first],
     )  # fmt: skip
 
 
@@ -329,9 +337,11 @@ def _modes(
     benchmarks.frames planes).
     """
     data, most = weighted(inliers.data, inliers.chosen), 2 * len(SPEEDS)
+    points = len(inliers.chosen)
     modes = _Modes(
         np.empty((most, STATE_SIZE)), np.empty((most, PARAMETERS, PARAMETERS)), np.empty(most),
         np.empty(most), np.empty(most, np.int64), np.empty(most),
+        np.empty((most, points), np.bool_), np.zeros((most, points)),
     )  # fmt: skip
     near, count, best = start.copy(), 0, -np.inf
     if slowest == 0:
@@ -359,6 +369,7 @@ def _modes(
     return _Modes(
         modes.states[:count], modes.covariances[:count], modes.evidences[:count],
         modes.costs[:count], modes.speeds[:count], modes.smooths[:count],
+        modes.chosen[:count], modes.squared_errors[:count],
     )  # fmt: skip
 
 
@@ -369,6 +380,9 @@ def _keep(modes: _Modes, count: int, speed: int, mode: Mode) -> int:
     modes.covariances[count] = mode.covariance
     modes.evidences[count], modes.costs[count] = mode.evidence, mode.cost
     modes.speeds[count], modes.smooths[count] = speed, mode.smooth
+    modes.chosen[count] = mode.held.chosen
+    if len(mode.squared_errors):
+        modes.squared_errors[count] = mode.squared_errors
     return count + 1
 
 
@@ -400,6 +414,7 @@ def _mode(
         if converged:
             break
     covariance, cost, scale = variance * inverted(information), cost / variance, 0.0
+    beside = np.zeros(0)
     held = _Held(
         inliers.chosen, noise, inliers.cost, inliers.freedom, np.zeros((0, 2, 0)),
         np.zeros((0, PARAMETERS)),
@@ -421,9 +436,11 @@ def _mode(
                 fit.log_determinant, cost, terms, inliers, fit.inliers, fit.noise
             )
             held = _Held(fit.inliers, fit.noise, np.nan, fit.freedom, held.field, held.pulls)
+            beside = fit.squared_errors
     if not (np.isfinite(evidence) and np.all(np.isfinite(covariance))):
-        return Mode(start, np.zeros((PARAMETERS, PARAMETERS)), -np.inf, np.inf, 0.0, held)
-    return Mode(state, covariance, evidence + odds, cost, scale, held)
+        nothing = np.zeros((PARAMETERS, PARAMETERS))
+        return Mode(start, nothing, -np.inf, np.inf, 0.0, held, beside)
+    return Mode(state, covariance, evidence + odds, cost, scale, held, beside)
 
 
 @inlined
@@ -595,7 +612,9 @@ def _over_leans(
     )  # fmt: skip
     area = np.prod(steps / (_PIN * steps[used - 1] * math.sqrt(2.0 * math.pi)))
     evidence = mode.evidence - whole + best + math.log(area * total)
-    return Mode(state, covariance, evidence, mode.cost, mode.smooth, held), True
+    return Mode(
+        state, covariance, evidence, mode.cost, mode.smooth, held, mode.squared_errors
+    ), True
 
 
 @inlined

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -281,17 +282,18 @@ def search(
     if start.found:
         inliers = observations.within(start.state, hypotheses.final_scale)
     drawn, blocks = [start.samples // max(len(usable), 1)] * len(usable), 0
+    ends, mounts = list(accumulate(pool.share for pool in usable)), observations.mounts
+    rotations = [mounts.axes @ rotation for rotation in draws.rotations]
     no_fit, best_gain = count * hypotheses.score_scale**2, 0.0
     while usable and (left := draws.most - sum(drawn)) > 0:
         samples = np.empty((min(hypotheses.block, left), size), dtype=np.int64)
-        _draw(observations, usable, drawn, draws.random, samples)
+        _draw(observations, usable, ends, drawn, draws.random, samples)
         models = np.empty((hypotheses.solutions, MODEL_SIZE, len(samples)))
         blocks += 1
-        rotation = draws.rotations[blocks % len(draws.rotations)]
-        camera, mounts = observations.camera[samples[:, 0]], observations.mounts
+        camera = observations.camera[samples[:, 0]]
         hypotheses.solve(
             observations.points, observations.rays, observations.tau, samples,
-            mounts.axes[camera] @ rotation, hypotheses.iterations, models,
+            rotations[blocks % len(rotations)][camera], hypotheses.iterations, models,
         )  # fmt: skip
         into_rig(models, camera, mounts)
         states, costs = best_models(
@@ -312,12 +314,14 @@ def search(
 
 
 def _draw(
-    observations: Observations, pools: Sequence[Pool], drawn: list[int], random: Random,
-    samples: IntArray,
+    observations: Observations, pools: Sequence[Pool], ends: Sequence[float], drawn: list[int],
+    random: Random, samples: IntArray,
 ) -> None:  # fmt: skip
-    """Fill the samples from all pools by their shares, and count what each has given."""
+    """Fill the samples from all pools by their shares, and count what each has given.
+
+    ``ends``: the sums of the shares so far.
+    """
     count, size = samples.shape
-    ends = np.cumsum([pool.share for pool in pools])
     first = 0
     for index, pool in enumerate(pools):
         part = samples[first : count if pool is pools[-1] else int(ends[index] * count / ends[-1])]

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What vibration that hides in the noise does to a motion: its evidence, and how far it moves it.
+"""What is not fitted: what it would explain, and what vibration that hides does to a motion.
 
 A fit with scales takes the most probable ones, and where a frame hardly shows that it shakes these
 are none at all. Here one factor of all scales is integrated over its hyperprior instead: given the
@@ -20,9 +20,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.scales import SCALES
+from rs_localizer.core.shake import CYCLES
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import MOTION_PARAMETERS
+from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
+from rs_localizer.estimation.frame_fit import score_products
+from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.refine import inverted
 
 # Where a hyperprior is sampled, in its deviations: three in a decade of scales.
 _NODES = np.linspace(-2.25, 2.25, 7)
@@ -93,3 +98,60 @@ def undetected_vibration(
                 best = scale * spread[i, moved] * spread[j, moved]
                 moments[i, j] += probable * scale * (spread[i, j] + best)
     return Undetected(most + math.log(total), moments / total)
+
+
+@kernel
+def score_statistics(
+    data: Array, count: int, state: Array, inliers: BoolArray, prior: PriorTerms,
+    noise: float, freedom: float, size: float, precision: float, turns: bool,
+) -> tuple[Array, Array, float, Undetected]:  # fmt: skip
+    """What each frequency of an in-frame turn, and a smooth error, would explain of the errors.
+
+    Score statistics at the best motion without them, chi-squared where there is nothing (Rao 1948).
+
+    Returns:
+        (15,) of the 14 frequencies and the smooth error; their degrees of freedom (15,): 6, and 20
+        or, where the motion mimics some of its columns, fewer; how much neighbouring rows agree;
+        and what vibration may do, of ``size`` (logarithm) times the ordinary one, known to this
+        ``precision``.
+    """
+    statistic, counts = np.zeros(SCALES), np.full(SCALES, 6.0)
+    variance, frequencies = noise * noise, len(CYCLES)
+    products, agreement = score_products(data, count, state, inliers, prior, variance, turns)
+    own, crossed, along, within, across, beside, every, moving, pushed, inverse = products
+    vibration = Undetected(-np.inf, np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)))
+    if turns:
+        for f in range(frequencies):
+            _beside_motion(own[f], crossed[f], inverse)
+            statistic[f] = _explained(inverted(own[f]), along[f]) / variance
+        pull, _ = _beside_motion(every, moving, inverse)
+        vibration = undetected_vibration(every, pull, pushed, variance, freedom, size, precision)
+    _, ridge = _beside_motion(within, across, inverse)
+    left = inverted(within)
+    statistic[frequencies] = _explained(left, beside) / variance
+    counts[frequencies] = max(len(ridge) - np.sum(np.diag(left) * ridge), 1.0)
+    return statistic, counts, agreement, vibration
+
+
+@kernel
+def _beside_motion(own: Array, crossed: Array, inverse: Array) -> tuple[Array, Array]:
+    """Take the motion out of products of columns, ``N - X M^-1 X^T``; by how much they move it, and
+    what stands on the diagonal so that columns that the motion mimics wholly explain nothing.
+    """
+    pulled, ridge = crossed @ inverse, 1e-6 * np.diag(own) + 1e-12
+    for i in range(len(own)):
+        own[i, i] += ridge[i]
+        for j in range(i + 1):
+            taken = 0.0
+            for k in range(PARAMETERS):
+                taken += pulled[i, k] * crossed[j, k]
+            own[i, j] -= taken
+            own[j, i] = own[i, j]
+    return pulled, ridge
+
+
+@kernel
+def _explained(inverse: Array, along: Array) -> float:
+    """Squares that columns explain beside the motion."""
+    explained = float(np.sum(along * (inverse @ along)))
+    return explained if np.isfinite(explained) else 0.0

@@ -20,9 +20,10 @@ from rs_localizer.core.scales import SCALES, SPEEDS, Scales
 from rs_localizer.core.shake import CYCLES, shake_at
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.acceptance import refusal
-from rs_localizer.estimation.frame_posterior import _look, frame_posterior
+from rs_localizer.estimation.frame_posterior import frame_posterior
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import held_terms
+from rs_localizer.estimation.undetected_vibration import score_statistics
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 
@@ -340,7 +341,7 @@ def test_scores_are_chi_squared_where_there_is_nothing():
     for seed in range(200):
         observations, state = frame(seed, 0.02, 0.5, 60)
         best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
-        statistic, *_ = _look(
+        statistic, *_ = score_statistics(
             observations.packed, len(observations), best.state,
             best.inliers, PRIOR, 0.5, best.freedom, 0.0, 1.0, True,
         )  # fmt: skip
@@ -357,7 +358,7 @@ def test_scores_tell_the_frequency():
     for cycles in (2.0, 5.5):
         observations, state = shaken(1, cycles, 0.3 * SWING, 0.2)
         best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
-        statistic, *_ = _look(
+        statistic, *_ = score_statistics(
             observations.packed, len(observations), best.state,
             best.inliers, PRIOR, best.noise, best.freedom, 0.0, 1.0, True,
         )  # fmt: skip
