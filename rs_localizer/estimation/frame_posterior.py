@@ -427,10 +427,10 @@ def _merged(frame: _Frame, slowest: int) -> tuple[Posterior, float]:
             else None
         ),
     )
-    if frame.smooth:
-        posterior = replace(posterior, inliers=found.chosen, squared_errors=found.squared_errors)
-        near = _near_outliers(posterior, frame.threshold)
-        posterior = replace(posterior, near_outliers=near)
+    if best.declared > 0.0:  # points that a known bend moves out of the gate are no outliers
+        beside = replace(best, inliers=found.chosen, squared_errors=found.squared_errors)
+        near = _near_outliers(beside, frame.threshold)
+        posterior = replace(posterior, inliers=found.chosen, near_outliers=near)
     return posterior, found.evidence - math.log(len(SPEEDS))
 
 
