@@ -301,15 +301,17 @@ def _fit(
 
 def _at_any_speed(frame: _Frame, fastest: FrameFit, slowest: int) -> tuple[Posterior, float]:
     """The mixture of all typical speeds of a camera that turns within the frame; its evidence."""
-    inliers, odds, last = _inliers(frame), _odds_of_speeds(frame), len(SPEEDS) - 1
-    if slowest == last:
-        odds = np.zeros(len(SPEEDS))
+    inliers, (odds, by_turn), last = _inliers(frame), _odds_of_speeds(frame), len(SPEEDS) - 1
+    weighed = slowest < last or frame.smooth or frame.planar  # as those without a turn
+    if not weighed:
+        odds, by_turn = _NOTHING, _NOTHING
     fits: list[FrameFit] = []
     evidences = np.full(len(SPEEDS), -math.inf)
     for speed in range(last, slowest - 1, -1):
         terms, fit = frame.terms, fastest
         if fits:
-            terms, start = terms_at(terms, SPEEDS[speed], False), fits[-1].state.copy()
+            start, turn_known = fits[-1].state.copy(), frame.assumed.turn is not None
+            terms = terms_at(terms, SPEEDS[speed], turn_known)
             if speed == 0:
                 start[12:] = 0.0
             gate = WIDEST_GATE * frame.threshold
@@ -318,12 +320,23 @@ def _at_any_speed(frame: _Frame, fastest: FrameFit, slowest: int) -> tuple[Poste
             if not fit.finite:
                 break
         fits.append(fit)
-        evidences[speed] = odds[speed] + log_evidence(
-            fit.log_determinant, fit.left + fit.prior_cost, terms, inliers, fit.inliers, fit.noise
+        evidences[speed] = (
+            odds[speed]
+            + by_turn[speed]
+            + log_evidence(
+                fit.log_determinant,
+                fit.left + fit.prior_cost,
+                terms,
+                inliers,
+                fit.inliers,
+                fit.noise,
+            )
         )
         if evidences[speed] < evidences.max() - FAR_LESS_PROBABLE / TEMPER:
             break
     total = float(np.logaddexp.reduce(evidences))
+    if weighed:
+        total -= math.log(len(SPEEDS))
     if len(fits) == 1:
         return _of_fit(frame, fastest), total
     own = evidences[::-1][: len(fits)]
@@ -354,7 +367,7 @@ def _at_any_speed(frame: _Frame, fastest: FrameFit, slowest: int) -> tuple[Poste
         speeds=weights,
         scales=posterior.scales._replace(speeds=np.maximum(own - own.max(), LEAST_LIKELY)),
     )
-    return posterior, total - math.log(len(SPEEDS))
+    return posterior, total
 
 
 def _of_fit(frame: _Frame, fit: FrameFit) -> Posterior:
@@ -382,10 +395,15 @@ def _of_fit(frame: _Frame, fit: FrameFit) -> Posterior:
     return replace(fitted, near_outliers=_near_outliers(fitted, frame.threshold))
 
 
-def _odds_of_speeds(frame: _Frame) -> Array:
-    """Logarithms (5,) of the odds of the typical speeds before this frame."""
-    odds: Array = frame.assumed.scales.speeds + frame.assumed.of_rest * _RESTS
-    return odds
+def _odds_of_speeds(frame: _Frame) -> tuple[Array, Array]:
+    """Logarithms of the odds (5,) of the typical speeds before this frame, and of their likelihood
+    (5,) by a gyroscope.
+    """
+    assumed = frame.assumed
+    by_turn = _NOTHING
+    if assumed.turn is not None:
+        by_turn = np.array([assumed.turn.evidence(speed) for speed in SPEEDS])
+    return assumed.scales.speeds + assumed.of_rest * _RESTS, by_turn
 
 
 def _clearly_moving(best: Posterior, terms: PriorTerms, assumed: Assumed) -> bool:
@@ -406,9 +424,7 @@ def _merged(frame: _Frame, slowest: int) -> tuple[Posterior, float]:
     ``slowest``: index of the first typical speed that is weighed.
     """
     best, assumed = frame.best, frame.assumed
-    odds, by_turn = _odds_of_speeds(frame), np.zeros(len(SPEEDS))
-    if assumed.turn is not None:
-        by_turn = np.array([assumed.turn.evidence(speed) for speed in SPEEDS])
+    odds, by_turn = _odds_of_speeds(frame)
     found = mixture_of(
         _inliers(frame), best.state, frame.terms, odds, by_turn, slowest,
         assumed.turn is not None, frame.planar, _smooth(frame),
