@@ -71,9 +71,9 @@ _DECLARED_PRECISION = 1.0
 # Scales from which a fit starts: those that it does not need shrink fast, those that it needs grow
 # slowly.
 _FIRST_TURN, _FIRST_SMOOTH = math.log(5e-3), math.log(0.3)
-# Steps from the optimum of the next faster speed. With all that a fit needs no figure of
-# benchmarks.frames (sine, bands, noise, hand) changes but times, by 1.7 at 95 %.
-_WARM_STEPS = 5
+# Steps from the next faster speed. More change nothing but times (benchmarks.frames); with five,
+# curled sheets jitter (benchmarks.real, single `sj`: 7.7 times as much as P3P; 12 and 25: 2.5).
+_WARM_STEPS = 12
 # A mode that loses more inliers than this part leaves is another group of points.
 _KEPT = 0.9
 # Probability that does not count.
@@ -377,30 +377,18 @@ def _of_fit(frame: _Frame, fit: FrameFit) -> Posterior:
     total = fit.log_scales * (own + precision)
     said = np.where(own > 0.1, (total - precision * mean) / np.maximum(own, 0.1), 0.0)
     fitted = replace(
-        frame.best,
-        state=fit.state,
-        covariance=fit.covariance,
-        noise=fit.noise,
-        freedom=fit.freedom,
-        inliers=fit.inliers,
-        squared_errors=fit.squared_errors,
-        shake=fit.turns,
-        model_error=fit.smooth,
-        shared=fit.smooth,
-        bend=frame.bend,
-        agreement=fit.agreement,
+        frame.best, state=fit.state, covariance=fit.covariance, noise=fit.noise,
+        freedom=fit.freedom, inliers=fit.inliers, squared_errors=fit.squared_errors,
+        shake=fit.turns, model_error=fit.smooth, shared=fit.smooth, bend=frame.bend,
+        agreement=fit.agreement, near_outliers=0,
         scales=Scales.nothing()._replace(means=said, precisions=np.where(own > 0.1, own, 0.0)),
-        near_outliers=0,
-    )
+    )  # fmt: skip
     return replace(fitted, near_outliers=_near_outliers(fitted, frame.threshold))
 
 
 def _odds_of_speeds(frame: _Frame) -> tuple[Array, Array]:
-    """Logarithms of the odds (5,) of the typical speeds before this frame, and of their likelihood
-    (5,) by a gyroscope.
-    """
-    assumed = frame.assumed
-    by_turn = _NOTHING
+    """Logarithms of the odds (5,) of the typical speeds, and of the likelihood by a gyroscope."""
+    assumed, by_turn = frame.assumed, _NOTHING
     if assumed.turn is not None:
         by_turn = np.array([assumed.turn.evidence(speed) for speed in SPEEDS])
     return assumed.scales.speeds + assumed.of_rest * _RESTS, by_turn
