@@ -115,6 +115,16 @@ class _Frame(NamedTuple):
     bend: Array  # (n,b) of a smooth error of the map (see frame_fit); (n,0): of the image
 
 
+class _Start(NamedTuple):
+    """Where a fit with an in-frame turn starts."""
+
+    state: Array  # (24,)
+    gate: float  # px
+    noise: float  # px
+    log_scales: Array  # (15,)
+    steps: int
+
+
 def frame_posterior(
     observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed,
     one_lens: bool = True,
@@ -271,8 +281,8 @@ def _shaken(
         gate = max(2.0 * WIDEST_GATE * threshold, _LARGEST_SHAKE * assumed.focal_length)
         noise = threshold
     starts = (best.state,) if other is None else (best.state, other)
-    fits = [_fit(frame, state, frame.terms, gate, noise, frame.hyper.first) for state in starts]
-    fits = [fit for fit in fits if fit.finite]
+    begins = [_Start(state, gate, noise, frame.hyper.first, STEPS) for state in starts]
+    fits = [fit for begin in begins if (fit := _fit(frame, frame.terms, begin)).finite]
     if not fits:
         return None
     most = max(np.count_nonzero(fit.inliers) for fit in fits)
@@ -286,17 +296,13 @@ def _shaken(
     return _at_any_speed(frame, fit, slowest)
 
 
-def _fit(
-    frame: _Frame, start: Array, terms: PriorTerms, gate: float, noise: float, log_scales: Array,
-    steps: int = STEPS,
-) -> FrameFit:  # fmt: skip
-    """Motion and in-frame turn near a state (24,) and logarithms (15,) of scales."""
-    fit: FrameFit = fit_frame(
-        frame.observations.packed, frame.observations.count, start, terms, frame.threshold,
-        gate, noise, log_scales, frame.hyper.mean, frame.hyper.precision,
-        True, frame.smooth, frame.bend, steps,
+def _fit(frame: _Frame, terms: PriorTerms, start: _Start) -> FrameFit:
+    """Motion and in-frame turn."""
+    return fit_frame(
+        frame.observations.packed, frame.observations.count, start.state, terms, frame.threshold,
+        start.gate, start.noise, start.log_scales, frame.hyper.mean, frame.hyper.precision,
+        True, frame.smooth, frame.bend, start.steps,
     )  # fmt: skip
-    return fit
 
 
 def _at_any_speed(frame: _Frame, fastest: FrameFit, slowest: int) -> tuple[Posterior, float]:
@@ -315,8 +321,8 @@ def _at_any_speed(frame: _Frame, fastest: FrameFit, slowest: int) -> tuple[Poste
             if speed == 0:
                 start[12:] = 0.0
             gate = WIDEST_GATE * frame.threshold
-            near = fits[-1]
-            fit = _fit(frame, start, terms, gate, near.noise, near.log_scales, _WARM_STEPS)
+            begin = _Start(start, gate, fits[-1].noise, fits[-1].log_scales, _WARM_STEPS)
+            fit = _fit(frame, terms, begin)
             if not fit.finite:
                 break
         fits.append(fit)
@@ -353,10 +359,8 @@ def _at_any_speed(frame: _Frame, fastest: FrameFit, slowest: int) -> tuple[Poste
     mean = probable @ steps
     away = steps - mean
     covariance = np.einsum("k,kij->ij", possible, np.array([fit.covariance for fit in fits]))
-    weights = np.zeros(len(SPEEDS))
+    weights, own, posterior = np.zeros(len(SPEEDS)), evidences - odds, _of_fit(frame, best)
     weights[::-1][: len(fits)] = possible
-    own = evidences - odds
-    posterior = _of_fit(frame, best)
     posterior = replace(
         posterior,
         state=apply_step(best.state, mean[:PARAMETERS]),
