@@ -59,7 +59,7 @@ _TERM_SIZES = np.array(
 _BENT_SIZES = (*DEGREE_SIZES, 0.125)
 # Combinations of functions that move no point by this part of the scale are left out.
 _LEAST_BEND = 0.003
-_LEAST_EXTENT = 1e-6  # m
+_LEAST_EXTENT = 1e-6  # m; points nearer together than this are one place, and nothing bends
 # A column whose scale moves no point by this part of the noise is left out: it changes nothing.
 _NEGLIGIBLE = 0.03
 # Neighbouring frequencies have scales alike to a factor of e (precision of the difference of their

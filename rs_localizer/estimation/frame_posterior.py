@@ -19,7 +19,7 @@ from scipy.special import ndtri
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.scales import SCALES, SPEEDS, Scales
 from rs_localizer.core.shake import CYCLES, TYPICAL_SIZES
-from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, step_between
+from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES
 from rs_localizer.estimation.assumptions import Assumed
 from rs_localizer.estimation.frame_fit import (
     FrameFit,
@@ -36,12 +36,13 @@ from rs_localizer.estimation.modes import (
     Inliers,
     SmoothError,
     log_evidence,
+    mixed,
     mixture_of,
 )
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior import PriorTerms, terms_at
-from rs_localizer.estimation.refine import apply_step, inverted
+from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residual_tests import standard_scores
 from rs_localizer.estimation.undetected_vibration import score_statistics
 
@@ -325,19 +326,13 @@ def _at_any_speed(frame: _Frame, fastest: FrameFit, slowest: int) -> tuple[Poste
             fit = _fit(frame, terms, begin)
             if not fit.finite:
                 break
-        fits.append(fit)
-        evidences[speed] = (
-            odds[speed]
-            + by_turn[speed]
-            + log_evidence(
-                fit.log_determinant,
-                fit.left + fit.prior_cost,
-                terms,
-                inliers,
-                fit.inliers,
-                fit.noise,
-            )
+        evidence = log_evidence(
+            fit.log_determinant, fit.left + fit.prior_cost, terms, inliers, fit.inliers, fit.noise
         )
+        if fits and not math.isfinite(evidence):
+            break
+        fits.append(fit)
+        evidences[speed] = odds[speed] + by_turn[speed] + evidence
         if evidences[speed] < evidences.max() - FAR_LESS_PROBABLE / TEMPER:
             break
     total = float(np.logaddexp.reduce(evidences))
@@ -352,20 +347,16 @@ def _at_any_speed(frame: _Frame, fastest: FrameFit, slowest: int) -> tuple[Poste
     possible = np.exp(TEMPER * (own - own.max()))
     probable, possible = probable / probable.sum(), possible / possible.sum()
     best = fits[int(probable.argmax())]
-    steps = np.array([
-        np.append(step_between(best.state, fit.state), (fit.turns - best.turns).ravel())
-        for fit in fits
-    ])  # fmt: skip
-    mean = probable @ steps
-    away = steps - mean
-    covariance = np.einsum("k,kij->ij", possible, np.array([fit.covariance for fit in fits]))
+    state, turns, covariance = mixed(
+        [(fit.state, fit.turns, fit.covariance) for fit in fits], probable, possible
+    )
     weights, own, posterior = np.zeros(len(SPEEDS)), evidences - odds, _of_fit(frame, best)
     weights[::-1][: len(fits)] = possible
     posterior = replace(
         posterior,
-        state=apply_step(best.state, mean[:PARAMETERS]),
-        covariance=covariance + (away.T * possible) @ away,
-        shake=best.turns + mean[PARAMETERS:].reshape(-1, 3),
+        state=state,
+        covariance=covariance,
+        shake=turns,
         model_error=fastest.smooth,
         shared=math.sqrt(possible @ np.array([fit.smooth for fit in fits]) ** 2),
         speeds=weights,
@@ -471,22 +462,24 @@ def _either(
         return shaken
     if weight > 1.0 - _NO_PART:
         return steady
-    # From the one that shakes: steps of motion and coefficients.
-    steps = np.zeros(len(shaken.covariance))
-    steps[:PARAMETERS] = step_between(shaken.state, steady.state)
-    steps[PARAMETERS:] = -shaken.shake.ravel()
-    mean = probable * steps
-    away = np.outer(steps - mean, steps - mean)
-    covariance = (1.0 - weight) * (shaken.covariance + np.outer(mean, mean)) + weight * away
-    covariance[:PARAMETERS, :PARAMETERS] += weight * steady.covariance
+    whole = np.zeros_like(shaken.covariance)
+    whole[:PARAMETERS, :PARAMETERS] = steady.covariance
+    state, turns, covariance = mixed(
+        [
+            (steady.state, np.zeros_like(shaken.shake), whole),
+            (shaken.state, shaken.shake, shaken.covariance),
+        ],
+        np.array([probable, 1.0 - probable]),
+        np.array([weight, 1.0 - weight]),
+    )
     likely = steady if probable > 0.5 else shaken
     shared = math.sqrt(weight * steady.shared**2 + (1.0 - weight) * shaken.shared**2)
     return replace(
         likely,
-        state=apply_step(shaken.state, mean[:PARAMETERS]),
+        state=state,
         covariance=covariance,
         arched=None,
-        shake=(1.0 - probable) * shaken.shake,
+        shake=turns,
         shared=shared,
         scales=shaken.scales._replace(
             speeds=weight * steady.scales.speeds + (1.0 - weight) * shaken.scales.speeds

@@ -21,6 +21,7 @@ told from another one, moves along other axes.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +50,7 @@ from rs_localizer.estimation.refine import (
     solve_positive,
     squared,
 )
-from rs_localizer.estimation.residuals import linearized, normal_equations
+from rs_localizer.estimation.residuals import linearized, normal_equations, squared_errors
 
 # More steps of Gauss-Newton than any fit needs that ends.
 STEPS = 25
@@ -178,6 +179,24 @@ def averaged(
     return state, covariance, steps, offsets, abouts
 
 
+def mixed(
+    parts: Sequence[tuple[Array, Array, Array]], probable: Array, possible: Array
+) -> tuple[Array, Array, Array]:
+    """State (24,), turn (28,3) and covariance of a mixture of these: the mean by the ones
+    probabilities (k,), second moments about it by the others.
+    """
+    near, turned, _ = parts[int(probable.argmax())]
+    steps = np.array([
+        np.append(step_between(near, state), (turns - turned).ravel()) for state, turns, _ in parts
+    ])  # fmt: skip
+    mean = probable @ steps
+    away = steps - mean
+    within = np.einsum("k,kij->ij", possible, np.array([one for _, _, one in parts]))
+    state = apply_step(near, mean[:PARAMETERS])
+    turns = turned + mean[PARAMETERS:].reshape(-1, 3)
+    return state, turns, within + (away.T * possible) @ away
+
+
 @inlined
 def _about_pivot(covariance: Array, by_turn: Array) -> Array:
     """A covariance (18,18) of steps as one of offsets, which go with the turn by (6,3)."""
@@ -206,7 +225,7 @@ class Mode(NamedTuple):
     cost: float  # noise variances
     smooth: float  # px, scale of the smooth error
     held: _Held
-    squared_errors: Array  # (n,) px^2, beside the smooth error; without one, none
+    squared_errors: Array  # (n,) px^2, beside the smooth error
 
 
 class _Modes(NamedTuple):
@@ -341,7 +360,7 @@ def _modes(
     modes = _Modes(
         np.empty((most, STATE_SIZE)), np.empty((most, PARAMETERS, PARAMETERS)), np.empty(most),
         np.empty(most), np.empty(most, np.int64), np.empty(most),
-        np.empty((most, points), np.bool_), np.zeros((most, points)),
+        np.empty((most, points), np.bool_), np.empty((most, points)),
     )  # fmt: skip
     near, count, best = start.copy(), 0, -np.inf
     if slowest == 0:
@@ -381,8 +400,7 @@ def _keep(modes: _Modes, count: int, speed: int, mode: Mode) -> int:
     modes.evidences[count], modes.costs[count] = mode.evidence, mode.cost
     modes.speeds[count], modes.smooths[count] = speed, mode.smooth
     modes.chosen[count] = mode.held.chosen
-    if len(mode.squared_errors):
-        modes.squared_errors[count] = mode.squared_errors
+    modes.squared_errors[count] = mode.squared_errors
     return count + 1
 
 
@@ -414,7 +432,7 @@ def _mode(
         if converged:
             break
     covariance, cost, scale = variance * inverted(information), cost / variance, 0.0
-    beside = np.zeros(0)
+    beside = squared_errors(inliers.data, len(inliers.chosen), state)
     held = _Held(
         inliers.chosen, noise, inliers.cost, inliers.freedom, np.zeros((0, 2, 0)),
         np.zeros((0, PARAMETERS)),
