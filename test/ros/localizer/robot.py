@@ -143,7 +143,8 @@ class Robot:
 
     def localize(self, info: Any, cloud: Any) -> None:
         """Send a frame until the node has answered."""
-        assert any(self.send(info, cloud) for _ in range(20)), "no answer"
+        # Again only once it must be lost: the answer to a second copy would be heard as the next.
+        assert any(self.send(info, cloud, timeout=20.0) for _ in range(3)), "no answer"
 
     def answered(self, name: str) -> dict[int, bytes]:
         """What the node said on a topic, by stamp."""
