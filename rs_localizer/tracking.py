@@ -68,6 +68,8 @@ _NEWEST = 0.3
 _LEARNING = 0.5
 # The least: with a tenth predictions hold 88 % of a webcam's frames, with this 93 and more.
 _LEAST_SCALE, _MOST_SCALE = 0.3, 1e4
+# Of the readout time: off by more, frames that stand alone are better than tracked ones.
+FAR_OFF = 0.5
 # Of a motion that is but a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least acceleration that a configuration may have, rad/s^2 and m/s^2.
@@ -141,6 +143,13 @@ class Tracker:
     def inertial(self) -> InertialStatus | None:
         """What became of the gyroscope; None without one."""
         return None if self._aid is None else self._aid.status
+
+    @property
+    def _trusts_motion(self) -> bool:
+        """Whether how far the camera goes from frame to frame tells how it moves within one."""
+        least = min(camera.readout_time for camera in self.localizer.rig.cameras.values())
+        known = self.readout_time_deviation < FAR_OFF * least
+        return self._memory is Memory.MOTION and self.trusts_readout_time and known
 
     def _follows(self, time_ns: int) -> bool:
         """Whether the motion of the last frame with a pose predicts that at a time."""
@@ -247,7 +256,7 @@ class Tracker:
 
         if self._aid is None:
             result, prior = localized(None)
-            if not result and self._track is not None and self._memory is Memory.MAP_AND_LENS:
+            if not result and self._track is not None and not self._trusts_motion:
                 # What other frames said may no longer hold: a hand bent the board, and let it go.
                 alone = self.localizer.find(points, pixels, scores, stamps=stamps)
                 if alone:
@@ -276,7 +285,7 @@ class Tracker:
         if self._memory is Memory.MAP_AND_LENS:
             return None if self._track is None else Prior(scales=self._track.experience.scales)
         prior = self.prediction(time_ns, span)
-        if prior is not None and not self.trusts_readout_time:
+        if prior is not None and not self._trusts_motion:
             rest = self.of_rest if turn is None else 0.0
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
         return prior if turn is None else without_gyro(prior, turn)
@@ -288,13 +297,12 @@ class Tracker:
             self._track = _followed(track, prior, result, time_ns)
         elif self._memory is Memory.MAP_AND_LENS:
             experience = Experience.of(result) if track is None else track.experience.and_of(result)
-            if track is not None:
-                seconds, typical = 1e-9 * (time_ns - track.time_ns), self.localizer.config
-                experience = experience.moving(
-                    track.experience.scales.speeds, track.estimate, result, seconds,
-                    typical.velocity_prior,
-                )  # fmt: skip
             self._track = _Track(result, time_ns, 0.0, experience, np.ones(2))
+        if track is not None and self._track is not None and not self._trusts_motion:
+            self._track.experience = self._track.experience.moving(
+                track.experience.scales.speeds, track.estimate, result,
+                1e-9 * (time_ns - track.time_ns), self.localizer.config.velocity_prior,
+            )  # fmt: skip
 
     def _before(self, time_ns: int) -> Before | None:
         """What the last frame says of the motion beside what a gyroscope sees."""

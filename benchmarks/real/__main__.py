@@ -88,7 +88,8 @@ def main() -> None:
     for clip in clips_of(args.folder, cache, args.images, args.only):
         shutter = shutter_of(clip, cache)
         if config.readout_time > 0.0:
-            shutter = replace(shutter, readout_time=config.readout_time)
+            of_config = (config.readout_time, config.readout_time_deviation)
+            shutter = replace(shutter, readout_time=of_config[0], deviation=of_config[1])
         print(f"{clip.name}: {len(clip.images)} images, calibrate: {shutter.verdict}", flush=True)
         rows[clip.name] = judged(clip, opencv_lens(clip), shutter, config)
         args.out.mkdir(parents=True, exist_ok=True)

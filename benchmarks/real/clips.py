@@ -24,8 +24,8 @@ from rs_localizer.trajectory.first_lens import first_lens
 from rs_localizer.trajectory.observe import Observed
 
 INDEX = "index.csv"
-# Of a video whose readout time is not found: that of an ordinary phone, s.
-_PHONE = 0.015
+# Of a video whose readout time is not found: that of an ordinary phone, s, give or take.
+_PHONE, _PHONE_DEVIATION = 0.015, 0.01
 # Images that OpenCV's calibration takes, evenly: more only take time.
 _CALIBRATION_IMAGES = 50
 _FEWEST = 20  # images that two halves of the bootstrap's blocks need
@@ -113,6 +113,7 @@ class Shutter:
     """What the package's calibration says of a clip."""
 
     readout_time: float  # s
+    deviation: float  # s
     scan_direction: str
     verdict: str  # in a few words
     lens: Camera | None
@@ -133,6 +134,7 @@ def shutter_of(clip: Clip, cache: Path) -> Shutter:
     known = found["readout_time"] > 1e-3
     return Shutter(
         found["readout_time"] if known else _PHONE,
+        0.0 if known else _PHONE_DEVIATION,
         found["direction"] if known else "top_to_bottom",
         found["verdict"],
         lens or None,

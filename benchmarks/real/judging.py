@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from benchmarks.real.clips import Clip, Shutter, halved
-from rs_localizer.config import LocalizerConfig
+from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
@@ -43,13 +43,14 @@ _PAPER = 0.002
 _BLOCK, _RESAMPLES = 10, 1000
 
 
-def judged(clip: Clip, lens: Camera, shutter: Shutter, config: LocalizerConfig) -> dict[str, float]:
+def judged(clip: Clip, lens: Camera, shutter: Shutter, config: NodeConfig) -> dict[str, float]:
     """One row of the table."""
     row: dict[str, float] = {"images": len(clip.images), "readout_ms": 1e3 * shutter.readout_time}
     if config.map_deviation == 0.0:  # nobody measured the board
         apart = clip.images[0].points - clip.images[0].points.mean(axis=0)
         paper = _PAPER * float(np.sqrt(np.square(apart).sum(axis=1).mean()))
         config = replace(config, map_deviation=paper)
+    config = replace(config, readout_time_deviation=shutter.deviation)
     camera = replace(lens, readout_time=shutter.readout_time, scan_direction=shutter.scan_direction)
     whole = list(clip.images)
     poses: dict[str, Poses] = {}
@@ -72,9 +73,7 @@ def judged(clip: Clip, lens: Camera, shutter: Shutter, config: LocalizerConfig) 
     return row
 
 
-def localized(
-    name: str, camera: Camera, images: Sequence[Observed], config: LocalizerConfig
-) -> Poses:
+def localized(name: str, camera: Camera, images: Sequence[Observed], config: NodeConfig) -> Poses:
     """Each image, by one of the methods.
 
     default: as a node without any parameter; single: with the readout time, each image alone;
@@ -88,6 +87,7 @@ def localized(
         ]
     if name == "tracked":
         tracker = Tracker(Localizer(camera, config))
+        tracker.readout_time_deviation = config.readout_time_deviation
         return [tracker.localize(image.stamp_ns, image.points, image.pixels) for image in images]
     localizer = Localizer(camera, replace(config, solver="p3p") if name == "p3p" else config)
     return [localizer.localize(image.points, image.pixels) for image in images]
@@ -152,9 +152,7 @@ def _twists(clip: Clip, poses: Poses, p3p: Poses, readout_time: float) -> dict[s
     }
 
 
-def _halves(
-    camera: Camera, images: Sequence[Observed], config: LocalizerConfig
-) -> dict[str, float]:
+def _halves(camera: Camera, images: Sequence[Observed], config: NodeConfig) -> dict[str, float]:
     """Poses of one half of the corners against those of the other, and what each says of the
     other's corners: rolling over global shutter, the direction of the scan, and the reversed one.
 

@@ -18,6 +18,7 @@ from rs_localizer.estimation.prior import (
     Prior,
     PriorTerms,
     held_terms,
+    knows_motion,
     motion_terms,
     terms_at,
     with_measurements,
@@ -91,7 +92,7 @@ _SLOWEST = 0.1
 
 def told_speed(terms: PriorTerms, prior: Prior | None) -> tuple[PriorTerms, Prior | None]:
     """The prior of the fastest motion that frames before leave possible, and what else they say."""
-    if prior is None or prior.motion is not None or prior.scales is None:
+    if prior is None or knows_motion(prior) or prior.scales is None:
         return terms, prior
     possible = [
         part for part, odds in zip(SPEEDS, prior.scales.speeds, strict=True) if odds > _DENIED

@@ -21,11 +21,7 @@ from rs_localizer.core.scales import SCALES, SPEEDS, Scales
 from rs_localizer.core.shake import CYCLES, TYPICAL_SIZES
 from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES
 from rs_localizer.estimation.assumptions import Assumed
-from rs_localizer.estimation.frame_fit import (
-    FrameFit,
-    bend_of,
-    fit_frame,
-)
+from rs_localizer.estimation.frame_fit import FrameFit, bend_of, fit_frame
 from rs_localizer.estimation.mirror import farthest, is_plane, mirrored
 from rs_localizer.estimation.modes import (
     FAR_LESS_PROBABLE,

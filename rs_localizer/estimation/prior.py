@@ -333,6 +333,11 @@ def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
     return PriorTerms(informations, references, gravity, pivots)
 
 
+def knows_motion(prior: Prior) -> bool:
+    """Whether a prior's motion is more than a first guess."""
+    return prior.covariance is not None and not np.isinf(np.diagonal(prior.covariance)).all()
+
+
 def with_motion(
     terms: PriorTerms, prior: Prior, centre: Array, turn_known: bool = False
 ) -> PriorTerms:
@@ -341,10 +346,8 @@ def with_motion(
     Its term, if it knows anything, is the last one. Beside a known turn it knows the gyroscope's
     errors, too.
     """
-    if prior.motion is None or prior.covariance is None:
+    if prior.motion is None or not knows_motion(prior):
         return terms
-    if np.isinf(np.diagonal(prior.covariance)).all():
-        return terms  # the motion is a first guess
     covariance = np.ascontiguousarray(prior.covariance, np.float64)
     return _with_motion(terms, covariance, state_in(prior.motion, centre), turn_known)
 

@@ -19,6 +19,7 @@ from rs_localizer.io.clouds import Correspondences
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.refusal import Notify
 from rs_localizer.solvers.table import find_solver
+from rs_localizer.tracking import FAR_OFF
 from rs_localizer.trajectory.online_readout import REVERSED, ReadoutMonitor, warm_up
 from rs_localizer.trajectory.readout_equations import MeasuredReadout, Measurement
 
@@ -89,7 +90,7 @@ class ScanAxis:
         self.direction: ScanDirection | None = None
 
     @property
-    def _leans(self) -> bool:
+    def leans(self) -> bool:
         """Whether frames fit the other axis better."""
         return self._evidence > _DOUBT
 
@@ -97,7 +98,7 @@ class ScanAxis:
     def doubtful(self) -> bool:
         """Whether they do, and its motions do not contradict: errors of map and lens may do it."""
         early = self._monitored < _CHANCES and self._monitor.odds.rolling > -_CONTRADICTS
-        return self._leans and (self.direction is not None or early)
+        return self.leans and (self.direction is not None or early)
 
     @property
     def wrong(self) -> bool:
@@ -120,7 +121,7 @@ class ScanAxis:
 
     def confirm(self) -> None:
         """Look no more: the motion along the axis that is set agrees from frame to frame."""
-        self._confirmed = not self._leans
+        self._confirmed = not self.leans
 
     def add(
         self,
@@ -142,7 +143,7 @@ class ScanAxis:
         self.other = None
         # The wrong axis makes in-frame turns, and refusals.
         odd = not result or len(result.shake) > 0
-        due = self._leans or self._dense > 0 or self._skipped >= _EVERY
+        due = self.leans or self._dense > 0 or self._skipped >= _EVERY
         due |= odd and self._evidence > _LEAST
         if self._confirmed or not due:
             return
@@ -158,7 +159,7 @@ class ScanAxis:
         ratio = ours - others
         ratio = min(max(ratio, -_MOST_OF_A_FRAME), _MOST_OF_A_FRAME)
         self._evidence = max(_MEMORY * self._evidence + ratio, _LEAST)
-        if other_result and self._leans:
+        if other_result and self.leans:
             self._measure(time_ns, other_result, cloud)
         self._certain = self.wrong and self._evidence > 0.0  # stays until as much speaks against it
         contradicted = self.direction is None and self._monitor.odds.rolling < -_CONTRADICTS
@@ -223,9 +224,8 @@ _SHARE = 300
 _WELL_KNOWN, _ENOUGH = 0.02, 60
 # So many deviations below zero, rows run the other way.
 _SURELY = 4.0
-# Of the setting: from here on frames that stand alone are better than tracked ones, and from here
-# on nothing tells the shutter from a global one.
-_FAR_OFF, _GLOBAL = 0.5, 0.2
+# Of the setting: from here on nothing tells the shutter from a global one.
+_GLOBAL = 0.2
 _CERTAINLY = math.log(1e9)  # of the odds for a global one that was found
 
 
@@ -269,11 +269,9 @@ class ReadoutWatch:
         self._reversed = False
         # Whether the last frames move, but not as the setting says, and no measurement tells.
         self.doubtful = False
-
-    @property
-    def trusted(self) -> bool:
-        """Whether what the camera does from frame to frame tells what it does within them."""
-        return not (self.far_off or self.doubtful or self.other_axis)
+        # Whether what the camera does from frame to frame tells what it does within them: after a
+        # doubt not before frames show it. To and fro between both, poses jump.
+        self.trusted = True
 
     @property
     def other_axis(self) -> Estimate | None:
@@ -316,6 +314,7 @@ class ReadoutWatch:
         self.measured, self.fault, self.error = None, "", 0.0
         self.far_off = self.global_shutter = self.surely_global = False
         self.doubtful = self._reversed = False
+        self.trusted = True
 
     def add(
         self,
@@ -335,6 +334,23 @@ class ReadoutWatch:
         wanted = estimates or config.readout_time > 0.0
         if not (wanted and find_solver(config.solver).rolling_shutter):
             return config
+        adopted = self._take(config, camera, time_ns, result, cloud, estimates)
+        if self.far_off or self.doubtful or (self._axis.leans and self.other_axis):
+            self.trusted = False
+        elif _is_some(config, self.measured) or self._monitor.odds.shown:
+            self.trusted = True
+        return adopted
+
+    def _take(
+        self,
+        config: NodeConfig,
+        camera: Camera,
+        time_ns: int,
+        result: Estimate | Failure,
+        cloud: Correspondences,
+        estimates: bool,
+    ) -> NodeConfig:
+        """Compare a frame with what is set; ``estimates``: the settings ask for what is found."""
         self._axis.add(config, camera, time_ns, cloud, result)
         if self._axis.wrong:
             return self._other_axis(config, estimates)
@@ -399,7 +415,7 @@ class ReadoutWatch:
         )
         self.error = 0.0 if wrong is None else off * max(shorter, 1.0)
         # A global shutter may be no worse.
-        short = measured.readout_time < _FAR_OFF * config.readout_time
+        short = measured.readout_time < FAR_OFF * config.readout_time
         self.far_off = short and (self.far_off or wrong is not None)
         self.global_shutter = self.far_off and (
             self.global_shutter if wrong is None else sure or wrong is _Kind.GLOBAL
@@ -459,7 +475,7 @@ def _is_some(config: NodeConfig, measured: MeasuredReadout | None) -> bool:
     """Whether the readout time was measured, and nearer to the one that is set than to none."""
     if measured is None:
         return False
-    return measured.readout_time - _SURELY * measured.deviation > _FAR_OFF * config.readout_time
+    return measured.readout_time - _SURELY * measured.deviation > FAR_OFF * config.readout_time
 
 
 def _wrong(config: NodeConfig, measured: MeasuredReadout) -> _Kind | None:

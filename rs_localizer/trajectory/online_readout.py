@@ -289,6 +289,12 @@ class ShutterHypotheses:
         return self._odds(_REVERSED, _SET, to_doubt=True) > 0.0
 
     @property
+    def shown(self) -> bool:
+        """Whether the frames show what is set, as surely as they would have to deny it."""
+        others = (self._odds(_SET, one, to_doubt=True) for one in (_NONE, _REVERSED))
+        return min(others) > _DOUBT
+
+    @property
     def doubtful(self) -> bool:
         """Whether the camera moves, and what is set does not show, or another value fits better."""
         least, apart = float(np.min(self._left[1, :_APART])), float(self._left[1, _APART])

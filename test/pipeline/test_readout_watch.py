@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.data import GLOBAL_SHUTTER_TAGS
 from benchmarks.independent.rotations import logarithm
@@ -97,6 +98,37 @@ def test_a_wrong_readout_time_is_said_once(factor, tracking):
     speed = np.concatenate([last.twist.linear, last.twist.angular])
     known = np.linalg.solve(last.twist.covariance, speed) @ speed
     assert known < (factor * READOUT / error) ** 2
+
+
+@pytest.mark.parametrize(("curl", "rate", "told"), [(0.0, 0.3, 0.015), (0.001, 0.05, 0.03)])
+def test_poses_do_not_go_to_and_fro_between_trust_and_doubt(curl, rate, told):
+    """Boards of paper, flat and curled by 1 mm, say little of the shutter: 15 ms."""
+    x, y = (
+        part.ravel() for part in np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.06, 0.06, 6))
+    )
+    rows = np.zeros(len(x), [(name, "<f8") for name in "xyzuv"])
+    rows["x"], rows["y"] = x, y
+    paper = np.column_stack([x, y, curl * (x / 0.1) ** 2])
+    rng, trusted = np.random.default_rng(0), []
+    frames = FrameLocalizer(NodeConfig(readout_time=told, map_deviation=2e-4))
+    frames.calibrate(read_camera_info(make_camera_info(CAMERA, 0)))
+    for k in range(45):
+        stamp, pixels = k / 30.0, np.zeros((len(x), 2))
+        for _ in range(4):  # a point is where its row sees it
+            t = stamp + 0.015 * pixels[:, 1] / 479.0
+            turns = [
+                0.3 + rate * np.sin(2.1 * t) / 2.1,
+                0.25 + rate * np.cos(1.7 * t) / 1.7,
+                0.1 + 0 * t,
+            ]
+            places = Rotation.from_rotvec(np.column_stack(turns)).apply(paper)
+            places += np.column_stack([0.01 * np.sin(t), 0.01 * np.cos(1.3 * t), 0.4 + 0 * t])
+            pixels = (places @ CAMERA.K.T)[:, :2] / places[:, 2:]
+        rows["u"], rows["v"] = (pixels + rng.normal(0.0, 0.15, pixels.shape)).T
+        assert frames.localize(make_cloud(make_message, 10**9 + round(1e9 * stamp), "map", rows))
+        trusted.append(frames.readout_watch.trusted)
+    changes = np.count_nonzero(np.diff(trusted))
+    assert changes <= (0 if curl == 0.0 else 1)
 
 
 def test_the_right_one_is_confirmed():
