@@ -8,10 +8,11 @@ import math
 
 import numpy as np
 
+from rs_localizer.core.blocks import median
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.observations import Observations, median_of
+from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Mirror, Posterior
 
 # Beyond this the camera turns by more than the motion model is meant for, rad per readout.
@@ -117,7 +118,7 @@ def refusal(
             f"errors of {posterior.model_error:.2g} px are smooth over the image: the calibration "
             "or the map is too far off for any pose",
         )
-    pace = median_of(observations.row_paces(state), posterior.inliers)
+    pace = median(observations.row_paces(state)[posterior.inliers])
     if pace < _LEAST_PACE:
         return Failure(
             Reason.IMPLAUSIBLE,

@@ -172,7 +172,7 @@ def averaged(
     for k in range(count):
         if possible[k] > 0.0:
             offsets[k], by_turn = offset_between(state, states[k], middle)
-            covariance = covariance + possible[k] * np.outer(offsets[k], offsets[k])
+            covariance = covariance + possible[k] * offsets[k] * offsets[k].reshape(PARAMETERS, 1)
             if possible[k] > _NO_PART:
                 abouts[k] = _about_pivot(covariances[k], by_turn)
                 covariance = covariance + possible[k] * abouts[k]
@@ -560,7 +560,8 @@ def _over_leans(
     """
     rotation, count = mode.state[:9].copy().reshape(3, 3), len(terms.informations)
     plane, centre, normal = plane_of(inliers.points, inliers.chosen)
-    flat = np.eye(3) - np.outer(rotation @ normal, rotation @ normal)
+    normal = rotation @ normal
+    flat = np.eye(3) - normal * normal.reshape(3, 1)
     sizes, axes = np.linalg.eigh(flat @ mode.covariance[TURN, TURN].copy() @ flat)
     if not (plane and sizes[2] > _KNOWN_LEAN**2):
         return mode, False

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray, Random
+from rs_localizer.core.blocks import median
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
 from rs_localizer.core.lens import LensError
@@ -35,22 +36,14 @@ from rs_localizer.estimation.residuals import (
 )
 
 
-@kernel
-def median_of(values: Array, chosen: BoolArray) -> float:
-    """Median of the chosen ones of values (n,); NaN if there are none."""
-    of = values[chosen]
-    middle = len(of) // 2
-    return float(np.partition(of, middle)[middle]) if len(of) > 0 else np.nan
-
-
 @inlined
 def median_point(points: Array, chosen: BoolArray) -> Array:
     """Median (3,) of each coordinate over some of the points (n,3); zero if there are none."""
-    median = np.zeros(3)
+    found = np.zeros(3)
     if np.any(chosen):
         for axis in range(3):
-            median[axis] = median_of(points[:, axis], chosen)
-    return median
+            found[axis] = median(points[:, axis][chosen])
+    return found
 
 
 @kernel
@@ -65,7 +58,7 @@ def _median_depth(data: Array, state: Array, chosen: BoolArray) -> float:
             place -= block[(CENTRE + k) * LANES + lane]
             depth += block[(AXES + 6 + k) * LANES + lane] * place
         depths[i] = depth
-    return median_of(depths, chosen)
+    return median(depths[chosen])
 
 
 # Pixels may lie outside the image by this part of it: noise, and features at its border.

@@ -388,7 +388,7 @@ def pivot_of(covariance: Array) -> Array:
             turned[i, i] += (1.0 + _RIDGE) * covariance[m, m]
     pivot = np.zeros(3)
     if np.all(np.isfinite(covariance[:6, :6])):
-        pivot[:] = np.linalg.solve(turned, along)
+        pivot = np.linalg.inv(turned) @ along
     return pivot if np.all(np.isfinite(pivot)) else np.zeros(3)
 
 

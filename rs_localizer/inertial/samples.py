@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.blocks import median
 from rs_localizer.core.simd.jit import kernel
 
 MARGIN = 4
@@ -120,7 +121,7 @@ def span_of(stamps: IntArray, start_ns: int, end_ns: int) -> Span:
         if i:
             steps[i - 1] = stamps[i] - stamps[i - 1]
             closest = min(closest, steps[i - 1])
-    period = float(np.median(steps))
+    period = median(steps)
     begin, end, gap = 0, count, 0.0
     for i in range(1, count):
         if steps[i - 1] > _MOST_PERIODS * period:

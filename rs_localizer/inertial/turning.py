@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.blocks import write
+from rs_localizer.core.blocks import median, write
 from rs_localizer.core.gyro_rotation import GyroRotation, turn_of
 from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
 from rs_localizer.core.simd.jit import kernel
@@ -53,7 +53,7 @@ def densified(times: Array, rates: Array) -> tuple[Array, Array]:
     steps = np.empty(count - 1)
     for i in range(count - 1):
         steps[i] = times[i + 1] - times[i]
-    width = 2.0 * np.pi * _BAND / np.median(steps)
+    width = 2.0 * np.pi * _BAND / median(steps)
     # The sine of a difference by those of both: n of them, not n^2.
     sines, cosines = np.sin(width * times), np.cos(width * times)
     factor = np.empty((count, count))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.blocks import write
+from rs_localizer.core.blocks import median, write
 from rs_localizer.core.rate_spline import multiplied
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import log
@@ -170,7 +170,7 @@ def score(of: Equations, value: float) -> Score:
         for i in range(SIDE):
             for j in range(SIDE):
                 squared[n] += error[n, i] * weights[n, i, j] * error[n, j]
-    scale = max(1.0, np.median(squared) / _MEDIAN)
+    scale = max(1.0, median(squared) / _MEDIAN)
     slope, noise, squares = 0.0, 0.0, 0.0
     covariance, displacement = np.empty((SIDE, SIDE)), np.empty(SIDE)
     for n in range(count):
