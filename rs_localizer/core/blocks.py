@@ -30,7 +30,8 @@ def write(target: Array, source: Array) -> None:
 def median(values: Array) -> float:
     """Of values (n,), the larger of two middle ones; NaN of none.
 
-    By Hoare's selection: NumPy's takes Numba 3 s to compile, with the sort of its indices.
+    By Hoare's selection: NumPy's median, outer product and solve, with their indices and messages,
+    were 47 of the 870 MB that the compiler takes for the default solver.
     """
     if len(values) == 0:
         return np.nan

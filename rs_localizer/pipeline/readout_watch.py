@@ -334,14 +334,14 @@ class ReadoutWatch:
         wanted = estimates or config.readout_time > 0.0
         if not (wanted and find_solver(config.solver).rolling_shutter):
             return config
-        adopted = self._take(config, camera, time_ns, result, cloud, estimates)
+        adopted = self._compare(config, camera, time_ns, result, cloud, estimates)
         if self.far_off or self.doubtful or (self._axis.leans and self.other_axis):
             self.trusted = False
         elif _is_some(config, self.measured) or self._monitor.odds.shown:
             self.trusted = True
         return adopted
 
-    def _take(
+    def _compare(
         self,
         config: NodeConfig,
         camera: Camera,
