@@ -687,7 +687,7 @@ def fit_frame(
     variance, chosen = noise * noise, PARAMETERS + first
     left = np.sum(squared[inliers]) / variance
     prior_cost += np.sum(coefficients**2 * np.exp(-2.0 * scales[groups]))
-    scale_cost, volume = _of_scales(
+    scale_cost, volume, spread = _of_scales(
         scales - hyper_mean, scales, hyper_precision, solved.decided,
         0 if with_turns else SCALES - 1, SCALES if with_smooth else SCALES - 1,
     )  # fmt: skip
@@ -699,6 +699,8 @@ def fit_frame(
     finite = finite and bool(np.all(np.isfinite(solved.covariance)))
     by_smooth = solved.covariance[:chosen, chosen:] / max(smooth, _TINY)
     own = solved.covariance[:chosen, :chosen] - by_smooth @ by_smooth.T
+    if with_turns:
+        own += _by_scales(solved.covariance[:chosen], coefficients, scales, groups, spread)
     return FrameFit(
         state, turns, own, noise, solved.freedom, inliers, squared, scales,
         solved.decided, smooth, agreement, evidence,
@@ -709,10 +711,11 @@ def fit_frame(
 @inlined
 def _of_scales(
     away: Array, scales: Array, precision: Array, decided: Array, first: int, last: int
-) -> tuple[float, float]:
+) -> tuple[float, float, Array]:
     """Cost of the log-scales from ``first`` to before ``last``, ``away`` from what is known of
-    them, and the logarithm of the determinant of their covariance over that of their hyperprior
-    (Laplace): modes and frames with an in-frame turn are not equally probable in them.
+    them, the logarithm of the determinant of their covariance over that of their hyperprior
+    (Laplace), as modes and frames with an in-frame turn are not equally probable in them, and that
+    covariance.
     """
     count, cost = last - first, 0.0
     before = np.zeros((count, count))
@@ -728,7 +731,25 @@ def _of_scales(
     after = before.copy()
     for i in range(count):
         after[i, i] += 2.0 * decided[first + i]
-    return cost, log_determinant_of_inverse(before) - log_determinant_of_inverse(after)
+    volume = log_determinant_of_inverse(before) - log_determinant_of_inverse(after)
+    return cost, volume, np.linalg.inv(after)
+
+
+@inlined
+def _by_scales(
+    covariance: Array, coefficients: Array, scales: Array, groups: IntArray, spread: Array
+) -> Array:
+    """Covariance (p,p) of motion and turn from not knowing the log-scales of the turn, of
+    covariance ``spread`` (Kass, Steffey, JASA 84, 1989), from theirs with all (p,m).
+    """
+    by_scale = np.zeros((len(covariance), SCALES - 1))
+    for k in range(TURNS):
+        g = groups[k]
+        pull = 2.0 * math.exp(-2.0 * scales[g]) * coefficients[k]
+        for i in range(len(covariance)):
+            by_scale[i, g] += pull * covariance[i, PARAMETERS + k]
+    of_turn = np.ascontiguousarray(spread[: SCALES - 1, : SCALES - 1])
+    return by_scale @ of_turn @ by_scale.T
 
 
 @kernel

@@ -15,6 +15,7 @@ from rs_localizer.core.shake import COMBINATIONS, CYCLES, FUNCTIONS, shake_at
 from rs_localizer.estimation.frame_fit import (
     SMOOTH_TERMS,
     TURNS,
+    _by_scales,
     _of_scales,
     fit_frame,
     full_prior,
@@ -433,12 +434,35 @@ def test_scales_cost_what_is_known_of_them_and_gain_what_is_not():
             (scales - mean)[part],
             (chain @ scales[:-1])[: last if first == 0 else 0],
         )
-        cost, volume = _of_scales(scales - mean, scales, precision, decided, first, last)
+        cost, volume, spread = _of_scales(scales - mean, scales, precision, decided, first, last)
         expected = np.sum(precision[part] * away**2) + np.sum(differences**2)
         assert cost == pytest.approx(expected)
         after = before + 2.0 * np.diag(decided[part])
         expected = np.linalg.slogdet(before)[1] - np.linalg.slogdet(after)[1]
         assert volume == pytest.approx(expected)
+        np.testing.assert_allclose(spread, np.linalg.inv(after), atol=1e-12)
+
+
+def test_scales_that_are_not_known_move_the_motion_as_differences_say():
+    lines, inliers = lines_of(4)
+    scales = np.random.default_rng(0).uniform(np.log(1e-4), np.log(1e-2), SCALES)
+    scales[-1] = np.log(0.5)
+    found, information, slope = solved(lines, inliers, scales, 1)
+    matrix, errors = design(lines, inliers)
+
+    def mean(change):
+        return posterior(matrix, errors, information, slope, scales + change)[0][: 18 + TURNS]
+
+    steps = 1e-4 * np.eye(SCALES)[:-1]
+    slopes = np.array([(mean(step) - mean(-step)) / 2e-4 for step in steps]).T
+    half = np.random.default_rng(1).normal(size=(SCALES, SCALES))
+    spread = half @ half.T
+    expected = slopes @ spread[:-1, :-1] @ slopes.T
+    added = _by_scales(found.covariance[: 18 + TURNS], found.values[18:], scales, GROUPS, spread)
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        added / np.outer(size, size), expected / np.outer(size, size), atol=1e-3
+    )
 
 
 def test_too_few_points_are_no_fit():
