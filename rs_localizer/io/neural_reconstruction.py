@@ -36,6 +36,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.io.calibration import pinhole_matrix, pixel_intrinsics
 from rs_localizer.io.maps.colmap import ModelImage, Points, write_model
 
 # Axes of OpenGL's camera, which looks along -z with y up, in ours.
@@ -45,8 +46,6 @@ _MODELS = {
     DistortionModel.PLUMB_BOB: ("OPENCV", ("k1", "k2", "p1", "p2", "k3")),
     DistortionModel.EQUIDISTANT: ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
-# nerfstudio has the corner of the first pixel at 0, 0, as COLMAP.
-_HALF = 0.5
 
 
 class NerfstudioError(ValueError):
@@ -68,15 +67,6 @@ def middle_of_image(camera: Camera) -> float:
     """The row time of the middle of the delivered image."""
     _, height = camera.size
     return float(camera.row_time(np.array([[0.0, (height - 1) / 2]]))[0])
-
-
-def pixel_intrinsics(camera: Camera) -> tuple[Array, Array]:
-    """Focal lengths (2,) and centre (2,) in px of the delivered image; 0, 0 is its first corner."""
-    binning = np.array(camera.binning, float)
-    offset = np.zeros(2)
-    if camera.roi is not None:
-        offset[:] = camera.roi.x_offset, camera.roi.y_offset
-    return np.diag(camera.K)[:2] / binning, (camera.K[:2, 2] - offset) / binning + _HALF
 
 
 def transforms(camera: Camera, views: Sequence[View], exposure: float = 0.0) -> dict[str, Any]:
@@ -155,7 +145,7 @@ def write_gsplat(
     """
     views = np.linalg.inv(poses)
     focal, centre = pixel_intrinsics(camera)
-    K = np.array([[focal[0], 0.0, centre[0]], [0.0, focal[1], centre[1]], [0.0, 0.0, 1.0]])
+    K = pinhole_matrix(*focal, *centre)
     np.save(folder / "viewmats.npy", views[:, 0])
     np.save(folder / "viewmats_rs.npy", views[:, 2])
     np.save(folder / "Ks.npy", np.broadcast_to(K, (len(names), 3, 3)))

@@ -17,9 +17,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.messages import Make, make_header
+from rs_localizer.io.messages import Make, make_header, make_quaternion, make_vector
 from rs_localizer.io.messages import stamp_ns as stamp_of
 
 Vector = tuple[float, float, float]
@@ -193,16 +192,14 @@ def make_transform(
     make: Make, stamp_ns: int, parent: str, child: str, parent_from_child: Transform
 ) -> Any:
     """A geometry_msgs/TransformStamped."""
-    x, y, z = parent_from_child.translation.tolist()
-    qx, qy, qz, qw = so3.quaternion(np.ascontiguousarray(parent_from_child.rotation)).tolist()
     return make(
         "geometry_msgs/msg/TransformStamped",
         header=make_header(make, stamp_ns, parent),
         child_frame_id=child,
         transform=make(
             "geometry_msgs/msg/Transform",
-            translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-            rotation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+            translation=make_vector(make, parent_from_child.translation),
+            rotation=make_quaternion(make, parent_from_child.rotation),
         ),
     )
 

@@ -43,7 +43,7 @@ import numpy as np
 import yaml
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.yaml_text import YamlError, check_tree, load_yaml
+from rs_localizer.io.yaml_text import YamlError, check_tree, file_faults, load_yaml
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.map_files import Entry, read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
@@ -280,15 +280,13 @@ def write_any(path: Path, marker_map: MarkerMap, name: str) -> None:
 
 def _tree(path: Path) -> dict[Any, Any]:
     kind = "JSON" if path.suffix.lower() == ".json" else "YAML"
-    try:
+    with file_faults(path, MarkerMapError, kind):
         text = path.read_text(encoding="utf-8")
-        tree = json.loads(text) if kind == "JSON" else load_yaml(text)
+        try:
+            tree = json.loads(text) if kind == "JSON" else load_yaml(text)
+        except (RecursionError, ValueError) as error:
+            raise YamlError(str(error)) from error
         check_tree(tree)
-    except OSError as error:
-        raise MarkerMapError(f"{path} cannot be read: {error.strerror}") from error
-    except (YamlError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise MarkerMapError(f"{path} is not a {kind} file: {reason}") from error
     if not isinstance(tree, dict):
         raise MarkerMapError(f"{path} must hold a mapping, found {str(tree)[:60]!r}")
     return tree

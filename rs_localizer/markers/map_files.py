@@ -60,7 +60,7 @@ import numpy as np
 import yaml
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.yaml_text import YamlError, load_yaml
+from rs_localizer.io.yaml_text import file_faults, load_yaml
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation
@@ -88,14 +88,8 @@ def read_marker_map(path: Path | str) -> MarkerMap:
         MarkerMapError: for anything that cannot be used, saying where and what was found.
     """
     path = Path(path)
-    try:
+    with file_faults(path, MarkerMapError):
         tree = load_yaml(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise MarkerMapError(f"{path} cannot be read: {error.strerror}") from error
-    except (YamlError, UnicodeDecodeError) as error:
-        raise MarkerMapError(
-            f"{path} is not a YAML file: {' '.join(str(error).split())}"
-        ) from error
     try:
         return _map(tree)
     except ValueError as error:
