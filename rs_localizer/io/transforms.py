@@ -285,18 +285,13 @@ class TransformTree:
                 continue
             link = _Link(parent, translation, through_matrix(rotation))
             self._parents.add(parent)
-            track = self._tracks.setdefault(child, _Track())
             if static:
                 self._tracks[child] = _Track(static=link)
             else:
-                track.add(stamp_of(stamped), link)
+                self._tracks.setdefault(child, _Track()).add(stamp_of(stamped), link)
 
     def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
-        """``target_from_source`` at a time; None: the latest that all its links have.
-
-        Raises:
-            TransformError: when it is not known for that time.
-        """
+        """``target_from_source`` at a time; None: the latest that all its links have."""
         target, source = target.removeprefix("/"), source.removeprefix("/")
         if target == source:
             return from_numbers((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -320,11 +315,7 @@ class TransformTree:
         return from_numbers(translation, through_matrix(rotation))
 
     def moves(self, target: str, source: str) -> bool:
-        """Whether a link between the two frames comes with a time.
-
-        Raises:
-            TransformError: when they are not connected.
-        """
+        """Whether a link between the two frames comes with a time."""
         target, source = target.removeprefix("/"), source.removeprefix("/")
         return target != source and self._latest(target, source) is not None
 

@@ -45,7 +45,7 @@ import yaml
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.yaml_text import YamlError, check_tree, file_faults, load_yaml
 from rs_localizer.markers.families import FAMILIES, Family, family
-from rs_localizer.markers.map_files import Entry, read_marker_map, write_marker_map
+from rs_localizer.markers.map_files import Entry, read_marker_map, rounded, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose, quaternion_of_rotation, rotation_of_quaternion
 from rs_localizer.markers.prints import Marker
@@ -94,7 +94,7 @@ def _read_wpilib(file: Entry, family: Family, unsaid: Unsaid) -> list[Marker]:
 def _write_wpilib(marker_map: MarkerMap, family: str) -> str:
     """The field is as large as its tags need, from the origin on."""
     tags, markers = [], marker_map.markers
-    sizes = sorted({_rounded([marker.size])[0] for marker in markers})
+    sizes = sorted({rounded([marker.size])[0] for marker in markers})
     if sizes and sizes[-1] > sizes[0] * (1.0 + _SAME_SIZE):
         raise MarkerMapError(
             f"a field of WPILib holds tags of one size, found {sizes[0]:g} to {sizes[-1]:g} m"
@@ -166,7 +166,7 @@ def _write_tagslam(marker_map: MarkerMap, family: str) -> str:
             "position_noise": _xyz(deviations[:3]),
             "rotation_noise": _xyz(deviations[3:]),
         }
-        tags.append({"id": marker.id, "size": _rounded([marker.size])[0], "pose": pose})
+        tags.append({"id": marker.id, "size": rounded([marker.size])[0], "pose": pose})
     # Each of its own: YAML would refer from one to the other.
     at_rest = {"position": _xyz(np.zeros(3)), "rotation": _xyz(np.zeros(3))}
     at_rest |= {f"{name}_noise": _xyz(np.full(3, _AT_REST)) for name in ("position", "rotation")}
@@ -205,7 +205,7 @@ def _write_apriltag_ros(marker_map: MarkerMap, family: str) -> str:
     """One bundle."""
     layout = []
     for marker in marker_map.markers:
-        tag: dict[str, Any] = {"id": marker.id, "size": _rounded([marker.size])[0]}
+        tag: dict[str, Any] = {"id": marker.id, "size": rounded([marker.size])[0]}
         tag |= _xyz(marker.pose.position)
         quaternion = _quaternion(marker.pose.rotation)
         layout.append(tag | dict(zip(("qx", "qy", "qz", "qw"), quaternion, strict=True)))
@@ -308,18 +308,13 @@ def _vector(entry: Entry, names: str) -> Array:
     return np.array([float(entry.take(name, _NUMBER, 0.0)) for name in names])
 
 
-def _rounded(values: Any) -> list[float]:
-    """Without the rounding errors of a fitted pose."""
-    return [round(float(value), 12) + 0.0 for value in values]
-
-
 def _quaternion(rotation: Array) -> list[float]:
     """x y z w."""
-    return _rounded(quaternion_of_rotation(rotation))
+    return rounded(quaternion_of_rotation(rotation))
 
 
 def _xyz(values: Array) -> dict[str, float]:
-    return dict(zip("xyz", _rounded(values), strict=True))
+    return dict(zip("xyz", rounded(values), strict=True))
 
 
 def _yaml(tree: dict[str, Any]) -> str:

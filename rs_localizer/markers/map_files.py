@@ -51,7 +51,7 @@ the top left one clockwise, as seen from the front.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -140,27 +140,26 @@ def _board(entry: Entry) -> Board:
     entry.where += f" ({kind})"
     if kind not in _BOARDS:
         raise EntryError(f"{entry.where}: type must be one of {', '.join(_BOARDS)}")
-    columns, rows = entry.take("columns", int), entry.take("rows", int)
-    spacing = entry.number("spacing") if "circles" in kind else 0.0
-    square = 0.0 if "circles" in kind else entry.number("square")
-    pose = _pose(entry)
-    shape = entry.take("shape", list) if "shape" in entry else None
-    deviation = entry.number("deviation") if "deviation" in entry else None
-    if kind != _CHARUCO:
-        inverted = entry.take("inverted", bool, False)
-        entry.finish()
-        with entry.named():
-            if kind == _CHESSBOARD:
-                return Chessboard(columns, rows, square, pose, inverted, shape, deviation)
-            asymmetric = kind == _ASYMMETRIC
-            return CircleGrid(columns, rows, spacing, asymmetric, inverted, pose, shape, deviation)
-    marker, name = entry.number("marker"), entry.take("family", str)
-    first_id, legacy = entry.take("first_id", int, 0), entry.take("legacy", bool, False)
+    counts = entry.take("columns", int), entry.take("rows", int)
+    spacing = entry.number("spacing" if "circles" in kind else "square")
+    given: dict[str, Any] = {"pose": _pose(entry)}
+    if "shape" in entry:
+        given["shape"] = entry.take("shape", list)
+    if "deviation" in entry:
+        given["deviation"] = entry.number("deviation")
+    if kind == _CHARUCO:
+        marker, name = entry.number("marker"), entry.take("family", str)
+        given |= {"first_id": entry.take("first_id", int, 0)}
+        given |= {"legacy": entry.take("legacy", bool, False)}
+    else:
+        given["inverted"] = entry.take("inverted", bool, False)
     entry.finish()
     with entry.named():
-        return Charuco(
-            columns, rows, square, marker, family(name), first_id, legacy, pose, shape, deviation
-        )
+        if kind == _CHARUCO:
+            return Charuco(*counts, spacing, marker, family(name), **given)
+        if kind == _CHESSBOARD:
+            return Chessboard(*counts, spacing, **given)
+        return CircleGrid(*counts, spacing, kind == _ASYMMETRIC, **given)
 
 
 def _pose(entry: Entry) -> Pose:
@@ -212,57 +211,48 @@ def _marker_entry(marker: Marker) -> dict[str, Any]:
         deviations["rotation_deviation"] = _significant(marker.deviations[3:])
     square = Marker.at(marker.family.name, marker.id, marker.size, marker.pose)
     if np.abs(square.corners - marker.corners).max() > _SAME * marker.size:
-        return entry | {"corners": _numbers(marker.corners)} | deviations
-    return entry | {"size": _rounded(marker.size)} | _pose_entry(marker.pose) | deviations
+        return entry | {"corners": [rounded(row) for row in marker.corners]} | deviations
+    return entry | {"size": rounded([marker.size])[0]} | _pose_entry(marker.pose) | deviations
 
 
 def _board_entry(board: Board) -> dict[str, Any]:
-    sizes: dict[str, Any] = {"columns": board.columns, "rows": board.rows}
-    shape = {} if board.shape is None else {"shape": _numbers(np.round(board.shape, 7))}
-    if board.deviation is not None:
-        shape["deviation"] = float(f"{board.deviation:.3g}")
-    if not isinstance(board, Charuco):
-        inverted = {"inverted": True} if board.inverted else {}
-        if isinstance(board, Chessboard):
-            kind, sizes["square"] = _CHESSBOARD, float(board.square)
-        else:
-            kind = _ASYMMETRIC if board.asymmetric else _CIRCLES
-            sizes["spacing"] = float(board.spacing)
-        return {"type": kind} | sizes | _pose_entry(board.pose) | inverted | shape
-    return (
-        {"type": _CHARUCO}
-        | sizes
-        | {
+    if isinstance(board, Charuco):
+        kind, own = _CHARUCO, {
             "square": float(board.square),
             "marker": float(board.marker),
             "family": board.family.name,
             "first_id": board.first_id,
             "legacy": board.legacy,
-        }
-        | _pose_entry(board.pose)
-        | shape
-    )
+        }  # fmt: skip
+    elif isinstance(board, Chessboard):
+        kind, own = _CHESSBOARD, {"square": float(board.square)}
+    else:
+        kind = _ASYMMETRIC if board.asymmetric else _CIRCLES
+        own = {"spacing": float(board.spacing)}
+    entry: dict[str, Any] = {"type": kind, "columns": board.columns, "rows": board.rows}
+    entry |= own | _pose_entry(board.pose)
+    if not isinstance(board, Charuco) and board.inverted:
+        entry["inverted"] = True
+    if board.shape is not None:
+        entry["shape"] = [rounded(row) for row in np.round(board.shape, 7)]
+    if board.deviation is not None:
+        entry["deviation"] = float(f"{board.deviation:.3g}")
+    return entry
 
 
 def _pose_entry(pose: Pose) -> dict[str, Any]:
     quaternion = quaternion_of_rotation(pose.rotation)
-    return {"position": _numbers(pose.position), "quaternion": _numbers(quaternion)}
+    return {"position": rounded(pose.position), "quaternion": rounded(quaternion)}
 
 
-def _numbers(values: Array) -> Any:
-    if values.ndim > 1:
-        return [_numbers(row) for row in values]
-    return [_rounded(value) for value in values]
+def rounded(values: Iterable[float]) -> list[float]:
+    """Without the rounding errors of a fitted pose: 0.16 and not 0.16000000000000003."""
+    return [round(float(value), 12) + 0.0 for value in values]
 
 
 def _significant(values: Array) -> list[float]:
     """Three digits: more are not known of a deviation."""
     return [float(f"{value:.3g}") for value in values]
-
-
-def _rounded(value: float) -> float:
-    """Without the rounding errors of a fitted pose: 0.16 and not 0.16000000000000003."""
-    return round(float(value), 12) + 0.0
 
 
 class EntryError(ValueError):

@@ -97,7 +97,7 @@ def test_what_covers_a_corner_does_not_move_it(render, look, project):
     for covered, expected in ((25, [0, 1, 2, 3]), (60, [0, 3])):
         image[y - 5 : y + covered, x - 5 : x + 12] = 120
         quads = pixels[None] + 0.5
-        found = refine(image, quads, np.array([marker.family.cells]))
+        found = refine(image, quads, marker.family.cells)
         assert np.flatnonzero(found[0]).tolist() == expected
         np.testing.assert_allclose(quads[found], pixels[found[0]], atol=0.25)
 
@@ -105,7 +105,7 @@ def test_what_covers_a_corner_does_not_move_it(render, look, project):
 def test_ids_are_rows_of_the_maps_points(render, look, project):
     turned = Pose(np.array([0.0, 0.0, 0.0]), np.diag([-1.0, -1.0, 1.0]))
     walls = wall("4x4_50", (2, 2), 0.06, 0.02, first_id=10, pose=turned)
-    board = Chessboard(4, 3, 0.02, Pose(np.array([0.0, 0.13, 0.0])))
+    board = Chessboard(4, 3, 0.02, pose=Pose(np.array([0.0, 0.13, 0.0])))
     marker_map = MarkerMap(walls, (board,), "hall")
     prints = [(pattern(m.family, m.id), m.corners) for m in walls]
     y, x = np.mgrid[:4, :5]
@@ -343,7 +343,7 @@ def moved(image: np.ndarray, truth: np.ndarray, cells: int) -> float:
     """The largest error (px) of corners (4,2), from a start that is half a pixel off."""
     quads = (truth + np.array([[0.4, -0.3], [-0.5, 0.2], [0.3, 0.5], [-0.2, -0.4]]))[None]
     gray = np.ascontiguousarray(np.clip(np.rint(image), 0, 255).astype(np.uint8))
-    assert np.all(refine(gray, quads, np.array([cells])))
+    assert np.all(refine(gray, quads, cells))
     return float(np.abs(quads[0] - truth).max())
 
 
@@ -410,6 +410,6 @@ def test_the_sides_of_a_fisheyes_marker_are_curves():
         far = np.linalg.norm(corners, axis=1, keepdims=True)
         truth = middle + focal * np.arctan(far / focal) * corners / far
         quads = truth[None] + 0.3
-        assert refine(np.rint(image).astype(np.uint8), quads, np.array([6])).all()
+        assert refine(np.rint(image).astype(np.uint8), quads, 6).all()
         outward.append(np.sum((quads[0] - truth) * (truth - middle), axis=1) / far[:, 0])
     assert abs(np.mean(outward)) < 0.03

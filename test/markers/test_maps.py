@@ -74,8 +74,8 @@ def test_what_is_written_is_read(tmp_path):
             Marker(family("aruco_original"), 1000, measured),
         ),
         boards=(
-            Chessboard(6, 4, 0.03, pose),
-            Charuco(5, 7, 0.04, 0.03, family("36h11"), 10, True, pose),
+            Chessboard(6, 4, 0.03, pose=pose),
+            Charuco(5, 7, 0.04, 0.03, family("36h11"), 10, True, pose=pose),
         ),
         map_frame="hall",
     )
