@@ -2,26 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses and velocities for neural reconstruction with a rolling shutter: nerfstudio, gsplat, NCore.
 
-nerfstudio's ``transforms.json``: fields as *Gaussian Splatting on the Move* (Seiskari et al., ECCV
-2024; its code converts to the same) reads them beside nerfstudio's own:
-``camera_linear_velocity`` and ``camera_angular_velocity``
-of each frame (m/s and rad/s, in the camera's axes), ``rolling_shutter_time`` and
-``exposure_time`` (s). The row ``y`` of ``h`` is exposed ``(y / h - 1 / 2) rolling_shutter_time``
-after the moment of ``transform_matrix``, which is the middle of the image.
-
-gsplat: ``viewmats.npy`` and ``viewmats_rs.npy`` (n,4,4) are ``camera_from_world`` at the first and
-at the last exposed row of the image (``rasterization`` interpolates between them), ``Ks.npy``
-(n,3,3) the intrinsics with the corner of the first pixel at 0, 0, of a lens with distortion
-``radial_coeffs.npy`` and so on, by the names of ``rasterization``, ``names.txt`` the images,
-``shutter.txt`` the name of ``RollingShutterType``. Beside it the same as a text model of COLMAP,
-with the lens and the poses of the middle row.
-
-NVIDIA's ``ncore.json`` has the fields of NCore's camera models
-(``OpenCVPinholeCameraModelParameters``, ``OpenCVFisheyeCameraModelParameters``) under their names,
-and of each frame what ``CameraSensorComponent.Writer.store_frame`` and
-``PosesComponent.Writer.store_dynamic_pose`` take: timestamps (us) and ``T_sensor_world`` at the
-first and at the last exposed row. NCore's own package makes a sequence of them
-(docs/integrations.md).
+What each file and field is: docs/integrations.md. The fields of nerfstudio's ``transforms.json``
+are those of *Gaussian Splatting on the Move* (Seiskari et al., ECCV 2024; its code converts to the
+same): the row ``y`` of ``h`` is exposed ``(y / h - 1 / 2) rolling_shutter_time`` after the moment
+of ``transform_matrix``, which is the middle of the image. gsplat and NCore interpolate between the
+poses at the first and at the last exposed row; NCore's own package makes a sequence of
+``ncore.json``.
 """
 
 from __future__ import annotations

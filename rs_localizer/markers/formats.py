@@ -18,19 +18,13 @@ to find, are left out::
           is_static: true
           default_tag_size: 0.16
           pose: {position: {x: 0, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}
-          tags:
-            - id: 0
-              size: 0.16
-              pose: {position: {x: 0, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}
+          tags: [{id: 0, size: 0.16, pose: {position: {x: 0, y: 0, z: 0}, rotation: ...}}]
 
 Bundles of apriltag_ros (ROS 1), YAML. Metres; axes as TagSLAM's (AprilRobotics/apriltag_ros #156).
 What is missing of a pose is that of the origin. Standalone tags have no place::
 
     tag_family: tag36h11
-    tag_bundles:
-      - name: wall
-        layout:
-          - {id: 0, size: 0.16, x: 0, y: 0, z: 0, qw: 1, qx: 0, qy: 0, qz: 0}
+    tag_bundles: [{name: wall, layout: [{id: 0, size: 0.16, x: 0, y: 0, z: 0, qw: 1, qx: 0, ...}]}]
 """
 
 import json

@@ -1,47 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of marker maps, in YAML.
-
-    map_frame: map                 # frame of all that follows; lengths in metres
-    markers:
-      - family: 4x4_50             # or any name of rs_localizer.markers.families
-        id: 3
-        size: 0.16                 # side of the black square
-        position: [0.0, 0.0, 1.5]  # of its middle
-        quaternion: [0.5, 0.5, 0.5, 0.5]  # x y z w; or rotation: three rows of a matrix
-        position_deviation: [0.001, 0.001, 0.002]  # optional, of a survey: m, and rad
-        rotation_deviation: [0.001, 0.001, 0.001]
-      - family: apriltag_36h11
-        id: 0
-        corners: [[0, 1, 2], [0, 1.2, 2], [0, 1.2, 1.8], [0, 1, 1.8]]
-    boards:
-      - type: chessboard
-        columns: 6                 # inner corners
-        rows: 4
-        square: 0.03
-        position: [0.0, 0.0, 0.0]
-        quaternion: [0.0, 0.0, 0.0, 1.0]
-        inverted: false            # optional: white on black paper
-        shape: [[0.0, 0.0, 0.001], ...]  # optional, of any board: how far from flat each corner is
-        deviation: 0.0002          # optional, of any board: m, how well its points are known;
-                                   # without it as paper is: 0.2 mm for each 10 cm from its middle
-      - type: circles              # or asymmetric_circles, OpenCV's pattern
-        columns: 4                 # circles
-        rows: 11
-        spacing: 0.02              # from row to row
-        position: [2.0, 0.0, 0.0]
-        quaternion: [0.0, 0.0, 0.0, 1.0]
-        inverted: false            # optional: white circles on black
-      - type: charuco
-        columns: 5                 # squares
-        rows: 7
-        square: 0.04
-        marker: 0.03
-        family: 5x5_100
-        first_id: 0                # optional
-        legacy: false              # optional: drawn by OpenCV before 4.6
-        position: [1.0, 0.0, 0.0]
-        quaternion: [0.0, 0.0, 0.0, 1.0]
+"""Files of marker maps, in YAML; an example of all that they may hold is in docs/maps.md.
 
 A pose is that of the print's frame: origin in its middle, x to the right, y up, z toward the
 viewer (the identity is a print that lies on the floor of a map whose z points up). Corners go from
@@ -82,7 +41,7 @@ _CHESSBOARD, _CIRCLES, _ASYMMETRIC, _CHARUCO = _BOARDS = (
 
 
 def read_marker_map(path: Path | str) -> MarkerMap:
-    """Read a map file (see the module).
+    """Read a map file.
 
     Raises:
         MarkerMapError: for anything that cannot be used, saying where and what was found.
