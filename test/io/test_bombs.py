@@ -143,12 +143,7 @@ def test_recordings_with_types_of_their_own(tmp_path):
 
 @pytest.mark.parametrize(
     ("mode", "storage"),
-    [
-        (CompressionMode.FILE, StoragePlugin.SQLITE3),
-        (CompressionMode.MESSAGE, StoragePlugin.SQLITE3),
-        (CompressionMode.STORAGE, StoragePlugin.MCAP),
-        (CompressionMode.MESSAGE, StoragePlugin.MCAP),
-    ],
+    [("FILE", "SQLITE3"), ("MESSAGE", "SQLITE3"), ("STORAGE", "MCAP"), ("MESSAGE", "MCAP")],
 )
 def test_packed_recordings(tmp_path, mode, storage, monkeypatch):
     monkeypatch.setattr(bags, "_MOST_UNPACKED", 1_000_000)
@@ -156,8 +151,8 @@ def test_packed_recordings(tmp_path, mode, storage, monkeypatch):
     text = "std_msgs/msg/String"
     store = get_typestore(Stores.ROS2_JAZZY)
     for length in (1000, 3_000_000):
-        writer = Writer(tmp_path / f"bag{length}", version=9, storage_plugin=storage)
-        writer.set_compression(mode, CompressionFormat.ZSTD)
+        writer = Writer(tmp_path / f"bag{length}", version=9, storage_plugin=StoragePlugin[storage])
+        writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
         with writer:
             connection = writer.add_connection("/a", text, typestore=store)
             message = make_message(text, data="a" * length)
