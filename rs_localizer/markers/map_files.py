@@ -108,8 +108,8 @@ def _board(entry: Entry) -> Board:
         given["deviation"] = entry.number("deviation")
     if kind == _CHARUCO:
         marker, name = entry.number("marker"), entry.take("family", str)
-        given |= {"first_id": entry.take("first_id", int, 0)}
-        given |= {"legacy": entry.take("legacy", bool, False)}
+        given["first_id"] = entry.take("first_id", int, 0)
+        given["legacy"] = entry.take("legacy", bool, False)
     else:
         given["inverted"] = entry.take("inverted", bool, False)
     entry.finish()
