@@ -3,7 +3,6 @@
 """sensor_msgs/Imu of rosbags and of rclpy are read alike; what no IMU measures is refused."""
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -165,12 +164,8 @@ def stray(folder: Path) -> None:
     ],
 )
 def test_readings_are_those_of_the_camera_behind_the_screen(
-    write: Callable[[Path], None],
-    app: str,
-    exposure: float | None,
-    readout: float | None,
-    tmp_path: Path,
-) -> None:
+    write, app, exposure, readout, tmp_path
+):
     video = tmp_path / "VID_20260101_120000.mp4"
     assert read_log(video) is None
     write(tmp_path)
@@ -185,24 +180,32 @@ def test_readings_are_those_of_the_camera_behind_the_screen(
     np.testing.assert_allclose(found.rates, RATES[:, 1:2] * up, atol=1e-12)
 
 
-def test_a_log_that_is_broken_is_named(tmp_path: Path) -> None:
+HEADING = "timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n"
+READINGS = [[BOOT + 0.01 * k, 0.0, 0.0, -1.0, 0.1 * k, 0.0, 0.0] for k in range(5)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ([], r"imu\.csv has no readings"),
+        ([row[:3] for row in READINGS], "5 lines of 3 numbers, 7 or more are needed"),
+        ([*READINGS, [BOOT + 1.0, math.nan, *READINGS[0][2:]]],
+         r"1 lines without a number, as 81235\.5, ?nan"),
+        ([[row[0] - 100.0, *row[1:]] for row in READINGS],
+         r"not of one time: 81134\.5 to 81134\.5 s, 81234\.5"),
+    ],
+)  # fmt: skip
+def test_a_log_that_is_broken_is_named(tmp_path, rows, said):
     stray(tmp_path)
-    (tmp_path / "imu.csv").write_text("timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n")
-    with pytest.raises(TelemetryError, match=r"imu\.csv has no readings"):
+    csv(tmp_path / "imu.csv", HEADING, rows)
+    with pytest.raises(TelemetryError, match=said):
         read_log(tmp_path / "rgb.mp4")
-    csv(tmp_path / "imu.csv", "timestamp, a_x, a_y\n", [[k, 0.0, 9.8] for k in range(5)])
-    with pytest.raises(TelemetryError, match="5 lines of 3 numbers, 7 or more are needed"):
-        read_log(tmp_path / "rgb.mp4")
-    rows = [[BOOT + 0.01 * k, 0.0, 0.0, -1.0, 0.1 * k, 0.0, 0.0] for k in range(5)]
-    heading = "timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n"
-    csv(tmp_path / "imu.csv", heading, [*rows, [BOOT + 1.0, float("nan"), *rows[0][2:]]])
-    with pytest.raises(TelemetryError, match=r"1 lines without a number, as 81235\.5, ?nan"):
-        read_log(tmp_path / "rgb.mp4")
-    csv(tmp_path / "imu.csv", heading, [[row[0] - 100.0, *row[1:]] for row in rows])
-    with pytest.raises(TelemetryError, match=r"not of one time: 81134\.5 to 81134\.5 s, 81234\.5"):
-        read_log(tmp_path / "rgb.mp4")
-    # The order of lines does not matter: backwards was once -100 Hz.
-    csv(tmp_path / "imu.csv", heading, rows[::-1])
+
+
+def test_the_order_of_lines_does_not_matter(tmp_path):
+    """Backwards was once -100 Hz."""
+    stray(tmp_path)
+    csv(tmp_path / "imu.csv", HEADING, READINGS[::-1])
     found = read_log(tmp_path / "rgb.mp4")
     assert found.rate == pytest.approx(100.0)
     np.testing.assert_allclose(found.rates[:, 1], -0.1 * np.arange(5))

@@ -55,7 +55,7 @@ def log(tmp_path: Path) -> Path:
     return path
 
 
-def test_readings_are_in_the_axes_of_the_camera(log: Path) -> None:
+def test_readings_are_in_the_axes_of_the_camera(log):
     found = read_telemetry(log)
     assert (found.rate, len(found.times), found.times[0]) == (pytest.approx(RATE), 400, 0.0)
     assert found.readout_time == pytest.approx(0.0205)
@@ -66,7 +66,7 @@ def test_readings_are_in_the_axes_of_the_camera(log: Path) -> None:
     np.testing.assert_allclose(found.rates[-1], [-0.1, 0.0, -0.3], atol=1e-9)
 
 
-def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
+def test_what_cannot_be_read_is_named(tmp_path):
     path = tmp_path / "broken.mp4"
     path.write_bytes(b"gpmd" + bytes(100))
     assert has_telemetry(path)
@@ -104,7 +104,7 @@ def dji(monkeypatch: Any) -> Any:
 
 
 @pytest.mark.parametrize(("model", "known"), [({}, True), ({"distortion_model": "gopro"}, False)])
-def test_lens_profiles(log: Path, dji: Any, model: dict[str, str], known: bool) -> None:
+def test_lens_profiles(log, dji, model, known):
     samples = telemetry_parser.Parser(str(log)).normalized_imu
     found = dji([{"Lens": {"Data": PROFILE | model}}], samples)
     name = model.get("distortion_model", "opencv_fisheye")
@@ -117,7 +117,7 @@ def test_lens_profiles(log: Path, dji: Any, model: dict[str, str], known: bool) 
         np.testing.assert_allclose(found.profile.project(points[0]), pixels[0], atol=1e-9)
 
 
-def test_orientations_take_the_place_of_a_gyroscope(dji: Any) -> None:
+def test_orientations_take_the_place_of_a_gyroscope(dji):
     """As of DJI; a camera that turns to the right and then lifts its view."""
     times = 0.01 * np.arange(40)
     turns = [
@@ -160,7 +160,7 @@ def field(tag: int, value: int | float | str | bytes) -> bytes:
     return varint(8 * tag + 2) + varint(len(data)) + data
 
 
-def test_a_file_of_insta360(tmp_path: Path) -> None:
+def test_a_file_of_insta360(tmp_path):
     """Its trailer, written by hand as telemetry-parser's source describes it; the lens is that of
     Mei and Rives, here by its own formula.
     """
@@ -246,7 +246,7 @@ def of_gopro(payloads: list[bytes], *settings: bytes, padding: int = 0) -> bytes
     return first + box("mdat", *payloads) + box("moov", *content, box("free", bytes(padding)))
 
 
-def test_a_file_of_gopro(tmp_path: Path) -> None:
+def test_a_file_of_gopro(tmp_path):
     """As GPMF's documentation has it: up, right to left, forward to back; a HERO7's readout times
     stand in a stream of their own.
     """
@@ -290,7 +290,7 @@ SAMPLES = {
 
 
 @pytest.mark.skipif("GOPRO_SAMPLES" not in os.environ, reason="GOPRO_SAMPLES=FOLDER has them")
-def test_real_samples(tmp_path: Path) -> None:
+def test_real_samples(tmp_path):
     for name, (rate, readout, upright) in SAMPLES.items():
         path = sample = Path(os.environ["GOPRO_SAMPLES"]) / name
         if not sample.exists():
@@ -352,7 +352,7 @@ def telemetry(log: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return give
 
 
-def test_detect_takes_gyroscope_and_readout_time(video: Path, telemetry: Any, capsys: Any) -> None:
+def test_detect_takes_gyroscope_and_readout_time(video, telemetry, capsys):
     telemetry(exposure=0.002)
     out = detect(video)
     assert (
@@ -381,9 +381,7 @@ def test_detect_takes_gyroscope_and_readout_time(video: Path, telemetry: Any, ca
         ({"stabilizer": "HS HLevel"}, [], "has stabilized this video (HS HLevel): its rows are"),
     ],
 )
-def test_where_the_gyroscope_says_nothing(
-    video: Path, telemetry: Any, capsys: Any, changes: Any, words: list[str], said: str
-) -> None:
+def test_where_the_gyroscope_says_nothing(video, telemetry, capsys, changes, words, said):
     telemetry(**changes)
     out = detect(video, *words)
     assert said in capsys.readouterr().out
@@ -393,8 +391,8 @@ def test_where_the_gyroscope_says_nothing(
 
 
 def test_a_lens_profile_takes_the_place_of_a_calibration_and_what_is_given_goes_before(
-    video: Path, telemetry: Any, capsys: Any
-) -> None:
+    video, telemetry, capsys
+):
     lens = Camera(160, 120, [[140.0, 0, 80], [0, 140, 60], [0, 0, 1]], np.zeros(4), "equidistant")
     telemetry(lens="lens profile by DJI (opencv_fisheye, 140 px)", profile=lens)
     out = video.parent / "seen"
@@ -413,7 +411,7 @@ def test_a_lens_profile_takes_the_place_of_a_calibration_and_what_is_given_goes_
         assert next(m for _, _, m in bag.messages(["/camera_info"])).k[0] == 150.0
 
 
-def test_maps_take_the_gyroscope_of_a_video(video: Path, telemetry: Any) -> None:
+def test_maps_take_the_gyroscope_of_a_video(video, telemetry):
     found = telemetry()
     parser = argparse.ArgumentParser()
     build.add_arguments(parser)
@@ -428,9 +426,7 @@ def test_maps_take_the_gyroscope_of_a_video(video: Path, telemetry: Any) -> None
 
 
 @pytest.mark.parametrize(("focal", "doubted"), [(280.0, False), (300.0, True)])
-def test_a_focal_length_that_disagrees_is_named(
-    video: Path, telemetry: Any, capsys: Any, focal: float, doubted: bool
-) -> None:
+def test_a_focal_length_that_disagrees_is_named(video, telemetry, capsys, focal, doubted):
     """Of another resolution of the same shape: half of the measured one is to be compared."""
     lens = Camera(160, 120, [[140.0, 0, 80], [0, 140, 60], [0, 0, 1]], np.zeros(4), "equidistant")
     telemetry(lens="lens profile", profile=lens)
