@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 from rs_localizer.config import NO_NAMES, CameraSettings, DetectorConfig, FeatureConfig, NodeConfig
-from rs_localizer.io.yaml_text import YamlError, load_yaml
+from rs_localizer.io.yaml_text import YamlError, file_faults, load_yaml
 
 NODE_NAME = "rs_localizer"
 DETECTOR_NAME = "marker_detector"
@@ -166,12 +166,8 @@ def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
         SettingsError: for a file that cannot be read, a name that is not a setting, or a file
             without parameters for the node.
     """
-    try:
+    with file_faults(path, SettingsError):
         tree = load_yaml(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(f"{path} cannot be read: {error.strerror}") from error
-    except (YamlError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from error
     values: dict[str, Any] = {}
     node = NODES[kind]
     blocks = list(_blocks(tree, "", node))

@@ -18,12 +18,11 @@ from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud, read_keypoints, read_map
 from rs_localizer.io.maps.files import read_map_file, write_map_file
-from rs_localizer.io.maps.landmarks import Map, MapError
+from rs_localizer.io.maps.landmarks import Map, MapError, map_rows
 from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.io.messages import MessageError
 from rs_localizer.settings import build
 from rs_localizer.settings import settings as all_settings
-from rs_localizer.simulation.scene import map_rows
 
 quick = settings(max_examples=40, deadline=None)
 # Of a PointField: 32 bits, unsigned or signed.

@@ -25,10 +25,10 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.files import write_npz
-from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.maps.landmarks import Map, map_rows
 from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
+from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room
 from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 

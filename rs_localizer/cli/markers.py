@@ -137,12 +137,12 @@ def _map(args: argparse.Namespace) -> MarkerMap:
     square = args.square or _SQUARE
     if args.chessboard is not None:
         _refuse(args, "markers", "family", "first_id", "marker")
-        board: Board = Chessboard(*read_counts(args.chessboard, "--chessboard"), square, pose)
+        board: Board = Chessboard(*read_counts(args.chessboard, "--chessboard"), square, pose=pose)
     else:
         columns, rows = read_counts(args.charuco, "--charuco")
         marker = args.marker or _MARKER_SHARE * square
         chosen = family(args.family or _FAMILY)
-        board = Charuco(columns, rows, square, marker, chosen, args.first_id or 0, False, pose)
+        board = Charuco(columns, rows, square, marker, chosen, args.first_id or 0, pose=pose)
     return MarkerMap(boards=(board,), map_frame=args.map_frame)
 
 

@@ -121,7 +121,7 @@ class FeatureError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Method:
+class _Method:
     """One way to find keypoints and to describe them.
 
     ``find`` and ``describe`` of OpenCV repeat much of each other's work. ``at_once`` says that to
@@ -131,10 +131,9 @@ class Method:
     create: Callable[[int], Any]  # OpenCV's detector for this many keypoints
     at_once: bool
     place: Callable[[Gray, Sequence[Any]], Array]  # pixels (n,2) of keypoints, sub-pixel, unbiased
-    pack: Callable[[NDArray[Any]], Descriptors]  # OpenCV's descriptors (n,d) as they are sent
 
 
-def root_descriptors(descriptors: NDArray[Any]) -> Descriptors:
+def _root(descriptors: NDArray[Any]) -> Descriptors:
     """SIFT as COLMAP has it: L1-normalised, square roots, times 512 in bytes.
 
     Arandjelovic, Zisserman, *Three things everyone should know to improve object retrieval*, CVPR
@@ -175,10 +174,6 @@ def _points(keypoints: Sequence[Any]) -> Array:
     return np.array([keypoint.pt for keypoint in keypoints], np.float64).reshape(-1, 2)
 
 
-def _sift_place(_: Gray, keypoints: Sequence[Any]) -> Array:
-    return _points(keypoints) + _SIFT_OFFSET
-
-
 def _orb_place(image: Gray, keypoints: Sequence[Any]) -> Array:
     octaves = np.array([keypoint.octave for keypoint in keypoints], np.int64)
     scale = _ORB_STEP**octaves
@@ -186,20 +181,11 @@ def _orb_place(image: Gray, keypoints: Sequence[Any]) -> Array:
     return refined(image, corners, octaves, _ORB_STEP)
 
 
-def _akaze_place(_: Gray, keypoints: Sequence[Any]) -> Array:
-    return _points(keypoints)
-
-
-def _as_it_is(descriptors: NDArray[Any]) -> Descriptors:
-    return np.ascontiguousarray(descriptors, np.uint8)
-
-
-METHODS: dict[str, Method] = {
-    FeatureKind.SIFT: Method(_sift, False, _sift_place, root_descriptors),
-    FeatureKind.ORB: Method(_orb, False, _orb_place, _as_it_is),
-    FeatureKind.AKAZE: Method(_akaze, True, _akaze_place, _as_it_is),
+_METHODS: dict[str, _Method] = {
+    FeatureKind.SIFT: _Method(_sift, False, lambda _, found: _points(found) + _SIFT_OFFSET),
+    FeatureKind.ORB: _Method(_orb, False, _orb_place),
+    FeatureKind.AKAZE: _Method(_akaze, True, lambda _, found: _points(found)),
 }
-"""All methods by their name."""
 
 
 # Keypoints that a cell of the grid holds on average.
@@ -257,9 +243,10 @@ class FeatureExtractor:
     """
 
     def __init__(self, kind: str, most: int) -> None:
-        if kind not in METHODS:
-            raise FeatureError(f"features must be one of {', '.join(METHODS)}; got {kind!r}")
-        self._method = METHODS[kind]
+        if kind not in _METHODS:
+            raise FeatureError(f"features must be one of {', '.join(_METHODS)}; got {kind!r}")
+        self._method = _METHODS[kind]
+        self._is_sift = kind == FeatureKind.SIFT
         self._most = most
         self._detector = self._method.create(most)
 
@@ -285,28 +272,28 @@ class FeatureExtractor:
         if min(image.shape) >= _LEAST_SIDE:
             if self._method.at_once:
                 detected, descriptors = self._detector.detectAndCompute(image, None)
-                rows = self._choose(detected, image)
-                detected = [detected[row] for row in rows]
-                descriptors = None if descriptors is None else descriptors[rows]
             else:
                 detected = self._detector.detect(image)
-                chosen = [detected[row] for row in self._choose(detected, image)]
+            rows = self._choose(detected, image)
+            detected = [detected[row] for row in rows]
+            if not self._method.at_once:
                 # Some are too near the rim, and others change their places.
-                detected, descriptors = self._detector.compute(image, chosen)
+                detected, descriptors = self._detector.compute(image, detected)
+            elif descriptors is not None:
+                descriptors = descriptors[rows]
         if descriptors is None:
             detected, descriptors = (), np.zeros((0, self._detector.descriptorSize()))
         return Features(
             _single(self._method.place(image, detected)),
             _single(np.array([keypoint.response for keypoint in detected])),
             _single(np.array([keypoint.size for keypoint in detected])),
-            self._method.pack(descriptors),
+            _root(descriptors) if self._is_sift else np.ascontiguousarray(descriptors, np.uint8),
         )
 
     def _choose(self, detected: Sequence[Any], image: Gray) -> list[int]:
-        pixels = np.array([keypoint.pt for keypoint in detected]).reshape(-1, 2)
         scores = np.array([keypoint.response for keypoint in detected])
         height, width = image.shape
-        rows: list[int] = balanced(pixels, scores, (width, height), self._most).tolist()
+        rows: list[int] = balanced(_points(detected), scores, (width, height), self._most).tolist()
         return rows
 
 

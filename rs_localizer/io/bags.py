@@ -14,7 +14,7 @@ import sqlite3
 from collections.abc import Collection, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from types import SimpleNamespace, TracebackType
+from types import SimpleNamespace
 from typing import Any, Self
 
 from lz4.frame import LZ4FrameDecompressor
@@ -40,8 +40,6 @@ from rs_localizer.io.yaml_text import load_yaml
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SUFFIXES = (".mcap", ".db3", ".bag")
 """Of files that are recordings."""
-# Fields that ROS 2 spells in lower case.
-_ROS1_FIELDS = {"sensor_msgs/msg/CameraInfo": {"D": "d", "K": "k", "R": "r", "P": "p"}}
 # Whoever plays a recording offers its topics as it says; on /tf_static everybody listens for what
 # was said before.
 _NO_LIMIT = QosTime(2**31 - 1, 10**9 - 1)
@@ -49,8 +47,6 @@ _LATCHED = Qos(
     QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
     _NO_LIMIT, _NO_LIMIT, QosLiveliness.AUTOMATIC, _NO_LIMIT, False,
 )  # fmt: skip
-_LATCHED_TOPICS = (TF_STATIC,)
-
 
 # Of a chunk or a message, unpacked: a hundred raw images of a megapixel are fewer.
 _MOST_UNPACKED = 2**28
@@ -104,16 +100,13 @@ def _bound_decompression() -> None:
     bounded = _BoundedZstd(ros2["zstd"])
     ros2["zstd"] = bounded
 
-    def lz4(data: bytes) -> bytes:
-        return _unpacked(LZ4FrameDecompressor(), data)
-
     ros1["decompressors"] |= {
         "bz2": lambda data: _unpacked(bz2.BZ2Decompressor(), data),
-        "lz4": lz4,
+        "lz4": lambda data: _unpacked(LZ4FrameDecompressor(), data),
     }
     mcap["DECOMPRESSORS"] |= {
         "zstd": lambda data, _: bounded.decompress(data),
-        "lz4": lambda data, _: lz4(data),
+        "lz4": lambda data, _: _unpacked(LZ4FrameDecompressor(), data),
     }
 
 
@@ -142,15 +135,11 @@ class BagReader:
     """An open recording (see :func:`open_bag`)."""
 
     def __init__(self, path: Location, reader: AnyReader) -> None:
-        self._path = path
+        self.path = path
         self._reader = reader
         self.topics: dict[str, str] = {
             name: info.msgtype or "several types" for name, info in reader.topics.items()
         }
-
-    @property
-    def path(self) -> Location:
-        return self._path
 
     def count(self, topics: Collection[str]) -> int:
         """How many messages the recording holds on these topics."""
@@ -166,13 +155,13 @@ class BagReader:
         missing = [topic for topic in topics if topic not in self.topics]
         if missing:
             raise BagError(
-                f"{self._path} has no topic {', '.join(missing)}; it has "
+                f"{self.path} has no topic {', '.join(missing)}; it has "
                 f"{', '.join(sorted(self.topics))}"
             )
         wanted = [c for c in self._reader.connections if c.topic in topics]
         if not wanted:
             return
-        with _explained(self._path):
+        with _explained(self.path):
             self._check_types({connection.msgtype for connection in wanted})
             for connection, stamp_ns, data in self._reader.messages(connections=wanted):
                 message = self._reader.deserialize(data, connection.msgtype)
@@ -185,7 +174,7 @@ class BagReader:
         own, standard = self._reader.typestore.fielddefs, typestore().fielddefs
         for name in (set(names) & set(standard)) - set(DEFINITIONS) if self._reader.is2 else ():
             if _fields_of(name, own) != _fields_of(name, standard):
-                raise BagError(f"{self._path} describes {name} otherwise than ROS 2 Jazzy does")
+                raise BagError(f"{self.path} describes {name} otherwise than ROS 2 Jazzy does")
 
 
 @contextlib.contextmanager
@@ -267,12 +256,10 @@ def _explained(path: Location) -> Iterator[None]:
 
 def _as_ros2(message: Any, type_name: str) -> Any:
     """A ROS 1 message with the field names of ROS 2 (``header.seq`` stays as an extra)."""
-    names = _ROS1_FIELDS.get(type_name)
-    if names is None:
+    if type_name != "sensor_msgs/msg/CameraInfo":
         return message
-    fields = {
-        names.get(name, name): getattr(message, name) for name in message.__dataclass_fields__
-    }
+    # ROS 2 spells D, K, R and P in lower case.
+    fields = {name.lower(): getattr(message, name) for name in message.__dataclass_fields__}
     fields.pop("__msgtype__", None)
     return make_message(type_name, **fields)
 
@@ -323,7 +310,7 @@ class BagWriter:
                 topic,
                 type_name,
                 typestore=typestore(),
-                offered_qos_profiles=[_LATCHED] if topic in _LATCHED_TOPICS else [],
+                offered_qos_profiles=[_LATCHED] if topic == TF_STATIC else [],
             )
             self._connections[topic] = connection
         return connection
@@ -336,13 +323,8 @@ class BagWriter:
             text = error.strerror if isinstance(error, OSError) else None
             raise BagError(f"{self._path} cannot be written: {text or error}") from error
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        if exc is None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if error is None:
             with self._explained():
                 self._writer.close()
             return

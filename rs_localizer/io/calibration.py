@@ -9,9 +9,10 @@ file of several cameras, the wanted one's name stands behind a ``#``: ``camchain
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 from xml.etree import ElementTree
@@ -20,7 +21,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
-from rs_localizer.io.yaml_text import YamlError, check_tree, load_yaml
+from rs_localizer.io.yaml_text import YamlError, check_tree, file_faults, load_yaml
 
 # OpenCV writes "%YAML:1.0" where YAML has "%YAML 1.0", and a tag of its own before matrices, which
 # are plain mappings of rows, cols, dt and data.
@@ -30,12 +31,8 @@ _TAG = re.compile(r"!!opencv[-_a-z]*")
 _FORBIDDEN = "<!ENTITY"
 
 
-def load_tree(text: str) -> Any:
-    """Mappings, lists and plain values of a file's text.
-
-    Raises:
-        YamlError: for text that is none of these, saying what was found.
-    """
+def _load_tree(text: str) -> Any:
+    """Mappings, lists and plain values of a file's text; YamlError for any other."""
     start = text.lstrip()[:1]
     if start == "<":
         return _load_xml(text)
@@ -52,12 +49,8 @@ def load_tree(text: str) -> Any:
 T = TypeVar("T")
 
 
-def choose(cameras: Mapping[str, T], name: str | None) -> T:
-    """The only camera of a file, or the one that is named.
-
-    Raises:
-        ValueError: when there are several, or none of that name.
-    """
+def _choose(cameras: Mapping[str, T], name: str | None) -> T:
+    """The only camera of a file, or the one that is named."""
     if name is None and len(cameras) == 1:
         return next(iter(cameras.values()))
     if not cameras:
@@ -101,16 +94,17 @@ def _number(word: str) -> Any:
         return word
 
 
-# Parameters of each model behind its size; f stands for both focal lengths. Names of coefficients
-# are those of OpenCV, whose order is k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4).
+# Parameters of each model behind its size, in the order of the models' numbers in COLMAP's binary
+# files; f stands for both focal lengths. Names of coefficients are those of OpenCV, whose order is
+# k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4).
 _COLMAP_MODELS: dict[str, tuple[str, str]] = {
     "SIMPLE_PINHOLE": ("f cx cy", "plumb_bob"),
     "PINHOLE": ("fx fy cx cy", "plumb_bob"),
     "SIMPLE_RADIAL": ("f cx cy k1", "plumb_bob"),
     "RADIAL": ("f cx cy k1 k2", "plumb_bob"),
     "OPENCV": ("fx fy cx cy k1 k2 p1 p2", "plumb_bob"),
-    "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "rational_polynomial"),
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "equidistant"),
+    "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "rational_polynomial"),
 }
 _ORDER = {
     "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
@@ -122,7 +116,12 @@ _LINE = re.compile(r"^\s*(\d+)\s+([A-Z][A-Z_]+)((?:\s+[-+.\deE]+)+)\s*$", re.MUL
 _HALF = 0.5
 
 
-def is_colmap(text: str) -> bool:
+def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
+    """The camera matrix (3,3)."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _is_colmap(text: str) -> bool:
     """Whether the first line that is no comment is one of ``cameras.txt``."""
     lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
     return _LINE.match(next(lines, "")) is not None
@@ -135,7 +134,7 @@ def colmap_camera(text: str, chosen: str | None) -> Camera:
         ValueError: when there are several, or for a model that is not supported.
     """
     cameras = {match[1]: (match[2], match[3].split()) for match in _LINE.finditer(text)}
-    model, words = choose(cameras, chosen)
+    model, words = _choose(cameras, chosen)
     if model not in _COLMAP_MODELS:
         raise ValueError(f"model must be one of {', '.join(_COLMAP_MODELS)}; found {model}")
     names, distortion = _COLMAP_MODELS[model]
@@ -144,22 +143,8 @@ def colmap_camera(text: str, chosen: str | None) -> Camera:
     values = dict(zip(names.split(), map(float, words[2:]), strict=True))
     fx, fy = (values.get(name, values.get("f", 0.0)) for name in ("fx", "fy"))
     D = [values.get(name, 0.0) for name in _ORDER[distortion]]
-    return Camera(
-        width=int(words[0]),
-        height=int(words[1]),
-        K=np.array(
-            [[fx, 0.0, values["cx"] - _HALF], [0.0, fy, values["cy"] - _HALF], [0.0, 0.0, 1.0]]
-        ),
-        D=np.array(D if any(D) else []),
-        distortion_model=distortion,
-    )
-
-
-# The numbers of these models in COLMAP's binary files.
-_COLMAP_NUMBERS = (
-    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"),
-    "FULL_OPENCV",
-)
+    K = pinhole_matrix(fx, fy, values["cx"] - _HALF, values["cy"] - _HALF)
+    return Camera(int(words[0]), int(words[1]), K, np.array(D if any(D) else []), distortion)
 
 
 def colmap_line(number: int, model: int, width: int, height: int, parameters: Array) -> str:
@@ -168,12 +153,18 @@ def colmap_line(number: int, model: int, width: int, height: int, parameters: Ar
     Raises:
         ValueError: for a model that is not supported.
     """
-    if not 0 <= model < len(_COLMAP_NUMBERS):
-        raise ValueError(
-            f"model must be one of {', '.join(_COLMAP_MODELS)}; found COLMAP's number {model}"
-        )
+    names = list(_COLMAP_MODELS)
+    if not 0 <= model < len(names):
+        raise ValueError(f"model must be one of {', '.join(names)}; found COLMAP's number {model}")
     values = " ".join(repr(float(value)) for value in parameters)
-    return f"{number} {_COLMAP_NUMBERS[model]} {width} {height} {values}"
+    return f"{number} {names[model]} {width} {height} {values}"
+
+
+def pixel_intrinsics(camera: Camera) -> tuple[Array, Array]:
+    """Focal lengths (2,) and centre (2,) in px of the delivered image; 0, 0 is its first corner."""
+    roi, binning = camera.roi, np.array(camera.binning, float)
+    offset = np.zeros(2) if roi is None else np.array([roi.x_offset, roi.y_offset], float)
+    return np.diag(camera.K)[:2] / binning, (camera.K[:2, 2] - offset) / binning + _HALF
 
 
 def colmap_parameters(camera: Camera) -> dict[str, Any]:
@@ -190,11 +181,9 @@ def colmap_parameters(camera: Camera) -> dict[str, Any]:
         raise ValueError(
             f"COLMAP knows {len(order)} coefficients of {distortion}, the lens has {len(D)}"
         )
-    offset = np.zeros(2) if camera.roi is None else (camera.roi.x_offset, camera.roi.y_offset)
-    binning = np.array(camera.binning, float)
-    fx, fy = (np.diag(camera.K)[:2] / binning).tolist()
-    cx, cy = ((camera.K[:2, 2] - offset) / binning + _HALF).tolist()
-    values = dict(zip(order, D, strict=False)) | {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    intrinsics = np.concatenate(pixel_intrinsics(camera)).tolist()
+    values = dict(zip(order, D, strict=False))
+    values |= dict(zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True))
     model = {"equidistant": "OPENCV_FISHEYE", "plumb_bob": "OPENCV"}.get(distortion, "FULL_OPENCV")
     if model == "OPENCV" and values.get("k3"):
         model = "FULL_OPENCV"
@@ -210,8 +199,7 @@ _DISTORTION = (
 _WIDTH = ("image_width", "image_Width", "width", "w")
 _HEIGHT = ("image_height", "image_Height", "height", "h")
 _SIZE = ("image_size", "imageSize", "img_size", "resolution", "size")
-# Coefficients by their own names, in OpenCV's order.
-_NAMED = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_NAMED = _ORDER["rational_polynomial"]
 _RATIONAL = 8  # coefficients and more
 # Other names of the models.
 _MODELS = {
@@ -224,22 +212,15 @@ _MODELS = {
 }
 
 
-def looks_like_fields(tree: dict[str, Any]) -> bool:
+def _has_fields(tree: dict[str, Any]) -> bool:
     """Whether a mapping has a camera matrix, or focal lengths."""
     return any(name in tree for name in (*_MATRIX, "fx"))
 
 
-def camera_of_fields(tree: dict[str, Any]) -> Camera:
-    """The camera.
-
-    Raises:
-        ValueError, KeyError, TypeError: when something is missing or impossible.
-    """
+def _of_fields(tree: dict[str, Any]) -> Camera:
     width, height = _size(tree)
     D = _distortion(tree)
-    return Camera(
-        width=width, height=height, K=_matrix(tree), D=D, distortion_model=_model(tree, len(D))
-    )
+    return Camera(width, height, _matrix(tree), D, _model(tree, len(D)))
 
 
 def _first(tree: dict[str, Any], names: tuple[str, ...]) -> Any:
@@ -270,8 +251,7 @@ def _matrix(tree: dict[str, Any]) -> Array:
     if item is not None:
         return _values(item).reshape(3, 3)
     fx, cx, cy = (float(tree[name]) for name in ("fx", "cx", "cy"))
-    fy = float(tree.get("fy", fx))
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return pinhole_matrix(fx, float(tree.get("fy", fx)), cx, cy)
 
 
 def _distortion(tree: dict[str, Any]) -> Array:
@@ -327,18 +307,9 @@ def read_calibration(path: Path | str) -> Camera:
         CalibrationError: for anything else, saying what was found.
     """
     path, chosen = _split(Path(path))
-    try:
+    with calibration_faults(path, "YAML, JSON or XML", "not a usable calibration"):
         text = path.read_text(encoding="utf-8")
         camera = _camera(text, chosen)
-    except OSError as error:
-        raise CalibrationError(f"{path} cannot be read: {error.strerror}") from error
-    except (YamlError, UnicodeDecodeError) as error:
-        raise CalibrationError(
-            f"{path} is not a YAML, JSON or XML file: {' '.join(str(error).split())}"
-        ) from error
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        fault = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise CalibrationError(f"{path} is not a usable calibration: {fault}") from error
     if camera is None:
         raise CalibrationError(
             f"{path} is not a calibration: expected a {CALIBRATION_KINDS}; {_fields_in_words(text)}"
@@ -353,6 +324,19 @@ def read_calibration(path: Path | str) -> Camera:
     return camera
 
 
+@contextlib.contextmanager
+def calibration_faults(path: Path, kind: str, unusable: str) -> Iterator[None]:
+    """Faults within ``with`` of a file, and of what it says, name the file."""
+    with file_faults(path, CalibrationError, kind):
+        try:
+            yield
+        except (YamlError, UnicodeDecodeError):
+            raise
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            fault = f"no {error}" if isinstance(error, KeyError) else str(error)
+            raise CalibrationError(f"{path} is {unusable}: {fault}") from error
+
+
 def _split(path: Path) -> tuple[Path, str | None]:
     match = _CHOICE.fullmatch(str(path))
     if match is None or path.exists():
@@ -361,27 +345,27 @@ def _split(path: Path) -> tuple[Path, str | None]:
 
 
 def _camera(text: str, chosen: str | None) -> Camera | None:
-    if is_colmap(text):
+    if _is_colmap(text):
         return colmap_camera(text, chosen)
-    tree = load_tree(text)
+    tree = _load_tree(text)
     if not isinstance(tree, dict):
         return None
     cameras = {name: item for name, item in tree.items() if _is_kalibr(item)}
     if cameras:
-        return kalibr_camera(choose(cameras, chosen))
+        return kalibr_camera(_choose(cameras, chosen))
     if chosen is not None:
         raise ValueError(f"it has no camera {chosen!r} to choose")
     readers: tuple[tuple[bool, Callable[[dict[str, Any]], Camera]], ...] = (
         (_is_kalibr(tree), kalibr_camera),
         ("pinhole" in tree, _boofcv),
-        (looks_like_fields(tree), camera_of_fields),
+        (_has_fields(tree), _of_fields),
     )
     return next((reader(tree) for fits, reader in readers if fits), None)
 
 
 def _fields_in_words(text: str) -> str:
     try:
-        tree = load_tree(text)
+        tree = _load_tree(text)
     except YamlError:
         tree = None
     keys = sorted(map(str, tree)) if isinstance(tree, dict) else []
@@ -420,13 +404,9 @@ def kalibr_camera(tree: dict[str, Any]) -> Camera:
     *front, fx, fy, cx, cy = map(float, tree["intrinsics"])
     behind = [] if name == "none" else tree["distortion_coeffs"]
     width, height = tree["resolution"]
-    return Camera(
-        width=int(width),
-        height=int(height),
-        K=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-        D=np.array([*front, *behind], np.float64),
-        distortion_model=_KALIBR_LENSES[name] if kind == "pinhole" else kind,
-    )
+    lens = _KALIBR_LENSES[name] if kind == "pinhole" else kind
+    D = np.array([*front, *behind], np.float64)
+    return Camera(int(width), int(height), pinhole_matrix(fx, fy, cx, cy), D, lens)
 
 
 def kalibr_fields(camera: Camera) -> dict[str, Any]:
@@ -463,20 +443,10 @@ def _boofcv(tree: dict[str, Any]) -> Camera:
     radial = [float(value) for value in lens.get("radial") or []]
     if len(radial) > 3:
         raise ValueError(f"at most 3 radial coefficients are supported, found {len(radial)}")
-    radial += [0.0] * (3 - len(radial))
-    k1, k2, k3 = radial
-    return Camera(
-        width=int(pinhole["width"]),
-        height=int(pinhole["height"]),
-        K=np.array(
-            [
-                [pinhole["fx"], 0.0, pinhole["cx"]],
-                [0.0, pinhole["fy"], pinhole["cy"]],
-                [0.0, 0.0, 1.0],
-            ]
-        ),
-        D=np.array([k1, k2, float(lens.get("t1", 0.0)), float(lens.get("t2", 0.0)), k3]),
-    )
+    k1, k2, k3 = radial + [0.0] * (3 - len(radial))
+    D = np.array([k1, k2, float(lens.get("t1", 0.0)), float(lens.get("t2", 0.0)), k3])
+    K = pinhole_matrix(*(pinhole[name] for name in ("fx", "fy", "cx", "cy")))
+    return Camera(int(pinhole["width"]), int(pinhole["height"]), K, D)
 
 
 def write_calibration(path: Path, camera: Camera) -> None:

@@ -35,8 +35,6 @@ _ARRAYS = ("descriptor",)  # several values per point
 _LONGEST_ROW = 2**31 - 1
 # Parts of an image, across and down, of which each keeps as many points as the others.
 _PARTS = (16, 12)
-# Added to the rows that were kept.
-_RESIDUAL = ("residual", "<f4")
 
 Field = tuple[str, int, int, int]  # name, offset, datatype, count
 
@@ -68,13 +66,13 @@ def read_correspondences(message: Any) -> Correspondences:
         MessageError: for anything that cannot be read, saying what was found.
     """
     frame = frame_id(message, "the frame of x, y, z")
-    rows = read_rows(message, ("x", "y", "z", "u", "v"), ("score", "id"))
+    rows = _read_rows(message, ("x", "y", "z", "u", "v"), ("score", "id"))
     return Correspondences(
         stamp_ns=stamp_ns(message),
         frame=frame,
         points=rows.columns("x", "y", "z"),
         pixels=rows.columns("u", "v"),
-        scores=rows.columns("score")[:, 0] if rows.has("score") else None,
+        scores=rows.values.get("score"),
         dropped=rows.dropped,
         table=rows.table,
     )
@@ -111,28 +109,23 @@ def thinned(cloud: Correspondences, most: int, size: tuple[int, int]) -> Corresp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class _Rows:
     """The rows of a cloud without NaN and infinity in the fields that were asked for."""
 
     table: NDArray[Any]  # (n,) structured: these fields as they came
     dropped: int  # rows that held NaN or infinity
-    _values: dict[str, Array]  # (n,) of each field of one real number
+    values: dict[str, Array]  # (n,) of each field of one real number
 
     def has(self, name: str) -> bool:
         return name in (self.table.dtype.names or ())
 
     def columns(self, *names: str) -> Array:
         """Fields of one real number each as an array (n, len(names))."""
-        return np.stack([self._values[name] for name in names], axis=1)
+        return np.stack([self.values[name] for name in names], axis=1)
 
 
-def read_rows(message: Any, required: Sequence[str], optional: Sequence[str]) -> Rows:
-    """The rows of a sensor_msgs/PointCloud2 with these fields; unusable rows are dropped.
-
-    Raises:
-        EmptyCloudError: for a cloud without points.
-        MessageError: for anything that cannot be read, saying what was found.
-    """
+def _read_rows(message: Any, required: Sequence[str], optional: Sequence[str]) -> _Rows:
+    """The rows of a sensor_msgs/PointCloud2 with these fields; unusable rows are dropped."""
     table = _view(message, required, optional)
     values: dict[str, Array] = {}
     finite = np.ones(len(table), dtype=np.bool_)
@@ -148,7 +141,7 @@ def read_rows(message: Any, required: Sequence[str], optional: Sequence[str]) ->
     dropped = len(table) - int(np.count_nonzero(finite))
     if dropped:
         values, table = {name: column[finite] for name, column in values.items()}, table[finite]
-    return Rows(table, dropped, values)
+    return _Rows(table, dropped, values)
 
 
 def _view(message: Any, required: Sequence[str], optional: Sequence[str]) -> NDArray[Any]:
@@ -233,7 +226,7 @@ def select_inliers(table: NDArray[Any], inliers: NDArray[np.bool_], residuals: A
 @lru_cache(maxsize=16)
 def _packed(row_type: np.dtype[Any]) -> np.dtype[Any]:
     fields: Mapping[str, Any] = row_type.fields or {}
-    return np.dtype([(n, fields[n][0].newbyteorder("<")) for n in fields] + [_RESIDUAL])
+    return np.dtype([(n, fields[n][0].newbyteorder("<")) for n in fields] + [("residual", "<f4")])
 
 
 def make_cloud(make: Make, stamp: int, frame: str, rows: NDArray[Any]) -> Any:
@@ -285,14 +278,14 @@ def read_keypoints(message: Any) -> Keypoints:
         EmptyCloudError: for a cloud without points.
         MessageError: for anything that cannot be read, saying what was found.
     """
-    rows = read_rows(message, ("u", "v"), ("id", "descriptor", "score"))
+    rows = _read_rows(message, ("u", "v"), ("id", "descriptor", "score"))
     ids, descriptors = _marks(rows, message)
     return Keypoints(
         stamp_ns=stamp_ns(message),
         pixels=rows.columns("u", "v"),
         ids=ids,
         descriptors=descriptors,
-        scores=rows.columns("score")[:, 0] if rows.has("score") else None,
+        scores=rows.values.get("score"),
         dropped=rows.dropped,
     )
 
@@ -305,16 +298,16 @@ def read_map(message: Any) -> Map:
         MessageError: for anything that cannot be read, saying what was found.
     """
     frame = frame_id(message, "the frame of x, y, z")
-    rows = read_rows(message, ("x", "y", "z"), ("id", "descriptor"))
+    rows = _read_rows(message, ("x", "y", "z"), ("id", "descriptor"))
     ids, descriptors = _marks(rows, message)
     try:
         landmarks = make_map(rows.columns("x", "y", "z"), ids, descriptors, frame)
-        return Map(landmarks.points, landmarks.ids, landmarks.descriptors, frame, rows.dropped)
+        return replace(landmarks, dropped=rows.dropped)
     except MapError as error:
         raise MessageError(str(error)) from error
 
 
-def _marks(rows: Rows, message: Any) -> tuple[Ids | None, Descriptors | None]:
+def _marks(rows: _Rows, message: Any) -> tuple[Ids | None, Descriptors | None]:
     """What the points are recognized by: ids (n,), descriptors (n,d)."""
     if not rows.has("id") and not rows.has("descriptor"):
         names = ", ".join(str(item.name) for item in message.fields)

@@ -36,13 +36,7 @@ class ImageClock:
     _absolute: bool = False
 
     def relative(self, own_ns: int | None) -> int | None:
-        """Stamp of the next image of a video.
-
-        Args:
-            own_ns: its presentation time; None: unknown.
-
-        Returns:
-            None for an image of which no time is known, among others that have one.
+        """Stamp of the next image of a video, by its presentation time; None: not known.
 
         Raises:
             TimesError: when the file has no times and no rate was given.

@@ -71,7 +71,8 @@ _MOST_PIXELS = 150_000_000
 _STILL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 # JPEG's markers of frames, by which the size is given.
 _FRAME_HEADERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
-_ALONE = {0x01, *range(0xD0, 0xD8)}
+ALONE = {0x01, *range(0xD0, 0xD8)}
+"""Markers of JPEG that stand alone; all others are followed by their length."""
 # Raw rows: a camera's note that the picture should be shown upright turns the shutter, too.
 _AS_IT_IS = cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
 
@@ -207,8 +208,8 @@ def _claimed_size(data: bytes, name: str) -> tuple[int, int] | None:
         if marker in _FRAME_HEADERS:
             height, width = struct.unpack_from(">HH", data, position + 5)
             return width, height
-        # Markers may be filled up with more of 0xFF, and some stand alone.
-        position += 1 if marker == 0xFF else 2 if marker in _ALONE else 2 + length
+        # Markers may be filled up with more of 0xFF.
+        position += 1 if marker == 0xFF else 2 if marker in ALONE else 2 + length
     return None
 
 

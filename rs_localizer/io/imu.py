@@ -11,7 +11,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io.bags import make_message
-from rs_localizer.io.messages import MessageError, frame_id, make_header, stamp_ns
+from rs_localizer.io.messages import MessageError, frame_id, make_header, make_vector, stamp_ns
 
 _LATEST_NS = 2**63 - 1
 _COLUMNS = "time in ns, angular velocity x y z in rad/s, specific force x y z in m/s^2"
@@ -105,25 +105,22 @@ def read_imu(message: Any) -> ImuReading:
             "angular_velocity_covariance[0] is -1: the message has no angular velocity (a topic of "
             "the accelerometer alone?)"
         )
-    turn = _vector(message.angular_velocity, "angular_velocity", "rad/s", _FASTEST)
+    turn = _checked(_values(message.angular_velocity), "angular_velocity", "rad/s", _FASTEST)
     force = None
-    if float(forces[0]) != _ABSENT and _is_finite(message.linear_acceleration):
-        acceleration = _vector(
-            message.linear_acceleration, "linear_acceleration", "m/s^2", _HARDEST
-        )
-        force = acceleration if any(acceleration) else None
+    acceleration = _values(message.linear_acceleration)
+    # Drivers of gyroscopes alone may send NaN or zeros for the rest.
+    if float(forces[0]) != _ABSENT and all(map(math.isfinite, acceleration)) and any(acceleration):
+        force = _checked(acceleration, "linear_acceleration", "m/s^2", _HARDEST)
     return ImuReading(
         stamp_ns=stamp_ns(message), frame=frame, angular_velocity=turn, linear_acceleration=force
     )
 
 
-def _is_finite(vector: Any) -> bool:
-    """Whether there is a measurement; drivers of gyroscopes alone may send NaN for the rest."""
-    return all(math.isfinite(float(value)) for value in (vector.x, vector.y, vector.z))
+def _values(vector: Any) -> Vector:
+    return float(vector.x), float(vector.y), float(vector.z)
 
 
-def _vector(vector: Any, name: str, unit: str, most: float) -> Vector:
-    values = (float(vector.x), float(vector.y), float(vector.z))
+def _checked(values: Vector, name: str, unit: str, most: float) -> Vector:
     if not all(map(math.isfinite, values)):
         raise MessageError(f"{name} is not finite: {values}")
     if max(map(abs, values)) > most:
@@ -141,21 +138,17 @@ def make_reading(
     Of a rate (3,) in rad/s and a force (3,) in m/s^2 (NaN: not measured), with their variances (0:
     not known).
     """
+    absent = np.array([_ABSENT, *[0.0] * 8])
     known = [np.eye(3).ravel() * variance for variance in variances]
     if not np.isfinite(force).all():
-        force, known[1] = np.zeros(3), np.array([_ABSENT, *[0.0] * 8])
+        force, known[1] = np.zeros(3), absent
     return make_message(
         "sensor_msgs/msg/Imu",
         header=make_header(make_message, stamp_ns, frame),
         orientation=make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=np.array([_ABSENT, *[0.0] * 8]),
-        angular_velocity=_vector3(rate),
+        orientation_covariance=absent,
+        angular_velocity=make_vector(make_message, rate),
         angular_velocity_covariance=known[0],
-        linear_acceleration=_vector3(force),
+        linear_acceleration=make_vector(make_message, force),
         linear_acceleration_covariance=known[1],
     )
-
-
-def _vector3(vector: Array) -> Any:
-    x, y, z = vector.tolist()
-    return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)

@@ -9,6 +9,10 @@ only in their containers, are read by the same code.
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+
 Make = Callable[..., Any]
 """Builds a message: ``make("geometry_msgs/msg/Point", x=0.0, y=0.0, z=0.0)``.
 
@@ -44,3 +48,17 @@ def make_header(make: Make, stamp: int, frame: str) -> Any:
         stamp=make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds),
         frame_id=frame,
     )
+
+
+def make_vector(make: Make, vector: Array, kind: str = "Vector3") -> Any:
+    """A Vector3, or a Point, of geometry_msgs with the values of a vector (3,)."""
+    x, y, z = vector.tolist()
+    return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+
+
+def make_quaternion(make: Make, rotation: Array) -> Any:
+    """A geometry_msgs/Quaternion of a rotation matrix (3,3)."""
+    from rs_localizer.core import so3  # kernels, which readers do not need
+
+    x, y, z, w = so3.quaternion(np.ascontiguousarray(rotation)).tolist()
+    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

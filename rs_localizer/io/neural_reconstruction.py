@@ -2,26 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses and velocities for neural reconstruction with a rolling shutter: nerfstudio, gsplat, NCore.
 
-nerfstudio's ``transforms.json``: fields as *Gaussian Splatting on the Move* (Seiskari et al., ECCV
-2024; its code converts to the same) reads them beside nerfstudio's own:
-``camera_linear_velocity`` and ``camera_angular_velocity``
-of each frame (m/s and rad/s, in the camera's axes), ``rolling_shutter_time`` and
-``exposure_time`` (s). The row ``y`` of ``h`` is exposed ``(y / h - 1 / 2) rolling_shutter_time``
-after the moment of ``transform_matrix``, which is the middle of the image.
-
-gsplat: ``viewmats.npy`` and ``viewmats_rs.npy`` (n,4,4) are ``camera_from_world`` at the first and
-at the last exposed row of the image (``rasterization`` interpolates between them), ``Ks.npy``
-(n,3,3) the intrinsics with the corner of the first pixel at 0, 0, of a lens with distortion
-``radial_coeffs.npy`` and so on, by the names of ``rasterization``, ``names.txt`` the images,
-``shutter.txt`` the name of ``RollingShutterType``. Beside it the same as a text model of COLMAP,
-with the lens and the poses of the middle row.
-
-NVIDIA's ``ncore.json`` has the fields of NCore's camera models
-(``OpenCVPinholeCameraModelParameters``, ``OpenCVFisheyeCameraModelParameters``) under their names,
-and of each frame what ``CameraSensorComponent.Writer.store_frame`` and
-``PosesComponent.Writer.store_dynamic_pose`` take: timestamps (us) and ``T_sensor_world`` at the
-first and at the last exposed row. NCore's own package makes a sequence of them
-(docs/integrations.md).
+What each file and field is: docs/integrations.md. The fields of nerfstudio's ``transforms.json``
+are those of *Gaussian Splatting on the Move* (Seiskari et al., ECCV 2024; its code converts to the
+same): the row ``y`` of ``h`` is exposed ``(y / h - 1 / 2) rolling_shutter_time`` after the moment
+of ``transform_matrix``, which is the middle of the image. gsplat and NCore interpolate between the
+poses at the first and at the last exposed row; NCore's own package makes a sequence of
+``ncore.json``.
 """
 
 from __future__ import annotations
@@ -36,6 +22,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.io.calibration import pinhole_matrix, pixel_intrinsics
 from rs_localizer.io.maps.colmap import ModelImage, Points, write_model
 
 # Axes of OpenGL's camera, which looks along -z with y up, in ours.
@@ -45,8 +32,6 @@ _MODELS = {
     DistortionModel.PLUMB_BOB: ("OPENCV", ("k1", "k2", "p1", "p2", "k3")),
     DistortionModel.EQUIDISTANT: ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
-# nerfstudio has the corner of the first pixel at 0, 0, as COLMAP.
-_HALF = 0.5
 
 
 class NerfstudioError(ValueError):
@@ -68,15 +53,6 @@ def middle_of_image(camera: Camera) -> float:
     """The row time of the middle of the delivered image."""
     _, height = camera.size
     return float(camera.row_time(np.array([[0.0, (height - 1) / 2]]))[0])
-
-
-def pixel_intrinsics(camera: Camera) -> tuple[Array, Array]:
-    """Focal lengths (2,) and centre (2,) in px of the delivered image; 0, 0 is its first corner."""
-    binning = np.array(camera.binning, float)
-    offset = np.zeros(2)
-    if camera.roi is not None:
-        offset[:] = camera.roi.x_offset, camera.roi.y_offset
-    return np.diag(camera.K)[:2] / binning, (camera.K[:2, 2] - offset) / binning + _HALF
 
 
 def transforms(camera: Camera, views: Sequence[View], exposure: float = 0.0) -> dict[str, Any]:
@@ -155,7 +131,7 @@ def write_gsplat(
     """
     views = np.linalg.inv(poses)
     focal, centre = pixel_intrinsics(camera)
-    K = np.array([[focal[0], 0.0, centre[0]], [0.0, focal[1], centre[1]], [0.0, 0.0, 1.0]])
+    K = pinhole_matrix(*focal, *centre)
     np.save(folder / "viewmats.npy", views[:, 0])
     np.save(folder / "viewmats_rs.npy", views[:, 2])
     np.save(folder / "Ks.npy", np.broadcast_to(K, (len(names), 3, 3)))

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
 
-import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.types import Estimate
 from rs_localizer.io import topics
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.messages import Make, make_header
+from rs_localizer.io.messages import Make, make_header, make_quaternion, make_vector
 
 TYPES = {
     topics.POSE: "geometry_msgs/msg/PoseStamped",
@@ -96,7 +94,11 @@ def each_message(
 
     @cache
     def pose() -> Any:
-        return _pose(make, frame.pose)
+        return make(
+            "geometry_msgs/msg/Pose",
+            position=make_vector(make, frame.pose.position, "Point"),
+            orientation=make_quaternion(make, frame.pose.rotation),
+        )
 
     @cache
     def pose_with_covariance() -> Any:
@@ -107,7 +109,7 @@ def each_message(
     @cache
     def velocity() -> Any:
         assert twist is not None
-        linear, angular = _vector(make, twist.linear), _vector(make, twist.angular)
+        linear, angular = make_vector(make, twist.linear), make_vector(make, twist.angular)
         return make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
 
     @cache
@@ -116,41 +118,23 @@ def each_message(
         kind = "geometry_msgs/msg/TwistWithCovariance"
         return make(kind, twist=velocity(), covariance=twist.covariance.ravel())
 
-    def odometry() -> dict[str, Any]:
-        parts = {"pose": pose_with_covariance(), "twist": velocity_with_covariance()}
-        return {"header": header(frame.map_frame), "child_frame_id": frame.body_frame, **parts}
-
-    poses: dict[str, Callable[[], dict[str, Any]]] = {
-        topics.POSE: lambda: {"header": header(frame.map_frame), "pose": pose()},
-        topics.POSE_WITH_COVARIANCE: lambda: {
-            "header": header(frame.map_frame), "pose": pose_with_covariance()
-        },
-    }  # fmt: skip
-    twists: dict[str, Callable[[], dict[str, Any]]] = {
-        topics.TWIST: lambda: {"header": header(frame.body_frame), "twist": velocity()},
-        topics.TWIST_WITH_COVARIANCE: lambda: {
-            "header": header(frame.body_frame), "twist": velocity_with_covariance()
-        },
-        topics.ODOMETRY: odometry,
-    }  # fmt: skip
-    for name, fields in (poses | ({} if twist is None else twists)).items():
+    parts: dict[str, dict[str, Callable[[], Any]]] = {
+        topics.POSE: {"pose": pose},
+        topics.POSE_WITH_COVARIANCE: {"pose": pose_with_covariance},
+    }
+    if twist is not None:
+        parts |= {
+            topics.TWIST: {"twist": velocity},
+            topics.TWIST_WITH_COVARIANCE: {"twist": velocity_with_covariance},
+            topics.ODOMETRY: {"pose": pose_with_covariance, "twist": velocity_with_covariance},
+        }
+    for name, builders in parts.items():
         if name in wanted:
-            yield name, make(TYPES[name], **fields())
+            fields = {key: build() for key, build in builders.items()}
+            if name == topics.ODOMETRY:
+                fields["child_frame_id"] = frame.body_frame
+            axes = frame.map_frame if "pose" in builders else frame.body_frame
+            yield name, make(TYPES[name], header=header(axes), **fields)
     if topics.INLIERS in wanted:
         cloud = make_cloud(make, frame.input_stamp_ns, frame.map_frame, frame.inliers)
         yield topics.INLIERS, cloud
-
-
-def _pose(make: Make, pose: Pose) -> Any:
-    x, y, z = pose.position.tolist()
-    qx, qy, qz, qw = so3.quaternion(np.ascontiguousarray(pose.rotation)).tolist()
-    return make(
-        "geometry_msgs/msg/Pose",
-        position=make("geometry_msgs/msg/Point", x=x, y=y, z=z),
-        orientation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-    )
-
-
-def _vector(make: Make, vector: Array) -> Any:
-    x, y, z = vector.tolist()
-    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
+from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.io import topics
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
@@ -56,11 +56,6 @@ def make_correspondences(
     return make_cloud(make_message, stamp_ns, MAP_FRAME, rows)
 
 
-def write_image(bag: BagWriter, topic: str, stamp_ns: int, encoding: str, data: bytes) -> None:
-    """Write :func:`make_image` of the camera."""
-    bag.write(topic, make_image(stamp_ns, encoding, data), stamp_ns)
-
-
 def make_image(stamp_ns: int, encoding: str, data: bytes, frame: str = CAMERA_FRAME) -> Any:
     """The sensor_msgs/CompressedImage of a ``jpeg`` or ``png``."""
     return make_message(
@@ -73,7 +68,7 @@ def make_image(stamp_ns: int, encoding: str, data: bytes, frame: str = CAMERA_FR
 
 def make_camera_info(camera: Camera, stamp_ns: int, frame: str = CAMERA_FRAME) -> Any:
     """The sensor_msgs/CameraInfo of a camera."""
-    roi = camera.roi
+    roi = camera.roi or Roi(0, 0, 0, 0)
     return make_message(
         "sensor_msgs/msg/CameraInfo",
         header=make_header(make_message, stamp_ns, frame),
@@ -88,10 +83,10 @@ def make_camera_info(camera: Camera, stamp_ns: int, frame: str = CAMERA_FRAME) -
         binning_y=camera.binning[1],
         roi=make_message(
             "sensor_msgs/msg/RegionOfInterest",
-            x_offset=roi.x_offset if roi else 0,
-            y_offset=roi.y_offset if roi else 0,
-            height=roi.height if roi else 0,
-            width=roi.width if roi else 0,
+            x_offset=roi.x_offset,
+            y_offset=roi.y_offset,
+            height=roi.height,
+            width=roi.width,
             do_rectify=False,
         ),
     )

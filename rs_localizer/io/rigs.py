@@ -15,10 +15,10 @@ other; besides what Kalibr writes, each may have ``readout_time`` (s) and ``scan
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -29,19 +29,21 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.calibration import (
-    CalibrationError,
+    calibration_faults,
     colmap_parameters,
     kalibr_camera,
     kalibr_fields,
 )
 from rs_localizer.io.transforms import Transform, TransformError, from_numbers, make_transform
-from rs_localizer.io.yaml_text import YamlError, load_yaml
+from rs_localizer.io.yaml_text import load_yaml
 
 RIG_FRAME = "rig"
 _CHAIN, _IMU, _SHIFT = "T_cn_cnm1", "T_cam_imu", "timeshift_cam_imu"
 _SHUTTER = ("readout_time", "scan_direction")
 # Entries of R R^T - I beyond this are no rounding of a file's digits.
 _ORTHONORMAL = 1e-3
+
+T = TypeVar("T")
 
 
 class RigParts(NamedTuple):
@@ -58,8 +60,7 @@ def read_camchain(path: Path | str) -> RigParts:
     Raises:
         CalibrationError: for anything else, saying what was found.
     """
-    parts: RigParts = _read(Path(path), _camchain)
-    return parts
+    return _load(Path(path), _camchain)
 
 
 def write_camchain(path: Path, parts: RigParts) -> None:
@@ -97,8 +98,7 @@ def read_rig_config(path: Path | str) -> dict[str, tuple[Array, Array]]:
     Raises:
         CalibrationError: for anything else, or several rigs.
     """
-    poses: dict[str, tuple[Array, Array]] = _read(Path(path), _rig_config)
-    return poses
+    return _load(Path(path), _rig_config)
 
 
 def write_rig_config(path: Path, parts: RigParts) -> None:
@@ -129,17 +129,9 @@ def write_rig_config(path: Path, parts: RigParts) -> None:
     path.write_text(json.dumps([{"cameras": entries}], indent=2) + "\n", "utf-8")
 
 
-def _read(path: Path, reader: Any) -> Any:
-    try:
+def _load(path: Path, reader: Callable[[Any], T]) -> T:
+    with calibration_faults(path, "YAML or JSON", "no usable rig"):
         return reader(load_yaml(path.read_text(encoding="utf-8")))  # JSON is YAML
-    except OSError as error:
-        raise CalibrationError(f"{path} cannot be read: {error.strerror}") from error
-    except (YamlError, UnicodeDecodeError) as error:
-        text = " ".join(str(error).split())
-        raise CalibrationError(f"{path} is not a YAML or JSON file: {text}") from error
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        fault = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise CalibrationError(f"{path} is no usable rig: {fault}") from error
 
 
 def _camchain(tree: Any) -> RigParts:

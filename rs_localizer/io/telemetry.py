@@ -113,7 +113,7 @@ def read_telemetry(path: Path) -> Telemetry | None:
         read = np.radians(np.array([sample["gyro"] for sample in turning], float))
         rates = read @ CAMERA_FROM_SENSOR.T
     else:
-        times, rates = from_orientations(tags)
+        times, rates = _of_orientations(tags)
     if len(times) < 2:
         return None
     forces = np.array([sample["accl"] for sample in samples if sample["accl"] is not None], float)
@@ -141,7 +141,7 @@ def read_telemetry(path: Path) -> Telemetry | None:
     )
 
 
-def from_orientations(tags: list[dict[str, Any]]) -> tuple[Array, Array]:
+def _of_orientations(tags: list[dict[str, Any]]) -> tuple[Array, Array]:
     """Times (n,) s and rates (n,3) rad/s of a camera that writes how it is turned instead (DJI).
 
     The library has orientations of a camera with x right, y up and z back. GoPros write both: rates
@@ -288,7 +288,7 @@ def read_log(video: Path) -> Telemetry | None:
         return None
     columns, clock = (_SEPARATE, 3) if log.forces is not None else (_TOGETHER, 0)
     readings, frames = _Table.read(log.readings, columns, clock), _Table.read(log.frames, 1)
-    starts = frames.column("timestamp", 0) * frames.second
+    starts = frames.values[:, 0] * frames.second
     exposure = _median(frames.named("exposure time"), frames.second)
     readout = _median(frames.named("frame readout time"), frames.second)
     if log.forces is not None:  # x, y, z, time
@@ -386,10 +386,6 @@ class _Table:
             if name.startswith(word):
                 return self.values[:, k]
         return None
-
-    def column(self, word: str, place: int) -> Array:
-        found = self.named(word)
-        return self.values[:, place] if found is None else found
 
 
 def _number(word: str) -> float:

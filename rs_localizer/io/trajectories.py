@@ -111,15 +111,15 @@ def write_twists(path: Path | str, twists: Twists, about: Sequence[str] = ()) ->
     _write_table(Path(path), (*about, "t wx wy wz vx vy vz"), twists.stamps_ns, values)
 
 
-def split_at_gaps(trajectory: Trajectory, factor: float = 3.0) -> list[Trajectory]:
-    """Parts without a pause longer than ``factor`` times the median spacing.
+def split_at_gaps(trajectory: Trajectory) -> list[Trajectory]:
+    """Parts without a pause longer than three times the median spacing.
 
     A recording that lost track for a while says nothing of the motion meanwhile.
     """
     spacing = np.diff(trajectory.stamps_ns)
     if len(spacing) == 0:
         return [trajectory]
-    ends = np.flatnonzero(spacing > factor * np.median(spacing)) + 1
+    ends = np.flatnonzero(spacing > 3.0 * np.median(spacing)) + 1
     bounds = [0, *ends.tolist(), len(trajectory)]
     return [trajectory.part(slice(*pair)) for pair in pairwise(bounds)]
 

@@ -17,9 +17,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.messages import Make, make_header
+from rs_localizer.io.messages import Make, make_header, make_quaternion, make_vector
 from rs_localizer.io.messages import stamp_ns as stamp_of
 
 Vector = tuple[float, float, float]
@@ -193,16 +192,14 @@ def make_transform(
     make: Make, stamp_ns: int, parent: str, child: str, parent_from_child: Transform
 ) -> Any:
     """A geometry_msgs/TransformStamped."""
-    x, y, z = parent_from_child.translation.tolist()
-    qx, qy, qz, qw = so3.quaternion(np.ascontiguousarray(parent_from_child.rotation)).tolist()
     return make(
         "geometry_msgs/msg/TransformStamped",
         header=make_header(make, stamp_ns, parent),
         child_frame_id=child,
         transform=make(
             "geometry_msgs/msg/Transform",
-            translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-            rotation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+            translation=make_vector(make, parent_from_child.translation),
+            rotation=make_quaternion(make, parent_from_child.rotation),
         ),
     )
 
@@ -288,18 +285,13 @@ class TransformTree:
                 continue
             link = _Link(parent, translation, through_matrix(rotation))
             self._parents.add(parent)
-            track = self._tracks.setdefault(child, _Track())
             if static:
                 self._tracks[child] = _Track(static=link)
             else:
-                track.add(stamp_of(stamped), link)
+                self._tracks.setdefault(child, _Track()).add(stamp_of(stamped), link)
 
     def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
-        """``target_from_source`` at a time; None: the latest that all its links have.
-
-        Raises:
-            TransformError: when it is not known for that time.
-        """
+        """``target_from_source`` at a time; None: the latest that all its links have."""
         target, source = target.removeprefix("/"), source.removeprefix("/")
         if target == source:
             return from_numbers((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -323,11 +315,7 @@ class TransformTree:
         return from_numbers(translation, through_matrix(rotation))
 
     def moves(self, target: str, source: str) -> bool:
-        """Whether a link between the two frames comes with a time.
-
-        Raises:
-            TransformError: when they are not connected.
-        """
+        """Whether a link between the two frames comes with a time."""
         target, source = target.removeprefix("/"), source.removeprefix("/")
         return target != source and self._latest(target, source) is not None
 

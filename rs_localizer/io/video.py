@@ -13,15 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.io.images import decode
+from rs_localizer.io.images import ALONE, decode
 from rs_localizer.io.messages import MessageError
 
 Image = NDArray[np.uint8]
 
 _JPEG_START = b"\xff\xd8"
-# Markers that stand alone; all others are followed by their length.
 _START, _END, _SCAN = 0xD8, 0xD9, 0xDA
-_LONELY = {0x01, *range(0xD0, 0xD8)}
 # For videos that are not JPEG already; artefacts stay below the noise of a corner.
 _QUALITY = 95
 
@@ -69,16 +67,15 @@ def read_video(path: Path | str, lens: int | None = None) -> Iterator[VideoImage
         raise VideoError(f"{path} does not exist")
     with path.open("rb") as file:
         is_stream = file.read(2) == _JPEG_START
-    any_image = False
     if lens is not None:
         images = _of_lens(path, lens)
     else:
         images = _from_stream(path) if is_stream else _from_container(path)
-    for item in images:
-        any_image = True
-        yield item
-    if not any_image:
+    first = next(images, None)
+    if first is None:
         raise VideoError(f"{path} holds no image that OpenCV can read")
+    yield first
+    yield from images
 
 
 @contextlib.contextmanager
@@ -178,7 +175,7 @@ def _walk_jpeg(data: bytes | mmap.mmap, start: int) -> tuple[bool, int]:
             break
         if marker == 0xFF:  # padding
             at += 1
-        elif marker in _LONELY:
+        elif marker in ALONE:
             at += 2
         elif at + 4 > len(data):
             break

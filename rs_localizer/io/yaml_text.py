@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """YAML that people write: small, and a tree."""
 
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -18,6 +21,17 @@ _MOST_CHARACTERS = 4_000_000
 
 class YamlError(ValueError):
     """Text that is no YAML, or more than anybody writes."""
+
+
+@contextlib.contextmanager
+def file_faults(path: Path, fault: type[ValueError], kind: str = "YAML") -> Iterator[None]:
+    """Faults of reading a text file, and of what it holds, within ``with`` name the file."""
+    try:
+        yield
+    except OSError as error:
+        raise fault(f"{path} cannot be read: {error.strerror}") from error
+    except (YamlError, UnicodeDecodeError) as error:
+        raise fault(f"{path} is not a {kind} file: {' '.join(str(error).split())}") from error
 
 
 class _Loader(yaml.SafeLoader):

@@ -49,8 +49,7 @@ def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = Non
     Returns:
         None when the whole board is not seen.
     """
-    if board.inverted:
-        image = np.asarray(cv2.bitwise_not(image), np.uint8)
+    image = _black_on_white(image, board)
     small, scale = _shrunk(image)
     if min(small.shape) < _SMALLEST_SEARCH:
         return None
@@ -130,8 +129,7 @@ class BoardSizes:
         if self._board is None or self._images <= self._next or len(self._sizes) >= _SIZES:
             return
         self._next = self._images + _EVERY
-        upright = cv2.bitwise_not(image) if self._board.inverted else image
-        small = _shrunk(np.asarray(upright, np.uint8))[0]
+        small, _ = _shrunk(_black_on_white(image, self._board))
         if min(small.shape) < _SMALLEST_SEARCH:
             return
         flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -189,6 +187,11 @@ def find_charuco(
             rows.append(corner)
             pixels.append(refined)
     return np.array(rows, np.int64), np.array(pixels, np.float64).reshape(-1, 2)
+
+
+def _black_on_white(image: Gray, board: Chessboard | CircleGrid) -> Gray:
+    """Black on white, as OpenCV wants it."""
+    return np.asarray(cv2.bitwise_not(image), np.uint8) if board.inverted else image
 
 
 def _shrunk(image: Gray) -> tuple[Gray, int]:
@@ -282,8 +285,7 @@ def find_circles(image: Gray, grid: CircleGrid, previous: Array | None = None) -
     Returns:
         None when the whole grid is not seen.
     """
-    if grid.inverted:
-        image = np.asarray(cv2.bitwise_not(image), np.uint8)
+    image = _black_on_white(image, grid)
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if grid.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     complete, centres = cv2.findCirclesGrid(
         image, (grid.columns, grid.rows), flags=kind, blobDetector=_blobs(image)

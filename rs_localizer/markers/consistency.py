@@ -13,7 +13,7 @@ from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Board, Marker
 
 # Prints within this distance of a plane (in sides of the marker) and this angle are in one.
-_SAME_PLANE, _PARALLEL = 0.2, np.cos(np.radians(5.0))
+SAME_PLANE, PARALLEL = 0.2, np.cos(np.radians(5.0))
 # A marker this many times larger than the median has its size in another unit, and so have all of
 # them if they are larger than any that is printed (m).
 _OTHER_UNIT, _LARGEST = 20.0, 5.0
@@ -63,16 +63,12 @@ def other_units(marker_map: MarkerMap) -> Iterator[str]:
                 f"{board.name} with {board.spacing:g} m from corner to corner: sizes are in "
                 f"metres; {1e-3 * board.spacing:g} would be {board.spacing:g} mm"
             )
-    yield from _other_units(marker_map.markers)
-
-
-def _other_units(markers: tuple[Marker, ...]) -> Iterator[str]:
-    if not markers:
+    if not marker_map.markers:
         return
-    usual = float(np.median([marker.size for marker in markers]))
+    usual = float(np.median([marker.size for marker in marker_map.markers]))
     if usual > _LARGEST:
         yield f"markers of {usual:g} m: are sizes and positions, given in metres, in another unit?"
-    for marker in markers:
+    for marker in marker_map.markers:
         if not usual / _OTHER_UNIT <= marker.size <= usual * _OTHER_UNIT:
             yield (
                 f"{marker.name} has a size of {marker.size:g} m, where {usual:g} m is usual: "
@@ -86,7 +82,7 @@ def _pair(a: _Plate, b: _Plate) -> Iterator[str]:
     normal = a.pose.rotation[:, 2]
     same_way = float(normal @ b.pose.rotation[:, 2])
     off = abs(float(normal @ (b.pose.position - a.pose.position)))
-    if abs(same_way) < _PARALLEL or off > _SAME_PLANE * side:
+    if abs(same_way) < PARALLEL or off > SAME_PLANE * side:
         return
     gap = _gap(a, b)
     if same_way < 0.0:

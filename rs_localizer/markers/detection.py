@@ -17,7 +17,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.markers.boards import find_charuco, find_chessboard, find_circles
 from rs_localizer.markers.dictionaries import DictionaryError, Gray, MarkerFinder
 from rs_localizer.markers.edges import refine
-from rs_localizer.markers.families import FAMILIES, Family
+from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.prints import Board, Charuco, Chessboard
 
@@ -141,9 +141,7 @@ class MarkerDetector:
                 if not self._knows(item.family, i)
             ),
             repeated=tuple(
-                f"{item.family.name} {i}"
-                for item in observations
-                for i in _twice(item.ids).tolist()
+                f"{item.family.name} {i}" for item in observations for i in _twice(item.ids)
             ),
         )
         self.seconds += time.perf_counter() - started
@@ -158,7 +156,7 @@ class MarkerDetector:
         ids, quads = ids[order], np.ascontiguousarray(quads[order])
         large = _sides(quads) >= self._min_side
         ids, quads = ids[large], quads[large]
-        exact = refine(image, quads, np.full(len(ids), family.cells))
+        exact = refine(image, quads, family.cells)
         different = _different(ids, quads, exact)
         ids, quads, exact = ids[different], quads[different], exact[different]
         mapped = np.array([self._knows(family, i) for i in ids.tolist()], bool)
@@ -203,7 +201,7 @@ class MarkerDetector:
 
 def warm_up() -> None:
     """Compile the kernels of detection."""
-    refine(np.zeros((8, 8), np.uint8), np.zeros((1, 4, 2)), np.full(1, 6))
+    refine(np.zeros((8, 8), np.uint8), np.zeros((1, 4, 2)), 6)
 
 
 def _finders(marker_map: MarkerMap) -> list[tuple[MarkerFinder, MarkerFinder]]:
@@ -259,8 +257,6 @@ def _spacings(pixels: Array) -> Array:
     return np.where(np.isfinite(nearest), nearest, 0.0)
 
 
-# Smaller ones (px) may be anything.
-_LEAST_SIDE = 12.0
 # Quadrilaterals are the same whose middles are nearer than this, in sides.
 _SAME = 0.5
 # Noise looks like a board of 3x3.
@@ -278,23 +274,17 @@ def recognized(image: Gray) -> list[str]:
     said = []
     for finder in _all_finders():
         ids, quads = finder.find(image)
-        good = [
-            (id_, quad)
-            for id_, quad in zip(ids.tolist(), quads, strict=True)
-            if _sides(quad[None])[0] >= _LEAST_SIDE
-        ]
-        if not good:
-            continue
-        corners = np.array([quad for _, quad in good])
-        exact = np.all(refine(image, corners, np.full(len(good), finder.family.cells)), axis=1)
-        named = []
-        for (id_, quad), certain in zip(good, exact, strict=True):
-            if certain and not any(_same(quad, other) for other in taken):
+        large = _sides(quads) >= LEAST_SIDE
+        ids, quads = ids[large], quads[large]
+        exact = refine(image, quads.copy(), finder.family.cells).all(axis=1)
+        named: set[int] = set()
+        for id_, quad in zip(ids[exact].tolist(), quads[exact], strict=True):
+            if not any(_same(quad, other) for other in taken):
                 taken.append(quad)
-                named.append(id_)
+                named.add(id_)
         if named:
-            listed = ", ".join(map(str, sorted(set(named))[:_MOST_IDS]))
-            more = ", ..." if len(set(named)) > _MOST_IDS else ""
+            listed = ", ".join(map(str, sorted(named)[:_MOST_IDS]))
+            more = ", ..." if len(named) > _MOST_IDS else ""
             said.append(f"{_smallest(finder.family, max(named)).name} {listed}{more}")
     board = chessboard_size(image)
     if board is not None:

@@ -336,13 +336,13 @@ def _corner(q: Array, at: int, before: Array, after: Array) -> tuple[float, floa
     return px + share * tx, py + share * ty
 
 
-def refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+def refine(image: NDArray[np.uint8], quads: Array, cells: int) -> NDArray[np.bool_]:
     """Move the corners of markers to where their sides meet, in place.
 
     Args:
         image: (h,w) gray, C-contiguous.
         quads: (m,4,2) corners, clockwise as seen in the image, within a pixel or so.
-        cells: (m,) cells along a side.
+        cells: along a side of each.
 
     Returns:
         (m,4): which corners were found; the others are left at their start.
@@ -356,7 +356,7 @@ def refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> 
 
 
 @kernel
-def _refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _refine(image: NDArray[np.uint8], quads: Array, cells: int) -> NDArray[np.bool_]:
     refined = np.zeros((len(quads), 4), np.bool_)
     curves = np.empty((4, 3))
     good = np.empty(4, np.bool_)
@@ -366,7 +366,7 @@ def _refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) ->
         before, rises = np.zeros((4, 5)), np.zeros((4, 5))
         for most_points in _POINTS:
             for s in range(4):
-                good[s] = _side(image, q, s, cells[m], most_points, before, rises[s], curves[s])
+                good[s] = _side(image, q, s, cells, most_points, before, rises[s], curves[s])
             for k in range(4):
                 refined[m, k] = good[k] and good[(k + 3) % 4]
                 moved[k] = q[k]
@@ -376,7 +376,7 @@ def _refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) ->
             q[:] = moved
             before[:] = rises
         dx, dy = quads[m, 1, 0] - quads[m, 0, 0], quads[m, 1, 1] - quads[m, 0, 1]
-        most = max(_MOST_MOVE_PIXELS, _MOST_MOVE_CELLS * math.sqrt(dx * dx + dy * dy) / cells[m])
+        most = max(_MOST_MOVE_PIXELS, _MOST_MOVE_CELLS * math.sqrt(dx * dx + dy * dy) / cells)
         for k in range(4):
             dx, dy = q[k, 0] - quads[m, k, 0], q[k, 1] - quads[m, k, 1]
             # Comparison with NaN is false.

@@ -18,19 +18,13 @@ to find, are left out::
           is_static: true
           default_tag_size: 0.16
           pose: {position: {x: 0, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}
-          tags:
-            - id: 0
-              size: 0.16
-              pose: {position: {x: 0, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}
+          tags: [{id: 0, size: 0.16, pose: {position: {x: 0, y: 0, z: 0}, rotation: ...}}]
 
 Bundles of apriltag_ros (ROS 1), YAML. Metres; axes as TagSLAM's (AprilRobotics/apriltag_ros #156).
 What is missing of a pose is that of the origin. Standalone tags have no place::
 
     tag_family: tag36h11
-    tag_bundles:
-      - name: wall
-        layout:
-          - {id: 0, size: 0.16, x: 0, y: 0, z: 0, qw: 1, qx: 0, qy: 0, qz: 0}
+    tag_bundles: [{name: wall, layout: [{id: 0, size: 0.16, x: 0, y: 0, z: 0, qw: 1, qx: 0, ...}]}]
 """
 
 import json
@@ -43,9 +37,9 @@ import numpy as np
 import yaml
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.yaml_text import YamlError, check_tree, load_yaml
+from rs_localizer.io.yaml_text import YamlError, check_tree, file_faults, load_yaml
 from rs_localizer.markers.families import FAMILIES, Family, family
-from rs_localizer.markers.map_files import Entry, read_marker_map, write_marker_map
+from rs_localizer.markers.map_files import Entry, read_marker_map, rounded, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose, quaternion_of_rotation, rotation_of_quaternion
 from rs_localizer.markers.prints import Marker
@@ -94,7 +88,7 @@ def _read_wpilib(file: Entry, family: Family, unsaid: Unsaid) -> list[Marker]:
 def _write_wpilib(marker_map: MarkerMap, family: str) -> str:
     """The field is as large as its tags need, from the origin on."""
     tags, markers = [], marker_map.markers
-    sizes = sorted({_rounded([marker.size])[0] for marker in markers})
+    sizes = sorted({rounded([marker.size])[0] for marker in markers})
     if sizes and sizes[-1] > sizes[0] * (1.0 + _SAME_SIZE):
         raise MarkerMapError(
             f"a field of WPILib holds tags of one size, found {sizes[0]:g} to {sizes[-1]:g} m"
@@ -166,7 +160,7 @@ def _write_tagslam(marker_map: MarkerMap, family: str) -> str:
             "position_noise": _xyz(deviations[:3]),
             "rotation_noise": _xyz(deviations[3:]),
         }
-        tags.append({"id": marker.id, "size": _rounded([marker.size])[0], "pose": pose})
+        tags.append({"id": marker.id, "size": rounded([marker.size])[0], "pose": pose})
     # Each of its own: YAML would refer from one to the other.
     at_rest = {"position": _xyz(np.zeros(3)), "rotation": _xyz(np.zeros(3))}
     at_rest |= {f"{name}_noise": _xyz(np.full(3, _AT_REST)) for name in ("position", "rotation")}
@@ -205,7 +199,7 @@ def _write_apriltag_ros(marker_map: MarkerMap, family: str) -> str:
     """One bundle."""
     layout = []
     for marker in marker_map.markers:
-        tag: dict[str, Any] = {"id": marker.id, "size": _rounded([marker.size])[0]}
+        tag: dict[str, Any] = {"id": marker.id, "size": rounded([marker.size])[0]}
         tag |= _xyz(marker.pose.position)
         quaternion = _quaternion(marker.pose.rotation)
         layout.append(tag | dict(zip(("qx", "qy", "qz", "qw"), quaternion, strict=True)))
@@ -280,15 +274,13 @@ def write_any(path: Path, marker_map: MarkerMap, name: str) -> None:
 
 def _tree(path: Path) -> dict[Any, Any]:
     kind = "JSON" if path.suffix.lower() == ".json" else "YAML"
-    try:
+    with file_faults(path, MarkerMapError, kind):
         text = path.read_text(encoding="utf-8")
-        tree = json.loads(text) if kind == "JSON" else load_yaml(text)
+        try:
+            tree = json.loads(text) if kind == "JSON" else load_yaml(text)
+        except (RecursionError, ValueError) as error:
+            raise YamlError(str(error)) from error
         check_tree(tree)
-    except OSError as error:
-        raise MarkerMapError(f"{path} cannot be read: {error.strerror}") from error
-    except (YamlError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise MarkerMapError(f"{path} is not a {kind} file: {reason}") from error
     if not isinstance(tree, dict):
         raise MarkerMapError(f"{path} must hold a mapping, found {str(tree)[:60]!r}")
     return tree
@@ -310,18 +302,13 @@ def _vector(entry: Entry, names: str) -> Array:
     return np.array([float(entry.take(name, _NUMBER, 0.0)) for name in names])
 
 
-def _rounded(values: Any) -> list[float]:
-    """Without the rounding errors of a fitted pose."""
-    return [round(float(value), 12) + 0.0 for value in values]
-
-
 def _quaternion(rotation: Array) -> list[float]:
     """x y z w."""
-    return _rounded(quaternion_of_rotation(rotation))
+    return rounded(quaternion_of_rotation(rotation))
 
 
 def _xyz(values: Array) -> dict[str, float]:
-    return dict(zip("xyz", _rounded(values), strict=True))
+    return dict(zip("xyz", rounded(values), strict=True))
 
 
 def _yaml(tree: dict[str, Any]) -> str:

@@ -10,12 +10,11 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.markers.consistency import PARALLEL, SAME_PLANE
 from rs_localizer.markers.detection import Detections, IntArray
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Marker
 
-# Markers within this distance of a plane (in sides) and this angle are in one.
-_SAME_PLANE, _PARALLEL = 0.2, np.cos(np.radians(5.0))
 # How far corners may be from where their neighbours put them, in sides of the markers. Among few
 # neighbours the projection takes in what the shutter and even a fisheye lens do; a marker that is
 # elsewhere, or mirrored, is off by about a side.
@@ -39,9 +38,8 @@ class MapCheck:
 
     def __init__(self, marker_map: MarkerMap) -> None:
         self._names = [marker.name for marker in marker_map.markers]
-        poses = [marker.pose for marker in marker_map.markers]
         self._planes = _planes(marker_map.markers)
-        self._rotations = [pose.rotation for pose in poses]
+        self._rotations = [marker.pose.rotation for marker in marker_map.markers]
 
     def fault(self, detections: Detections) -> str | None:
         """What is wrong with the map according to this image; None if nothing can be said."""
@@ -60,9 +58,8 @@ class MapCheck:
             return None
         rows = np.concatenate(list(whole.values()))
         first = next(iter(whole))
-        points = (detections.points[rows] - detections.points[rows[0]]) @ self._rotations[first][
-            :, :2
-        ]
+        plane = self._rotations[first][:, :2]
+        points = (detections.points[rows] - detections.points[rows[0]]) @ plane
         pixels = detections.pixels[rows]
         if _misfit(points, pixels) < _MISFITS:
             return None
@@ -118,7 +115,7 @@ def _planes(markers: tuple[Marker, ...]) -> list[int]:
         normal = pose.rotation[:, 2]
         for number, (other, offset, size) in enumerate(kept):
             off = abs(float(other @ pose.position) - offset)
-            if float(normal @ other) > _PARALLEL and off < _SAME_PLANE * min(size, marker.size):
+            if float(normal @ other) > PARALLEL and off < SAME_PLANE * min(size, marker.size):
                 numbers.append(number)
                 break
         else:
@@ -232,11 +229,6 @@ def still_pose(points: Array, rays: Array) -> tuple[Array, Array] | None:
     return turn, np.asarray(translation, np.float64).ravel()
 
 
-def still_errors(camera: Camera, pose: tuple[Array, Array], points: Array, pixels: Array) -> Array:
-    """From where the pixels (n,2) are to where a pose puts the points (n,3): px."""
-    return camera.project(points @ pose[0].T + pose[1]) - pixels
-
-
 def rms(errors: Array) -> float:
     """Root mean square of the lengths of errors (n,2)."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
@@ -275,8 +267,10 @@ Fit = Callable[[Camera, Array, Array], Predict | None]
 def still_fit(camera: Camera, points: Array, pixels: Array) -> Predict | None:
     """The fit of a camera that does not move, or of a global shutter."""
     pose = still_pose(points, camera.rays(pixels))
-    if pose is None:
-        return None
+    return None if pose is None else _predict(camera, pose)
+
+
+def _predict(camera: Camera, pose: tuple[Array, Array]) -> Predict:
     return lambda some: camera.project(some @ pose[0].T + pose[1])
 
 
@@ -311,9 +305,9 @@ class LeaveOneOut:
         rows = np.concatenate(list(whole.values()))
         points, pixels = detections.points, detections.pixels
         pose = still_pose(points[rows], camera.rays(pixels[rows]))
-        still = still_fit(camera, points[rows], pixels[rows])
-        if pose is None or still is None:
+        if pose is None:
             return
+        still = _predict(camera, pose)
         fit = still_fit if rms(still(points[rows]) - pixels[rows]) < _STILL else self._fit
         together = fit(camera, points[rows], pixels[rows])
         if together is None:

@@ -1,47 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of marker maps, in YAML.
-
-    map_frame: map                 # frame of all that follows; lengths in metres
-    markers:
-      - family: 4x4_50             # or any name of rs_localizer.markers.families
-        id: 3
-        size: 0.16                 # side of the black square
-        position: [0.0, 0.0, 1.5]  # of its middle
-        quaternion: [0.5, 0.5, 0.5, 0.5]  # x y z w; or rotation: three rows of a matrix
-        position_deviation: [0.001, 0.001, 0.002]  # optional, of a survey: m, and rad
-        rotation_deviation: [0.001, 0.001, 0.001]
-      - family: apriltag_36h11
-        id: 0
-        corners: [[0, 1, 2], [0, 1.2, 2], [0, 1.2, 1.8], [0, 1, 1.8]]
-    boards:
-      - type: chessboard
-        columns: 6                 # inner corners
-        rows: 4
-        square: 0.03
-        position: [0.0, 0.0, 0.0]
-        quaternion: [0.0, 0.0, 0.0, 1.0]
-        inverted: false            # optional: white on black paper
-        shape: [[0.0, 0.0, 0.001], ...]  # optional, of any board: how far from flat each corner is
-        deviation: 0.0002          # optional, of any board: m, how well its points are known;
-                                   # without it as paper is: 0.2 mm for each 10 cm from its middle
-      - type: circles              # or asymmetric_circles, OpenCV's pattern
-        columns: 4                 # circles
-        rows: 11
-        spacing: 0.02              # from row to row
-        position: [2.0, 0.0, 0.0]
-        quaternion: [0.0, 0.0, 0.0, 1.0]
-        inverted: false            # optional: white circles on black
-      - type: charuco
-        columns: 5                 # squares
-        rows: 7
-        square: 0.04
-        marker: 0.03
-        family: 5x5_100
-        first_id: 0                # optional
-        legacy: false              # optional: drawn by OpenCV before 4.6
-        position: [1.0, 0.0, 0.0]
-        quaternion: [0.0, 0.0, 0.0, 1.0]
+"""Files of marker maps, in YAML; an example of all that they may hold is in docs/maps.md.
 
 A pose is that of the print's frame: origin in its middle, x to the right, y up, z toward the
 viewer (the identity is a print that lies on the floor of a map whose z points up). Corners go from
@@ -51,7 +10,7 @@ the top left one clockwise, as seen from the front.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -60,7 +19,7 @@ import numpy as np
 import yaml
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.yaml_text import YamlError, load_yaml
+from rs_localizer.io.yaml_text import file_faults, load_yaml
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation
@@ -82,20 +41,14 @@ _CHESSBOARD, _CIRCLES, _ASYMMETRIC, _CHARUCO = _BOARDS = (
 
 
 def read_marker_map(path: Path | str) -> MarkerMap:
-    """Read a map file (see the module).
+    """Read a map file.
 
     Raises:
         MarkerMapError: for anything that cannot be used, saying where and what was found.
     """
     path = Path(path)
-    try:
+    with file_faults(path, MarkerMapError):
         tree = load_yaml(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise MarkerMapError(f"{path} cannot be read: {error.strerror}") from error
-    except (YamlError, UnicodeDecodeError) as error:
-        raise MarkerMapError(
-            f"{path} is not a YAML file: {' '.join(str(error).split())}"
-        ) from error
     try:
         return _map(tree)
     except ValueError as error:
@@ -146,27 +99,26 @@ def _board(entry: Entry) -> Board:
     entry.where += f" ({kind})"
     if kind not in _BOARDS:
         raise EntryError(f"{entry.where}: type must be one of {', '.join(_BOARDS)}")
-    columns, rows = entry.take("columns", int), entry.take("rows", int)
-    spacing = entry.number("spacing") if "circles" in kind else 0.0
-    square = 0.0 if "circles" in kind else entry.number("square")
-    pose = _pose(entry)
-    shape = entry.take("shape", list) if "shape" in entry else None
-    deviation = entry.number("deviation") if "deviation" in entry else None
-    if kind != _CHARUCO:
-        inverted = entry.take("inverted", bool, False)
-        entry.finish()
-        with entry.named():
-            if kind == _CHESSBOARD:
-                return Chessboard(columns, rows, square, pose, inverted, shape, deviation)
-            asymmetric = kind == _ASYMMETRIC
-            return CircleGrid(columns, rows, spacing, asymmetric, inverted, pose, shape, deviation)
-    marker, name = entry.number("marker"), entry.take("family", str)
-    first_id, legacy = entry.take("first_id", int, 0), entry.take("legacy", bool, False)
+    counts = entry.take("columns", int), entry.take("rows", int)
+    spacing = entry.number("spacing" if "circles" in kind else "square")
+    given: dict[str, Any] = {"pose": _pose(entry)}
+    if "shape" in entry:
+        given["shape"] = entry.take("shape", list)
+    if "deviation" in entry:
+        given["deviation"] = entry.number("deviation")
+    if kind == _CHARUCO:
+        marker, name = entry.number("marker"), entry.take("family", str)
+        given["first_id"] = entry.take("first_id", int, 0)
+        given["legacy"] = entry.take("legacy", bool, False)
+    else:
+        given["inverted"] = entry.take("inverted", bool, False)
     entry.finish()
     with entry.named():
-        return Charuco(
-            columns, rows, square, marker, family(name), first_id, legacy, pose, shape, deviation
-        )
+        if kind == _CHARUCO:
+            return Charuco(*counts, spacing, marker, family(name), **given)
+        if kind == _CHESSBOARD:
+            return Chessboard(*counts, spacing, **given)
+        return CircleGrid(*counts, spacing, kind == _ASYMMETRIC, **given)
 
 
 def _pose(entry: Entry) -> Pose:
@@ -218,57 +170,48 @@ def _marker_entry(marker: Marker) -> dict[str, Any]:
         deviations["rotation_deviation"] = _significant(marker.deviations[3:])
     square = Marker.at(marker.family.name, marker.id, marker.size, marker.pose)
     if np.abs(square.corners - marker.corners).max() > _SAME * marker.size:
-        return entry | {"corners": _numbers(marker.corners)} | deviations
-    return entry | {"size": _rounded(marker.size)} | _pose_entry(marker.pose) | deviations
+        return entry | {"corners": [rounded(row) for row in marker.corners]} | deviations
+    return entry | {"size": rounded([marker.size])[0]} | _pose_entry(marker.pose) | deviations
 
 
 def _board_entry(board: Board) -> dict[str, Any]:
-    sizes: dict[str, Any] = {"columns": board.columns, "rows": board.rows}
-    shape = {} if board.shape is None else {"shape": _numbers(np.round(board.shape, 7))}
-    if board.deviation is not None:
-        shape["deviation"] = float(f"{board.deviation:.3g}")
-    if not isinstance(board, Charuco):
-        inverted = {"inverted": True} if board.inverted else {}
-        if isinstance(board, Chessboard):
-            kind, sizes["square"] = _CHESSBOARD, float(board.square)
-        else:
-            kind = _ASYMMETRIC if board.asymmetric else _CIRCLES
-            sizes["spacing"] = float(board.spacing)
-        return {"type": kind} | sizes | _pose_entry(board.pose) | inverted | shape
-    return (
-        {"type": _CHARUCO}
-        | sizes
-        | {
+    if isinstance(board, Charuco):
+        kind, own = _CHARUCO, {
             "square": float(board.square),
             "marker": float(board.marker),
             "family": board.family.name,
             "first_id": board.first_id,
             "legacy": board.legacy,
-        }
-        | _pose_entry(board.pose)
-        | shape
-    )
+        }  # fmt: skip
+    elif isinstance(board, Chessboard):
+        kind, own = _CHESSBOARD, {"square": float(board.square)}
+    else:
+        kind = _ASYMMETRIC if board.asymmetric else _CIRCLES
+        own = {"spacing": float(board.spacing)}
+    entry: dict[str, Any] = {"type": kind, "columns": board.columns, "rows": board.rows}
+    entry |= own | _pose_entry(board.pose)
+    if not isinstance(board, Charuco) and board.inverted:
+        entry["inverted"] = True
+    if board.shape is not None:
+        entry["shape"] = [rounded(row) for row in np.round(board.shape, 7)]
+    if board.deviation is not None:
+        entry["deviation"] = float(f"{board.deviation:.3g}")
+    return entry
 
 
 def _pose_entry(pose: Pose) -> dict[str, Any]:
     quaternion = quaternion_of_rotation(pose.rotation)
-    return {"position": _numbers(pose.position), "quaternion": _numbers(quaternion)}
+    return {"position": rounded(pose.position), "quaternion": rounded(quaternion)}
 
 
-def _numbers(values: Array) -> Any:
-    if values.ndim > 1:
-        return [_numbers(row) for row in values]
-    return [_rounded(value) for value in values]
+def rounded(values: Iterable[float]) -> list[float]:
+    """Without the rounding errors of a fitted pose: 0.16 and not 0.16000000000000003."""
+    return [round(float(value), 12) + 0.0 for value in values]
 
 
 def _significant(values: Array) -> list[float]:
     """Three digits: more are not known of a deviation."""
     return [float(f"{value:.3g}") for value in values]
-
-
-def _rounded(value: float) -> float:
-    """Without the rounding errors of a fitted pose: 0.16 and not 0.16000000000000003."""
-    return round(float(value), 12) + 0.0
 
 
 class EntryError(ValueError):

@@ -14,7 +14,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Board, Charuco, Marker, deviation_of, with_points
+from rs_localizer.markers.prints import Board, Charuco, Marker
 
 
 class MarkerMapError(ValueError):
@@ -78,7 +78,7 @@ class MarkerMap:
 
         Markers are exact: what their places are worth is their survey's to say.
         """
-        boards = [(len(board.points), deviation_of(board)) for board in self.boards]
+        boards = [(len(board.points), board.points_deviation) for board in self.boards]
         if not boards:
             return {}
         counts, deviations = np.array(boards).T
@@ -96,7 +96,7 @@ class MarkerMap:
                 for marker, part in zip(self.markers, parts[:own], strict=True)
             ),
             boards=tuple(
-                with_points(board, part, deviation)
+                board.with_points(part, deviation)
                 for board, part in zip(self.boards, parts[own:], strict=True)
             ),
         )

@@ -102,31 +102,21 @@ def draw_world(
     def poses_at(tau: Array) -> tuple[Array, Array]:
         return path.at(before + camera.readout_time * (tau - first))
 
-    lines: list[tuple[Array, tuple[int, int, int]]] = []
-    sizes = []
-    for pose, size in _standing(detections, marker_map):
-        sizes.append(size)
-        lines += [(line, _CUBE) for line in _cube(pose, size)]
-    length = max(sizes, default=0.0)
+    standing = list(_standing(detections, marker_map))
+    length = max((size for _, size in standing), default=0.0)
+    lines = [(line, "", _CUBE) for pose, size in standing for line in _cube(pose, size)]
     lines += [
-        (_edge(np.zeros(3), length * axis), color)
-        for axis, (_, color) in zip(np.eye(3), _AXES, strict=True)
+        (_edge(np.zeros(3), length * axis), name, color)
+        for axis, (name, color) in zip(np.eye(3), _AXES, strict=True)
     ]
-    names = dict(zip(range(len(lines) - len(_AXES), len(lines)), _AXES, strict=True))
-    points = np.concatenate([line for line, _ in lines])
-    pixels, _ = project_rolling(camera, poses_at, points)
+    pixels, _ = project_rolling(camera, poses_at, np.concatenate([line for line, *_ in lines]))
     width, height = camera.size
     middle, reach = 0.5 * np.array([width, height]), (0.5 + _FARTHEST) * max(width, height)
-    with np.errstate(invalid="ignore"):
-        near = np.abs(pixels - middle).max(axis=1) < reach
-    start = 0
-    for index, (line, color) in enumerate(lines):
-        end = start + len(line)
-        if near[start:end].all():
-            _line(picture, pixels[start:end], color)
-            if index in names:
-                _text(picture, names[index][0], pixels[end - 1], color)
-        start = end
+    for (_, name, color), seen in zip(lines, pixels.reshape(-1, _EDGE_POINTS, 2), strict=True):
+        if np.abs(seen - middle).max() < reach:  # NaN is not
+            _line(picture, seen, color)
+            if name:
+                _text(picture, name, seen[-1], color)
 
 
 def _standing(detections: Detections, marker_map: MarkerMap) -> Iterator[tuple[Pose, float]]:

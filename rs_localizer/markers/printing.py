@@ -35,12 +35,11 @@ def plan(marker_map: MarkerMap, page: str = "a4") -> list[Page]:
     Raises:
         PrintError: when something is larger than the page.
     """
-    size = PAGES[page]
-    pages = [_board_page(board, size, page) for board in marker_map.boards]
+    pages = [_board_page(board, page) for board in marker_map.boards]
     markers = marker_map.markers
     if markers:
-        together = _together(markers, size)
-        pages += [together] if together is not None else _apart(markers, size, page)
+        together = _together(markers, PAGES[page])
+        pages += [together] if together is not None else _apart(markers, page)
     return pages
 
 
@@ -51,7 +50,7 @@ def _room(size: tuple[float, float]) -> tuple[float, float]:
     return size[0] - 2 * MARGIN, size[1] - 2 * MARGIN - _TEXT_HEIGHT
 
 
-def _turned(size: tuple[float, float], width: float, height: float) -> tuple[float, float] | None:
+def _paper(size: tuple[float, float], width: float, height: float) -> tuple[float, float] | None:
     """The page, upright or on its side, on which this fits."""
     for paper in (size, size[::-1]):
         room = _room(paper)
@@ -60,24 +59,24 @@ def _turned(size: tuple[float, float], width: float, height: float) -> tuple[flo
     return None
 
 
-def _too_large(what: str, width: float, height: float, size: tuple[float, float], page: str) -> str:
-    room = _room(size)
-    return (
-        f"{what} takes {width:.0f} x {height:.0f} mm, but {page} has room for {room[0]:.0f} x "
-        f"{room[1]:.0f} mm; choose a larger page or a smaller size"
-    )
-
-
-def _board_page(board: Board, size: tuple[float, float], page: str) -> Page:
-    figure = _board_figure(board)
-    paper = _turned(size, figure.width, figure.height)
+def _needed(what: str, page: str, width: float, height: float) -> tuple[float, float]:
+    """The same, or a PrintError."""
+    paper = _paper(PAGES[page], width, height)
     if paper is None:
-        raise PrintError(_too_large(board.name, figure.width, figure.height, size, page))
+        room = _room(PAGES[page])
+        raise PrintError(
+            f"{what} takes {width:.0f} x {height:.0f} mm, but {page} has room for {room[0]:.0f} x "
+            f"{room[1]:.0f} mm; choose a larger page or a smaller size"
+        )
+    return paper
+
+
+def _board_page(board: Board, page: str) -> Page:
+    figure = _board_figure(board)
+    paper = _needed(board.name, page, figure.width, figure.height)
     note = f"{figure.label}; mount it on something flat"
-    page_ = _middle(paper, [(0.0, 0.0, figure)], figure.width, figure.height, note)
-    x, y, _ = page_.figures[0]
-    middle = (x + 0.5 * figure.width, y + 0.5 * figure.height)
-    return replace(page_, axes=_axes(board.pose, middle, paper))
+    laid = _middle(paper, [(0.0, 0.0, figure)], figure.width, figure.height, note)
+    return _with_axes(laid, board.pose)
 
 
 def _together(markers: tuple[Marker, ...], size: tuple[float, float]) -> Page | None:
@@ -96,29 +95,33 @@ def _together(markers: tuple[Marker, ...], size: tuple[float, float]) -> Page | 
     left, bottom = min(x for x, _, _ in figures), min(y for _, y, _ in figures)
     width = max(x + figure.width for x, _, figure in figures) - left
     height = max(y + figure.height for _, y, figure in figures) - bottom
-    paper = _turned(size, width, height)
+    paper = _paper(size, width, height)
     if paper is None:
         return None
     moved = [(x - left, y - bottom, figure) for x, y, figure in figures]
     note = "all markers are where the map has them" if len(markers) > 1 else ""
-    laid = _middle(paper, moved, width, height, note)
-    x, y, figure = laid.figures[0]
-    middle = (x + 0.5 * figure.width, y + 0.5 * figure.height)
-    return replace(laid, axes=_axes(first, middle, paper))
+    return _with_axes(_middle(paper, moved, width, height, note), first)
 
 
-def _axes(pose: Pose, middle: tuple[float, float], size: tuple[float, float]) -> Axes:
-    """How the map's frame lies on a page that has a print of this pose at ``middle``."""
+def _with_axes(page: Page, pose: Pose) -> Page:
+    """The page and how the map's frame lies on it, by the pose of its first print."""
+    left, bottom, figure = page.figures[0]
     right, up, out = (_direction(pose.rotation[:, k]) for k in range(3))
     x, y, z = -pose.position @ pose.rotation * _MM
-    origin = (middle[0] + x, middle[1] + y)
-    text = ", ".join(f"{value:g}" for value in np.round(pose.position, 4) + 0.0)
-    where = f"the middle of the first print is at ({text}) m"
-    if abs(z) > _FLAT * _MM or not (0 <= origin[0] <= size[0] and 0 <= origin[1] <= size[1]):
-        return Axes(right, up, out, None, f"{where}; the origin is not on this page")
-    if np.hypot(x, y) < _FLAT * _MM:
-        return Axes(right, up, out, origin, "the origin is in the middle of the print")
-    return Axes(right, up, out, origin, where)
+    origin = (left + 0.5 * figure.width + x, bottom + 0.5 * figure.height + y)
+    where = f"the middle of the first print is at ({_place(pose)}) m"
+    inside = 0 <= origin[0] <= page.width and 0 <= origin[1] <= page.height
+    if abs(z) > _FLAT * _MM or not inside:
+        axes = Axes(right, up, out, None, f"{where}; the origin is not on this page")
+    elif np.hypot(x, y) < _FLAT * _MM:
+        axes = Axes(right, up, out, origin, "the origin is in the middle of the print")
+    else:
+        axes = Axes(right, up, out, origin, where)
+    return replace(page, axes=axes)
+
+
+def _place(pose: Pose) -> str:
+    return ", ".join(f"{value:g}" for value in np.round(pose.position, 4) + 0.0)
 
 
 def _direction(vector: Array) -> str:
@@ -129,16 +132,15 @@ def _direction(vector: Array) -> str:
     return f"{'+' if vector[axis] > 0 else '-'}{'xyz'[axis]}"
 
 
-def _apart(markers: tuple[Marker, ...], size: tuple[float, float], page: str) -> list[Page]:
+def _apart(markers: tuple[Marker, ...], page: str) -> list[Page]:
     """As many markers to a page as fit, to be cut out and put where the map has them."""
     figures = [_marker_figure(marker, placed=True) for marker in markers]
     width = max(figure.width for figure in figures)
     height = max(figure.height for figure in figures)
-    paper = _turned(size, width, height)
-    if paper is None:
-        raise PrintError(_too_large(markers[0].name, width, height, size, page))
+    _needed(markers[0].name, page, width, height)
+    papers = PAGES[page], PAGES[page][::-1]
     columns, rows, paper = max(
-        ((int(_room(w)[0] // width), int(_room(w)[1] // height), w) for w in (size, size[::-1])),
+        ((int(_room(w)[0] // width), int(_room(w)[1] // height), w) for w in papers),
         key=lambda item: item[0] * item[1],
     )
     pages = []
@@ -174,8 +176,7 @@ def _marker_figure(marker: Marker, placed: bool = False) -> Figure:
     side = cell * (marker.family.cells + 2)
     label = f"{marker.family.name}  id {marker.id}  {marker.size * _MM:g} mm"
     if placed:
-        place = ", ".join(f"{value:g}" for value in np.round(marker.pose.position, 4) + 0.0)
-        label += f"  middle at ({place}) m"
+        label += f"  middle at ({_place(marker.pose)}) m"
     return Figure(black, side, side, cell, label)
 
 

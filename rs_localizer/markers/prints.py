@@ -8,7 +8,7 @@ Corners of a marker are in OpenCV's order: top left, top right, bottom right, bo
 upright print seen from its front. Corners of boards go row by row from the top left one.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -82,32 +82,72 @@ class Marker:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chessboard:
-    """A chessboard by its inner corners.
+class _Board:
+    """Points in rows, in one plane or nearly."""
+
+    columns: int
+    rows: int
+    _: KW_ONLY
+    pose: Pose = field(default_factory=Pose)
+    shape: Array | None = None  # (n,3) m, how far from flat each point is, in the print's axes
+    deviation: float | None = None  # m, of the points' places as they are given; None: paper's
+
+    @property
+    def flat(self) -> Array:
+        """Points (n,3) in the print's axes, row by row, of a board that is flat."""
+        raise NotImplementedError
+
+    @property
+    def points(self) -> Array:
+        """Points (n,3) in the map, row by row."""
+        return self.pose(self.flat if self.shape is None else self.flat + self.shape)
+
+    @property
+    def points_deviation(self) -> float:
+        """By how much (m, rms of one standard deviation) points are off: as given, or paper's."""
+        if self.deviation is not None:
+            return self.deviation
+        apart = self.points - self.points.mean(axis=0)
+        return _PAPER * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+
+    def with_points(self, points: Array, deviation: float | None = None) -> Self:
+        """The board with its points at (n,3) in the map, known to a deviation (m)."""
+        shape = (points - self.pose(self.flat)) @ self.pose.rotation
+        return replace(self, shape=shape, deviation=deviation)
+
+    def _check(self, *lengths: str) -> None:
+        if max(self.columns, self.rows) > _MOST_SQUARES:
+            raise ValueError(
+                f"a board may be {_MOST_SQUARES} squares wide and high, got "
+                f"{self.columns}x{self.rows}"
+            )
+        for name in lengths:
+            _positive(getattr(self, name), name)
+        if self.shape is not None:
+            object.__setattr__(self, "shape", finite(self.shape, self.flat.shape, "shape"))
+        if self.deviation is not None and not 0.0 <= self.deviation < np.inf:
+            raise ValueError(f"deviation must be 0 or more metres, found {self.deviation!r}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chessboard(_Board):
+    """A chessboard by its inner corners, of which ``columns`` are in a row.
 
     It looks the same turned by half (a square one by a quarter, too): which corner is the first
     is only known when columns + rows is odd, from the color of the square beyond it.
     """
 
-    columns: int  # inner corners along a row
-    rows: int
     square: float  # m
-    pose: Pose = field(default_factory=Pose)
     inverted: bool = False  # white squares on black, with black paper around them
-    shape: Array | None = None  # (n,3) m, how far from flat each corner is, in the print's axes
-    deviation: float | None = None  # m, of the points' places as they are given; None: paper's
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3:  # OpenCV's own limit
             raise ValueError(f"a board needs 3x3 inner corners, got {self.columns}x{self.rows}")
-        _not_too_many(self.columns, self.rows)
-        _positive(self.square, "square")
-        _check_shape(self, self.columns * self.rows)
+        self._check("square")
 
     @property
-    def points(self) -> Array:
-        """Inner corners (n,3), row by row."""
-        return self.pose(_bent(_grid(self.columns, self.rows, self.square), self.shape))
+    def flat(self) -> Array:
+        return _grid(self.columns, self.rows, self.square)
 
     @property
     def spacing(self) -> float:
@@ -125,39 +165,31 @@ class Chessboard:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CircleGrid:
-    """A grid of circles by their centres.
+class CircleGrid(_Board):
+    """A grid of circles by their centres, of which ``columns`` are in a row.
 
     In an asymmetric one, every second row is shifted by half the distance of neighbours in a row,
     which is twice the spacing (OpenCV's pattern): so it is known how it lies. A symmetric one looks
     the same turned by half.
     """
 
-    columns: int  # circles along a row
-    rows: int
     spacing: float  # m: from row to row
     asymmetric: bool = False
     inverted: bool = False  # white circles on black
-    pose: Pose = field(default_factory=Pose)
-    shape: Array | None = None  # (n,3) m, how far from flat each centre is, in the print's axes
-    deviation: float | None = None  # m, of the points' places as they are given; None: paper's
 
     def __post_init__(self) -> None:
         if self.columns < 2 or self.rows < 3:
             raise ValueError(f"a grid needs 2x3 circles, got {self.columns}x{self.rows}")
-        _not_too_many(self.columns, self.rows)
-        _positive(self.spacing, "spacing")
-        _check_shape(self, self.columns * self.rows)
+        self._check("spacing")
 
     @property
-    def points(self) -> Array:
-        """Centres (n,3), row by row."""
+    def flat(self) -> Array:
         if not self.asymmetric:
-            return self.pose(_bent(_grid(self.columns, self.rows, self.spacing), self.shape))
+            return _grid(self.columns, self.rows, self.spacing)
         row, column = np.mgrid[: self.rows, : self.columns].astype(np.float64)
         x = 2.0 * column + row % 2.0 - 0.5 * (2 * self.columns - 1)
         flat = np.stack([x, 0.5 * (self.rows - 1) - row, np.zeros_like(x)], axis=-1)
-        return self.pose(_bent(flat.reshape(-1, 3) * self.spacing, self.shape))
+        return np.asarray(flat.reshape(-1, 3) * self.spacing)
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -172,33 +204,26 @@ class CircleGrid:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Charuco:
+class Charuco(_Board):
     """A chessboard with a marker in each of its white squares: seen in part, it is known, too.
 
-    Markers have ids from ``first_id`` on, row by row from the top left. The top left square is
-    black; with ``legacy`` (OpenCV before 4.6) it is white when the number of rows is even.
+    ``columns`` are squares along a row; the points are inner corners of the squares. Markers have
+    ids from ``first_id`` on, row by row from the top left. The top left square is black; with
+    ``legacy`` (OpenCV before 4.6) it is white when the number of rows is even.
     """
 
-    columns: int  # squares along a row
-    rows: int
     square: float  # m
     marker: float  # m, side of the black square of a marker
     family: Family
     first_id: int = 0
     legacy: bool = False
-    pose: Pose = field(default_factory=Pose)
-    shape: Array | None = None  # (n,3) m, how far from flat each corner is, in the print's axes
-    deviation: float | None = None  # m, of the points' places as they are given; None: paper's
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 2 or self.columns * self.rows < 6:
             raise ValueError(
                 f"a ChArUco board needs 2x3 squares or more, got {self.columns}x{self.rows}"
             )
-        _not_too_many(self.columns, self.rows)
-        _positive(self.square, "square")
-        _positive(self.marker, "marker")
-        _check_shape(self, (self.columns - 1) * (self.rows - 1))
+        self._check("square", "marker")
         if self.marker >= self.square:
             raise ValueError(
                 f"the markers of {self.marker} m do not fit into squares of {self.square} m"
@@ -218,10 +243,8 @@ class Charuco:
         return [(column, row) for column, row in cells if (column + row) % 2 == white]
 
     @property
-    def points(self) -> Array:
-        """Inner corners (n,3) of the squares, row by row: (columns - 1) x (rows - 1)."""
-        flat = _grid(self.columns - 1, self.rows - 1, self.square)
-        return self.pose(_bent(flat, self.shape))
+    def flat(self) -> Array:
+        return _grid(self.columns - 1, self.rows - 1, self.square)
 
     @property
     def markers(self) -> list[Marker]:
@@ -250,31 +273,6 @@ class Charuco:
 
 
 Board = Chessboard | CircleGrid | Charuco
-
-
-def with_points(board: Board, points: Array, deviation: float | None = None) -> Board:
-    """The board with its points at (n,3) in the map, known to a deviation (m)."""
-    flat = replace(board, shape=None).points
-    return replace(board, shape=(points - flat) @ board.pose.rotation, deviation=deviation)
-
-
-def deviation_of(board: Board) -> float:
-    """By how much (m, rms of one standard deviation) points are off: as given, or as paper is."""
-    if board.deviation is not None:
-        return board.deviation
-    apart = board.points - board.points.mean(axis=0)
-    return _PAPER * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
-
-
-def _bent(flat: Array, shape: Array | None) -> Array:
-    return flat if shape is None else flat + shape
-
-
-def _check_shape(board: Board, count: int) -> None:
-    if board.shape is not None:
-        object.__setattr__(board, "shape", finite(board.shape, (count, 3), "shape"))
-    if board.deviation is not None and not 0.0 <= board.deviation < np.inf:
-        raise ValueError(f"deviation must be 0 or more metres, found {board.deviation!r}")
 
 
 def _grid(columns: int, rows: int, spacing: float) -> Array:
@@ -308,10 +306,3 @@ def _square_pose(corners: Array) -> Pose:
 def _positive(value: float, name: str) -> None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
         raise ValueError(f"{name} must be a length in metres above 0, found {value!r}")
-
-
-def _not_too_many(columns: int, rows: int) -> None:
-    if max(columns, rows) > _MOST_SQUARES:
-        raise ValueError(
-            f"a board may be {_MOST_SQUARES} squares wide and high, got {columns}x{rows}"
-        )

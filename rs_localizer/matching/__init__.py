@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,7 @@ class Visible:
     gate: float  # px
 
 
-class Index(Protocol):
+class Index:
     """A search among the descriptors (n,d) that it was made of.
 
     Costs are what one core of an AMD EPYC took, in ns: they only decide which search is made, and
@@ -72,44 +72,63 @@ class Index(Protocol):
 
     pair_cost: float  # of a query and a landmark, in the search among all
     candidate_cost: float  # of a landmark that is predicted near a query
+    _rows: NDArray[Any]  # (n,w) as the kernels take them
+    _search_within: Any
 
     def nearest(self, queries: Descriptors) -> Nearest:
         """Among all of them, for queries (q,d)."""
-        ...
+        raise NotImplementedError
 
     def nearest_within(
         self, queries: Descriptors, pixels: Array, visible: Visible
     ) -> tuple[Nearest, IntArray]:
         """Among those predicted near pixels (q,2); also each one's own nearest query (v,)."""
-        ...
+        result, count = Nearest.none(len(queries)), len(visible.landmarks)
+        owners = np.full(count, -1, np.int64)
+        near = Near(pixels, visible.landmarks, visible.pixels, visible.gate)
+        best = Best(result.distances, result.landmarks, np.full(count, np.inf), owners)
+        self._search_within(self._packed(queries), self._rows, near, best)
+        return result, owners
+
+    @staticmethod
+    def _packed(descriptors: Descriptors) -> NDArray[Any]:
+        raise NotImplementedError
 
 
-class BinaryIndex:
+class _BinaryIndex(Index):
     """Bits, compared by how many of them differ."""
+
+    _search_within = staticmethod(nearest_binary_within)
 
     def __init__(self, descriptors: Descriptors) -> None:
         self.pair_cost, self.candidate_cost = 0.014 * descriptors.shape[1], 100.0
-        self._rows = _words(descriptors)
+        self._rows = self._packed(descriptors)
         self._columns = np.ascontiguousarray(self._rows.T)
 
     def nearest(self, queries: Descriptors) -> Nearest:
         result = Nearest.none(len(queries))
-        nearest_binary(_words(queries), self._columns, result.distances, result.landmarks)
+        nearest_binary(self._packed(queries), self._columns, result.distances, result.landmarks)
         return result
 
-    def nearest_within(
-        self, queries: Descriptors, pixels: Array, visible: Visible
-    ) -> tuple[Nearest, IntArray]:
-        return _within(nearest_binary_within, self._rows, _words(queries), pixels, visible)
+    @staticmethod
+    def _packed(descriptors: Descriptors) -> NDArray[Any]:
+        """Bytes (n,d) as words (n,w), w a multiple of four; the bytes that are added are zero."""
+        count, width = descriptors.shape
+        chunk = _WORD_BYTES * _WORDS_AT_ONCE
+        padded = np.zeros((count, -(-width // chunk) * chunk), np.uint8)
+        padded[:, :width] = descriptors
+        return padded.view(np.uint64)
 
 
-class RealIndex:
+class _RealIndex(Index):
     """Numbers, compared by their Euclidean distance."""
+
+    _search_within = staticmethod(nearest_real_within)
 
     def __init__(self, descriptors: Descriptors) -> None:
         width = descriptors.shape[1]
         self.pair_cost, self.candidate_cost = 0.033 * width, 1.8 * width
-        self._rows = np.array(descriptors, np.float32)
+        self._rows = self._packed(descriptors)
         with np.errstate(over="ignore"):
             self._squares = np.square(self._rows).sum(axis=1)
 
@@ -137,36 +156,14 @@ class RealIndex:
             np.take_along_axis(result.landmarks, order, 1),
         )
 
-    def nearest_within(
-        self, queries: Descriptors, pixels: Array, visible: Visible
-    ) -> tuple[Nearest, IntArray]:
-        rows = np.array(queries, np.float32)
-        return _within(nearest_real_within, self._rows, rows, pixels, visible)
+    @staticmethod
+    def _packed(descriptors: Descriptors) -> NDArray[Any]:
+        return np.array(descriptors, np.float32)
 
 
 def make_index(descriptors: Descriptors, *, binary: bool) -> Index:
     """The search for descriptors (n,d) that are bits or numbers."""
-    return BinaryIndex(descriptors) if binary else RealIndex(descriptors)
-
-
-def _within(
-    search: Any, rows: NDArray[Any], queries: NDArray[Any], pixels: Array, visible: Visible
-) -> tuple[Nearest, IntArray]:
-    result, count = Nearest.none(len(queries)), len(visible.landmarks)
-    owners = np.full(count, -1, np.int64)
-    near = Near(pixels, visible.landmarks, visible.pixels, visible.gate)
-    best = Best(result.distances, result.landmarks, np.full(count, np.inf), owners)
-    search(queries, rows, near, best)
-    return result, owners
-
-
-def _words(descriptors: Descriptors) -> NDArray[np.uint64]:
-    """Bytes (n,d) as words (n,w), w a multiple of four; the bytes that are added are zero."""
-    count, width = descriptors.shape
-    chunk = _WORD_BYTES * _WORDS_AT_ONCE
-    padded = np.zeros((count, -(-width // chunk) * chunk), np.uint8)
-    padded[:, :width] = descriptors
-    return padded.view(np.uint64)
+    return _BinaryIndex(descriptors) if binary else _RealIndex(descriptors)
 
 
 # Standard deviations of the prediction within which the camera is looked for.
@@ -341,9 +338,8 @@ class Matcher:
         if self.choose(keypoints, settings) == MatchBy.ID:
             return self._by_id(keypoints)
         assert keypoints.descriptors is not None
-        queries = keypoints.descriptors
         chosen = _best(keypoints, settings.max_keypoints)
-        queries, pixels = queries[chosen], keypoints.pixels[chosen]
+        queries, pixels = keypoints.descriptors[chosen], keypoints.pixels[chosen]
         if settings.gate > 0.0 and camera is not None and prior is not None:
             matches, mutual = self._predicted(queries, pixels, settings, camera, prior)
         else:
@@ -368,20 +364,13 @@ class Matcher:
                 f"have {_marks(keypoints.ids, keypoints.descriptors)}, the map has "
                 f"{_marks(self.map.ids, self.map.descriptors)}"
             )
-        if by == MatchBy.DESCRIPTOR:
-            self._check(keypoints.descriptors)
+        sent, ours = keypoints.descriptors, self.map.descriptors
+        if by == MatchBy.DESCRIPTOR and sent is not None and ours is not None:
+            # SIFT is sent in bytes and in floats, which are the same numbers.
+            kinds_fit = sent.dtype == ours.dtype or ours.dtype == np.float32
+            if not kinds_fit or sent.shape[1] != ours.shape[1]:
+                raise MatchError(f"the keypoints have {_kind(sent)}, the map has {_kind(ours)}")
         return by
-
-    def _check(self, descriptors: Descriptors | None) -> None:
-        ours = self.map.descriptors
-        assert descriptors is not None
-        assert ours is not None
-        # SIFT is sent in bytes and in floats, which are the same numbers.
-        kinds_fit = descriptors.dtype == ours.dtype or ours.dtype == np.float32
-        if not kinds_fit or descriptors.shape[1] != ours.shape[1]:
-            raise MatchError(f"the keypoints have {_kind(descriptors)}, the map has {_kind(ours)}")
-
-    # -- steps ------------------------------------------------------------------------------
 
     def _by_id(self, keypoints: Keypoints) -> Matches:
         assert keypoints.ids is not None

@@ -25,7 +25,7 @@ from rs_localizer.io.recording import (
 )
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.detection import recognized
-from rs_localizer.markers.map_check import LeaveOneOut, Predict, rms, still_errors, still_pose
+from rs_localizer.markers.map_check import LeaveOneOut, Predict, rms, still_fit
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
@@ -276,10 +276,8 @@ def static_residual(camera: Camera, detected: Detected) -> float:
     detections = detected.detections
     if len(detections.ids) < _LEAST_CORNERS:
         return np.nan
-    pose = still_pose(detections.points, camera.rays(detections.pixels))
-    if pose is None:
-        return np.nan
-    return rms(still_errors(camera, pose, detections.points, detections.pixels))
+    predict = still_fit(camera, detections.points, detections.pixels)
+    return np.nan if predict is None else rms(predict(detections.points) - detections.pixels)
 
 
 @dataclass(slots=True)

@@ -4,15 +4,12 @@
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.messages import make_header
+from rs_localizer.io.messages import make_header, make_quaternion, make_vector
 from rs_localizer.io.recording import (
     CAMERA_FRAME,
     CAMERA_INFO_TOPIC,
@@ -20,8 +17,8 @@ from rs_localizer.io.recording import (
     MAP_FRAME,
     RAW_IMAGE_TOPIC,
     make_camera_info,
+    make_image,
     write_frame,
-    write_image,
 )
 from rs_localizer.simulation.frames import SimulatedFrame
 from rs_localizer.simulation.renderer import RenderedFrame
@@ -52,7 +49,8 @@ def write_simulated(
 def write_rendered(bag: BagWriter, camera: Camera, frame: RenderedFrame) -> None:
     """Camera info, image, and the truth at the first and at the middle row."""
     bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, frame.stamp_ns), frame.stamp_ns)
-    write_image(bag, RAW_IMAGE_TOPIC, frame.stamp_ns, frame.format, frame.data)
+    image = make_image(frame.stamp_ns, frame.format, frame.data)
+    bag.write(RAW_IMAGE_TOPIC, image, frame.stamp_ns)
     write_truth(bag, frame.stamp_ns, frame.first_row)
     if frame.middle_ns != frame.stamp_ns:
         write_truth(bag, frame.middle_ns, frame.middle_row)
@@ -66,15 +64,13 @@ def write_truth(
     recorded_ns: int | None = None,
 ) -> None:
     """Pose and twist of a body in the map, of one instant; recorded then, or at another time."""
-    x, y, z = state.positions[0].tolist()
-    qx, qy, qz, qw = so3.quaternion(np.ascontiguousarray(state.rotations[0])).tolist()
     pose = make_message(
         "geometry_msgs/msg/PoseStamped",
         header=make_header(make_message, stamp_ns, MAP_FRAME),
         pose=make_message(
             "geometry_msgs/msg/Pose",
-            position=make_message("geometry_msgs/msg/Point", x=x, y=y, z=z),
-            orientation=make_message("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+            position=make_vector(make_message, state.positions[0], "Point"),
+            orientation=make_quaternion(make_message, state.rotations[0]),
         ),
     )
     twist = make_message(
@@ -82,15 +78,10 @@ def write_truth(
         header=make_header(make_message, stamp_ns, body),
         twist=make_message(
             "geometry_msgs/msg/Twist",
-            linear=_vector(state.linear[0]),
-            angular=_vector(state.angular[0]),
+            linear=make_vector(make_message, state.linear[0]),
+            angular=make_vector(make_message, state.angular[0]),
         ),
     )
     recorded_ns = stamp_ns if recorded_ns is None else recorded_ns
     bag.write(TRUE_POSE_TOPIC, pose, recorded_ns)
     bag.write(TRUE_TWIST_TOPIC, twist, recorded_ns)
-
-
-def _vector(vector: Array) -> Any:
-    x, y, z = vector.tolist()
-    return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)

@@ -57,23 +57,6 @@ def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generato
     return rows
 
 
-def map_rows(landmarks: Map) -> NDArray[Any]:
-    """Rows (n,) of a cloud of landmarks."""
-    kinds: list[tuple[Any, ...]] = [(name, "<f8") for name in "xyz"]
-    if landmarks.ids is not None:
-        kinds.append(("id", landmarks.id_type))
-    if landmarks.descriptors is not None:
-        kinds.append(("descriptor", landmarks.descriptors.dtype, landmarks.descriptors.shape[1:]))
-    rows = np.empty(len(landmarks), kinds)
-    for name, column in zip("xyz", landmarks.points.T, strict=True):
-        rows[name] = column
-    if landmarks.ids is not None:
-        rows["id"] = landmarks.ids
-    if landmarks.descriptors is not None:
-        rows["descriptor"] = landmarks.descriptors
-    return rows
-
-
 # Points of the map; enough that a narrow camera close to a wall still sees some hundreds.
 _POINTS = 30_000
 # Walls stand this far beyond the path of the camera (m); rooms as people record them in.

@@ -14,10 +14,10 @@ from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.files import write_map_file
-from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.maps.landmarks import Map, map_rows
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.simulation.recording import write_simulated
-from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
+from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room
 from rs_localizer.simulation.settings import FrameSettings
 
 FRAMES = 8

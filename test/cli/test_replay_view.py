@@ -12,7 +12,7 @@ import pytest
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.recording import IMAGE_TOPIC, write_image
+from rs_localizer.io.recording import IMAGE_TOPIC, make_image
 from rs_localizer.io.trajectories import read_motions
 from rs_localizer.offline import viewing as paths
 
@@ -34,7 +34,8 @@ def flight(tmp_path_factory) -> Path:
         for topic, recorded, message in bag.messages(tuple(bag.topics)):
             copy.write(topic, message, recorded)
             if topic == "/correspondences":
-                write_image(copy, IMAGE_TOPIC, stamp_ns(message), "jpeg", jpeg)
+                stamp = stamp_ns(message)
+                copy.write(IMAGE_TOPIC, make_image(stamp, "jpeg", jpeg), stamp)
     return folder / "flight"
 
 

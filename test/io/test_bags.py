@@ -11,17 +11,13 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
 from rs_localizer.io.bags import STORAGES, BagError, BagWriter, make_message, open_bag
-
-
-def header(seconds: int) -> Any:
-    stamp = make_message("builtin_interfaces/msg/Time", sec=seconds, nanosec=7)
-    return make_message("std_msgs/msg/Header", stamp=stamp, frame_id="map")
+from rs_localizer.io.messages import make_header
 
 
 def point(seconds: int, x: float) -> Any:
     return make_message(
         "geometry_msgs/msg/PointStamped",
-        header=header(seconds),
+        header=make_header(make_message, seconds * 10**9 + 7, "map"),
         point=make_message("geometry_msgs/msg/Point", x=x, y=0.25, z=-1e-300),
     )
 
@@ -33,30 +29,6 @@ def write_ros2(path: Path, storage: str) -> None:
         bag.write("/other", point(2, 2.0), 2_000_000_007)
 
 
-def write_ros1(path: Path) -> None:
-    store = get_typestore(Stores.ROS1_NOETIC)
-    types = store.types
-    stamp = types["builtin_interfaces/msg/Time"](sec=5, nanosec=6)
-    info = types["sensor_msgs/msg/CameraInfo"](
-        header=types["std_msgs/msg/Header"](seq=9, stamp=stamp, frame_id="cam"),
-        height=480,
-        width=640,
-        distortion_model="plumb_bob",
-        D=np.array([0.1, 0.2, 0.3, 0.4, 0.5]),
-        K=np.arange(9.0),
-        R=np.eye(3).ravel(),
-        P=np.arange(12.0),
-        binning_x=2,
-        binning_y=1,
-        roi=types["sensor_msgs/msg/RegionOfInterest"](
-            x_offset=1, y_offset=2, height=3, width=4, do_rectify=False
-        ),
-    )
-    with Ros1Writer(path) as bag:
-        connection = bag.add_connection("/camera_info", info.__msgtype__, typestore=store)
-        bag.write(connection, 5_000_000_006, store.serialize_ros1(info, info.__msgtype__))
-
-
 @pytest.mark.parametrize("storage", STORAGES)
 def test_ros2_round_trip_in_order_of_time(tmp_path, storage):
     write_ros2(tmp_path / "bag", storage)
@@ -66,7 +38,6 @@ def test_ros2_round_trip_in_order_of_time(tmp_path, storage):
             assert bag.topics == dict.fromkeys(
                 ("/points", "/other"), "geometry_msgs/msg/PointStamped"
             )
-            assert bag.count(["/points"]) == 2
             assert bag.count(["/points", "/other", "/absent"]) == 3
             read = list(bag.messages(["/points", "/other"]))
         assert [(topic, stamp) for topic, stamp, _ in read] == [
@@ -85,25 +56,31 @@ def test_killed_recorder_left_no_metadata(tmp_path):
 
 
 def test_ros1_has_the_names_of_ros2(tmp_path):
-    write_ros1(tmp_path / "old.bag")
+    store = get_typestore(Stores.ROS1_NOETIC)
+    types = store.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=5, nanosec=6)
+    roi = types["sensor_msgs/msg/RegionOfInterest"](1, 2, 3, 4, False)
+    info = types["sensor_msgs/msg/CameraInfo"](
+        types["std_msgs/msg/Header"](seq=9, stamp=stamp, frame_id="cam"), 480, 640, "plumb_bob",
+        D=np.arange(5.0), K=np.arange(9.0), R=np.zeros(9), P=np.zeros(12), binning_x=2,
+        binning_y=1, roi=roi,
+    )  # fmt: skip
+    with Ros1Writer(tmp_path / "old.bag") as bag:
+        connection = bag.add_connection("/camera_info", info.__msgtype__, typestore=store)
+        bag.write(connection, 5_000_000_006, store.serialize_ros1(info, info.__msgtype__))
     with open_bag(tmp_path / "old.bag") as bag:
-        ((topic, stamp, info),) = bag.messages(["/camera_info"])
-    assert (topic, stamp) == ("/camera_info", 5_000_000_006)
-    assert (info.header.stamp.sec, info.header.stamp.nanosec) == (5, 6)
-    assert info.header.frame_id == "cam"
-    np.testing.assert_array_equal(info.k, np.arange(9.0))
-    np.testing.assert_array_equal(info.d, [0.1, 0.2, 0.3, 0.4, 0.5])
-    assert (info.binning_x, info.roi.width) == (2, 4)
+        ((topic, recorded_ns, found),) = bag.messages(["/camera_info"])
+    assert (topic, recorded_ns) == ("/camera_info", 5_000_000_006)
+    assert (found.header.stamp.nanosec, found.header.frame_id) == (6, "cam")
+    np.testing.assert_array_equal(found.k, np.arange(9.0))
+    np.testing.assert_array_equal(found.d, np.arange(5.0))
+    assert (found.binning_x, found.roi.width) == (2, 4)
 
 
 def test_what_was_written_before_an_error_stays_readable(tmp_path):
-    def interrupted() -> None:
-        with BagWriter(tmp_path / "bag") as bag:
-            bag.write("/points", point(1, 1.0), 1)
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
+    bag = BagWriter(tmp_path / "bag").__enter__()
+    bag.write("/points", point(1, 1.0), 1)
+    bag.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
     with open_bag(tmp_path / "bag") as bag:
         assert bag.count(["/points"]) == 1
 
@@ -133,13 +110,12 @@ def test_what_is_no_recording_is_refused(tmp_path, name, content, expected):
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("keep", [0.6])
-def test_truncated_recording(tmp_path, storage, keep):
+def test_truncated_recording(tmp_path, storage):
     with BagWriter(tmp_path / "bag", storage) as bag:
         for index in range(500):
             bag.write("/points", point(index, 1.0), index)
     (data,) = (file for file in (tmp_path / "bag").iterdir() if file.name != "metadata.yaml")
     content = data.read_bytes()
-    data.write_bytes(content[: int(keep * len(content))])
+    data.write_bytes(content[: int(0.6 * len(content))])
     with pytest.raises(BagError, match="bag cannot be read"), open_bag(tmp_path / "bag") as opened:
         list(opened.messages(["/points"]))

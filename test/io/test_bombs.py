@@ -115,7 +115,7 @@ def test_damaged_hdf5(tmp_path):
             file[f"a{number}.jpg/b.jpg/matches0"] = np.arange(9)
     whole = path.read_bytes()
     rng = np.random.default_rng(0)
-    for _ in range(200):
+    for _ in range(50):
         data = bytearray(whole)
         start = int(rng.integers(100, len(data) - 64))
         data[start : start + 64] = rng.integers(0, 256, 64, np.uint8).tobytes()
@@ -143,12 +143,7 @@ def test_recordings_with_types_of_their_own(tmp_path):
 
 @pytest.mark.parametrize(
     ("mode", "storage"),
-    [
-        (CompressionMode.FILE, StoragePlugin.SQLITE3),
-        (CompressionMode.MESSAGE, StoragePlugin.SQLITE3),
-        (CompressionMode.STORAGE, StoragePlugin.MCAP),
-        (CompressionMode.MESSAGE, StoragePlugin.MCAP),
-    ],
+    [("FILE", "SQLITE3"), ("MESSAGE", "SQLITE3"), ("STORAGE", "MCAP"), ("MESSAGE", "MCAP")],
 )
 def test_packed_recordings(tmp_path, mode, storage, monkeypatch):
     monkeypatch.setattr(bags, "_MOST_UNPACKED", 1_000_000)
@@ -156,8 +151,8 @@ def test_packed_recordings(tmp_path, mode, storage, monkeypatch):
     text = "std_msgs/msg/String"
     store = get_typestore(Stores.ROS2_JAZZY)
     for length in (1000, 3_000_000):
-        writer = Writer(tmp_path / f"bag{length}", version=9, storage_plugin=storage)
-        writer.set_compression(mode, CompressionFormat.ZSTD)
+        writer = Writer(tmp_path / f"bag{length}", version=9, storage_plugin=StoragePlugin[storage])
+        writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
         with writer:
             connection = writer.add_connection("/a", text, typestore=store)
             message = make_message(text, data="a" * length)
@@ -165,19 +160,18 @@ def test_packed_recordings(tmp_path, mode, storage, monkeypatch):
     with open_bag(tmp_path / "bag1000") as bag:
         assert [len(message.data) for _, _, message in bag.messages(["/a"])] == [1000]
 
-    def read() -> None:
-        with open_bag(tmp_path / "bag3000000") as bag:
-            list(bag.messages(["/a"]))
-
-    with pytest.raises(BagError, match=r"stand for over|times its size"):
-        read()
+    with (
+        pytest.raises(BagError, match=r"stand for over|times its size"),
+        open_bag(tmp_path / "bag3000000") as bag,
+    ):
+        list(bag.messages(["/a"]))
 
 
 def test_metadata_that_merges_for_ever(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.write("/a", make_message("std_msgs/msg/String", data="a"), 1)
-    file = tmp_path / "bag" / "metadata.yaml"
     merges = "".join(f"k{n}: &a{n} {{<<: [*a{n - 1}, *a{n - 1}]}}\n" for n in range(1, 40))
-    file.write_text(f"{file.read_text()}\nk0: &a0 {{x: 1}}\n{merges}")
+    with (tmp_path / "bag" / "metadata.yaml").open("a") as file:
+        file.write(f"\nk0: &a0 {{x: 1}}\n{merges}")
     with pytest.raises(BagError, match="more than 100000 values"), open_bag(tmp_path / "bag"):
         pass

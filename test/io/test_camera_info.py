@@ -11,8 +11,6 @@ from rs_localizer.core.camera import Roi
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
 
-K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
-
 
 def roi(x: int, y: int, width: int, height: int) -> SimpleNamespace:
     return SimpleNamespace(x_offset=x, y_offset=y, width=width, height=height, do_rectify=True)
@@ -22,14 +20,11 @@ def test_a_plain_camera(make_camera_info):
     calibration = read_camera_info(make_camera_info(d=np.array([0.1, -0.2, 0.01, 0.02, 0.3])))
     camera = calibration.camera(0.03, "bottom_to_top")
     assert calibration.frame == "camera"
-    assert (camera.width, camera.height) == (640, 480)
-    assert np.array_equal(camera.K, K)
+    assert (camera.width, camera.height, camera.distortion_model) == (640, 480, "plumb_bob")
+    assert np.array_equal(camera.K, [[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
     assert camera.D.tolist() == [0.1, -0.2, 0.01, 0.02, 0.3]
-    assert camera.distortion_model == "plumb_bob"
-    assert camera.readout_time == 0.03
-    assert camera.scan_direction == "bottom_to_top"
-    assert camera.binning == (1, 1)
-    assert camera.roi is None
+    assert (camera.readout_time, camera.scan_direction) == (0.03, "bottom_to_top")
+    assert (camera.binning, camera.roi) == ((1, 1), None)
 
 
 def test_ros1_has_capitals(make_camera_info):

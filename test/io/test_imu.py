@@ -2,83 +2,65 @@
 # SPDX-License-Identifier: Apache-2.0
 """sensor_msgs/Imu of rosbags and of rclpy are read alike; what no IMU measures is refused."""
 
-import importlib.util
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rs_localizer.io.bags import make_message
-from rs_localizer.io.imu import ImuFileError, read_imu, read_imu_csv
+from rs_localizer.io.imu import ImuFileError, make_reading, read_imu, read_imu_csv
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.telemetry import TelemetryError, read_log
 
-ROS = importlib.util.find_spec("rclpy") is not None
+ABSENT = np.array([-1.0, *[0.0] * 8])
 
 
 def make(**changed: Any) -> Any:
-    fields = {
-        "orientation_covariance": np.array([-1.0, *[0.0] * 8]),
-        "angular_velocity": (0.1, -0.2, 0.3),
-        "angular_velocity_covariance": np.zeros(9),
-        "linear_acceleration": (0.5, 0.0, 9.8),
-        "linear_acceleration_covariance": np.zeros(9),
-        "frame": "imu_link",
-    } | changed
-    vectors = {}
-    for name in ("angular_velocity", "linear_acceleration"):
-        x, y, z = fields[name]
-        vectors[name] = make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-    stamp = make_message("builtin_interfaces/msg/Time", sec=12, nanosec=345_678_901)
-    return make_message(
-        "sensor_msgs/msg/Imu",
-        header=make_message("std_msgs/msg/Header", stamp=stamp, frame_id=fields.pop("frame")),
-        orientation=make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-        **(fields | vectors),
+    turn, push = changed.get("turn", (0.1, -0.2, 0.3)), changed.get("push", (0.5, 0.0, 9.8))
+    frame = changed.get("frame", "imu_link")
+    message = make_reading(12_345_678_901, np.array(turn), np.zeros(3), frame, (1e-4, 0.0))
+    message.linear_acceleration.x, message.linear_acceleration.y, message.linear_acceleration.z = (
+        push
     )
+    message.angular_velocity_covariance = changed.get("turn_covariance", np.zeros(9))
+    message.linear_acceleration_covariance = changed.get("push_covariance", np.zeros(9))
+    return message
 
 
-def as_rclpy(message: Any) -> Any:
-    from rs_localizer.ros.node.conversion import copy_message
+@pytest.mark.parametrize("of_rclpy", [False, True])
+def test_a_message(of_rclpy):
+    message = make()
+    if of_rclpy:
+        pytest.importorskip("rclpy")
+        from rs_localizer.ros.node.conversion import copy_message
 
-    return copy_message(message, message.__msgtype__)
-
-
-MAKERS: list[Callable[[Any], Any]] = [lambda message: message, as_rclpy][: 1 + ROS]
-
-
-@pytest.mark.parametrize("like", MAKERS)
-def test_a_message(like):
-    variances = np.diag([1e-4, 4e-4, 7e-4]).ravel()
-    found = read_imu(like(make(angular_velocity_covariance=variances)))
-    assert found.stamp_ns == 12_345_678_901
-    assert found.frame == "imu_link"
+        message = copy_message(message, message.__msgtype__)
+    found = read_imu(message)
+    assert (found.stamp_ns, found.frame) == (12_345_678_901, "imu_link")
     assert found.angular_velocity == (0.1, -0.2, 0.3)
     assert found.linear_acceleration == (0.5, 0.0, 9.8)
 
 
-def test_a_gyroscope_alone():
-    absent = np.array([-1.0, *[0.0] * 8])
-    found = read_imu(make(linear_acceleration_covariance=absent))
-    assert found.linear_acceleration is None
-    assert read_imu(make(linear_acceleration=(0.0, math.inf, 0.0))).linear_acceleration is None
-    assert read_imu(make(linear_acceleration=(0.0, 0.0, 0.0))).linear_acceleration is None
-    # What an absent measurement holds does not matter.
-    assert read_imu(
-        make(linear_acceleration=(math.nan,) * 3, linear_acceleration_covariance=absent)
-    ).angular_velocity == (0.1, -0.2, 0.3)
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"push_covariance": ABSENT}, {"push": (0.0, math.inf, 0.0)}, {"push": (0.0, 0.0, 0.0)},
+        {"push": (math.nan,) * 3, "push_covariance": ABSENT},
+    ],
+)  # fmt: skip
+def test_a_gyroscope_alone(changed):
+    found = read_imu(make(**changed))
+    assert (found.angular_velocity, found.linear_acceleration) == ((0.1, -0.2, 0.3), None)
 
 
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"angular_velocity_covariance": np.array([-1.0, *[0.0] * 8])}, "has no angular velocity"),
-        ({"angular_velocity": (0.0, math.nan, 0.0)}, "angular_velocity is not finite: .*nan"),
-        ({"angular_velocity": (0.0, 250.0, 0.0)}, r"\(0.0, 250.0, 0.0\) rad/s.*is it in rad/s"),
-        ({"linear_acceleration": (0.0, 0.0, 9810.0)}, "9810.0.*is it in m/s"),
+        ({"turn_covariance": ABSENT}, "has no angular velocity"),
+        ({"turn": (0.0, math.nan, 0.0)}, "angular_velocity is not finite: .*nan"),
+        ({"turn": (0.0, 250.0, 0.0)}, r"\(0.0, 250.0, 0.0\) rad/s.*is it in rad/s"),
+        ({"push": (0.0, 0.0, 9810.0)}, "9810.0.*is it in m/s"),
         ({"frame": ""}, "header.frame_id is empty"),
     ],
 )  # fmt: skip
@@ -99,13 +81,9 @@ def test_a_file_of_euroc(tmp_path):
     assert stamps.tolist() == [1403636579758555392, 1403636579758555393]
     np.testing.assert_array_equal(rates, 2 * [[-0.1, 0.14, 0.07]])
     np.testing.assert_array_equal(forces, 2 * [[8.12, -0.3, -3.7]])
-
-
-def test_a_file_from_a_spreadsheet(tmp_path):
-    """Which marks UTF-8, ends lines twice, and puts spaces."""
-    path = tmp_path / "data.csv"
-    path.write_bytes(b"\xef\xbb\xbf" + (HEAD + LINE.replace(",", ", ")).encode())
-    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    # A spreadsheet marks UTF-8 and ends lines twice.
+    text = "\ufeff" + (HEAD + LINE).replace("\n", "\r\n")
+    path.write_bytes(text.encode())
     assert read_imu_csv(path).stamps_ns.tolist() == [1403636579758555392]
 
 
@@ -186,17 +164,12 @@ def stray(folder: Path) -> None:
     ],
 )
 def test_readings_are_those_of_the_camera_behind_the_screen(
-    write: Callable[[Path], None],
-    app: str,
-    exposure: float | None,
-    readout: float | None,
-    tmp_path: Path,
-) -> None:
+    write, app, exposure, readout, tmp_path
+):
     video = tmp_path / "VID_20260101_120000.mp4"
     assert read_log(video) is None
     write(tmp_path)
     found = read_log(video)
-    assert found is not None
     assert (found.camera, found.readout_time, found.exposure) == (app, readout, exposure)
     assert found.rate == pytest.approx(200.0, rel=1e-4)
     # Times are those since the middle of the first image's exposure.
@@ -207,25 +180,32 @@ def test_readings_are_those_of_the_camera_behind_the_screen(
     np.testing.assert_allclose(found.rates, RATES[:, 1:2] * up, atol=1e-12)
 
 
-def test_a_log_that_is_broken_is_named(tmp_path: Path) -> None:
+HEADING = "timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n"
+READINGS = [[BOOT + 0.01 * k, 0.0, 0.0, -1.0, 0.1 * k, 0.0, 0.0] for k in range(5)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ([], r"imu\.csv has no readings"),
+        ([row[:3] for row in READINGS], "5 lines of 3 numbers, 7 or more are needed"),
+        ([*READINGS, [BOOT + 1.0, math.nan, *READINGS[0][2:]]],
+         r"1 lines without a number, as 81235\.5, ?nan"),
+        ([[row[0] - 100.0, *row[1:]] for row in READINGS],
+         r"not of one time: 81134\.5 to 81134\.5 s, 81234\.5"),
+    ],
+)  # fmt: skip
+def test_a_log_that_is_broken_is_named(tmp_path, rows, said):
     stray(tmp_path)
-    (tmp_path / "imu.csv").write_text("timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n")
-    with pytest.raises(TelemetryError, match=r"imu\.csv has no readings"):
+    csv(tmp_path / "imu.csv", HEADING, rows)
+    with pytest.raises(TelemetryError, match=said):
         read_log(tmp_path / "rgb.mp4")
-    csv(tmp_path / "imu.csv", "timestamp, a_x, a_y\n", [[k, 0.0, 9.8] for k in range(5)])
-    with pytest.raises(TelemetryError, match="5 lines of 3 numbers, 7 or more are needed"):
-        read_log(tmp_path / "rgb.mp4")
-    rows = [[BOOT + 0.01 * k, 0.0, 0.0, -1.0, 0.1 * k, 0.0, 0.0] for k in range(5)]
-    heading = "timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n"
-    csv(tmp_path / "imu.csv", heading, [*rows, [BOOT + 1.0, float("nan"), *rows[0][2:]]])
-    with pytest.raises(TelemetryError, match=r"1 lines without a number, as 81235\.5, ?nan"):
-        read_log(tmp_path / "rgb.mp4")
-    csv(tmp_path / "imu.csv", heading, [[row[0] - 100.0, *row[1:]] for row in rows])
-    with pytest.raises(TelemetryError, match=r"not of one time: 81134\.5 to 81134\.5 s, 81234\.5"):
-        read_log(tmp_path / "rgb.mp4")
-    # The order of lines does not matter: backwards was once -100 Hz.
-    csv(tmp_path / "imu.csv", heading, rows[::-1])
+
+
+def test_the_order_of_lines_does_not_matter(tmp_path):
+    """Backwards was once -100 Hz."""
+    stray(tmp_path)
+    csv(tmp_path / "imu.csv", HEADING, READINGS[::-1])
     found = read_log(tmp_path / "rgb.mp4")
-    assert found is not None
     assert found.rate == pytest.approx(100.0)
     np.testing.assert_allclose(found.rates[:, 1], -0.1 * np.arange(5))

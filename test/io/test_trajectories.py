@@ -22,9 +22,7 @@ def trajectory(stamps_ns: list[int]) -> Trajectory:
     rng = np.random.default_rng(1)
     quaternions = rng.normal(size=(len(stamps_ns), 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return Trajectory(
-        np.array(stamps_ns, dtype=np.int64), rng.normal(size=(len(stamps_ns), 3)), quaternions
-    )
+    return Trajectory(np.array(stamps_ns), rng.normal(size=(len(stamps_ns), 3)), quaternions)
 
 
 @pytest.mark.parametrize(

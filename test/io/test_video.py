@@ -19,9 +19,12 @@ def jpegs(count: int) -> list[bytes]:
     return [cv2.imencode(".jpg", image, restarts)[1].tobytes() for image in images]
 
 
-def with_segment(jpeg: bytes, content: bytes) -> bytes:
-    """With an application segment, such as that of a thumbnail, after the start marker."""
-    return jpeg[:2] + b"\xff\xe1" + (len(content) + 2).to_bytes(2, "big") + content + jpeg[2:]
+def film(path: Path, images: list[np.ndarray], code: str = "mp4v", rate: float = 30.0) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), rate, (64, 48))
+    for image in images:
+        writer.write(image)
+    writer.release()
+    return path
 
 
 def test_images_are_the_original_bytes():
@@ -45,13 +48,8 @@ def test_stream_and_container(tmp_path):
     assert {item.seconds for item in read} == {None}
     assert read[0][1].shape == (24, 32)
 
-    writer = cv2.VideoWriter(
-        str(tmp_path / "a.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30.0, (64, 48)
-    )
-    for level in (50, 100, 150, 200):
-        writer.write(np.full((48, 64, 3), level, np.uint8))
-    writer.release()
-    read = list(read_video(tmp_path / "a.avi"))
+    levels = [np.full((48, 64, 3), level, np.uint8) for level in (50, 100, 150, 200)]
+    read = list(read_video(film(tmp_path / "a.avi", levels, "MJPG")))
     assert [round(float(image.mean()), -1) for _, image, _ in read] == [50, 100, 150, 200]
     assert all(cv2.imdecode(np.frombuffer(jpeg, np.uint8), 0) is not None for jpeg, *_ in read)
 
@@ -60,18 +58,14 @@ def test_rows_stay_as_the_sensor_read_them(tmp_path):
     # Orientation 3 of EXIF: to be shown turned by half.
     exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x03" + bytes(7)
     plain = jpegs(1)[0]
-    (tmp_path / "a.mjpeg").write_bytes(with_segment(plain, exif))
+    segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    (tmp_path / "a.mjpeg").write_bytes(plain[:2] + segment + plain[2:])
     ((_, image, _),) = read_video(tmp_path / "a.mjpeg")
     np.testing.assert_array_equal(image, cv2.imdecode(np.frombuffer(plain, np.uint8), 0))
 
-    writer = cv2.VideoWriter(
-        str(tmp_path / "a.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (64, 48)
-    )
     picture = np.zeros((48, 64, 3), np.uint8)
     picture[:24] = 200
-    writer.write(picture)
-    writer.release()
-    data = bytearray((tmp_path / "a.mp4").read_bytes())
+    data = bytearray(film(tmp_path / "a.mp4", [picture]).read_bytes())
     matrix = struct.pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
     assert data.count(matrix) == 2  # of the movie, then of its track
     half = struct.pack(">9i", -1 << 16, 0, 0, 0, -1 << 16, 0, 64 << 16, 48 << 16, 1 << 30)
@@ -88,11 +82,8 @@ def mp4(path: Path, milliseconds: list[int]) -> None:
     OpenCV writes a constant rate. The table of durations (ISO/IEC 14496-12, ``stts``) is replaced,
     and the sizes of the boxes around it are mended.
     """
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 1000.0, (64, 48))
-    for k in range(len(milliseconds)):
-        writer.write(np.full((48, 64, 3), 40 + 10 * k, np.uint8))
-    writer.release()
-    data = path.read_bytes()
+    levels = [np.full((48, 64, 3), 40 + 10 * k, np.uint8) for k in range(len(milliseconds))]
+    data = film(path, levels, rate=1000.0).read_bytes()
     at = data.index(b"stts") - 4
     size, _, count = struct.unpack_from(">I4xII", data, at)
     (unit,) = struct.unpack_from(">I", data, at + 20)  # of a millisecond
@@ -131,12 +122,7 @@ def test_an_image_whose_time_is_not_told_has_none(monkeypatch, tmp_path):
     class Forgetful:
         def __init__(self, name: str) -> None:
             self.video, self.count = real(name), 0
-
-        def set(self, *arguments: float) -> bool:
-            return bool(self.video.set(*arguments))
-
-        def release(self) -> None:
-            self.video.release()
+            self.set, self.release = self.video.set, self.video.release
 
         def read(self) -> object:
             self.count += 1

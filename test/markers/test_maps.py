@@ -74,8 +74,8 @@ def test_what_is_written_is_read(tmp_path):
             Marker(family("aruco_original"), 1000, measured),
         ),
         boards=(
-            Chessboard(6, 4, 0.03, pose),
-            Charuco(5, 7, 0.04, 0.03, family("36h11"), 10, True, pose),
+            Chessboard(6, 4, 0.03, pose=pose),
+            Charuco(5, 7, 0.04, 0.03, family("36h11"), 10, True, pose=pose),
         ),
         map_frame="hall",
     )
@@ -105,12 +105,10 @@ CORNERS = [[0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]]
         (MARKER | {"rotation": np.eye(3).tolist()}, "both a rotation and a quaternion"),
         ({"family": "4x4_50"}, "marker 1 has no id; it has nothing else"),
         (PLAIN | {"rotation": np.diag([-1.0, 1.0, 1.0]).tolist()}, "the rotation mirrors"),
-        (
-            {"family": "4x4_50", "id": 1, "corners": [CORNERS[k] for k in (0, 2, 1, 3)]},
-            "the corners are not a square in the order top left, top right",
-        ),
+        ({"family": "4x4_50", "id": 1, "corners": [CORNERS[k] for k in (0, 2, 1, 3)]},
+         "the corners are not a square in the order top left, top right"),
     ],
-)
+)  # fmt: skip
 def test_faults_of_markers(tmp_path, entry, text):
     with pytest.raises(MarkerMapError, match=text) as error:
         read(tmp_path, {"map_frame": "map", "markers": [entry]})
@@ -144,16 +142,12 @@ def test_points_of_a_board_are_known_as_paper_is_unless_its_file_says_better(tmp
         ({"markers": [MARKER]}, "the map has no map_frame"),
         ({"map_frame": "map", "markers": [MARKER, MARKER]}, "marker 4x4_50 3 is there twice"),
         # The small dictionaries are the beginning of the large ones.
-        (
-            {"map_frame": "map", "markers": [MARKER, MARKER | {"family": "4x4_1000"}]},
-            "there twice: as marker 4x4_50 3 and as marker 4x4_1000 3",
-        ),
-        (
-            {"map_frame": "map", "boards": [CHESSBOARD, CHESSBOARD]},
-            "2 boards without markers .*, which cannot be told apart",
-        ),
+        ({"map_frame": "map", "markers": [MARKER, MARKER | {"family": "4x4_1000"}]},
+         "there twice: as marker 4x4_50 3 and as marker 4x4_1000 3"),
+        ({"map_frame": "map", "boards": [CHESSBOARD, CHESSBOARD]},
+         "2 boards without markers .*, which cannot be told apart"),
     ],
-)
+)  # fmt: skip
 def test_faults_of_maps(tmp_path, tree, text):
     with pytest.raises(MarkerMapError, match=text):
         read(tmp_path, tree)

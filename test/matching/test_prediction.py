@@ -14,7 +14,7 @@ from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.clouds import Keypoints
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.matching import Matcher, Visible, find_view, predict
+from rs_localizer.matching import Matcher, find_view, predict
 from rs_localizer.simulation.scene import room
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
@@ -39,21 +39,13 @@ def points() -> Any:
     return room(np.zeros((1, 3)), np.random.default_rng(0), count=20_000)
 
 
-def predicted(view: Camera, prior: Prior, points: Any, least_gate: float) -> Visible:
-    return predict(view, prior, points, find_view(view, prior, points, least_gate))
-
-
-def camera(name: str) -> Camera:
-    return Camera(640, 480, K, readout_time=0.03, **CAMERAS[name])
-
-
 @pytest.mark.parametrize("name", list(CAMERAS))
 def test_all_that_the_image_shows_is_predicted_where_it_is(name, points):
-    view = camera(name)
+    view = Camera(640, 480, K, readout_time=0.03, **CAMERAS[name])
     pixels, _ = project_rolling(view, MOTION.at_rows, points)
     shown = np.flatnonzero(view.inside(pixels))
     assert len(shown) > 300
-    found = predicted(view, SURE, points, 20.0)
+    found = predict(view, SURE, points, find_view(view, SURE, points, 20.0))
     assert found.gate == 20.0
     assert np.all(np.diff(found.pixels[:, 1]) >= 0.0)
     place = {row: k for k, row in enumerate(found.landmarks.tolist())}
@@ -79,7 +71,7 @@ def are_seen(view: Camera, points: Any, pixels: Any) -> Any:
 @pytest.mark.parametrize("mutual", [True, False])
 def test_a_prediction_tells_apart_what_looks_the_same(points, mutual):
     """Only a hundred kinds of landmarks: by their looks alone none is recognized."""
-    view = camera("ideal")
+    view = Camera(640, 480, K, readout_time=0.03)
     rng = np.random.default_rng(1)
     descriptors = rng.integers(0, 256, (100, 32), dtype=np.uint8)[rng.integers(0, 100, len(points))]
     pixels, _ = project_rolling(view, MOTION.at_rows, points)

@@ -13,14 +13,14 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud, read_map
-from rs_localizer.io.maps.landmarks import Map, MapError
+from rs_localizer.io.maps.landmarks import Map, MapError, map_rows
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.frames import FrameLocalizer, read_landmarks
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
+from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room
 from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
 

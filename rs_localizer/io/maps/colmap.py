@@ -11,7 +11,7 @@ import sqlite3
 import struct
 import time
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from rs_localizer.io.maps.landmarks import Map, MapError, make_map
 
 # Id, x, y, z, color, error, length of the track; then image and feature of each observation.
 _POINT = struct.Struct("<Q3d3BdQ")
+_COUNT = struct.Struct("<Q")
 _OBSERVATION = np.dtype([("image", "<u4"), ("feature", "<u4")])
 
 
@@ -56,7 +57,7 @@ def read_model(folder: Path) -> Model:
 def _read_binary(data: bytes) -> Model:
     if len(data) < 8:
         raise MapError("points3D.bin is truncated")
-    (count,) = struct.unpack_from("<Q", data)
+    (count,) = _COUNT.unpack_from(data)
     if 8 + count * _POINT.size > len(data):
         raise MapError(f"points3D.bin is truncated: {count} points, found {len(data)} bytes")
     ids = np.empty(count, np.uint64)
@@ -121,7 +122,6 @@ def _read_text(path: Path) -> Model:
 
 # Number, quaternion, translation, number of the camera; then the name, ended by a zero.
 _IMAGE = struct.Struct("<I7dI")
-_COUNT = struct.Struct("<Q")
 _FEATURE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 _NO_POINT = -1
 
@@ -291,19 +291,14 @@ def write_model(
             if point != _NO_POINT:
                 tracks[point].append(f" {image.number} {feature}")
     described = zip(points.ids.tolist(), points.points, points.colors, points.errors, strict=True)
-    for file, text in (
-        ("cameras.txt", f"1 {lens['model']} {width} {height} {_line(lens['params'])}\n"),
-        ("images.txt", "".join(rows)),
-        (
-            "points3D.txt",
-            "".join(
-                f"{point} {_line(place)} {' '.join(map(str, color))} {float(error)!r}"
-                f"{''.join(tracks[point])}\n"
-                for point, place, color, error in described
-            ),
-        ),
-    ):
-        (folder / file).write_text(text, encoding="utf-8")
+    landmarks = [
+        f"{point} {_line(place)} {' '.join(map(str, color))} {float(error)!r}"
+        f"{''.join(tracks[point])}\n"
+        for point, place, color, error in described
+    ]
+    cameras = [f"1 {lens['model']} {width} {height} {_line(lens['params'])}\n"]
+    for name, lines in (("cameras", cameras), ("images", rows), ("points3D", landmarks)):
+        (folder / f"{name}.txt").write_text("".join(lines), encoding="utf-8")
 
 
 def _line(values: Array | list[float]) -> str:
@@ -346,10 +341,7 @@ def read_colmap(folder: Path, frame: str, database: Path | None = None) -> Map:
     except MapError as error:
         raise MapError(f"{database}: {error}") from error
     landmarks = make_map(model.points[usable], model.ids[usable], descriptors, frame)
-    unknown = len(usable) - int(np.count_nonzero(usable))
-    return Map(
-        landmarks.points, landmarks.ids, landmarks.descriptors, frame, landmarks.dropped + unknown
-    )
+    return replace(landmarks, dropped=landmarks.dropped + int(np.count_nonzero(~usable)))
 
 
 def _find_database(places: tuple[Path, ...]) -> Path | None:

@@ -7,6 +7,7 @@ and ``covariances`` (n,3,3; m^2, NaN: not known). Nothing in them is ever unpick
 allocated before the headers of the arrays, the sizes in the archive and the size of the file agree.
 """
 
+import math
 import struct
 import tokenize
 import warnings
@@ -68,15 +69,9 @@ def _arrays(file: IO[bytes]) -> dict[str, NDArray[Any]]:
 
 def write_npz(path: Path, landmarks: Map) -> None:
     """Write a map; what is read back is the same to the last bit."""
-    arrays: dict[str, Any] = {"points": landmarks.points}
-    if landmarks.ids is not None:
-        arrays["ids"] = landmarks.ids
-    if landmarks.descriptors is not None:
-        arrays["descriptors"] = landmarks.descriptors
-    if landmarks.covariances is not None:
-        arrays["covariances"] = landmarks.covariances
+    arrays = {name: getattr(landmarks, name) for name in _ARRAYS}
     with path.open("wb") as file:  # given a name, NumPy would append a suffix
-        np.savez(file, **arrays)
+        np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
 
 
 def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
@@ -108,12 +103,9 @@ def _size(file: IO[bytes], name: str) -> int:
     shape, _, kind = readers[version](file, max_header_size=_LONGEST_HEADER)
     if kind.hasobject or kind.kind not in "fiu":
         raise MapError(f"{name} must hold numbers, found {kind}")
-    count = 1
-    for length in shape:  # Python integers: these products do not overflow
-        if length < 0:
-            raise MapError(f"{name} has the shape {shape}")
-        count *= int(length)
-    return file.tell() + count * kind.itemsize
+    if min(shape, default=0) < 0:
+        raise MapError(f"{name} has the shape {shape}")
+    return file.tell() + math.prod(shape) * kind.itemsize  # Python integers do not overflow
 
 
 _READERS = {".npz": read_npz, ".ply": read_ply}

@@ -42,7 +42,7 @@ class Map:
         covariances: (n,3,3) m^2, NaN for those of which none is known; or None.
 
     Raises:
-        MapError: for anything else, saying what was found.
+        MapError: without a landmark, a frame, or with points that are nowhere.
     """
 
     points: Array
@@ -53,24 +53,13 @@ class Map:
     covariances: Array | None = None
 
     def __post_init__(self) -> None:
-        count = len(self.points)
-        if self.points.shape != (count, 3) or self.points.dtype != np.float64:
-            raise MapError(
-                f"points must be (n,3) float64, got {self.points.shape} {self.points.dtype}"
-            )
-        if count == 0:
+        if len(self) == 0:
             dropped = f"; {self.dropped} with NaN or infinity were dropped" if self.dropped else ""
             raise MapError(f"the map has no landmarks{dropped}")
         if not self.frame:
             raise MapError("the map's frame has no name")
         if not np.abs(self.points).max() < _FARTHEST:
             raise MapError(f"points must be finite and within {_FARTHEST:g} m")
-        if self.ids is not None:
-            _check_ids(self.ids, count)
-        if self.descriptors is not None:
-            _check_descriptors(self.descriptors, count)
-        if self.covariances is not None and self.covariances.shape != (count, 3, 3):
-            raise MapError(f"covariances must be ({count},3,3), found {self.covariances.shape}")
 
     def __len__(self) -> int:
         return len(self.points)
@@ -115,14 +104,10 @@ def make_map(
         raise MapError(f"points must be (n,3) numbers, found {points.shape} {points.dtype}")
     points = np.ascontiguousarray(points, dtype=np.float64)
     finite = np.isfinite(points).all(axis=1)
-    if ids is not None:
-        if ids.shape != (len(points),) or ids.dtype.kind not in "iu":
-            raise MapError(f"ids must be ({len(points)},) integers, found {ids.shape} {ids.dtype}")
-        if len(ids) and not -(2**31) <= int(ids.min()) <= int(ids.max()) < 2**32:
-            raise MapError(_id_range(int(ids.min()), int(ids.max())))
-        ids = np.ascontiguousarray(ids, dtype=np.int64)
+    if ids is not None and (ids.shape != (len(points),) or ids.dtype.kind not in "iu"):
+        raise MapError(f"ids must be ({len(points)},) integers, found {ids.shape} {ids.dtype}")
     if descriptors is not None:
-        if descriptors.ndim != 2 or len(descriptors) != len(points):
+        if descriptors.ndim != 2 or len(descriptors) != len(points) or not descriptors.shape[1]:
             raise MapError(f"descriptors must be ({len(points)},d), found {descriptors.shape}")
         if descriptors.dtype.kind == "f":
             with np.errstate(over="ignore"):
@@ -142,7 +127,27 @@ def make_map(
         ids = None if ids is None else ids[finite]
         descriptors = None if descriptors is None else descriptors[finite]
         covariances = None if covariances is None else covariances[finite]
+    if ids is not None:
+        _check_ids(ids)  # before they are converted, which may wrap them
+        ids = np.ascontiguousarray(ids, dtype=np.int64)
     return Map(points, ids, descriptors, frame, dropped, covariances)
+
+
+def map_rows(landmarks: Map) -> NDArray[Any]:
+    """Rows (n,) of a cloud of landmarks."""
+    kinds: list[tuple[Any, ...]] = [(name, "<f8") for name in "xyz"]
+    if landmarks.ids is not None:
+        kinds.append(("id", landmarks.id_type))
+    if landmarks.descriptors is not None:
+        kinds.append(("descriptor", landmarks.descriptors.dtype, landmarks.descriptors.shape[1:]))
+    rows = np.empty(len(landmarks), kinds)
+    for name, column in zip("xyz", landmarks.points.T, strict=True):
+        rows[name] = column
+    if landmarks.ids is not None:
+        rows["id"] = landmarks.ids
+    if landmarks.descriptors is not None:
+        rows["descriptor"] = landmarks.descriptors
+    return rows
 
 
 def _equal(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
@@ -151,11 +156,12 @@ def _equal(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
     return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
 
 
-def _check_ids(ids: Ids, count: int) -> None:
-    if ids.shape != (count,) or ids.dtype != np.int64:
-        raise MapError(f"ids must be ({count},) int64, got {ids.shape} {ids.dtype}")
-    if not any(_fit(ids, kind) for kind in _ID_TYPES):
-        raise MapError(_id_range(int(ids.min()), int(ids.max())))
+def _check_ids(ids: NDArray[Any]) -> None:
+    if len(ids) and not any(_fit(ids, kind) for kind in _ID_TYPES):
+        raise MapError(
+            "ids must lie between 0 and 4294967295 or between -2147483648 and 2147483647, the "
+            f"integers of a PointCloud2; found {ids.min()} to {ids.max()}"
+        )
     ordered = np.sort(ids)
     repeated = np.unique(ordered[1:][ordered[1:] == ordered[:-1]])
     if len(repeated):
@@ -165,23 +171,6 @@ def _check_ids(ids: Ids, count: int) -> None:
         )
 
 
-def _check_descriptors(descriptors: Descriptors, count: int) -> None:
-    shape, kind = descriptors.shape, descriptors.dtype
-    if len(shape) != 2 or shape[0] != count or shape[1] == 0:
-        raise MapError(f"descriptors must be ({count},d), found {shape}")
-    if kind not in (np.uint8, np.float32):
-        raise MapError(f"descriptors must be uint8 or float32, found {kind}")
-    if kind == np.float32 and not np.isfinite(descriptors).all():
-        raise MapError("descriptors must be finite, found NaN or infinity")
-
-
-def _fit(ids: Ids, kind: np.dtype[Any]) -> bool:
+def _fit(ids: NDArray[Any], kind: np.dtype[Any]) -> bool:
     limits = np.iinfo(kind)
     return bool(limits.min <= ids.min() and ids.max() <= limits.max)
-
-
-def _id_range(lowest: int, highest: int) -> str:
-    return (
-        "ids must lie between 0 and 4294967295 or between -2147483648 and 2147483647, the "
-        f"integers of a PointCloud2; found {lowest} to {highest}"
-    )

@@ -15,7 +15,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.io.maps.landmarks import Map, MapError, make_map
+from rs_localizer.io.maps.landmarks import Map, MapError, make_map, map_rows
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -30,10 +30,6 @@ _MOST_HEADER_LINES = 1000
 _LONGEST_LIST = 2**16 - 1
 # Stands before a list in its row; no property of a file has a space in its name.
 _LENGTH = "length of "
-
-
-class PlyError(ValueError):
-    """A file that cannot be read as PLY; the text says what was found."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,29 +61,35 @@ class _Element:
         try:
             return np.dtype(kinds)
         except ValueError as error:  # a name that comes twice, a list beyond all bounds
-            raise PlyError(f"the properties of {self.name} make no table: {error}") from error
+            raise MapError(f"the properties of {self.name} make no table: {error}") from error
 
 
-def read_vertices(path: Path) -> NDArray[Any]:
-    """The element ``vertex`` as a structured array (n,); raises PlyError, or OSError as any file.
+def read_ply(path: Path, frame: str) -> Map:
+    """Read a map; raises MapError for anything that is none, OSError as any file."""
+    table = _vertices(path)
+    names = table.dtype.names or ()
+    if missing := [name for name in "xyz" if name not in names]:
+        raise MapError(
+            f"the vertices have no property {', '.join(missing)}; found {', '.join(names)}"
+        )
+    for name in ("x", "y", "z", "id"):
+        if name in names and table.dtype[name].shape:
+            raise MapError(f"property {name} must be one number, found a list")
+    return make_map(
+        np.stack([table[name].astype(np.float64) for name in "xyz"], axis=1),
+        table["id"] if "id" in names else None,
+        table["descriptor"] if "descriptor" in names else None,
+        frame,
+    )
 
-    What stands before the vertices must have no lists; what follows them is not read.
+
+def write_ply(path: Path, landmarks: Map, *, binary: bool = True) -> None:
+    """Write a map; what is read back is the same to the last bit, from text too.
+
+    Raises:
+        MapError: for descriptors too long for a PLY file.
     """
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        order, elements = _header(file)
-        for element in elements:
-            if element.name == "vertex":
-                if not element.properties:
-                    raise PlyError("the vertices have no properties")
-                table = (_binary if order else _ascii)(file, element, order, size - file.tell())
-                return table[[item.name for item in element.properties]]
-            _skip(file, element, order, size - file.tell())
-    raise PlyError("the file has no element vertex")
-
-
-def write_vertices(path: Path, table: NDArray[Any], *, binary: bool) -> None:
-    """Write a structured array (n,); one-dimensional arrays in it become lists."""
+    table = map_rows(landmarks)
     header = ["ply", f"format {'binary_little_endian' if binary else 'ascii'} 1.0"]
     header.append(f"element vertex {len(table)}")
     kinds: list[tuple[Any, ...]] = []
@@ -95,8 +97,8 @@ def write_vertices(path: Path, table: NDArray[Any], *, binary: bool) -> None:
         kind = table.dtype[name]
         type_name = _NAMES[kind.base.str[1:]]
         if kind.shape:
-            if not 0 < kind.shape[0] <= _LONGEST_LIST:
-                raise PlyError(f"a list of {kind.shape[0]} values does not fit into a PLY file")
+            if kind.shape[0] > _LONGEST_LIST:
+                raise MapError(f"a list of {kind.shape[0]} values does not fit into a PLY file")
             header.append(f"property list ushort {type_name} {name}")
             kinds.append((_LENGTH + name, "<u2"))
         else:
@@ -120,10 +122,28 @@ def _line(row: Any) -> bytes:
     return f"{' '.join(words)}\n".encode("ascii")
 
 
+def _vertices(path: Path) -> NDArray[Any]:
+    """The element ``vertex`` as a structured array (n,).
+
+    What stands before the vertices must have no lists; what follows them is not read.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        order, elements = _header(file)
+        for element in elements:
+            if element.name == "vertex":
+                if not element.properties:
+                    raise MapError("the vertices have no properties")
+                table = (_binary if order else _ascii)(file, element, order, size - file.tell())
+                return table[[item.name for item in element.properties]]
+            _skip(file, element, order, size - file.tell())
+    raise MapError("the file has no element vertex")
+
+
 def _header(file: IO[bytes]) -> tuple[str, list[_Element]]:
     """Byte order (empty for text) and elements."""
     if file.readline(_LONGEST_LINE).rstrip() != b"ply":
-        raise PlyError("no PLY file: the first line is not 'ply'")
+        raise MapError("no PLY file: the first line is not 'ply'")
     order: str | None = None
     elements: list[_Element] = []
     for _ in range(_MOST_HEADER_LINES):
@@ -145,14 +165,14 @@ def _header(file: IO[bytes]) -> tuple[str, list[_Element]]:
                 pass
             case _:
                 text = repr(line.strip()[:80]) if line else "the end of the file"
-                raise PlyError(f"the header is not understood at {text}")
-    raise PlyError(f"the header has more than {_MOST_HEADER_LINES} lines")
+                raise MapError(f"the header is not understood at {text}")
+    raise MapError(f"the header has more than {_MOST_HEADER_LINES} lines")
 
 
 def _skip(file: IO[bytes], element: _Element, order: str, size: int) -> None:
     """Pass over an element that stands before the vertices."""
     if element.lists:
-        raise PlyError(f"element {element.name} with lists stands before the vertices")
+        raise MapError(f"element {element.name} with lists stands before the vertices")
     if order:
         row = element.row_type(order, 0).itemsize
         _check_size(element, row, size)
@@ -165,7 +185,7 @@ def _skip(file: IO[bytes], element: _Element, order: str, size: int) -> None:
 
 def _check_size(element: _Element, row: int, size: int) -> None:
     if element.count * max(row, 1) > size:
-        raise PlyError(
+        raise MapError(
             f"the file is truncated: {element.count} x {element.name} take at least "
             f"{element.count * max(row, 1)} bytes, found {max(size, 0)}"
         )
@@ -184,7 +204,7 @@ def _binary(file: IO[bytes], element: _Element, order: str, size: int) -> NDArra
         _check_size(element, row_type.itemsize, size)
     data = file.read(element.count * row_type.itemsize)
     if len(data) != element.count * row_type.itemsize:
-        raise PlyError("the file became shorter while it was read")
+        raise MapError("the file became shorter while it was read")
     table: NDArray[Any] = np.frombuffer(data, row_type)
     _check_lengths(table, element)
     return table
@@ -201,10 +221,10 @@ def _ascii(file: IO[bytes], element: _Element, order: str, size: int) -> NDArray
             numbers.extend(map(float, line.split()))
         except ValueError:
             text = line[:80].decode("ascii", "replace").strip()
-            raise PlyError(f"vertex {index + 1} is not a line of numbers: {text!r}") from None
+            raise MapError(f"vertex {index + 1} is not a line of numbers: {text!r}") from None
         per_row = per_row or len(numbers)
         if not line or len(numbers) != (index + 1) * per_row:
-            raise PlyError(
+            raise MapError(
                 f"vertex {index + 1} of {element.count} must have {per_row} numbers, found "
                 f"{len(numbers) - index * per_row}"
             )
@@ -215,7 +235,7 @@ def _ascii(file: IO[bytes], element: _Element, order: str, size: int) -> NDArray
     row_type = element.row_type("<", width)
     expected = sum(math.prod(row_type[name].shape) for name in row_type.names or ())
     if element.count and expected != per_row:
-        raise PlyError(f"a vertex must have {expected} numbers, found {per_row}")
+        raise MapError(f"a vertex must have {expected} numbers, found {per_row}")
     values = np.frombuffer(numbers, np.float64).reshape(element.count, per_row)
     table = np.zeros(element.count, row_type)
     start = 0
@@ -226,7 +246,7 @@ def _ascii(file: IO[bytes], element: _Element, order: str, size: int) -> NDArray
         if kind.base.kind in "iu":
             limits = np.iinfo(kind.base)
             if not np.all((part >= limits.min) & (part <= limits.max) & (part == np.floor(part))):
-                raise PlyError(f"{name} holds what is not a {_NAMES[kind.base.str[1:]]}")
+                raise MapError(f"{name} holds what is not a {_NAMES[kind.base.str[1:]]}")
         with np.errstate(over="ignore"):
             table[name] = part.reshape(element.count, *kind.shape)
     _check_lengths(table, element)
@@ -235,7 +255,7 @@ def _ascii(file: IO[bytes], element: _Element, order: str, size: int) -> NDArray
 
 def _checked_width(width: int) -> int:
     if not 0 < width <= _LONGEST_LIST:
-        raise PlyError(f"a list must hold 1 to {_LONGEST_LIST} values, found {width}")
+        raise MapError(f"a list must hold 1 to {_LONGEST_LIST} values, found {width}")
     return width
 
 
@@ -243,53 +263,7 @@ def _check_lengths(table: NDArray[Any], element: _Element) -> None:
     for item in element.lists if len(table) else ():
         lengths, width = table[_LENGTH + item.name], table.dtype[item.name].shape[0]
         if lengths.min() != width or lengths.max() != width:
-            raise PlyError(
+            raise MapError(
                 f"the lists {item.name} must be equally long, found {lengths.min()} to "
                 f"{lengths.max()} values"
             )
-
-
-def read_ply(path: Path, frame: str) -> Map:
-    """Read a map; raises MapError for anything that is none, OSError as any file."""
-    try:
-        table = read_vertices(path)
-    except PlyError as error:
-        raise MapError(str(error)) from error
-    names = table.dtype.names or ()
-    if missing := [name for name in "xyz" if name not in names]:
-        raise MapError(
-            f"the vertices have no property {', '.join(missing)}; found {', '.join(names)}"
-        )
-    for name in ("x", "y", "z", "id"):
-        if name in names and table.dtype[name].shape:
-            raise MapError(f"property {name} must be one number, found a list")
-    return make_map(
-        np.stack([table[name].astype(np.float64) for name in "xyz"], axis=1),
-        table["id"] if "id" in names else None,
-        table["descriptor"] if "descriptor" in names else None,
-        frame,
-    )
-
-
-def write_ply(path: Path, landmarks: Map, *, binary: bool = True) -> None:
-    """Write a map; what is read back is the same to the last bit, from text too.
-
-    Raises:
-        MapError: for descriptors too long for a PLY file.
-    """
-    kinds: list[tuple[Any, ...]] = [(name, "<f8") for name in "xyz"]
-    if landmarks.ids is not None:
-        kinds.append(("id", landmarks.id_type))
-    if landmarks.descriptors is not None:
-        kinds.append(("descriptor", landmarks.descriptors.dtype, landmarks.descriptors.shape[1:]))
-    table = np.empty(len(landmarks), kinds)
-    for column, name in enumerate("xyz"):
-        table[name] = landmarks.points[:, column]
-    if landmarks.ids is not None:
-        table["id"] = landmarks.ids
-    if landmarks.descriptors is not None:
-        table["descriptor"] = landmarks.descriptors
-    try:
-        write_vertices(path, table, binary=binary)
-    except PlyError as error:
-        raise MapError(str(error)) from error

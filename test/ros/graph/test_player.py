@@ -17,7 +17,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
-from rs_localizer.io.recording import make_camera_info, write_frame, write_image
+from rs_localizer.io.recording import make_camera_info, make_image, write_frame
 
 FRAMES = 8
 PERIOD_NS = 100_000_000
@@ -118,7 +118,8 @@ def test_images_are_played_for_a_detector(tmp_path, peer):
         for k in range(FRAMES):
             stamp_ns = START_NS + k * PERIOD_NS
             bag.write("/cam/camera_info", make_camera_info(Camera(640, 480, K), stamp_ns), stamp_ns)
-            write_image(bag, "/cam/image/compressed", stamp_ns, "png", bytes([k]) * 100)
+            image = make_image(stamp_ns, "png", bytes([k]) * 100)
+            bag.write("/cam/image/compressed", image, stamp_ns)
     images: list[CompressedImage] = []
     infos: list[CameraInfo] = []
     subscribe = peer.node.create_subscription

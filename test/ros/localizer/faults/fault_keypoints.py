@@ -10,9 +10,8 @@ import numpy as np
 from live_world import DESCRIPTORS, PATIENCE, SECOND, World
 
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.maps.landmarks import Map, map_rows
 from rs_localizer.ros.node.conversion import make_message
-from rs_localizer.simulation.scene import map_rows
 
 
 def landmarks(world: World, frame: str = "map") -> Map:

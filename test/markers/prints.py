@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images of prints in known poses, drawn without the package's own code."""
 
-from collections.abc import Callable
-
 import cv2
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -79,28 +76,3 @@ def rectangle(width: float, height: float) -> Array:
     """Corners (4,3) of a print around the origin of the map, from the top left clockwise."""
     x, y = 0.5 * width, 0.5 * height
     return np.array([[-x, y, 0], [x, y, 0], [x, -y, 0], [-x, -y, 0]])
-
-
-@pytest.fixture(name="look")
-def _look() -> Callable[..., tuple[Array, Array]]:
-    return look
-
-
-@pytest.fixture(name="project")
-def _project() -> Callable[..., Array]:
-    return project
-
-
-@pytest.fixture(name="render")
-def _render() -> Callable[..., NDArray[np.uint8]]:
-    return render
-
-
-@pytest.fixture(name="chessboard_cells")
-def _chessboard_cells() -> Callable[..., NDArray[np.bool_]]:
-    return chessboard_cells
-
-
-@pytest.fixture(name="rectangle")
-def _rectangle() -> Callable[..., Array]:
-    return rectangle
