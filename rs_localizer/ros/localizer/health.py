@@ -13,19 +13,18 @@ from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.inputs import Role, input_named, said
 from rs_localizer.pipeline.refusal import IMU_REASONS
 from rs_localizer.ros.node.health import (
-    SOME,
     Health,
     Judgement,
     Level,
     State,
-    lost_on_the_way,
+    hindrance,
     milliseconds,
     one_line,
     out_of_service,
     refused,
 )
 from rs_localizer.ros.node.inputs import Silence
-from rs_localizer.ros.node.statistics import WINDOW, Summary
+from rs_localizer.ros.node.statistics import Summary
 from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 
@@ -214,17 +213,8 @@ def _judge_frames(summary: Summary[Answer], oddities: Mapping[str, str]) -> Judg
         message = "; ".join(filter(None, [message, one_line(oddities)]))
         return Judgement(Level.ERROR, State.LOST, message)
     state = State.TRACKING if last.tracked else State.LOCALIZED
-    bad, replaced = sum(summary.recently_refused.values()), summary.recently_replaced
-    if bad > SOME * summary.recently_received:
-        message = f"{bad} frames were refused in the last {WINDOW:.0f} s"
+    if message := hindrance(summary, "frames", "localized") or one_line(oddities):
         return Judgement(Level.WARN, state, message)
-    if replaced > SOME * summary.recently_received:
-        message = f"{replaced} frames came while another was localized in the last {WINDOW:.0f} s"
-        return Judgement(Level.WARN, state, message)
-    if summary.recently_missing > SOME * summary.recently_received:
-        return Judgement(Level.WARN, state, lost_on_the_way(summary))
-    if oddities:
-        return Judgement(Level.WARN, state, one_line(oddities))
     message = f"{state} with {last.inliers} of {last.points} points"
     return Judgement(Level.OK, state, message)
 

@@ -95,13 +95,27 @@ def one_line(oddities: Mapping[str, str]) -> str:
     return "; ".join(f"{name}: {text}" for name, text in oddities.items())
 
 
-def lost_on_the_way(summary: Summary[Any]) -> str:
-    """What to say where stamps have gaps."""
-    sent = summary.recently_received + summary.recently_missing
-    return (
-        f"messages are lost: by their stamps, {summary.recently_missing} of {sent} have not come "
-        f"in the last {WINDOW:.0f} s (is the publisher best effort, or the machine too slow?)"
-    )
+def hindrance(summary: Summary[Any], what: str, worked_on: str) -> str:
+    """Why some of the last messages have no result; empty where nearly all have one.
+
+    Args:
+        summary: of a node that works.
+        what: the messages are.
+        worked_on: is done with them.
+    """
+    worth_it = SOME * summary.recently_received
+    lately = f"in the last {WINDOW:.0f} s"
+    if (bad := sum(summary.recently_refused.values())) > worth_it:
+        return f"{bad} {what} were refused {lately}"
+    if summary.recently_replaced > worth_it:
+        return f"{summary.recently_replaced} {what} came while another was {worked_on} {lately}"
+    if summary.recently_missing > worth_it:
+        sent = summary.recently_received + summary.recently_missing
+        return (
+            f"messages are lost: by their stamps, {summary.recently_missing} of {sent} have not "
+            f"come {lately} (is the publisher best effort, or the machine too slow?)"
+        )
+    return ""
 
 
 def milliseconds(name: str, value: Percentiles | None) -> dict[str, str]:
