@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,10 +54,8 @@ def tf2_ros() -> Iterator[Any]:
             del sys.modules["tf2_ros"]
 
 
-def record(
-    path: Path, known: float = 1.0, count: int = 12, more: Sequence[tuple[str, Any]] = ()
-) -> Path:
-    """A flight, a calibration that knows a part of the distortion, and more messages before."""
+def record(path: Path, known: float = 1.0, count: int = 12) -> Path:
+    """A flight, and a calibration that knows a part of the distortion."""
     distortion = np.array([-0.2, 0.05, 0.0, 0.0, 0.0])
     camera = Camera(640, 480, K, distortion, readout_time=READOUT_TIME)
     motion = ConstantVelocity(
@@ -66,8 +64,6 @@ def record(
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
     settings = FrameSettings(points=100, noise=0.7, outliers=0.3)
     with BagWriter(path) as bag:
-        for topic, message in more:
-            bag.write(topic, message, START_NS)
         for frame in list(simulate_frames(camera, motion, world, settings))[:count]:
             write_simulated(bag, replace(camera, D=known * distortion), frame)
     return path
@@ -107,6 +103,7 @@ class Robot:
         self._node = f"{namespace}/rs_localizer"
         self.answers: dict[str, list[bytes]] = {name: [] for name in TYPES}
         self.values: dict[str, str] = {}  # of the diagnostics
+        self.odd: set[str] = set()  # what has ever been odd by them
         for name, kind in TYPES.items():
             peer.node.create_subscription(
                 message_class(kind), f"{self._node}/{name}", self.answers[name].append,
@@ -122,6 +119,7 @@ class Robot:
         for status in message.status:
             if status.name.endswith(": localizer"):
                 self.values = {item.key: item.value for item in status.values}
+                self.odd |= {name for name in self.values if name.startswith("Odd: ")}
 
     def connect(self) -> None:
         def connected() -> bool:

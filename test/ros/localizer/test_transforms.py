@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
-from robot import tf2_ros
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Localized, Pose
 from rs_localizer.io.transforms import TransformError
 from rs_localizer.ros.localizer.transforms import Broadcaster, check
+
+from .robot import tf2_ros
 
 Notes = list[tuple[str, str]]
 HALF_TURN = (0.0, 0.0, 1.0, 0.0)

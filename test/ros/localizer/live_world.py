@@ -22,7 +22,6 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from robot import READOUT_TIME, K, inputs
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 
 from rs_localizer.core.camera import Camera
@@ -34,6 +33,8 @@ from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import random_descriptors, room
 from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
+
+from .robot import READOUT_TIME, K, inputs
 
 PATIENCE = 20.0  # s, of a machine that is busy
 CLOSE = 0.05  # m: the poses are right
