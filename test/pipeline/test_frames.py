@@ -339,26 +339,28 @@ def test_a_flight_that_goes_on_has_none(jumps):
 
 
 @pytest.mark.parametrize(
-    ("position", "turn"), [((0.0, 0.3, 0.0), (0.0, 0.0, 0.0)), ((0.0, 0.0, 0.0), (0.3, 0.0, 0.0))]
-)
-def test_a_step_that_nobody_makes_is_one(jumps, position, turn):
-    jumps.add(frame(0.0, twist=twist()))
-    assert jumps.add(frame(PERIOD, position, turn, twist=twist())) == 1
-    assert jumps.add(frame(2 * PERIOD, position, turn, twist=twist())) == 1  # it stays there
-
-
-def test_after_a_gap_a_camera_may_be_elsewhere(jumps):
-    jumps.add(frame(0.0, twist=twist()))
-    assert jumps.add(frame(1.0, (0.3, 0.0, 0.0), twist=twist())) == 0
-
-
-def test_without_a_twist_any_camera_may_move(jumps):
-    jumps.add(frame(0.0))
-    assert jumps.add(frame(PERIOD, (0.1, 0.0, 0.0), (0.2, 0.0, 0.0))) == 0  # 3 m/s, 6 rad/s
-    assert jumps.add(frame(2 * PERIOD, (2.0, 0.0, 0.0))) == 1
-
-
-def test_another_map_and_a_clock_that_goes_back_are_jumps(jumps):
-    jumps.add(frame(1.0))
-    assert jumps.add(frame(1.0 + PERIOD, map_frame="other")) == 1
-    assert jumps.add(frame(0.0, map_frame="other")) == 2
+    ("frames", "counts"),
+    [
+        # A step that nobody makes, or turn; it stays there.
+        (
+            [frame(k * PERIOD, (0.0, 0.3 * min(k, 1), 0.0), twist=twist()) for k in range(3)],
+            [0, 1, 1],
+        ),
+        ([frame(k * PERIOD, turn=(0.3 * k, 0.0, 0.0), twist=twist()) for k in range(2)], [0, 1]),
+        # After a gap a camera may be elsewhere.
+        ([frame(k, (0.3 * k, 0.0, 0.0), twist=twist()) for k in (0.0, 1.0)], [0, 0]),
+        # Without a twist it may be moving: 3 m/s, 6 rad/s.
+        (
+            [frame(0.0), frame(PERIOD, (0.1, 0.0, 0.0), (0.2, 0.0, 0.0)),
+             frame(2 * PERIOD, (2.0, 0.0, 0.0))],
+            [0, 0, 1],
+        ),
+        # Another map, and a clock that goes back.
+        (
+            [frame(1.0), frame(1.0 + PERIOD, map_frame="other"), frame(0.0, map_frame="other")],
+            [0, 1, 2],
+        ),
+    ],
+)  # fmt: skip
+def test_jumps_are_counted(jumps, frames, counts):
+    assert [jumps.add(each) for each in frames] == counts

@@ -15,6 +15,8 @@ from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.types import Estimate
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at, with_timing
 
+from .motions import disturbed
+
 READOUT_TIME = 0.03
 TAUS = [-0.5, 0.0, 0.3, -7.0]
 # Per readout: none, nearly none, fast, and around half a turn.
@@ -46,24 +48,6 @@ def estimate(rate: float, seed: int = 0, acceleration: float = 0.0, shake: float
         joint_covariance=root @ root.T,
         global_shutter_inliers=10,
         iterations=100,
-    )
-
-
-def disturbed(motion: Estimate, error: Array) -> Estimate:
-    """The motion with errors in the order of its joint covariance, by its definition."""
-    phi, rho, d_omega, d_v, d_alpha, d_a = error[:18].reshape(6, 3)
-    map_from_camera = motion.rotation.T
-    centre = -map_from_camera @ motion.translation + map_from_camera @ rho
-    rotation = Rotation.from_rotvec(-phi).as_matrix() @ motion.rotation
-    return replace(
-        motion,
-        rotation=rotation,
-        translation=-rotation @ centre,
-        angular_velocity=motion.angular_velocity + d_omega,
-        linear_velocity=motion.linear_velocity + d_v,
-        angular_acceleration=motion.angular_acceleration + d_alpha,
-        linear_acceleration=motion.linear_acceleration + d_a,
-        shake=motion.shake + error[18:].reshape(-1, 3),
     )
 
 

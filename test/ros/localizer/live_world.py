@@ -7,7 +7,6 @@ import re
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +23,11 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 
-from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import BagWriter
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.managed import spin
-from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.simulation.recording import write_simulated
-from rs_localizer.simulation.scene import random_descriptors, room
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import ConstantVelocity
+from rs_localizer.simulation.scene import random_descriptors
 
-from .robot import READOUT_TIME, K, inputs
+from .robot import READOUT_TIME, inputs, record
 
 PATIENCE = 20.0  # s, of a machine that is busy
 CLOSE = 0.05  # m: the poses are right
@@ -43,54 +36,21 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DESCRIPTORS = random_descriptors(5000, np.random.default_rng(9))  # of the landmarks, by number
 
 
-@dataclass(frozen=True)
-class Recording:
-    """Frames, the true position of each, and one camera_info for all."""
-
-    info: CameraInfo
-    clouds: list[PointCloud2]
-    truth: list[np.ndarray]
-    exact: PointCloud2  # the first frame without noise
-
-
-def record(path: Path) -> Recording:
-    """A flight, written to a bag and read again."""
-    camera = Camera(640, 480, K, np.array([-0.2, 0.05, 0.0, 0.0, 0.0]), readout_time=READOUT_TIME)
-    motion = ConstantVelocity(np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4)
-    world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
-    settings = FrameSettings(points=100, noise=0.7)
-    frames = list(simulate_frames(camera, motion, world, settings))
-    first = next(simulate_frames(camera, motion, world, replace(settings, noise=0.0)))
-    info, clouds = _written(path, camera, frames)
-    return Recording(
-        info=info,
-        clouds=clouds,
-        truth=[frame.first_row.positions[0] for frame in frames],
-        exact=_written(path.with_name("exact"), camera, [first])[1][0],
-    )
-
-
-def _written(
-    path: Path, camera: Camera, frames: list[SimulatedFrame]
-) -> tuple[CameraInfo, list[PointCloud2]]:
-    with BagWriter(path) as bag:
-        for frame in frames:
-            write_simulated(bag, camera, frame)
-    infos, clouds = zip(*inputs(path), strict=True)
-    return infos[0], list(clouds)
-
-
 class World:
-    """A live node in a thread, a peer that talks to it over DDS, and what the node has said."""
+    """A live node in a thread, a peer that talks to it over DDS, and what the node has said.
 
-    def __init__(self, recording: Recording, *arguments: str, namespace: str = "") -> None:
-        self.recording = recording
+    Args:
+        bag: to be written: a flight without noise.
+    """
+
+    def __init__(self, bag: Path) -> None:
+        self.truth = record(bag, noise=0.0, outliers=0.0)  # positions, of the frames
+        infos, self.clouds = zip(*inputs(bag), strict=True)
+        self.camera_info = infos[0]
         self.context = Context()
         rclpy.init(context=self.context)
         self.node = LocalizerNode(
-            context=self.context,
-            namespace=namespace,
-            cli_args=["--ros-args", "-p", f"readout_time:={READOUT_TIME}", *arguments],
+            context=self.context, cli_args=["--ros-args", "-p", f"readout_time:={READOUT_TIME}"]
         )
         # Every single one, where the log leaves out repetitions.
         self.said: list[str] = []
@@ -102,7 +62,7 @@ class World:
         assert self.node.trigger_configure().name == self.node.trigger_activate().name == "SUCCESS"
         self._stopped = threading.Event()
         self._threads = [threading.Thread(target=spin, args=(self.node, self._stopped.is_set))]
-        self.peer = Peer(self.context, namespace)
+        self.peer = Peer(self.context)
         self._threads.append(threading.Thread(target=self._spin_peer))
         for thread in self._threads:
             thread.start()
@@ -113,9 +73,7 @@ class World:
 
     def cloud(self, index: int = 0, **changes: Any) -> PointCloud2:
         """A good frame, later than the last, with fields changed."""
-        source = self.recording.clouds[index]
-        fields = {name: getattr(source, name) for name in source.get_fields_and_field_types()}
-        message = PointCloud2(**(fields | changes))
+        message = changed(self.clouds[index], changes)
         if "header" not in changes:
             self.stamp += SECOND // 30
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.stamp, SECOND)
@@ -123,13 +81,11 @@ class World:
 
     def info(self, **changes: Any) -> CameraInfo:
         """A good camera_info with fields changed."""
-        source = self.recording.info
-        fields = {name: getattr(source, name) for name in source.get_fields_and_field_types()}
-        return CameraInfo(**(fields | changes))
+        return changed(self.camera_info, changes)
 
     def table(self) -> np.ndarray:
         """The rows of a good frame."""
-        return self.table_of(self.recording.clouds[0])
+        return self.table_of(self.clouds[0])
 
     def table_of(self, cloud: PointCloud2) -> np.ndarray:
         kinds = {PointField.FLOAT32: "<f4", PointField.UINT32: "<u4"}
@@ -195,9 +151,9 @@ class World:
     def localizes(self) -> bool:
         """Whether a good frame is answered, and with the true position."""
         for _ in range(20):  # any of them may be lost while the node follows a publisher's quality
-            if self.poses(self.recording.info, self.cloud(), within=1.0):
+            if self.poses(self.camera_info, self.cloud(), within=1.0):
                 found = self.peer.poses[-1].pose.position
-                error = np.array([found.x, found.y, found.z]) - self.recording.truth[0]
+                error = np.array([found.x, found.y, found.z]) - self.truth[0]
                 return bool(np.linalg.norm(error) < CLOSE)
         return False
 
@@ -216,11 +172,17 @@ class World:
         rclpy.shutdown(context=self.context)
 
 
+def changed(message: Any, changes: dict[str, Any]) -> Any:
+    """A copy with other fields."""
+    fields = {name: getattr(message, name) for name in message.get_fields_and_field_types()}
+    return type(message)(**(fields | changes))
+
+
 class Peer:
     """Publishes as a camera does, and listens."""
 
-    def __init__(self, context: Context, namespace: str) -> None:
-        self.node = Node("peer", context=context, namespace=namespace)
+    def __init__(self, context: Context) -> None:
+        self.node = Node("peer", context=context)
         self.poses: list[PoseStamped] = []
         self.diagnoses: list[str] = []
         create = self.node.create_publisher

@@ -33,7 +33,6 @@ from rs_localizer.simulation.true_motion import ConstantVelocity
 READOUT_TIME = 0.03
 SHUTTER = ("-p", f"readout_time:={READOUT_TIME}")
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-START_NS = 10**12
 KINDS = {"/camera_info": CameraInfo, "/correspondences": PointCloud2, "/imu": Imu}
 STAND_IN = Path(__file__).parents[1] / "stand_in"
 INSTALLED = importlib.util.find_spec("tf2_ros") is not None
@@ -54,19 +53,20 @@ def tf2_ros() -> Iterator[Any]:
             del sys.modules["tf2_ros"]
 
 
-def record(path: Path, known: float = 1.0, count: int = 12) -> Path:
-    """A flight, and a calibration that knows a part of the distortion."""
+def record(
+    path: Path, known: float = 1.0, noise: float = 0.7, outliers: float = 0.3
+) -> list[np.ndarray]:
+    """A flight, with a calibration that knows a part of the distortion; its true positions."""
     distortion = np.array([-0.2, 0.05, 0.0, 0.0, 0.0])
     camera = Camera(640, 480, K, distortion, readout_time=READOUT_TIME)
-    motion = ConstantVelocity(
-        np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.5, start_ns=START_NS
-    )
+    motion = ConstantVelocity(np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4)
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
-    settings = FrameSettings(points=100, noise=0.7, outliers=0.3)
+    settings = FrameSettings(points=100, noise=noise, outliers=outliers)
+    frames = list(simulate_frames(camera, motion, world, settings))
     with BagWriter(path) as bag:
-        for frame in list(simulate_frames(camera, motion, world, settings))[:count]:
+        for frame in frames:
             write_simulated(bag, replace(camera, D=known * distortion), frame)
-    return path
+    return [frame.first_row.positions[0] for frame in frames]
 
 
 def inputs(recording: Path) -> list[tuple[Any, Any]]:

@@ -24,7 +24,9 @@ from .robot import READOUT_TIME, SHUTTER, Robot, inputs, record, replayed
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
     """A flight with a calibration that is off."""
-    return record(tmp_path_factory.mktemp("bags") / "flight", 0.7)
+    path = tmp_path_factory.mktemp("bags") / "flight"
+    record(path, 0.7)
+    return path
 
 
 def test_node_and_replay_say_the_same_to_the_last_byte(recording, tmp_path, start_node, peer):

@@ -6,9 +6,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rclpy.context import Context
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
+from rs_localizer.ros.node import inputs as inputs_module
 from rs_localizer.ros.node.inputs import LATCHED as LATCHED_DATA
 from rs_localizer.ros.node.inputs import Inputs, Topic, best
 from rs_localizer.ros.node.refusals import Refusals
@@ -83,3 +86,33 @@ def test_a_topic_follows_its_publishers(peer):
     assert present() == {BEST_EFFORT}  # nobody there: as it was
     inputs.close()
     assert not told.counts
+
+
+def test_publishers_that_cannot_be_heard_are_named(peer, monkeypatch):
+    monkeypatch.setattr(inputs_module, "_LONG", 0.0)
+    said: list[str] = []
+    qos = {"depth": 1, "reliability": RELIABLE}
+    topics = {name: Topic(PointCloud2, print, qos) for name in ("one", "other", "third")}
+    inputs = Inputs(peer.node, topics, Refusals(said.append))
+    context = Context()
+    context.init(args=[])
+    driver = Node("driver", context=context)
+    driver.create_publisher(PointCloud2, "one", QoSProfile(depth=1, reliability=BEST_EFFORT))
+    driver.create_publisher(CameraInfo, "other", 1)
+    wanted = {
+        "one": "the QoS of /driver does not fit: Best effort publisher and reliable subscription",
+        "other": "/driver publishes sensor_msgs/msg/CameraInfo, not sensor_msgs/msg/PointCloud2",
+        "third": "it has no publisher",
+    }
+
+    def causes() -> bool:
+        return all(item.cause.startswith(wanted[name]) for name, item in inputs.silence().items())
+
+    assert peer.spin_until(causes), inputs.silence()
+    mismatches = {name: item.mismatch for name, item in inputs.silence().items()}
+    assert mismatches == {"one": True, "other": True, "third": False}
+    line = f"incompatible_publisher: no message arrives on /one: {wanted['one']}"
+    assert any(text.startswith(line) for text in said)
+    inputs.close()
+    driver.destroy_node()
+    context.try_shutdown()
