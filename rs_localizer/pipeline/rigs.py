@@ -8,7 +8,6 @@ says, at the time of the frame. Poses are those of ``base_frame``, as of one cam
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -74,33 +73,21 @@ def inputs_of(config: NodeConfig) -> Mapping[str, Input]:
 
 def _of_camera(item: Input, name: str) -> Input:
     """An input of one camera of a rig."""
+
+    def rig(localizer: FrameLocalizer) -> RigLocalizer:
+        assert isinstance(localizer, RigLocalizer)  # whose inputs these are
+        return localizer
+
     own = replace(item, topic=f"{name}/{item.topic}", about=f"{name}: {item.about}")
     if item.topic == CAMERA_INFO:
         return replace(
             own,
-            use=functools.partial(_calibrate, name),
-            held=functools.partial(_calibration, name),
+            use=lambda localizer, found: rig(localizer).calibrate_camera(name, found),
+            held=lambda localizer: rig(localizer).calibrations.get(name),
         )
-    return replace(own, use=functools.partial(_localize, name, item.topic))
-
-
-def _rig(localizer: FrameLocalizer) -> RigLocalizer:
-    assert isinstance(localizer, RigLocalizer)  # whose inputs these are
-    return localizer
-
-
-def _calibrate(name: str, localizer: FrameLocalizer, calibration: Calibration) -> None:
-    _rig(localizer).calibrate_camera(name, calibration)
-
-
-def _calibration(name: str, localizer: FrameLocalizer) -> Calibration | None:
-    return _rig(localizer).calibrations.get(name)
-
-
-def _localize(
-    name: str, kind: str, localizer: FrameLocalizer, message: Any
-) -> Iterator[Localized | Refusal]:
-    return _rig(localizer).add(name, kind, message)
+    return replace(
+        own, use=lambda localizer, message: rig(localizer).add(name, item.topic, message)
+    )
 
 
 class RigLocalizer(FrameLocalizer):

@@ -32,7 +32,6 @@ from rs_localizer.ros.node.conversion import create_output, make_message
 from rs_localizer.ros.node.health import (
     SOME,
     Health,
-    Judgement,
     Level,
     State,
     hindrance,
@@ -57,10 +56,9 @@ class Sight:
     values: dict[str, str]
 
 
-def diagnose(judgement: Judgement, summary: Summary[Sight]) -> Health:
-    """What a node says of itself."""
+def values_of(summary: Summary[Sight]) -> dict[str, str]:
+    """What a node says in numbers."""
     values = {
-        "State": judgement.state_in_words,
         "Images in (Hz)": f"{summary.rate_in:.1f}",
         "Images done (Hz)": f"{summary.rate_out:.1f}",
         **milliseconds("Latency", summary.latency),
@@ -73,26 +71,25 @@ def diagnose(judgement: Judgement, summary: Summary[Sight]) -> Health:
         "Images replaced": str(summary.replaced),
         "Images refused": str(summary.refused),
     }
-    values |= refused(summary)
-    return Health(judgement.level, judgement.state, judgement.message, values)
+    return values | refused(summary)
 
 
 def judge(
     summary: Summary[Sight], silence: Mapping[str, Silence], oddities: Mapping[str, str]
-) -> Judgement:
+) -> Health:
     """Of an active node that somebody listens to: ``waiting for images`` or ``detecting``."""
     causes = [f"{item.topic}: {item.cause}" for item in silence.values() if item.cause]
     if causes or not silence:
         message = "; ".join([f"{State.WAITING} images", *causes])
-        return Judgement(Level.WARN, State.WAITING, message, "images")
+        return Health(Level.WARN, State.WAITING, message, subject="images")
     message = hindrance(summary, "images", "looked at")
     if sum(summary.recently_refused.values()) > SOME * summary.recently_received:
         message += f": {', '.join(sorted(summary.recently_refused))}"
     if message := message or one_line(oddities):
-        return Judgement(Level.WARN, State.DETECTING, message)
+        return Health(Level.WARN, State.DETECTING, message)
     last = summary.last
     message = "no image has been looked at yet" if last is None else last.text
-    return Judgement(Level.OK, State.DETECTING, message)
+    return Health(Level.OK, State.DETECTING, message)
 
 
 # Types of the topics whose messages are looked at.
@@ -240,11 +237,11 @@ class ImageNode(
         judgement = out_of_service(self.state)
         if judgement is None and not self._listening:
             message = f"nobody subscribes to the {self.output} or the debug image"
-            judgement = Judgement(Level.OK, State.IDLE, message)
+            judgement = Health(Level.OK, State.IDLE, message)
         if judgement is None:
             silence = {name: item for name, item in self.silence.items() if name in _IMAGES}
             judgement = judge(summary, silence, self.refusals.recent(self.odd, WINDOW))
-        return diagnose(judgement, summary), ""
+        return judgement.with_values(values_of(summary)), ""
 
     # -- who listens ------------------------------------------------------------------------
 
