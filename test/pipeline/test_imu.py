@@ -162,10 +162,10 @@ def test_it_makes_poses_better(flight):
     assert np.median(both.errors()[0]) < 0.75 * np.median(alone.errors()[0])
     # An IMU that is not used changes nothing, to the last bit.
     for other in (
-        fly(flight, config=NodeConfig(readout_time=READOUT_TIME, imu=Imu(use="none"))),
-        fly(flight, mounting=False),
+        fly(flight, config=NodeConfig(readout_time=READOUT_TIME, imu=Imu(use="none")), most=30),
+        fly(flight, mounting=False, most=30),
     ):
-        for a, b in zip(other.frames, alone.frames, strict=True):
+        for a, b in zip(other.frames, alone.frames[:30], strict=True):
             assert np.array_equal(a.pose.position, b.pose.position)
             assert np.array_equal(a.pose.rotation, b.pose.rotation)
 
@@ -299,8 +299,9 @@ def test_two_hundred_interruptions(flight):
 
 def test_frames_that_stand_alone_use_it_too(flight):
     config = NodeConfig(readout_time=READOUT_TIME, tracking=False)
-    both, alone = fly(flight, config=config), fly(flight, lambda message, time: (), config)
-    both.assert_none_is_lost_or_wrong(count(flight))
+    both = fly(flight, config=config, most=45)
+    alone = fly(flight, lambda message, time: (), config, most=45)
+    both.assert_none_is_lost_or_wrong(45)
     assert both.state.share > 0.9
     assert not any(frame.estimate.tracked for frame in both.frames)
     assert np.median(both.errors()[0]) < 0.75 * np.median(alone.errors()[0])

@@ -5,30 +5,211 @@
 A fault is a row of :data:`FAULTS`.
 """
 
+import array
 import contextlib
 import re
 import resource
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import TransformStamped
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Imu, PointField
+from sensor_msgs.msg import CameraInfo, Imu, PointCloud2, PointField
 from std_srvs.srv import Trigger
 
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.conversion import make_message
-from rs_localizer.simulation.scene import map_rows
+from rs_localizer.ros.node.managed import spin
+from rs_localizer.simulation.scene import map_rows, random_descriptors
 
-from .live_world import DESCRIPTORS, PATIENCE, SECOND, World
-from .robot import tf2_ros
+from .robot import READOUT_TIME, inputs, record, tf2_ros
+
+PATIENCE = 20.0  # s, of a machine that is busy
+CLOSE = 0.05  # m: the poses are right
+SECOND = 1_000_000_000
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+DESCRIPTORS = random_descriptors(5000, np.random.default_rng(9))  # of the landmarks, by number
+
+
+class World:
+    """A live node in a thread, a peer that talks to it over DDS, and what the node has said.
+
+    Args:
+        bag: to be written: a flight without noise.
+    """
+
+    def __init__(self, bag: Path) -> None:
+        self.truth = record(bag, noise=0.0, outliers=0.0)  # positions, of the frames
+        infos, self.clouds = zip(*inputs(bag), strict=True)
+        self.camera_info = infos[0]
+        self.context = Context()
+        rclpy.init(context=self.context)
+        self.node = LocalizerNode(
+            context=self.context, cli_args=["--ros-args", "-p", f"readout_time:={READOUT_TIME}"]
+        )
+        # Every single one, where the log leaves out repetitions.
+        self.said: list[str] = []
+        notice = self.node.refusals.notice
+        self.node.refusals.notice = lambda *texts: (
+            self.said.append(": ".join(texts)),
+            notice(*texts),
+        )
+        assert self.node.trigger_configure().name == self.node.trigger_activate().name == "SUCCESS"
+        self.peer = Node("peer", context=self.context)
+        self.heard: list[PoseStamped] = []
+        self.diagnoses: list[str] = []
+        create = self.peer.create_publisher
+        self._publishers = {
+            "camera_info": create(CameraInfo, "camera_info", 10),
+            "correspondences": create(PointCloud2, "correspondences", 10),
+            "keypoints": create(PointCloud2, "keypoints", 10),
+            "map_points": create(PointCloud2, "map_points", LATCHED),
+        }
+        self.peer.create_subscription(PoseStamped, "rs_localizer/pose", self.heard.append, 100)
+        self.peer.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.peer)
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=spin, args=(self.node, self._stopped.is_set))
+        self._thread.start()
+        self.stamp = SECOND
+        self.wait(self.connected)
+
+    # -- what faults need --------------------------------------------------------------------
+
+    def cloud(self, index: int = 0, **changes: Any) -> PointCloud2:
+        """A good frame, later than the last, with fields changed."""
+        message = changed(self.clouds[index], changes)
+        if "header" not in changes:
+            self.stamp += SECOND // 30
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.stamp, SECOND)
+        return message
+
+    def info(self, **changes: Any) -> CameraInfo:
+        """A good camera_info with fields changed."""
+        return changed(self.camera_info, changes)
+
+    def table(self) -> np.ndarray:
+        """The rows of a good frame."""
+        return self.table_of(self.clouds[0])
+
+    def table_of(self, cloud: PointCloud2) -> np.ndarray:
+        kinds = {PointField.FLOAT32: "<f4", PointField.UINT32: "<u4"}
+        columns = [(item.name, kinds[item.datatype]) for item in cloud.fields]
+        return np.frombuffer(bytes(cloud.data), columns).copy()
+
+    def cloud_of(self, table: np.ndarray) -> PointCloud2:
+        """A frame with these rows."""
+        return self.cloud(
+            width=len(table), row_step=table.nbytes, data=array.array("B", table.tobytes())
+        )
+
+    def connected(self) -> bool:
+        counts = [each.get_subscription_count() for each in self._publishers.values()]
+        return min(counts) > 0 and self.peer.count_publishers("rs_localizer/pose") > 0
+
+    def send(self, *messages: Any) -> None:
+        """Each a camera_info or correspondences, or a pair of a topic and its message."""
+        for message in messages:
+            if isinstance(message, tuple):
+                topic, message = message
+            else:
+                topic = "camera_info" if isinstance(message, CameraInfo) else "correspondences"
+            self._publishers[topic].publish(message)
+
+    def poses(self, *messages: Any, count: int = 1, within: float = PATIENCE) -> bool:
+        """Send; whether so many poses come."""
+        before = len(self.heard)
+        self.send(*messages)
+        return self.until(lambda: len(self.heard) >= before + count, within)
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        client = self.peer.create_client(kind, f"rs_localizer/{name}")
+        assert client.wait_for_service(PATIENCE)
+        future = client.call_async(request)
+        assert self.until(future.done)
+        self.peer.destroy_client(client)
+        return future.result()
+
+    def set(self, **values: object) -> str:
+        """Set parameters at once: the reason of a refusal, else nothing."""
+        parameters = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+        ]
+        request = SetParametersAtomically.Request(parameters=parameters)
+        return str(
+            self.call(SetParametersAtomically, "set_parameters_atomically", request).result.reason
+        )
+
+    def change_state(self, transition: int) -> bool:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return bool(self.call(ChangeState, "change_state", request).success)
+
+    def diagnosis(self, text: str) -> bool:
+        """Whether this comes up in the diagnostics."""
+        del self.diagnoses[:-1]
+        return self.until(lambda: any(re.search(text, item) for item in self.diagnoses))
+
+    def until(self, condition: Callable[[], Any], within: float = PATIENCE) -> bool:
+        deadline = time.monotonic() + within
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            self._executor.spin_once(timeout_sec=0.005)
+        return True
+
+    def wait(self, condition: Callable[[], Any]) -> None:
+        assert self.until(condition)
+
+    # ----------------------------------------------------------------------------------------
+
+    def localizes(self) -> bool:
+        """Whether a good frame is answered, and with the true position."""
+        for _ in range(20):  # any of them may be lost while the node follows a publisher's quality
+            if self.poses(self.camera_info, self.cloud(), within=1.0):
+                found = self.heard[-1].pose.position
+                error = np.array([found.x, found.y, found.z]) - self.truth[0]
+                return bool(np.linalg.norm(error) < CLOSE)
+        return False
+
+    def _take(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = [f"{item.key} = {item.value}" for item in status.values]
+            level = ["OK", "WARN", "ERROR", "STALE"][status.level[0]]
+            self.diagnoses.append("\n".join([f"{level}: {status.message}", *values]))
+
+    def close(self) -> None:
+        self._stopped.set()
+        self._thread.join()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self.peer.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+def changed(message: Any, changes: dict[str, Any]) -> Any:
+    """A copy with other fields."""
+    fields = {name: getattr(message, name) for name in message.get_fields_and_field_types()}
+    return type(message)(**(fields | changes))
 
 
 def info(**changes: Any) -> Callable[[World], Any]:
@@ -56,7 +237,7 @@ def stamped(*seconds: float) -> Callable[[World], Any]:
             # On a busy machine the pose of a frame before may come first.
             assert any(
                 world.poses(message, within=1.0)
-                and world.peer.poses[-1].header.stamp == message.header.stamp
+                and world.heard[-1].header.stamp == message.header.stamp
                 for _ in range(20)
             )
         return "; ".join(world.said[before:])
@@ -73,10 +254,10 @@ def many(world: World) -> str:
     rng = np.random.default_rng(3)
     for name in "uv":
         table[name] += rng.normal(0.0, 0.5, len(table))
-    before = len(world.peer.poses)
+    before = len(world.heard)
     hand_over(world, "camera_info", world.camera_info)
     hand_over(world, "correspondences", world.cloud_of(table))
-    world.wait(lambda: len(world.peer.poses) > before)
+    world.wait(lambda: len(world.heard) > before)
     return ""
 
 
@@ -215,16 +396,16 @@ def slow(world: World) -> Callable[[], None]:
 
 def deactivated(world: World) -> str:
     """Deactivated while a frame is worked on: it is not published any more."""
-    before, sent = len(world.peer.poses), world.stamp
+    before, sent = len(world.heard), world.stamp
     go_on = slow(world)
     assert world.change_state(Transition.TRANSITION_DEACTIVATE)
     go_on()
     assert world.diagnosis("OK: the node is inactive: activate it")
-    stamps = [pose.header.stamp for pose in world.peer.poses[before:]]
+    stamps = [pose.header.stamp for pose in world.heard[before:]]
     # Poses of earlier frames may still have been on their way.
     assert all(stamp.sec * SECOND + stamp.nanosec <= sent for stamp in stamps)
     assert world.change_state(Transition.TRANSITION_ACTIVATE)
-    world.wait(world.peer.connected)
+    world.wait(world.connected)
     return "the node is inactive: activate it"
 
 
@@ -239,7 +420,7 @@ def cleaned_up(world: World) -> str:
     ):
         assert world.change_state(transition)
     go_on()
-    world.wait(world.peer.connected)
+    world.wait(world.connected)
     assert world.diagnosis("waiting for camera_info")
     return "waiting for camera_info"
 
@@ -278,9 +459,9 @@ def simulated_time(world: World) -> str:
     """Without a clock time stands still at zero; with one it may run backwards."""
     assert world.set(use_sim_time=True) == ""
     assert world.poses(world.cloud())
-    before = len(world.peer.diagnoses)
-    world.wait(lambda: len(world.peer.diagnoses) >= before + 2)
-    clock = world.peer.node.create_publisher(Clock, "/clock", 10)
+    before = len(world.diagnoses)
+    world.wait(lambda: len(world.diagnoses) >= before + 2)
+    clock = world.peer.create_publisher(Clock, "/clock", 10)
     for second in (100, 50, 200):
         message = Clock()
         message.clock.sec = second
@@ -290,7 +471,7 @@ def simulated_time(world: World) -> str:
             lambda second=second: world.node.get_clock().now().nanoseconds == second * SECOND
         )
         assert world.poses(world.cloud())
-    world.peer.node.destroy_publisher(clock)
+    world.peer.destroy_publisher(clock)
     assert world.set(use_sim_time=False) == ""
     return "diagnostics go on"
 
@@ -371,20 +552,19 @@ def replaced_within_a_frame(world: World) -> str:
         return localize(message)
 
     frames.localize_keypoints = wait
-    before = len(world.peer.poses)
+    before = len(world.heard)
     world.wait(lambda: world.send(keypoints(world)) or started.wait(0.1))
     world.send(map_message(world, frame="hall"))
     world.wait(lambda: "map_points" in world.node.worker._updates)
     go_on.set()
-    world.wait(lambda: len(world.peer.poses) > before)
-    assert world.peer.poses[before].header.frame_id == "map"
+    world.wait(lambda: len(world.heard) > before)
+    assert world.heard[before].header.frame_id == "map"
     world.wait(lambda: world.poses(keypoints(world), within=0.3))
-    assert world.peer.poses[-1].header.frame_id == "hall"
+    assert world.heard[-1].header.frame_id == "hall"
     world.send(map_message(world))
     world.wait(
         lambda: (
-            world.poses(keypoints(world), within=0.3)
-            and world.peer.poses[-1].header.frame_id == "map"
+            world.poses(keypoints(world), within=0.3) and world.heard[-1].header.frame_id == "map"
         )
     )
     return next(text for text in world.said if text.startswith("map_replaced"))
@@ -412,11 +592,11 @@ class Static:
         self._world = world
         item = TransformStamped(child_frame_id=child)
         item.header.frame_id, item.transform.translation.x = parent, x
-        self._broadcaster = tf2.StaticTransformBroadcaster(world.peer.node)
+        self._broadcaster = tf2.StaticTransformBroadcaster(world.peer)
         self._broadcaster.sendTransform(item)
 
     def close(self) -> None:
-        self._world.peer.node.destroy_publisher(self._broadcaster.pub_tf)
+        self._world.peer.destroy_publisher(self._broadcaster.pub_tf)
 
 
 def second_parent(world: World) -> str:
@@ -440,14 +620,14 @@ def second_parent(world: World) -> str:
 
 def imu_comes(world: World) -> str:
     """An IMU with axes of its own: from now on the node listens to TF."""
-    imus = world.peer.node.create_publisher(Imu, "imu", 10)
+    imus = world.peer.create_publisher(Imu, "imu", 10)
     with tf2_ros():
         world.wait(imus.get_subscription_count)
         reading = Imu()
         reading.header.frame_id = "imu"
         reading.header.stamp.sec, reading.header.stamp.nanosec = divmod(world.stamp, SECOND)
-        world.wait(lambda: imus.publish(reading) or world.peer.node.count_subscribers("/tf_static"))
-    world.peer.node.destroy_publisher(imus)
+        world.wait(lambda: imus.publish(reading) or world.peer.count_subscribers("/tf_static"))
+    world.peer.destroy_publisher(imus)
     return "listens to TF"
 
 
@@ -535,12 +715,12 @@ def world(tmp_path_factory) -> Iterator[World]:
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
 def test_fault(world, fault):
-    seen, poses = len(world.said), len(world.peer.poses)
+    seen, poses = len(world.said), len(world.heard)
     result = fault.do(world)
     answers = [result] if isinstance(result, str) else []
 
     def done() -> bool:
-        if fault.pose and len(world.peer.poses) == poses:
+        if fault.pose and len(world.heard) == poses:
             return False
         return any(re.search(fault.says, text) for text in ["", *answers, *world.said[seen:]])
 
