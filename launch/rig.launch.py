@@ -13,12 +13,11 @@ from launch_ros.actions import Node
 from launch import LaunchContext, LaunchDescription
 from rs_localizer.config import DetectorConfig
 from rs_localizer.ros.launching import (
-    PACKAGE,
     argument,
     chosen_parameters,
     common_arguments,
-    lifetime,
     localizer,
+    own_node,
     share,
     starting,
     views,
@@ -60,18 +59,8 @@ def _detector(chosen: dict[str, str], kind: str, name: str) -> Node:
     """The detector of one camera."""
     own: dict[str, Any] = {}
     if kind == DETECTOR_NAME:
-        own = {
-            key: value
-            for key, value in chosen_parameters(chosen, DetectorConfig).items()
-            if key in ("marker_map", "use_sim_time")
-        }
-    return Node(
-        package=PACKAGE,
-        executable=kind,
-        name=kind,
-        namespace="/".join(part for part in (chosen["namespace"].strip("/"), name) if part),
-        parameters=[chosen["detector_params_file"], own],
-        arguments=["--ros-args", "--log-level", chosen["log_level"]],
-        output="screen",
-        **lifetime(chosen),
-    )
+        given = chosen_parameters(chosen, DetectorConfig)
+        own = {key: given[key] for key in given if key in ("marker_map", "use_sim_time")}
+    namespace = "/".join(part for part in (chosen["namespace"].strip("/"), name) if part)
+    parameters = [chosen["detector_params_file"], own]
+    return own_node(chosen, kind, kind, parameters, namespace=namespace)

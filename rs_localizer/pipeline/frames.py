@@ -22,7 +22,6 @@ from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import (
     Correspondences,
-    EmptyCloudError,
     Keypoints,
     read_correspondences,
     read_keypoints,
@@ -30,7 +29,6 @@ from rs_localizer.io.clouds import (
 )
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
-from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms import Transforms, TransformTree
@@ -39,11 +37,12 @@ from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.pipeline.imu import ImuInput, inertial_settings
 from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
-from rs_localizer.pipeline.readout_watch import ReadoutWatch
-from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
+from rs_localizer.pipeline.readout_watch import ReadoutWatch, Watched
+from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
 from rs_localizer.pipeline.tags import Tags, read_tags
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Memory, Tracker
+from rs_localizer.trajectory import online_readout
 
 
 class Landmarks:
@@ -163,47 +162,30 @@ def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[
         camera: that ``camera_info`` describes.
         camera_frame: its optical frame.
     """
-    notices = {
-        Notice.MAP_IS_CAMERA: _frame(cloud.frame, camera_frame),
-        Notice.COARSE_COORDINATES: _coordinates(cloud),
-        Notice.PIXELS_OUTSIDE: _pixels(cloud, camera),
-    }
-    return {name: text for name, text in notices.items() if text}
-
-
-def _frame(frame: str, camera_frame: str) -> str:
-    if frame != camera_frame:
-        return ""
-    return (
-        f"the points are given in {frame!r}, which is the camera's own frame: header.frame_id of "
-        "the cloud (or map) must name the frame of x, y, z"
-    )
-
-
-def _coordinates(cloud: Correspondences) -> str:
-    if len(cloud.points) == 0 or cloud.table.dtype["x"].itemsize > 4:
-        return ""
-    largest = np.abs(cloud.points).max()
-    step = float(np.spacing(np.float32(largest)))
-    if step < _FINE:
-        return ""
-    return (
-        f"coordinates of {largest:.0f} m in FLOAT32 are known to {1e3 * step:.0f} mm only: send "
-        "them as FLOAT64, or from an origin nearby"
-    )
-
-
-def _pixels(cloud: Correspondences, camera: Camera) -> str:
+    notices: dict[Notice, str] = {}
+    if cloud.frame == camera_frame:
+        notices[Notice.MAP_IS_CAMERA] = (
+            f"the points are given in {cloud.frame!r}, which is the camera's own frame: "
+            "header.frame_id of the cloud (or map) must name the frame of x, y, z"
+        )
+    if len(cloud.points) > 0 and cloud.table.dtype["x"].itemsize <= 4:
+        largest = np.abs(cloud.points).max()
+        step = float(np.spacing(np.float32(largest)))
+        if step >= _FINE:
+            notices[Notice.COARSE_COORDINATES] = (
+                f"coordinates of {largest:.0f} m in FLOAT32 are known to {1e3 * step:.0f} mm "
+                "only: send them as FLOAT64, or from an origin nearby"
+            )
     width, height = camera.size
     limit = np.array(camera.size) - 0.5 + _SLACK
     outside = np.any((cloud.pixels < -0.5 - _SLACK) | (cloud.pixels > limit), axis=1)
-    if not np.any(outside):
-        return ""
-    u, v = cloud.pixels[outside][0]
-    return (
-        f"{outside.sum()} of {len(outside)} pixels lie outside the {width} x {height} of "
-        f"camera_info, as ({u:.0f}, {v:.0f}): are both of the same camera and resolution?"
-    )
+    if np.any(outside):
+        u, v = cloud.pixels[outside][0]
+        notices[Notice.PIXELS_OUTSIDE] = (
+            f"{outside.sum()} of {len(outside)} pixels lie outside the {width} x {height} of "
+            f"camera_info, as ({u:.0f}, {v:.0f}): are both of the same camera and resolution?"
+        )
+    return notices
 
 
 def lens_is_off(lens: LensError) -> str:
@@ -334,7 +316,7 @@ class FrameLocalizer:
         so3.log(np.eye(3))
         so3.exp_many(np.zeros((1, 3)))  # of the watch over the readout time
         matching.warm_up()
-        self.readout_watch.warm_up(self._camera)
+        online_readout.warm_up(self._camera)
 
     def calibrate(self, calibration: Calibration) -> None:
         """Use this calibration from the next frame on.
@@ -376,13 +358,8 @@ class FrameLocalizer:
 
     def localize(self, message: Any) -> Localized | Refusal:
         """Localize one sensor_msgs/PointCloud2 of correspondences; never raises for bad ones."""
-        try:
-            cloud = read_correspondences(message)
-        except EmptyCloudError as error:
-            return Refusal(Reason.EMPTY_CLOUD, str(error))
-        except MessageError as error:
-            return Refusal(Reason.BAD_CLOUD, str(error))
-        return self.localize_cloud(cloud)
+        cloud = read_or_refuse(read_correspondences, message, Reason.BAD_CLOUD)
+        return cloud if isinstance(cloud, Refusal) else self.localize_cloud(cloud)
 
     def localize_cloud(self, cloud: Correspondences) -> Localized | Refusal:
         """Localize correspondences, however they came."""
@@ -398,12 +375,9 @@ class FrameLocalizer:
         Tracked, landmarks are first looked for where the motion predicts them only, then, if that
         gives no pose, all over the map.
         """
-        try:
-            keypoints = read_keypoints(message)
-        except EmptyCloudError as error:
-            return Refusal(Reason.EMPTY_CLOUD, str(error))
-        except MessageError as error:
-            return Refusal(Reason.BAD_KEYPOINTS, str(error))
+        keypoints = read_or_refuse(read_keypoints, message, Reason.BAD_KEYPOINTS)
+        if isinstance(keypoints, Refusal):
+            return keypoints
         if self.map is not None:
             self._follow(keypoints.stamp_ns, self.map.frame)
         by = self._landmarks.how(keypoints, self.config.matching)
@@ -443,7 +417,7 @@ class FrameLocalizer:
         tracker.readout_time_deviation = deviation
         matches = (cloud.points, cloud.pixels, cloud.scores)
         result = self.imu.track(tracker, config, time_ns, frame, self.transforms, matches)
-        adopted = watch.add(config, camera, time_ns, result, cloud)
+        adopted = watch.add(Watched(time_ns, cloud, result, config, camera))
         wrong_axis = watch.wrong_axis
         if adopted is not config:
             self._use(self._calibration, adopted)

@@ -3,13 +3,13 @@
 """The readout time that the camera's own motion shows, beside the one that is set."""
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 
 import numpy as np
 
 from rs_localizer.config import LONGEST_READOUT_TIME, NodeConfig
-from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice
 from rs_localizer.core.scanning import ScanDirection
@@ -20,7 +20,7 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.refusal import Notify
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import FAR_OFF
-from rs_localizer.trajectory.online_readout import REVERSED, ReadoutMonitor, warm_up
+from rs_localizer.trajectory.online_readout import REVERSED, ReadoutMonitor
 from rs_localizer.trajectory.readout_equations import MeasuredReadout, Measurement
 
 _OTHER_AXIS = {
@@ -63,6 +63,17 @@ _OF_TURNS = float(FUNCTIONS)
 _OF_LENS = 20.0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Watched:
+    """A frame as it was localized."""
+
+    time_ns: int  # when its middle row was exposed
+    cloud: Correspondences
+    result: Estimate | Failure
+    config: NodeConfig  # by which it was localized
+    camera: Camera
+
+
 class ScanAxis:
     """Whether the shutter moves over rows or over columns, from the frames themselves.
 
@@ -73,11 +84,7 @@ class ScanAxis:
     """
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all frames."""
-        self._localizer: Localizer | None = None
+        self._localizer: Localizer | None = None  # by the other axis
         self._monitor, self._monitored = ReadoutMonitor(), 0
         self._evidence = 0.0  # logarithm of the odds of the other axis
         self._dense = _TRIED_FIRST  # frames that are still to be tried, each
@@ -123,56 +130,36 @@ class ScanAxis:
         """Look no more: the motion along the axis that is set agrees from frame to frame."""
         self._confirmed = not self.leans
 
-    def add(
-        self,
-        config: NodeConfig,
-        camera: Camera,
-        time_ns: int,
-        cloud: Correspondences,
-        result: Estimate | Failure,
-    ) -> None:
-        """Compare a frame whose middle row was exposed at ``time_ns``.
-
-        Args:
-            config: the settings by which it was localized,
-            camera: and the camera.
-            cloud: what was localized,
-            result: and what came of it.
-        """
+    def add(self, frame: Watched) -> None:
+        """Compare a frame."""
         self._skipped += 1
         self.other = None
         # The wrong axis makes in-frame turns, and refusals.
-        odd = not result or len(result.shake) > 0
+        odd = not frame.result or len(frame.result.shake) > 0
         due = self.leans or self._dense > 0 or self._skipped >= _EVERY
         due |= odd and self._evidence > _LEAST
         if self._confirmed or not due:
             return
         self._skipped, self._dense = 0, self._dense - 1
-        if not find_solver(config.solver).rolling_shutter:
-            return
+        cloud, config = frame.cloud, frame.config
         if self._localizer is None:
             other = _OTHER_AXIS[ScanDirection(config.scan_direction)]
-            self._localizer = Localizer(replace(camera, scan_direction=other), config)
-        other_result = self._localizer.find(cloud.points, cloud.pixels, cloud.scores)
-        results = [(camera, result), (self._localizer.camera, other_result)]
-        ours, others = _costs(results, cloud.pixels, _TRUNCATED * config.inlier_threshold)
-        ratio = ours - others
-        ratio = min(max(ratio, -_MOST_OF_A_FRAME), _MOST_OF_A_FRAME)
+            self._localizer = Localizer(replace(frame.camera, scan_direction=other), config)
+        found = self._localizer.find(cloud.points, cloud.pixels, cloud.scores)
+        sideways = replace(frame, result=found, camera=self._localizer.camera)
+        ours, others = _costs((frame, sideways), _TRUNCATED * config.inlier_threshold)
+        ratio = min(max(ours - others, -_MOST_OF_A_FRAME), _MOST_OF_A_FRAME)
         self._evidence = max(_MEMORY * self._evidence + ratio, _LEAST)
-        if other_result and self.leans:
-            self._measure(time_ns, other_result, cloud)
+        if found and self.leans:
+            self._measure(sideways, found)
         self._certain = self.wrong and self._evidence > 0.0  # stays until as much speaks against it
         contradicted = self.direction is None and self._monitor.odds.rolling < -_CONTRADICTS
-        if other_result and self._evidence > 0.0 and not contradicted:
-            self.other = other_result
+        if found and self._evidence > 0.0 and not contradicted:
+            self.other = found
 
-    def _measure(self, time_ns: int, estimate: Estimate, cloud: Correspondences) -> None:
-        assert self._localizer is not None
-        camera = self._localizer.camera
-        lens = estimate.lens
-        camera = camera if lens is None else lens.mended(camera)
+    def _measure(self, frame: Watched, estimate: Estimate) -> None:
         try:
-            self._monitor.add(time_ns, camera, estimate, cloud.points, cloud.pixels)
+            _look(self._monitor, frame, estimate)
             self._monitored += 1
             due = self._monitored % _MEASURED_EVERY == 0
             measured = self._monitor.measure() if due else None
@@ -181,37 +168,43 @@ class ScanAxis:
             return
         if measured is None or not measured.contradicts(0.0):
             return
-        large = abs(measured.readout_time) > _LEAST_SHARE * camera.readout_time
+        large = abs(measured.readout_time) > _LEAST_SHARE * frame.camera.readout_time
         if not (large and measured.relative_deviation < _KNOWN):
             return
-        direction = ScanDirection(camera.scan_direction)
+        direction = ScanDirection(frame.camera.scan_direction)
         self.measured = replace(measured, readout_time=abs(measured.readout_time))
         self.direction = direction if measured.readout_time > 0.0 else REVERSED[direction]
 
 
-def _costs(
-    results: list[tuple[Camera, Estimate | Failure]], pixels: Array, most: float
-) -> list[float]:
-    """What results for the same points (n,2) leave: negative logarithms of likelihoods.
+def _look(monitor: ReadoutMonitor, frame: Watched, estimate: Estimate) -> None:
+    """Let a monitor take a frame, with the lens that explains it best."""
+    lens, cloud = estimate.lens, frame.cloud
+    camera = frame.camera if lens is None else lens.mended(frame.camera)
+    monitor.add(frame.time_ns, camera, estimate, cloud.points, cloud.pixels)
+
+
+def _costs(frames: Sequence[Watched], most: float) -> list[float]:
+    """What results for the same points leave: negative logarithms of likelihoods.
 
     Args:
         most: px, where residuals are cut off.
     """
-    estimates = [result for _, result in results if result]
+    estimates = [frame.result for frame in frames if frame.result]
     if not estimates:
-        return [0.0] * len(results)
+        return [0.0] * len(frames)
     noise = max(min(one.residual_rms for one in estimates) / math.sqrt(2.0), _LEAST_NOISE)
 
-    def cost(camera: Camera, result: Estimate | Failure) -> float:
+    def cost(frame: Watched) -> float:
+        result, pixels = frame.result, frame.cloud.pixels
         if not result:
             return len(pixels) * most**2 / (2.0 * noise**2)
         cut = np.fmin(result.residuals, most)  # NaN: unusable by either
-        turns = shake_at(camera.row_time(pixels[result.inliers]), result.shake)[:, :2]
-        moved = float(np.sum((camera.focal_length * turns) ** 2)) / (2.0 * noise**2)
+        turns = shake_at(frame.camera.row_time(pixels[result.inliers]), result.shake)[:, :2]
+        moved = float(np.sum((frame.camera.focal_length * turns) ** 2)) / (2.0 * noise**2)
         of_lens = 0.0 if result.lens is None else _OF_LENS
         return float(cut @ cut) / (2.0 * noise**2) + min(moved, _OF_TURNS) + of_lens
 
-    return [cost(*pair) for pair in results]
+    return [cost(frame) for frame in frames]
 
 
 # Frames from one measurement to the next: few at first, more when there is more to compute.
@@ -248,8 +241,11 @@ class ReadoutWatch:
 
     def __init__(self, notice: Notify) -> None:
         self._notice = notice
-        self._monitor = ReadoutMonitor()
-        self._axis = ScanAxis()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self._monitor, self._axis = ReadoutMonitor(), ScanAxis()
         self._under_way: Measurement | None = None
         self._frames, self._next = 0, _AT_FIRST
         self._said: set[_Kind] = set()
@@ -300,66 +296,35 @@ class ReadoutWatch:
         """Logarithm of the odds that what looks like motion within an image is none."""
         return _CERTAINLY if self.global_shutter else 0.0
 
-    def warm_up(self, camera: Camera) -> None:
-        """Compile what frames of this camera need."""
-        warm_up(camera)
-
-    def reset(self) -> None:
-        """Forget all frames."""
-        self._monitor.reset()
-        self._axis.reset()
-        self._under_way = None
-        self._frames, self._next = 0, _AT_FIRST
-        self._said.clear()
-        self.measured, self.fault, self.error = None, "", 0.0
-        self.far_off = self.global_shutter = self.surely_global = False
-        self.doubtful = self._reversed = False
-        self.trusted = True
-
-    def add(
-        self,
-        config: NodeConfig,
-        camera: Camera,
-        time_ns: int,
-        result: Estimate | Failure,
-        cloud: Correspondences,
-    ) -> NodeConfig:
-        """Take a frame whose middle row was exposed at ``time_ns``, and what came of it.
+    def add(self, frame: Watched) -> NodeConfig:
+        """Take a frame.
 
         Returns:
-            the settings, with the readout time and scan direction that were measured where they
+            its settings, with the readout time and scan direction that were measured where they
             ask for it.
         """
+        config = frame.config
         estimates = config.estimate_readout_time and config.readout_time == 0.0
         wanted = estimates or config.readout_time > 0.0
         if not (wanted and find_solver(config.solver).rolling_shutter):
             return config
-        adopted = self._compare(config, camera, time_ns, result, cloud, estimates)
+        adopted = self._compare(frame, estimates)
         if self.far_off or self.doubtful or (self._axis.leans and self.other_axis):
             self.trusted = False
         elif _is_some(config, self.measured) or self._monitor.odds.shown:
             self.trusted = True
         return adopted
 
-    def _compare(
-        self,
-        config: NodeConfig,
-        camera: Camera,
-        time_ns: int,
-        result: Estimate | Failure,
-        cloud: Correspondences,
-        estimates: bool,
-    ) -> NodeConfig:
+    def _compare(self, frame: Watched, estimates: bool) -> NodeConfig:
         """Compare a frame with what is set; ``estimates``: the settings ask for what is found."""
-        self._axis.add(config, camera, time_ns, cloud, result)
+        config = frame.config
+        self._axis.add(frame)
         if self._axis.wrong:
             return self._other_axis(config, estimates)
-        if not result:
+        if not frame.result:
             return config
-        lens = result.lens
-        camera = camera if lens is None else lens.mended(camera)
         try:
-            measured = self._measure(camera, time_ns, result, cloud)
+            measured = self._measure(frame, frame.result)
         except np.linalg.LinAlgError:  # a frame that says nothing must not stop the next ones
             self._monitor.reset()
             self._under_way, self.doubtful = None, False
@@ -429,10 +394,8 @@ class ReadoutWatch:
             self._said.add(kind)
             self._notice(Notice.READOUT_TIME, text)
 
-    def _measure(
-        self, camera: Camera, time_ns: int, estimate: Estimate, cloud: Correspondences
-    ) -> MeasuredReadout | None:
-        self._monitor.add(time_ns, camera, estimate, cloud.points, cloud.pixels)
+    def _measure(self, frame: Watched, estimate: Estimate) -> MeasuredReadout | None:
+        _look(self._monitor, frame, estimate)
         self._frames += 1
         if self._frames >= self._next:
             self._next += min(max(_AT_FIRST, round(_GROWTH * self._frames)), _LATER)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from rs_localizer.core.reasons import ImuReason, Notice, Reason
+from rs_localizer.io.clouds import EmptyCloudError
 from rs_localizer.io.messages import MessageError
 
 Read = TypeVar("Read")
@@ -43,9 +44,11 @@ def unheard(notice: Notice | ImuReason, text: str) -> None:
 
 
 def read_or_refuse(read: Callable[[Any], Read], message: Any, reason: Reason) -> Read | Refusal:
-    """What is read of a message; refused for this reason if it cannot be."""
+    """What is read of a message; refused for this reason if it cannot be, or as empty."""
     try:
         return read(message)
+    except EmptyCloudError as error:
+        return Refusal(Reason.EMPTY_CLOUD, str(error))
     except MessageError as error:
         return Refusal(reason, str(error))
 

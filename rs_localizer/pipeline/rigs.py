@@ -8,8 +8,7 @@ says, at the time of the frame. Poses are those of ``base_frame``, as of one cam
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,13 +25,12 @@ from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import (
     Correspondences,
-    EmptyCloudError,
+    Keypoints,
     read_correspondences,
     read_keypoints,
     select_inliers,
     thinned,
 )
-from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import CameraShare, Localized
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS
 from rs_localizer.io.transforms import Transform, TransformError, Transforms
@@ -40,7 +38,7 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.frames import ANY_CALIBRATION, FrameLocalizer, oddities
 from rs_localizer.pipeline.inputs import INPUTS, Input
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
-from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
+from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
 from rs_localizer.pipeline.rig_frames import FrameAssembler, Image
 from rs_localizer.pipeline.rig_watch import RigWatch
 from rs_localizer.solvers.table import find_solver
@@ -75,33 +73,21 @@ def inputs_of(config: NodeConfig) -> Mapping[str, Input]:
 
 def _of_camera(item: Input, name: str) -> Input:
     """An input of one camera of a rig."""
+
+    def rig(localizer: FrameLocalizer) -> RigLocalizer:
+        assert isinstance(localizer, RigLocalizer)  # whose inputs these are
+        return localizer
+
     own = replace(item, topic=f"{name}/{item.topic}", about=f"{name}: {item.about}")
     if item.topic == CAMERA_INFO:
         return replace(
             own,
-            use=functools.partial(_calibrate, name),
-            held=functools.partial(_calibration, name),
+            use=lambda localizer, found: rig(localizer).calibrate_camera(name, found),
+            held=lambda localizer: rig(localizer).calibrations.get(name),
         )
-    return replace(own, use=functools.partial(_localize, name, item.topic))
-
-
-def _rig(localizer: FrameLocalizer) -> RigLocalizer:
-    assert isinstance(localizer, RigLocalizer)  # whose inputs these are
-    return localizer
-
-
-def _calibrate(name: str, localizer: FrameLocalizer, calibration: Calibration) -> None:
-    _rig(localizer).calibrate_camera(name, calibration)
-
-
-def _calibration(name: str, localizer: FrameLocalizer) -> Calibration | None:
-    return _rig(localizer).calibrations.get(name)
-
-
-def _localize(
-    name: str, kind: str, localizer: FrameLocalizer, message: Any
-) -> Iterator[Localized | Refusal]:
-    return _rig(localizer).add(name, kind, message)
+    return replace(
+        own, use=lambda localizer, message: rig(localizer).add(name, item.topic, message)
+    )
 
 
 class RigLocalizer(FrameLocalizer):
@@ -111,10 +97,7 @@ class RigLocalizer(FrameLocalizer):
     """
 
     def __init__(
-        self,
-        config: NodeConfig,
-        notice: Notify = unheard,
-        transforms: Transforms | None = None,
+        self, config: NodeConfig, notice: Notify = unheard, transforms: Transforms | None = None
     ) -> None:
         self.calibrations: dict[str, Calibration] = {}
         self._assembler = FrameAssembler(config.cameras, config.rig.window, notice)
@@ -158,14 +141,8 @@ class RigLocalizer(FrameLocalizer):
     @property
     def camera_frame(self) -> str:
         """The optical frame whose axes are the rig's; empty as long as it is unknown."""
-        return next(
-            (
-                self.calibrations[name].frame
-                for name in self._config.cameras
-                if name in self.calibrations
-            ),
-            "",
-        )
+        known = (self.calibrations.get(name) for name in self._config.cameras)
+        return next((calibration.frame for calibration in known if calibration), "")
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -250,18 +227,18 @@ class RigLocalizer(FrameLocalizer):
         self, name: str, kind: str, message: Any, camera: Camera
     ) -> Correspondences | Refusal:
         """What a camera saw of the map."""
-        try:
-            if kind == CORRESPONDENCES:
-                return read_correspondences(message)
-            keypoints = read_keypoints(message)
-        except EmptyCloudError as error:
-            return Refusal(Reason.EMPTY_CLOUD, f"{name}: {error}")
-        except MessageError as error:
-            return Refusal(INPUTS[kind].refused, f"{name}: {error}")
-        by = self._landmarks.how(keypoints, self._config.matching)
+        read: Callable[[Any], Any]
+        read = read_correspondences if kind == CORRESPONDENCES else read_keypoints
+        found: Correspondences | Keypoints | Refusal
+        found = read_or_refuse(read, message, INPUTS[kind].refused)
+        if isinstance(found, Refusal):
+            return replace(found, detail=f"{name}: {found.detail}")
+        if isinstance(found, Correspondences):
+            return found
+        by = self._landmarks.how(found, self._config.matching)
         if isinstance(by, Refusal):
             return by
-        return self._landmarks.match(keypoints, self._config.matching, camera, None)
+        return self._landmarks.match(found, self._config.matching, camera, None)
 
     def _localize_frame(self, images: Sequence[Image]) -> Localized | Refusal:
         reference = images[0].cloud
@@ -318,9 +295,8 @@ class RigLocalizer(FrameLocalizer):
         """Pose and twist of the rig's axes at the published moment."""
         config, cloud = self._config, images[0].cloud
         time_ns = origin_ns + round(1e9 * result.time)
-        own_ns = self.watch.offset_ns(
-            images[0].camera
-        )  # what is published has stamps of that clock
+        # What is published has stamps of that camera's clock.
+        own_ns = self.watch.offset_ns(images[0].camera)
         stamp_ns = time_ns - own_ns if config.pose_time == PoseTime.MID_FRAME else cloud.stamp_ns
         tau = (stamp_ns + own_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
         moving = find_solver(config.solver).rolling_shutter

@@ -12,12 +12,11 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.detections import TagDetections, read_detections
-from rs_localizer.io.messages import MessageError
 from rs_localizer.markers.detection import Detections
 from rs_localizer.markers.map_check import MapCheck
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.pipeline.refusal import Notify, Refusal
+from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse
 
 # The order of corners is held against the map until so many images of two or more tags agree, then
 # in one image of so many.
@@ -54,10 +53,9 @@ class Tags:
 
     def match(self, message: Any) -> Correspondences | Refusal:
         """Correspondences of an AprilTagDetectionArray; never raises for a bad one."""
-        try:
-            detections = read_detections(message)
-        except MessageError as error:
-            return Refusal(Reason.BAD_DETECTIONS, str(error))
+        detections = read_or_refuse(read_detections, message, Reason.BAD_DETECTIONS)
+        if isinstance(detections, Refusal):
+            return detections
         if len(detections.ids) == 0:
             return Refusal(Reason.EMPTY_CLOUD, "the detector has found no tag")
         rows = self._known(detections)
@@ -98,10 +96,8 @@ class Tags:
             self._agreed += 1
             return None
         for order in _ORDERS:
-            if (
-                self._check.fault(self._detections(detections, detections.corners[:, order]))
-                is None
-            ):
+            reordered = self._detections(detections, detections.corners[:, order])
+            if self._check.fault(reordered) is None:
                 # A message has ours backwards.
                 names = [_CORNERS[order.index(k)] for k in (3, 2, 1, 0)]
                 return (
@@ -118,18 +114,17 @@ class Tags:
         )
 
     def _correspondences(self, detections: TagDetections) -> Correspondences:
-        rows = (detections.ids[:, None] + np.arange(4)).ravel()
         sides = np.linalg.norm(np.roll(detections.corners, -1, axis=1) - detections.corners, axis=2)
         scores = np.repeat(sides.min(axis=1), 4)
-        points, pixels = self._points[rows], detections.corners.reshape(-1, 2)
+        found = self._detections(detections, detections.corners)
         names = [(name, "<f8") for name in "xyz"]
         fields = [*names, ("u", "<f4"), ("v", "<f4"), ("score", "<f4"), ("id", "<u4")]
-        table = np.empty(len(rows), fields)
-        for name, column in zip("xyzuv", [*points.T, *pixels.T], strict=True):
+        table = np.empty(len(scores), fields)
+        columns = [*found.points.T, *found.pixels.T, scores, found.ids]
+        for (name, _), column in zip(fields, columns, strict=True):
             table[name] = column
-        table["score"], table["id"] = scores, rows
         return Correspondences(
-            detections.stamp_ns, self._map.map_frame, points, pixels, scores, 0, table
+            detections.stamp_ns, self._map.map_frame, found.points, found.pixels, scores, 0, table
         )
 
 

@@ -17,7 +17,14 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from rs_localizer.config import NO_NAMES, DetectorConfig, NodeConfig
-from rs_localizer.settings import NODES, Kind, SettingsError, load_params_file, settings
+from rs_localizer.settings import (
+    NODE_NAME,
+    NODES,
+    Kind,
+    SettingsError,
+    load_params_file,
+    settings,
+)
 
 PACKAGE = "rs_localizer"
 # Drivers by their package, and their executables; both publish image_raw and camera_info.
@@ -152,25 +159,32 @@ def need_package(name: str, why: str) -> None:
         ) from None
 
 
-def localizer(
-    configurations: Mapping[str, str], remappings: Iterable[tuple[str, Any]],
-    of_map: Mapping[str, Any] | None = None,
+def own_node(
+    configurations: Mapping[str, str], executable: str, name: str, parameters: list[Any],
+    remappings: Iterable[tuple[str, Any]] = (), namespace: Any = None,
 ) -> Node:  # fmt: skip
-    """The node rs_localizer with its params file, what its map says, and the given settings."""
+    """A node of this package, with its log level; in the namespace of all unless one is given."""
     return Node(
         package=PACKAGE,
-        executable="localizer",
-        name="rs_localizer",
-        namespace=LaunchConfiguration("namespace"),
-        parameters=[
-            LaunchConfiguration("params_file"),
-            {**(of_map or {}), **chosen_parameters(configurations)},
-        ],
+        executable=executable,
+        name=name,
+        namespace=LaunchConfiguration("namespace") if namespace is None else namespace,
+        parameters=parameters,
         remappings=list(remappings),
         arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
         output="screen",
         **lifetime(configurations),
     )
+
+
+def localizer(
+    configurations: Mapping[str, str], remappings: Iterable[tuple[str, Any]],
+    of_map: Mapping[str, Any] | None = None,
+) -> Node:  # fmt: skip
+    """The node rs_localizer with its params file, what its map says, and the given settings."""
+    given = {**(of_map or {}), **chosen_parameters(configurations)}
+    parameters = [LaunchConfiguration("params_file"), given]
+    return own_node(configurations, "localizer", NODE_NAME, parameters, remappings)
 
 
 def views(configurations: Mapping[str, str]) -> list[Node]:
@@ -238,11 +252,8 @@ def camera_driver(configurations: Mapping[str, str]) -> list[Node]:
         raise RuntimeError(f"camera must be one of none, {', '.join(DRIVERS)}; got {package!r}")
     need_package(package, f"camera:={package}")
     url = ParameterValue(configurations["calibration"], value_type=str)
-    time = {
-        key: value
-        for key, value in chosen_parameters(configurations).items()
-        if key == "use_sim_time"
-    }
+    chosen = chosen_parameters(configurations)
+    time = {name: chosen[name] for name in chosen if name == "use_sim_time"}
     return [
         Node(
             package=package,
@@ -268,18 +279,10 @@ def detector(
         parameters: those that were given besides.
     """
     image = LaunchConfiguration("image")
-    return Node(
-        package=PACKAGE,
-        executable=name,
-        name=name,
-        namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration(params_file), dict(parameters)],
-        remappings=[
-            ("image", image),
-            ("image/compressed", [image, "/compressed"]),
-            ("camera_info", LaunchConfiguration("camera_info")),
-        ],
-        arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
-        output="screen",
-        **lifetime(configurations),
-    )
+    remappings = [
+        ("image", image),
+        ("image/compressed", [image, "/compressed"]),
+        ("camera_info", LaunchConfiguration("camera_info")),
+    ]
+    given = [LaunchConfiguration(params_file), dict(parameters)]
+    return own_node(configurations, name, name, given, remappings)

@@ -4,10 +4,9 @@
 
 from __future__ import annotations
 
-import functools
 import importlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import rs_localizer
 from rs_localizer.process import limit_threads
@@ -76,33 +75,20 @@ def _help(name: str) -> str:
 
 def main(args: list[str] | None = None) -> int:
     """Run the localizer until Ctrl-C or SIGTERM, which end it with exit code 0 at any time."""
-    return _guarded("localizer", _run, args)
+    return _run("localizer", args)
 
 
 def marker_detector(args: list[str] | None = None) -> int:
     """Run the marker detector likewise."""
-    return _guarded("marker_detector", _run, args)
+    return _run("marker_detector", args)
 
 
 def feature_detector(args: list[str] | None = None) -> int:
     """Run the feature detector likewise."""
-    return _guarded("feature_detector", _run, args)
+    return _run("feature_detector", args)
 
 
-def _run(name: str) -> Run:
-    """What runs a node; imports it, which takes long."""
-    from rs_localizer.ros.node.managed import run
-
-    node, path, _ = _NODES[name]
-    module, _, kind = path.rpartition(".")
-    make = getattr(importlib.import_module(f"rs_localizer.ros.{module}"), kind)
-    return functools.partial(run, make, node)
-
-
-Run = Callable[[StopRequest, list[str] | None], int]
-
-
-def _guarded(name: str, load: Callable[[str], Run], args: list[str] | None) -> int:
+def _run(name: str, args: list[str] | None) -> int:
     limit_threads()
     with StopRequest() as stop:
         try:
@@ -111,8 +97,13 @@ def _guarded(name: str, load: Callable[[str], Run], args: list[str] | None) -> i
                 if text is not None:
                     sys.stdout.write(text)
                     return 0
-                run = load(name)
+                # What takes long.
+                from rs_localizer.ros.node.managed import run
+
+                node, path, _ = _NODES[name]
+                module, _, kind = path.rpartition(".")
+                make = getattr(importlib.import_module(f"rs_localizer.ros.{module}"), kind)
         except ImportError as error:
             sys.stderr.write(f"{name}: {explain(error)}\n")
             return 1
-        return run(stop, args)
+        return run(make, node, stop, args)

@@ -29,6 +29,8 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.published import Broadcast, broadcast
 from rs_localizer.pipeline.refusal import Refusal
 
+from .motions import disturbed
+
 READOUT_TIME = 0.03
 STAMP_NS = 5_000_000_000
 # Axes of the optical frame (right, down, forward) in a body's (forward, left, up): REP-103.
@@ -94,22 +96,6 @@ def estimate() -> Estimate:
         joint_covariance=root @ root.T,
         global_shutter_inliers=4,
         iterations=10,
-    )
-
-
-def disturbed(motion: Motion, error: Array) -> Motion:
-    """The motion with errors in the order of ``Estimate.covariance``, by its definition."""
-    phi, rho, d_omega, d_v, d_alpha, d_a = error.reshape(6, 3)
-    map_from_camera = motion.rotation.T
-    centre = -map_from_camera @ motion.translation + map_from_camera @ rho
-    rotation = Rotation.from_rotvec(-phi).as_matrix() @ motion.rotation
-    return Motion(
-        rotation,
-        -rotation @ centre,
-        motion.angular_velocity + d_omega,
-        motion.linear_velocity + d_v,
-        angular_acceleration=motion.angular_acceleration + d_alpha,
-        linear_acceleration=motion.linear_acceleration + d_a,
     )
 
 

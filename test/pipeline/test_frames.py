@@ -19,9 +19,7 @@ from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized, Pose, Twist
 from rs_localizer.io.recording import make_camera_info
@@ -33,6 +31,8 @@ from rs_localizer.simulation.frames import simulate_frames
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import ConstantVelocity
+
+from .clouds import cloud_of
 
 FIELDS = [(name, 8 * i, 8) for i, name in enumerate("xyzuv")]
 READOUT_TIME = 0.03
@@ -249,13 +249,8 @@ def simulated(direction: str, **settings: Any) -> list[tuple[Any, Any]]:
     motion = ConstantVelocity(np.array([1.0, -2.0, 3.0]), np.array([1.0, 0.5, -1.5]), 0.3)
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
     clean = FrameSettings(points=150, noise=0.0, outliers=0.0)
-    result = []
-    for frame in simulate_frames(camera, motion, world, clean):
-        rows = np.zeros(len(frame.points), [(name, "<f8") for name in "xyzuv"])
-        for name, column in zip("xyzuv", [*frame.points.T, *frame.pixels.T], strict=True):
-            rows[name] = column
-        result.append((make_cloud(make_message, frame.stamp_ns, "map", rows), motion))
-    return result
+    frames = simulate_frames(camera, motion, world, clean)
+    return [(cloud_of(frame.stamp_ns, frame.points, frame.pixels), motion) for frame in frames]
 
 
 @pytest.mark.parametrize("pose_time", list(PoseTime))
@@ -290,17 +285,13 @@ def test_signs_and_frames_against_the_true_motion(make_camera_info, direction, p
 
 def test_no_more_than_max_points_are_used_and_that_is_said_once():
     camera = Camera(640, 480, np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]]))
-    rows = np.zeros(3000, [(name, "<f8") for name in "xyzuv"])
     rng = np.random.default_rng(0)
-    points = rng.uniform((-1.0, -0.7, 2.0), (1.0, 0.7, 4.0), (len(rows), 3))
-    pixels = camera.project(points)
-    for name, column in zip("xyzuv", [*points.T, *pixels.T], strict=True):
-        rows[name] = column
+    points = rng.uniform((-1.0, -0.7, 2.0), (1.0, 0.7, 4.0), (3000, 3))
     notices: list[str] = []
     frames = FrameLocalizer(NodeConfig(max_points=500), lambda name, text: notices.append(text))
     frames.calibrate(read_camera_info(make_camera_info(camera, 0)))
     for stamp_ns in (1, 2):
-        result = frames.localize(make_cloud(make_message, stamp_ns, "map", rows))
+        result = frames.localize(cloud_of(stamp_ns, points, camera.project(points)))
         assert isinstance(result, Localized)
         assert len(result.estimate.inliers) == 500
     assert notices == ["3000 points have come; max_points of them, 500, are used"]
@@ -348,26 +339,28 @@ def test_a_flight_that_goes_on_has_none(jumps):
 
 
 @pytest.mark.parametrize(
-    ("position", "turn"), [((0.0, 0.3, 0.0), (0.0, 0.0, 0.0)), ((0.0, 0.0, 0.0), (0.3, 0.0, 0.0))]
-)
-def test_a_step_that_nobody_makes_is_one(jumps, position, turn):
-    jumps.add(frame(0.0, twist=twist()))
-    assert jumps.add(frame(PERIOD, position, turn, twist=twist())) == 1
-    assert jumps.add(frame(2 * PERIOD, position, turn, twist=twist())) == 1  # it stays there
-
-
-def test_after_a_gap_a_camera_may_be_elsewhere(jumps):
-    jumps.add(frame(0.0, twist=twist()))
-    assert jumps.add(frame(1.0, (0.3, 0.0, 0.0), twist=twist())) == 0
-
-
-def test_without_a_twist_any_camera_may_move(jumps):
-    jumps.add(frame(0.0))
-    assert jumps.add(frame(PERIOD, (0.1, 0.0, 0.0), (0.2, 0.0, 0.0))) == 0  # 3 m/s, 6 rad/s
-    assert jumps.add(frame(2 * PERIOD, (2.0, 0.0, 0.0))) == 1
-
-
-def test_another_map_and_a_clock_that_goes_back_are_jumps(jumps):
-    jumps.add(frame(1.0))
-    assert jumps.add(frame(1.0 + PERIOD, map_frame="other")) == 1
-    assert jumps.add(frame(0.0, map_frame="other")) == 2
+    ("frames", "counts"),
+    [
+        # A step that nobody makes, or turn; it stays there.
+        (
+            [frame(k * PERIOD, (0.0, 0.3 * min(k, 1), 0.0), twist=twist()) for k in range(3)],
+            [0, 1, 1],
+        ),
+        ([frame(k * PERIOD, turn=(0.3 * k, 0.0, 0.0), twist=twist()) for k in range(2)], [0, 1]),
+        # After a gap a camera may be elsewhere.
+        ([frame(k, (0.3 * k, 0.0, 0.0), twist=twist()) for k in (0.0, 1.0)], [0, 0]),
+        # Without a twist it may be moving: 3 m/s, 6 rad/s.
+        (
+            [frame(0.0), frame(PERIOD, (0.1, 0.0, 0.0), (0.2, 0.0, 0.0)),
+             frame(2 * PERIOD, (2.0, 0.0, 0.0))],
+            [0, 0, 1],
+        ),
+        # Another map, and a clock that goes back.
+        (
+            [frame(1.0), frame(1.0 + PERIOD, map_frame="other"), frame(0.0, map_frame="other")],
+            [0, 1, 2],
+        ),
+    ],
+)  # fmt: skip
+def test_jumps_are_counted(jumps, frames, counts):
+    assert [jumps.add(each) for each in frames] == counts

@@ -28,7 +28,7 @@ from rs_localizer.io.trajectories import read_motions
 from rs_localizer.io.transforms import Transform, TransformError, TransformTree, make_transform
 from rs_localizer.offline.replay import imu_first
 from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
-from rs_localizer.pipeline.imu import ImuState, in_camera_axes
+from rs_localizer.pipeline.imu import in_camera_axes
 
 READOUT_TIME = 0.03
 CONFIG = NodeConfig(readout_time=READOUT_TIME)
@@ -72,7 +72,7 @@ class Flown:
         self._truth = flight.truth
         self.results: list[Localized | Refusal] = []
         self.notices: Counter[str] = Counter()
-        self.state: ImuState | None = None
+        self.state: Any = None
 
     @property
     def frames(self) -> list[Localized]:
@@ -108,7 +108,9 @@ def fly(
     change: Change = lambda message, time: (message,),
     config: NodeConfig = CONFIG,
     mounting: Any = None,
+    most: int = 1000,
 ) -> Flown:
+    """Localize a flight, or so many of its frames."""
     flown = Flown(flight)
     tree = TransformTree()
     if mounting is not False:
@@ -127,6 +129,8 @@ def fly(
         return item[0] == "/correspondences" and frames.awaits_imu(stamp_ns(item[2]), 1.0)
 
     for topic, _, message in imu_first(changed(), "/imu", awaits):
+        if len(flown.results) == most:
+            break
         if topic == "/camera_info":
             frames.calibrate(read_camera_info(message))
         elif topic == "/imu":
@@ -151,7 +155,6 @@ def later(message: Any, seconds: float) -> Any:
 def test_it_makes_poses_better(flight):
     both, alone = fly(flight), fly(flight, lambda message, time: ())
     both.assert_none_is_lost_or_wrong(count(flight))
-    assert both.state is not None
     assert both.state.share == 1.0
     assert both.state.unused is None
     assert both.state.rate == pytest.approx(400.0)
@@ -159,10 +162,10 @@ def test_it_makes_poses_better(flight):
     assert np.median(both.errors()[0]) < 0.75 * np.median(alone.errors()[0])
     # An IMU that is not used changes nothing, to the last bit.
     for other in (
-        fly(flight, config=NodeConfig(readout_time=READOUT_TIME, imu=Imu(use="none"))),
-        fly(flight, mounting=False),
+        fly(flight, config=NodeConfig(readout_time=READOUT_TIME, imu=Imu(use="none")), most=30),
+        fly(flight, mounting=False, most=30),
     ):
-        for a, b in zip(other.frames, alone.frames, strict=True):
+        for a, b in zip(other.frames, alone.frames[:30], strict=True):
             assert np.array_equal(a.pose.position, b.pose.position)
             assert np.array_equal(a.pose.rotation, b.pose.rotation)
 
@@ -179,43 +182,22 @@ def clipped(message: Any, limit: float) -> Any:
     return result
 
 
-def jumped(seconds: float) -> Change:
-    return lambda message, time: (later(message, seconds if time > 1.0 else 0.0),)
-
-
-def rarer() -> Change:
-    taken = Counter[str]()
-
-    def change(message: Any, time: float) -> Iterable[Any]:
-        taken["all"] += 1
-        return (message,) if taken["all"] % 8 == 0 else ()
-
-    return change
-
-
+# What a reading buffer by itself says of others is in test/inertial/test_buffer.py.
 FAULTS: dict[str, tuple[Change, ImuReason]] = {
     "stops": (without(1.0, 9.0), ImuReason.STOPPED),
     "begins late": (without(-9.0, 1.0), ImuReason.BEGINS_LATER),
-    "jumps ahead": (jumped(5.0), ImuReason.BEGINS_LATER),
-    "is set back": (jumped(-5.0), ImuReason.STOPPED),
-    "has another clock": (lambda m, time: (later(m, 1000.0),), ImuReason.BEGINS_LATER),
-    "comes at 50 Hz": (rarer(), ImuReason.TOO_SLOW),
+    "is set back": (
+        lambda message, time: (later(message, -5.0 if time > 1.0 else 0.0),), ImuReason.STOPPED
+    ),
     "is cut": (without(1.0, 1.05), ImuReason.GAP),
-}
+}  # fmt: skip
 
 
-# What a reading buffer by itself says of the others is in test/inertial/test_buffer.py.
-QUICK = ("stops", "begins late", "is set back", "is cut")
-
-
-@pytest.mark.parametrize(
-    "fault", [*QUICK, *(pytest.param(f, marks=pytest.mark.bench) for f in FAULTS if f not in QUICK)]
-)
+@pytest.mark.parametrize("fault", FAULTS)
 def test_the_camera_goes_on_alone(flight, fault):
     change, reason = FAULTS[fault]
     flown = fly(flight, change)
     flown.assert_none_is_lost_or_wrong(count(flight))
-    assert flown.state is not None
     assert flown.state.reasons[reason] > 0
     lasts = fault not in ("is cut", "begins late")
     assert flown.notices[reason] == lasts  # told once, not at every frame
@@ -231,7 +213,6 @@ def test_a_gyroscope_at_the_end_of_its_range(tmp_path):
     flight = Flight(path)
     flown = fly(flight, lambda message, time: (clipped(message, 2.2),))
     flown.assert_none_is_lost_or_wrong(count(flight))
-    assert flown.state is not None
     assert flown.state.reasons[ImuReason.SATURATED] > 3
     assert flown.state.used > 3
 
@@ -255,11 +236,8 @@ def test_a_wrong_mounting_is_noticed_and_told_with_its_angle(flight):
     rotation.x, rotation.y, rotation.z, rotation.w = wrong.as_quat().tolist()
     flown = fly(flight, mounting=upside_down)
     flown.assert_none_is_lost_or_wrong(count(flight))
-    assert flown.state is not None
-    assert flown.state.unused is not None
     assert flown.state.unused.reason == ImuReason.TURNED
     angle = re.search(r"by (\d+) degrees", str(flown.state.unused))
-    assert angle is not None
     assert 175 <= int(angle[1]) <= 180
 
 
@@ -275,10 +253,8 @@ def alternating() -> Change:
 
 
 def test_two_frame_ids_in_turns_are_named(flight):
-    flown = fly(flight, alternating())
-    flown.assert_none_is_lost_or_wrong(count(flight))
-    assert flown.state is not None
-    assert flown.state.mostly is not None
+    flown = fly(flight, alternating(), most=30)
+    flown.assert_none_is_lost_or_wrong(30)
     assert flown.state.mostly.reason == ImuReason.TWO_FRAMES
     assert "'imu_a' and 'imu_b'" in str(flown.state.mostly)
 
@@ -286,9 +262,8 @@ def test_two_frame_ids_in_turns_are_named(flight):
 @pytest.mark.parametrize(("down", "degrees"), [((0.0, 0.0, -1.0), 0.0), ((0.0, 1.0, 0.0), 90.0)])
 def test_gravity_is_compared_with_the_map(flight, down, degrees):
     imu = Imu(gravity=True)
-    flown = fly(flight, config=NodeConfig(readout_time=READOUT_TIME, imu=imu, gravity_in_map=down))
-    assert flown.state is not None
-    assert flown.state.gravity is not None
+    config = NodeConfig(readout_time=READOUT_TIME, imu=imu, gravity_in_map=down)
+    flown = fly(flight, config=config)
     assert math.degrees(flown.state.gravity) == pytest.approx(degrees, abs=5.0)
 
 
@@ -307,7 +282,6 @@ def test_two_hundred_interruptions(flight):
 
     flown = fly(flight, change)
     flown.assert_none_is_lost_or_wrong(count(flight))
-    assert flown.state is not None
     assert flown.state.reasons[ImuReason.GAP] > 5
     # What is free of gaps uses it at once, and no frame has to be searched anew.
     longest = 2.5 * MS * 1000 / 400
@@ -325,9 +299,9 @@ def test_two_hundred_interruptions(flight):
 
 def test_frames_that_stand_alone_use_it_too(flight):
     config = NodeConfig(readout_time=READOUT_TIME, tracking=False)
-    both, alone = fly(flight, config=config), fly(flight, lambda message, time: (), config)
-    both.assert_none_is_lost_or_wrong(count(flight))
-    assert both.state is not None
+    both = fly(flight, config=config, most=45)
+    alone = fly(flight, lambda message, time: (), config, most=45)
+    both.assert_none_is_lost_or_wrong(45)
     assert both.state.share > 0.9
     assert not any(frame.estimate.tracked for frame in both.frames)
     assert np.median(both.errors()[0]) < 0.75 * np.median(alone.errors()[0])
@@ -338,9 +312,7 @@ def test_without_a_readout_time_or_for_a_global_shutter_it_is_not_used_and_that_
         (NodeConfig(), ImuReason.NO_READOUT_TIME),
         (NodeConfig(readout_time=READOUT_TIME, solver="p3p"), ImuReason.NOT_TRACKING),
     ):
-        flown = fly(flight, config=config)
-        assert flown.state is not None
-        assert flown.state.unused is not None
+        flown = fly(flight, config=config, most=8)
         assert flown.state.unused.reason == reason
         assert flown.notices[reason] == 1
 
@@ -372,7 +344,6 @@ def test_a_fixed_mounting_turns_rates_and_forces():
         readings(rates, forces), TIMES, tree({0: mounting}, True), FRAMES, EXPOSURE, 10 * MS
     )
     np.testing.assert_allclose(found.angular_velocity, mounting.apply(rates), atol=1e-12)
-    assert found.specific_force is not None
     np.testing.assert_allclose(found.specific_force, mounting.apply(forces), atol=1e-12)
     assert found.times_ns is TIMES
 
@@ -406,7 +377,6 @@ def test_a_head_that_turns_the_camera_turns_its_rates():
     true = at((found.times_ns - NOW) * 1e-9)
     expected = true.apply([0.1, 0.2, -0.3]) + turn
     np.testing.assert_allclose(found.angular_velocity, expected, atol=1e-6)
-    assert found.specific_force is not None
     np.testing.assert_allclose(found.specific_force, true.apply([0.0, 0.0, 9.8]), atol=1e-5)
 
 

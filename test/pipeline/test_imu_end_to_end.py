@@ -16,11 +16,12 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.config import Imu, NodeConfig
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms import Transform, TransformTree, make_transform
 from rs_localizer.pipeline.frames import FrameLocalizer
+
+from .clouds import cloud_of
 
 Array = NDArray[np.float64]
 
@@ -72,12 +73,8 @@ def cloud(seconds: float, direction: str, rng: np.random.Generator) -> object:
     rays = np.c_[(pixels - CENTRE) / FOCAL, np.ones(80)] * rng.uniform(2.0, 8.0, (80, 1))
     points = map_from_camera(seen).apply(rays) + position(seen)
     pixels[:8] = rng.uniform([0.0, 0.0], [WIDTH - 1, HEIGHT - 1], (8, 2))
-    rows = np.empty(80, [(name, "<f8") for name in "xyzuv"])
-    for name, column in zip("xyzuv", [*points.T, *pixels.T], strict=True):
-        rows[name] = column
-    for name in "uv":
-        rows[name] += rng.normal(scale=0.3, size=80)
-    return make_cloud(make_message, START_NS + round(1e9 * seconds), "map", rows)
+    noise = rng.normal(scale=0.3, size=(2, 80)).T
+    return cloud_of(START_NS + round(1e9 * seconds), points, pixels + noise)
 
 
 def measured(stamp_ns: int, rate: Array) -> SimpleNamespace:

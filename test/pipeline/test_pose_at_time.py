@@ -15,6 +15,8 @@ from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.types import Estimate
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at, with_timing
 
+from .motions import disturbed
+
 READOUT_TIME = 0.03
 TAUS = [-0.5, 0.0, 0.3, -7.0]
 # Per readout: none, nearly none, fast, and around half a turn.
@@ -46,24 +48,6 @@ def estimate(rate: float, seed: int = 0, acceleration: float = 0.0, shake: float
         joint_covariance=root @ root.T,
         global_shutter_inliers=10,
         iterations=100,
-    )
-
-
-def disturbed(motion: Estimate, error: Array) -> Estimate:
-    """The motion with errors in the order of its joint covariance, by its definition."""
-    phi, rho, d_omega, d_v, d_alpha, d_a = error[:18].reshape(6, 3)
-    map_from_camera = motion.rotation.T
-    centre = -map_from_camera @ motion.translation + map_from_camera @ rho
-    rotation = Rotation.from_rotvec(-phi).as_matrix() @ motion.rotation
-    return replace(
-        motion,
-        rotation=rotation,
-        translation=-rotation @ centre,
-        angular_velocity=motion.angular_velocity + d_omega,
-        linear_velocity=motion.linear_velocity + d_v,
-        angular_acceleration=motion.angular_acceleration + d_alpha,
-        linear_acceleration=motion.linear_acceleration + d_a,
-        shake=motion.shake + error[18:].reshape(-1, 3),
     )
 
 
@@ -104,13 +88,12 @@ def twist(motion: Estimate, tau: float) -> Array:
     return np.concatenate([linear, angular])
 
 
-def numerical_jacobian(
-    function: Callable[[Array], Array], step: float, size: int = 3 * len(DEVIATIONS)
-) -> Array:
-    columns = [
-        (function(step * unit) - function(-step * unit)) / (2.0 * step) for unit in np.eye(size)
-    ]
-    return np.array(columns).T
+def covariance(motion: Estimate, function: Callable[[Array], Array], step: float) -> Array:
+    """Of a function of the motion's errors, by central differences."""
+    units = step * np.eye(len(motion.joint_covariance))
+    columns = [(function(unit) - function(-unit)) / (2.0 * step) for unit in units]
+    jacobian = np.array(columns).T
+    return jacobian @ motion.joint_covariance @ jacobian.T
 
 
 @pytest.mark.parametrize("tau", TAUS)
@@ -121,6 +104,9 @@ def test_pose(rate, tau):
     result = pose_at(motion, tau)
     assert np.allclose(result.rotation, rotation, atol=1e-13)
     assert np.allclose(result.position, position, atol=1e-13)
+    motion = estimate(rate)
+    expected = covariance(motion, lambda error: pose_error(motion, tau, error), 1e-5)
+    assert np.allclose(pose_at(motion, tau).covariance, expected, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("tau", TAUS)
@@ -130,26 +116,11 @@ def test_twist_is_the_rate_of_change_of_the_pose(rate, tau):
     result = twist_at(motion, tau, READOUT_TIME)
     expected = twist(motion, tau)
     assert np.allclose([*result.linear, *result.angular], expected, rtol=1e-6, atol=2e-6)
-
-
-@pytest.mark.parametrize("tau", TAUS)
-@pytest.mark.parametrize("rate", RATES)
-def test_pose_covariance(rate, tau):
-    motion = estimate(rate)
-    jacobian = numerical_jacobian(lambda error: pose_error(motion, tau, error), 1e-5)
-    expected = jacobian @ motion.joint_covariance @ jacobian.T
-    assert np.allclose(pose_at(motion, tau).covariance, expected, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("tau", TAUS)
-@pytest.mark.parametrize("rate", RATES)
-def test_twist_covariance(rate, tau):
-    motion = estimate(rate)
     # Far outside the readout there is no shaking.
-    covariance = motion.joint_covariance[:18, :18]
-    motion = replace(motion, shake=np.zeros((0, 3)), joint_covariance=covariance)
-    jacobian = numerical_jacobian(lambda error: twist(disturbed(motion, error), tau), 1e-4, 18)
-    expected = jacobian @ motion.joint_covariance @ jacobian.T
+    motion = estimate(rate)
+    joint = motion.joint_covariance[:18, :18]
+    motion = replace(motion, shake=np.zeros((0, 3)), joint_covariance=joint)
+    expected = covariance(motion, lambda error: twist(disturbed(motion, error), tau), 1e-4)
     found = twist_at(motion, tau, READOUT_TIME).covariance
     assert np.allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
@@ -164,8 +135,7 @@ def test_covariances_of_an_uneven_motion(acceleration, shake, tau):
         (twist_at(motion, tau, READOUT_TIME).covariance,
          lambda error: twist(disturbed(motion, error), tau), 1e-4),
     ):  # fmt: skip
-        jacobian = numerical_jacobian(function, step)
-        expected = jacobian @ motion.joint_covariance @ jacobian.T
+        expected = covariance(motion, function, step)
         scale = np.sqrt(np.diag(expected))
         assert np.allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale),
                            atol=0.005)  # fmt: skip

@@ -17,10 +17,8 @@ from rs_localizer import data
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
-from rs_localizer.io.bags import make_message, open_bag
+from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.outputs import Localized
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.offline.replay import find_topics, replay
@@ -30,23 +28,24 @@ from rs_localizer.simulation.frames import simulate_frames
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import RecordedMotion, TrueState, sampled_states
+from rs_localizer.trajectory.readout_equations import MeasuredReadout
+
+from .clouds import cloud_of
 
 READOUT = 0.02
 CAMERA = Camera(
     640, 480, np.array([[420.0, 0.0, 319.5], [0.0, 420.0, 239.5], [0.0, 0.0, 1.0]]),
     readout_time=READOUT,
 )  # fmt: skip
+CALIBRATION = read_camera_info(make_camera_info(CAMERA, 0))
 FRAMES = 80
 START = 600  # frames into the recording, where the hand is on its way
 
 
 @cache
-def clouds(direction: str = "top_to_bottom", count: int = FRAMES, start: int = START) -> list[Any]:
-    return [message for message, _ in frames_with_truth(direction, count, start)]
-
-
-@cache
-def frames_with_truth(direction: str, count: int, start: int) -> list[tuple[Any, TrueState]]:
+def frames_with_truth(
+    direction: str = "top_to_bottom", count: int = FRAMES, start: int = START
+) -> list[tuple[Any, TrueState]]:
     """Clouds, and where the camera was when their first rows, or columns, were exposed."""
     motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
     world = room(sampled_states(motion).positions, np.random.default_rng(0), count=3000)
@@ -56,48 +55,52 @@ def frames_with_truth(direction: str, count: int, start: int) -> list[tuple[Any,
     messages = []
     camera = changed(CAMERA, scan_direction=direction)
     for frame in simulate_frames(camera, motion, world, seen, stamps_ns=stamps):
-        rows = np.zeros(len(frame.points), [(name, "<f8") for name in "xyzuv"])
-        for name, column in zip("xyzuv", [*frame.points.T, *frame.pixels.T], strict=True):
-            rows[name] = column
-        cloud = make_cloud(make_message, frame.stamp_ns, "map", rows)
+        cloud = cloud_of(frame.stamp_ns, frame.points, frame.pixels)
         messages.append((cloud, frame.first_row))
     return messages
 
 
-def watched(count: int = FRAMES, **settings: Any) -> tuple[FrameLocalizer, list[str]]:
-    notices: list[str] = []
+class Watched:
+    """What is localized of some of the frames, and what is said of it."""
 
-    def notice(name: str, text: str) -> None:
-        if name == "readout_time":
-            notices.append(text)
+    def __init__(self, count: int = FRAMES, seen: Any = None, **settings: Any) -> None:
+        self.clouds = [message for message, _ in seen or frames_with_truth()]
+        self.said: list[tuple[str, str]] = []
+        self.frames = FrameLocalizer(NodeConfig(**settings), lambda *said: self.said.append(said))
+        self.frames.calibrate(CALIBRATION)
+        self.watch = self.frames.readout_watch
+        self.results = [self.frames.localize(message) for message in self.clouds[:count]]
 
-    frames = FrameLocalizer(NodeConfig(**settings), notice)
-    frames.calibrate(read_camera_info(make_camera_info(CAMERA, 0)))
-    for message in clouds()[:count]:
-        frames.localize(message)
-    return frames, notices
+    @property
+    def notices(self) -> list[str]:
+        """Of the readout time."""
+        return [text for name, text in self.said if name == "readout_time"]
+
+    def last(self) -> Any:
+        """What the last frame gives, which has a twist."""
+        found = self.frames.localize(self.clouds[-1])
+        assert found
+        assert found.twist is not None
+        return found
 
 
 @pytest.mark.parametrize(("factor", "tracking"), [(0.8, True), (1.2, False)])
 def test_a_wrong_readout_time_is_said_once(factor, tracking):
-    frames, notices = watched(readout_time=factor * READOUT, tracking=tracking)
-    assert len(notices) == 1
-    assert notices[0].startswith("estimated readout time ")
-    assert notices[0].endswith(f" ms differs from readout_time = {1e3 * factor * READOUT:g} ms")
-    found = frames.readout_watch.measured
+    seen = Watched(readout_time=factor * READOUT, tracking=tracking)
+    (text,) = seen.notices
+    assert text.startswith("estimated readout time ")
+    assert text.endswith(f" ms differs from readout_time = {1e3 * factor * READOUT:g} ms")
+    found = seen.watch.measured
     assert found is not None
     assert abs(found.readout_time - READOUT) < 4.0 * found.deviation < 0.1 * READOUT
-    assert frames.readout_watch.fault
-    assert not frames.readout_watch.far_off
+    assert seen.watch.fault
+    assert not seen.watch.far_off
     # As long as it is wrong, what is published is as uncertain as that.
-    error = frames.readout_watch.error
+    error = seen.watch.error
     assert error == pytest.approx(0.2 * READOUT * max(factor, 1.0), rel=0.1)
-    last = frames.localize(clouds()[-1])
-    assert last
-    assert last.twist is not None
-    speed = np.concatenate([last.twist.linear, last.twist.angular])
-    known = np.linalg.solve(last.twist.covariance, speed) @ speed
-    assert known < (factor * READOUT / error) ** 2
+    twist = seen.last().twist
+    speed = np.concatenate([twist.linear, twist.angular])
+    assert np.linalg.solve(twist.covariance, speed) @ speed < (factor * READOUT / error) ** 2
 
 
 @pytest.mark.parametrize(("curl", "rate", "told"), [(0.0, 0.3, 0.015), (0.001, 0.05, 0.03)])
@@ -106,12 +109,11 @@ def test_poses_do_not_go_to_and_fro_between_trust_and_doubt(curl, rate, told):
     x, y = (
         part.ravel() for part in np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.06, 0.06, 6))
     )
-    rows = np.zeros(len(x), [(name, "<f8") for name in "xyzuv"])
-    rows["x"], rows["y"] = x, y
+    flat = np.column_stack([x, y, 0.0 * x])
     paper = np.column_stack([x, y, curl * (x / 0.1) ** 2])
     rng, trusted = np.random.default_rng(0), []
     frames = FrameLocalizer(NodeConfig(readout_time=told, map_deviation=2e-4))
-    frames.calibrate(read_camera_info(make_camera_info(CAMERA, 0)))
+    frames.calibrate(CALIBRATION)
     for k in range(45):
         stamp, pixels = k / 30.0, np.zeros((len(x), 2))
         for _ in range(4):  # a point is where its row sees it
@@ -124,19 +126,17 @@ def test_poses_do_not_go_to_and_fro_between_trust_and_doubt(curl, rate, told):
             places = Rotation.from_rotvec(np.column_stack(turns)).apply(paper)
             places += np.column_stack([0.01 * np.sin(t), 0.01 * np.cos(1.3 * t), 0.4 + 0 * t])
             pixels = (places @ CAMERA.K.T)[:, :2] / places[:, 2:]
-        rows["u"], rows["v"] = (pixels + rng.normal(0.0, 0.15, pixels.shape)).T
-        assert frames.localize(make_cloud(make_message, 10**9 + round(1e9 * stamp), "map", rows))
+        pixels = pixels + rng.normal(0.0, 0.15, pixels.shape)
+        assert frames.localize(cloud_of(10**9 + round(1e9 * stamp), flat, pixels))
         trusted.append(frames.readout_watch.trusted)
     changes = np.count_nonzero(np.diff(trusted))
     assert changes <= (0 if curl == 0.0 else 1)
 
 
 def test_the_right_one_is_confirmed():
-    frames, notices = watched(readout_time=READOUT)
-    assert notices == []
-    assert frames.readout_watch.fault == ""
-    assert not frames.readout_watch.far_off
-    found = frames.readout_watch.measured
+    seen = Watched(readout_time=READOUT)
+    assert (seen.notices, seen.watch.fault, seen.watch.far_off) == ([], "", False)
+    found = seen.watch.measured
     assert found is not None
     assert abs(found.readout_time - READOUT) < 4.0 * found.deviation
 
@@ -154,21 +154,17 @@ def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm():
 @pytest.mark.parametrize("tracking", [True, pytest.param(False, marks=pytest.mark.bench)])
 def test_a_reversed_scan_is_said_and_covariances_hold(tracking):
     given = {"readout_time": READOUT, "tracking": tracking}
-    frames, (text,) = watched(FRAMES - 1, scan_direction="bottom_to_top", **given)
+    seen = Watched(FRAMES - 1, scan_direction="bottom_to_top", **given)
+    (text,) = seen.notices
     assert "against scan_direction bottom_to_top" in text
     assert text.endswith("is it top_to_bottom?")
-    assert frames.readout_watch.far_off
-    assert frames.readout_watch.may_be_reversed
-    right, _ = watched(FRAMES - 1, **given)
-    last, known = (of.localize(clouds()[-1]) for of in (frames, right))
-    assert last
-    assert known
+    assert seen.watch.far_off
+    assert seen.watch.may_be_reversed
+    last, known = seen.last(), Watched(FRAMES - 1, **given).last()
     way = known.pose.position - last.pose.position
     turn = logarithm(known.pose.rotation @ last.pose.rotation.T)
     assert np.linalg.norm(way) > 2e-3  # the first row is the last
     assert within(np.r_[way, turn], last.pose.covariance)
-    assert last.twist is not None
-    assert known.twist is not None
     twist = (known.twist.linear - last.twist.linear, known.twist.angular - last.twist.angular)
     assert within(np.concatenate(twist), last.twist.covariance)
 
@@ -177,42 +173,37 @@ def within(error: np.ndarray, covariance: np.ndarray) -> bool:
     return bool(error @ np.linalg.solve(covariance, error) < 16.8)  # 99 % of six
 
 
-def test_a_global_shutter_has_no_twist():
-    frames = FrameLocalizer(NodeConfig(readout_time=READOUT))
-    with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
-        for (*_, found), _ in zip(replay(bag, find_topics(bag), frames), range(40), strict=False):
-            assert found
-    assert found.twist is None
-    assert "(a global shutter)" in frames.readout_watch.fault
-
-
 @pytest.mark.parametrize("tracking", [True, False])
-def test_a_global_shutter_is_known_within_a_second_and_stays_one(tracking):
+def test_a_global_shutter_is_known_within_a_second_and_has_no_twist(tracking):
     frames = FrameLocalizer(NodeConfig(readout_time=READOUT, tracking=tracking))
     with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
-        for (*_, found), _ in zip(replay(bag, find_topics(bag), frames), range(30), strict=False):
-            assert found
+        answers = replay(bag, find_topics(bag), frames)
+        found = [found for (*_, found), _ in zip(answers, range(40), strict=False)]
+    assert all(found)
     assert frames.readout_watch.far_off
     assert frames.readout_watch.global_shutter
-    assert np.linalg.norm(found.estimate.angular_velocity) < 1e-4  # 0.3 deg/s
+    assert "(a global shutter)" in frames.readout_watch.fault
+    assert found[-1].twist is None
+    assert np.linalg.norm(found[29].estimate.angular_velocity) < 1e-4  # 0.3 deg/s
 
 
 @pytest.mark.parametrize("change", ["reset", "settings", "camera", "map"])
 def test_what_changes_starts_afresh(change):
-    frames, notices = watched(40, readout_time=0.8 * READOUT)
-    assert notices
+    seen = Watched(2, readout_time=0.8 * READOUT)
+    frames = seen.frames
+    seen.watch.measured = MeasuredReadout(READOUT, 1e-4, 50, 50.0)
+    seen.watch.fault = "it differs"
     if change == "reset":
         frames.reset()
     elif change == "settings":
         frames.config = changed(frames.config, seed=1)
     elif change == "camera":
-        frames.calibrate(read_camera_info(make_camera_info(changed(CAMERA, width=641), 0)))
+        frames.calibrate(changed(CALIBRATION, width=641))
     else:
-        message = clouds()[40]
-        header = changed(message.header, frame_id="another map")
-        frames.localize(changed(message, header=header))
-    assert frames.readout_watch.measured is None
-    assert frames.readout_watch.fault == ""
+        message = seen.clouds[2]
+        frames.localize(changed(message, header=changed(message.header, frame_id="another map")))
+    assert seen.watch.measured is None
+    assert seen.watch.fault == ""
 
 
 @pytest.mark.parametrize(
@@ -220,34 +211,17 @@ def test_what_changes_starts_afresh(change):
 )
 def test_the_readout_time_from_nothing(direction):
     given = {"estimate_readout_time": True, "scan_direction": direction}
-    frames, notices = watched(FRAMES - 1, **given)
-    assert len(notices) == 1
-    assert notices[0].startswith("estimated: ")
-    assert frames.config.scan_direction == "top_to_bottom"
-    assert frames.config.readout_time == pytest.approx(READOUT, rel=0.06)
-    assert frames.config.readout_time_deviation < 0.02 * READOUT * 1.06
-    last = frames.localize(clouds()[-1])
-    assert last
-    assert last.twist is not None
-    assert last.estimate.tracked
+    seen = Watched(FRAMES - 1, **given)
+    (text,) = seen.notices
+    assert text.startswith("estimated: ")
+    config = seen.frames.config
+    assert config.scan_direction == "top_to_bottom"
+    assert config.readout_time == pytest.approx(READOUT, rel=0.06)
+    assert config.readout_time_deviation < 0.02 * READOUT * 1.06
+    assert seen.last().estimate.tracked
     # Of another camera nothing is known yet.
-    frames.calibrate(read_camera_info(make_camera_info(changed(CAMERA, width=641), 0)))
-    assert frames.config == NodeConfig(**given)
-
-
-def sideways(
-    count: int, start: int = START, **settings: Any
-) -> tuple[FrameLocalizer, list[str], list[Localized | Refusal]]:
-    """Frames of a camera that scans from left to right, by the default direction."""
-    notices: list[str] = []
-
-    def notice(name: str, text: str) -> None:
-        notices.append(f"{name}: {text}")
-
-    frames = FrameLocalizer(NodeConfig(**settings), notice)
-    frames.calibrate(read_camera_info(make_camera_info(CAMERA, 0)))
-    messages = clouds("left_to_right", count, start)
-    return frames, notices, [frames.localize(message) for message in messages]
+    seen.frames.calibrate(changed(CALIBRATION, width=641))
+    assert seen.frames.config == NodeConfig(**given)
 
 
 @pytest.mark.parametrize(
@@ -259,27 +233,26 @@ def sideways(
 def test_the_wrong_axis_is_named_and_no_pose_comes_of_it(tracking, start):
     # Before: 7 to 26 frames had poses 0.5 to 3.5 degrees off, at most one in five inside its 95 %
     # region, and the advice was to calibrate again, or that the shutter is a global one.
-    frames, notices, results = sideways(FRAMES, start, readout_time=READOUT, tracking=tracking)
-    assert not any(results[20:])
-    for result, (_, truth) in zip(
-        results, frames_with_truth("left_to_right", FRAMES, start), strict=True
-    ):
-        if not result:
-            continue
-        turn = logarithm(result.pose.rotation @ truth.rotations[0].T)
-        assert within(np.r_[result.pose.position - truth.positions[0], turn],
-                      result.pose.covariance)  # fmt: skip
-    refusal = frames.localize(clouds("left_to_right", FRAMES, start)[-1])
+    sideways = frames_with_truth("left_to_right", FRAMES, start)
+    seen = Watched(seen=sideways, readout_time=READOUT, tracking=tracking)
+    assert not any(seen.results[20:])
+    for result, (_, truth) in zip(seen.results, sideways, strict=True):
+        if result:
+            turn = logarithm(result.pose.rotation @ truth.rotations[0].T)
+            off = np.r_[result.pose.position - truth.positions[0], turn]
+            assert within(off, result.pose.covariance)
+    refusal = seen.frames.localize(seen.clouds[-1])
     assert isinstance(refusal, Refusal)
     assert refusal.reason == Reason.SCAN_AXIS
     assert "not top_to_bottom" in refusal.detail
-    named = r"readout_time: the image shows .* moves left_to_right in (19\.9|2)"
-    assert any(re.match(named, text) for text in notices)
-    assert not any("global" in text for text in notices)
+    named = r"the image shows .* moves left_to_right in (19\.9|2)"
+    assert any(re.match(named, text) for text in seen.notices)
+    assert not any("global" in text for _, text in seen.said)
 
 
 def test_the_axis_is_found_with_the_readout_time():
-    frames, _, results = sideways(110, estimate_readout_time=True)
-    assert frames.config.scan_direction == "left_to_right"
-    assert frames.config.readout_time == pytest.approx(READOUT, rel=0.06)
-    assert results[-1]
+    sideways = frames_with_truth("left_to_right", 110)
+    seen = Watched(110, sideways, estimate_readout_time=True)
+    assert seen.frames.config.scan_direction == "left_to_right"
+    assert seen.frames.config.readout_time == pytest.approx(READOUT, rel=0.06)
+    assert seen.results[-1]

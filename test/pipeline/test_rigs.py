@@ -112,7 +112,7 @@ SIDEWAYS = np.array([0.3, 0.8, -0.5]) / np.linalg.norm([0.3, 0.8, -0.5])
 @pytest.mark.parametrize(
     ("degrees", "centimetres", "scene", "seconds"),
     # Before a wall, lenses of ordinary calibrations explain it for longer.
-    [(1.0, 0.0, rich, 3.0), (0.0, 1.0, rich, 3.0), (0.0, 1.0, lambda motion: wall(), 6.0)],
+    [(1.0, 1.0, rich, 3.0), (0.0, 1.0, lambda motion: wall(), 6.0)],
 )
 def test_a_wrong_extrinsic_is_named(tmp_path, degrees, centimetres, scene, seconds):
     motion, (rotation, translation) = hand(5.0, seconds), PARTS.camera_from_rig["right"]
@@ -214,15 +214,11 @@ def test_one_camera_gives_the_same_bytes_by_name(tmp_path):
             np.testing.assert_array_equal(one.inliers[field], other.inliers[field])
 
 
-def prepare_named(path, cameras):
-    with open_bag(path) as bag:
-        prepare(bag, build({"cameras": cameras, "readout_time": 0.03}))
-
-
 def test_what_is_missing_is_said(tmp_path, opposed):
-    path, _ = opposed
-    with pytest.raises(BagError, match="has no topic rear/camera_info; it has /left/camera_info"):
-        prepare_named(path, ["left", "rear"])
+    settings = build({"cameras": ["left", "rear"], "readout_time": 0.03})
+    said = "has no topic rear/camera_info; it has /left/camera_info"
+    with open_bag(opposed[0]) as bag, pytest.raises(BagError, match=said):
+        prepare(bag, settings)
     record(tmp_path / "bag", seconds=0.2, names=("left",))
     frames, refused, _ = localize(tmp_path / "bag", max_orientation_deviation=1.0)
     assert {len(frame.cameras) for frame in frames} <= {1}

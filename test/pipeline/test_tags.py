@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -164,17 +165,23 @@ def test_poses_are_those_of_our_own_detector_within_their_covariances(
     assert np.median(distances) < 7.8  # 95 % of chi-squared with 3 degrees of freedom
 
 
-def corners_of(walls: Path, order: list[int], shift: float = 0.5) -> list[list[Any]]:
-    """Our own detector's quads as tags whose corners come in this order of apriltag's."""
+@cache
+def quads(walls: Path) -> list[tuple[Any, list[tuple[int, np.ndarray]]]]:
+    """Of the first images, what our own detector finds."""
     ours = MarkerDetector(read_marker_map(walls / "marker_map.yaml"))
-    found = []
-    for header, image in images(walls)[:4]:
-        tags = []
-        for seen in ours.detect(image).markers:
-            for number, quad in zip(seen.ids.tolist(), seen.quads, strict=True):
-                tags.append((FAMILY, number, (quad[::-1] + shift)[order]))
-        found.append([header, tags])
-    return found
+    return [
+        (header, [it for seen in ours.detect(image).markers
+                  for it in zip(seen.ids.tolist(), seen.quads, strict=True)])
+        for header, image in images(walls)[:4]
+    ]  # fmt: skip
+
+
+def corners_of(walls: Path, order: list[int]) -> list[tuple[Any, list[Any]]]:
+    """Those as tags whose corners come in this order of apriltag's."""
+    return [
+        (header, [(FAMILY, number, (quad[::-1] + 0.5)[order]) for number, quad in found])
+        for header, found in quads(walls)
+    ]
 
 
 @pytest.mark.parametrize("kind", [APRILTAG_TYPE, ISAAC_TYPE])

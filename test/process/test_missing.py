@@ -56,12 +56,22 @@ def test_a_command_says_it_in_one_line(tmp_path, name, words, advice):
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(("name", "code"), [("scipy", NODE), ("yaml", DETECTOR)])
-def test_a_node_says_it_in_one_line(tmp_path, name, code):
+PACKAGE = "the Python package {} is not installed: sudo apt install "
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "said"),
+    [
+        ("scipy", NODE, f"localizer: {PACKAGE}"),
+        ("yaml", DETECTOR, f"marker_detector: {PACKAGE}"),
+        ("rclpy", NODE, "localizer: No module named '{}'; source a ROS 2 workspace"),
+    ],
+)
+def test_a_node_says_it_in_one_line(tmp_path, name, code, said):
     pytest.importorskip("rclpy", reason="needs ROS 2")
     done = run(code, without(tmp_path, name))
     assert done.returncode == 1
-    assert f": the Python package {name} is not installed: " in done.stderr
+    assert done.stderr.startswith(said.format(name))
     assert done.stderr.count("\n") == 1
 
 

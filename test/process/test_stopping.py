@@ -116,10 +116,7 @@ for path in set(re.findall(r"/\\S*openblas\\S*", open("/proc/self/maps").read())
 print(*found)
 """
 COMMAND = "import sys; sys.argv[1:] = ['--version']; from rs_localizer.__main__ import run; run()"
-NODE = """
-import rs_localizer.ros.main as program
-program._guarded("name", lambda name: lambda stop, args: 0, None)
-"""
+NODE = "from rs_localizer.ros.main import main; main(['--version'])"
 
 
 def threads(program: str, **variables: str) -> list[int]:

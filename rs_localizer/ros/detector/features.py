@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``feature_detector``: images in; keypoints with descriptors out."""
 
-from dataclasses import dataclass
 from typing import Any
 
 from rs_localizer.config import FeatureConfig
@@ -10,29 +9,16 @@ from rs_localizer.features.extraction import draw_features
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
-from rs_localizer.ros.detector.node import Drawing, Finder, ImageNode, Show, Work
+from rs_localizer.ros.detector.node import Drawing, Finder, ImageNode, Show, Sight, Work
 from rs_localizer.ros.node.worker import Worker
 from rs_localizer.settings import FEATURES_NAME
 
 
-@dataclass(frozen=True, slots=True)
-class FeatureSight:
-    """What is told of the last image."""
-
-    keypoints: int
-
-    @property
-    def text(self) -> str:
-        return f"{self.keypoints or 'no'} keypoints in the last image"
-
-    @property
-    def values(self) -> dict[str, str]:
-        return {"Keypoints": str(self.keypoints)}
-
-
-def tell(extracted: Extracted) -> tuple[int, FeatureSight]:
+def tell(extracted: Extracted) -> tuple[int, Sight]:
     """Stamp of an image (ns), and what the statistics keep of it."""
-    return extracted.image.stamp_ns, FeatureSight(len(extracted.features))
+    count = len(extracted.features)
+    text = f"{count or 'no'} keypoints in the last image"
+    return extracted.image.stamp_ns, Sight(text, {"Keypoints": str(count)})
 
 
 class FeatureDetectorNode(ImageNode[FeatureConfig, Extracted]):

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``marker_detector``: images in; correspondences with a marker map out."""
 
-from dataclasses import dataclass
 from typing import Any
 
 from rs_localizer.config import DetectorConfig
@@ -10,47 +9,27 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import CORRESPONDENCES
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.ros.detector.node import Drawing, Finder, ImageNode, Show, Work
+from rs_localizer.ros.detector.node import Drawing, Finder, ImageNode, Show, Sight, Work
 from rs_localizer.ros.node.worker import Worker
 from rs_localizer.settings import DETECTOR_NAME
 
 
-@dataclass(frozen=True, slots=True)
-class MarkerSight:
-    """What is told of the last image."""
-
-    markers: int  # of the map
-    boards: int
-    corners: int
-    unknown: int  # markers that are not in the map
-
-    @property
-    def text(self) -> str:
-        if self.corners == 0:
-            return "the last image shows no part of the map"
-        boards = f" and {self.boards} boards" if self.boards else ""
-        return f"{self.corners} corners of {self.markers} markers{boards}"
-
-    @property
-    def values(self) -> dict[str, str]:
-        return {
-            "Markers": str(self.markers),
-            "Boards": str(self.boards),
-            "Corners": str(self.corners),
-            "Markers not in the map": str(self.unknown),
-        }
-
-
-def tell(detected: Detected) -> tuple[int, MarkerSight]:
+def tell(detected: Detected) -> tuple[int, Sight]:
     """Stamp of an image (ns), and what the statistics keep of it."""
     detections = detected.detections
-    sight = MarkerSight(
-        markers=sum(int(item.mapped.sum()) for item in detections.markers),
-        boards=len(detections.boards),
-        corners=len(detections.ids),
-        unknown=len(detections.unknown),
-    )
-    return detected.image.stamp_ns, sight
+    markers = sum(int(item.mapped.sum()) for item in detections.markers)
+    boards, corners = len(detections.boards), len(detections.ids)
+    text = "the last image shows no part of the map"
+    if corners:
+        text = f"{corners} corners of {markers} markers"
+        text += f" and {boards} boards" if boards else ""
+    values = {
+        "Markers": str(markers),
+        "Boards": str(boards),
+        "Corners": str(corners),
+        "Markers not in the map": str(len(detections.unknown)),
+    }
+    return detected.image.stamp_ns, Sight(text, values)
 
 
 class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):

@@ -32,10 +32,9 @@ from rs_localizer.ros.node.conversion import create_output, make_message
 from rs_localizer.ros.node.health import (
     SOME,
     Health,
-    Judgement,
     Level,
     State,
-    lost_on_the_way,
+    hindrance,
     milliseconds,
     one_line,
     out_of_service,
@@ -49,36 +48,17 @@ from rs_localizer.ros.node.worker import Worker
 Result = TypeVar("Result")
 
 
-class Sight(Protocol):
-    """What is told of the last image."""
-
-    @property
-    def text(self) -> str:
-        """In one sentence."""
-        ...
-
-    @property
-    def values(self) -> dict[str, str]:
-        """By readable names."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
-class Condition:
-    """What the node knows of itself."""
+class Sight:
+    """What is told of the last image: in one sentence, and by readable names."""
 
-    life_cycle: str  # label of the state
-    output: str  # what it publishes
-    wanted: bool  # whether somebody listens
-    silence: Mapping[str, Silence]  # of the image topics
-    oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
+    text: str
+    values: dict[str, str]
 
 
-def diagnose(condition: Condition, summary: Summary[Sight]) -> Health:
-    """Judge the node: ``inactive``, ``idle``, ``waiting for images`` or ``detecting``."""
-    judgement = _judge(condition, summary)
+def values_of(summary: Summary[Sight]) -> dict[str, str]:
+    """What a node says in numbers."""
     values = {
-        "State": judgement.state_in_words,
         "Images in (Hz)": f"{summary.rate_in:.1f}",
         "Images done (Hz)": f"{summary.rate_out:.1f}",
         **milliseconds("Latency", summary.latency),
@@ -91,38 +71,25 @@ def diagnose(condition: Condition, summary: Summary[Sight]) -> Health:
         "Images replaced": str(summary.replaced),
         "Images refused": str(summary.refused),
     }
-    values |= refused(summary)
-    return Health(judgement.level, judgement.state, judgement.message, values)
+    return values | refused(summary)
 
 
-def _judge(condition: Condition, summary: Summary[Sight]) -> Judgement:
-    if (idle := out_of_service(condition.life_cycle)) is not None:
-        return idle
-    if not condition.wanted:
-        message = f"nobody subscribes to the {condition.output} or the debug image"
-        return Judgement(Level.OK, State.IDLE, message)
-    causes = [f"{item.topic}: {item.cause}" for item in condition.silence.values() if item.cause]
-    if causes or not condition.silence:
+def judge(
+    summary: Summary[Sight], silence: Mapping[str, Silence], oddities: Mapping[str, str]
+) -> Health:
+    """Of an active node that somebody listens to: ``waiting for images`` or ``detecting``."""
+    causes = [f"{item.topic}: {item.cause}" for item in silence.values() if item.cause]
+    if causes or not silence:
         message = "; ".join([f"{State.WAITING} images", *causes])
-        return Judgement(Level.WARN, State.WAITING, message, "images")
-    bad = sum(summary.recently_refused.values())
-    if bad > SOME * summary.recently_received:
-        reasons = ", ".join(sorted(summary.recently_refused))
-        message = f"{bad} images were refused in the last {WINDOW:.0f} s: {reasons}"
-        return Judgement(Level.WARN, State.DETECTING, message)
-    if summary.recently_replaced > SOME * summary.recently_received:
-        message = (
-            f"{summary.recently_replaced} images came while another was looked at in the last "
-            f"{WINDOW:.0f} s"
-        )
-        return Judgement(Level.WARN, State.DETECTING, message)
-    if summary.recently_missing > SOME * summary.recently_received:
-        return Judgement(Level.WARN, State.DETECTING, lost_on_the_way(summary))
-    if condition.oddities:
-        return Judgement(Level.WARN, State.DETECTING, one_line(condition.oddities))
+        return Health(Level.WARN, State.WAITING, message, subject="images")
+    message = hindrance(summary, "images", "looked at")
+    if sum(summary.recently_refused.values()) > SOME * summary.recently_received:
+        message += f": {', '.join(sorted(summary.recently_refused))}"
+    if message := message or one_line(oddities):
+        return Health(Level.WARN, State.DETECTING, message)
     last = summary.last
     message = "no image has been looked at yet" if last is None else last.text
-    return Judgement(Level.OK, State.DETECTING, message)
+    return Health(Level.OK, State.DETECTING, message)
 
 
 # Types of the topics whose messages are looked at.
@@ -266,14 +233,15 @@ class ImageNode(
         work.config = config
 
     def examine(self) -> tuple[Health, str]:
-        condition = Condition(
-            life_cycle=self.state,
-            output=self.output,
-            wanted=bool(self._listening),
-            silence={name: item for name, item in self.silence.items() if name in _IMAGES},
-            oddities=self.refusals.recent(self.odd, WINDOW),
-        )
-        return diagnose(condition, self.statistics.summary()), ""
+        summary = self.statistics.summary()
+        judgement = out_of_service(self.state)
+        if judgement is None and not self._listening:
+            message = f"nobody subscribes to the {self.output} or the debug image"
+            judgement = Health(Level.OK, State.IDLE, message)
+        if judgement is None:
+            silence = {name: item for name, item in self.silence.items() if name in _IMAGES}
+            judgement = judge(summary, silence, self.refusals.recent(self.odd, WINDOW))
+        return judgement.with_values(values_of(summary)), ""
 
     # -- who listens ------------------------------------------------------------------------
 

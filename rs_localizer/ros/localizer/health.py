@@ -13,19 +13,17 @@ from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.inputs import Role, input_named, said
 from rs_localizer.pipeline.refusal import IMU_REASONS
 from rs_localizer.ros.node.health import (
-    SOME,
     Health,
-    Judgement,
     Level,
     State,
-    lost_on_the_way,
+    hindrance,
     milliseconds,
     one_line,
     out_of_service,
     refused,
 )
 from rs_localizer.ros.node.inputs import Silence
-from rs_localizer.ros.node.statistics import WINDOW, Summary
+from rs_localizer.ros.node.statistics import Summary
 from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 
@@ -155,20 +153,18 @@ def diagnose(condition: Condition, summary: Summary[Answer]) -> Health:
     ``busy``, ``lost``, ``localized`` (by a search) and ``tracking``. What is odd is a warning where
     nothing worse is to be said.
     """
-    judgement = _judge(condition, summary)
-    values = {"State": judgement.state_in_words} | _values(condition, summary)
-    return Health(judgement.level, judgement.state, judgement.message, values)
+    return _judge(condition, summary).with_values(_values(condition, summary))
 
 
-def _judge(condition: Condition, summary: Summary[Answer]) -> Judgement:
+def _judge(condition: Condition, summary: Summary[Answer]) -> Health:
     if (idle := out_of_service(condition.life_cycle)) is not None:
         return idle
     if condition.changing:
         message = "the kernels for the new settings are being compiled"
-        return Judgement(Level.WARN, State.COMPILING, message)
+        return Health(Level.WARN, State.COMPILING, message)
     if summary.busy is not None and summary.busy > _LONG_WORK:
         message = f"a frame has been worked on for {summary.busy:.1f} s"
-        return Judgement(Level.WARN, State.BUSY, message)
+        return Health(Level.WARN, State.BUSY, message)
     silent = _silent_frames(condition)
     if condition.missing:
         level = Level.WARN if silent else Level.ERROR
@@ -180,13 +176,13 @@ def _judge(condition: Condition, summary: Summary[Answer]) -> Judgement:
         if any(item.mismatch for item in condition.silence.values()):
             level = Level.ERROR
         message = "; ".join([f"{State.WAITING} {what}", *causes])
-        return Judgement(level, State.WAITING, message, what)
+        return Health(level, State.WAITING, message, subject=what)
     if silent is not None:
         return silent
     return _judge_frames(summary, condition.oddities)
 
 
-def _silent_frames(condition: Condition) -> Judgement | None:
+def _silent_frames(condition: Condition) -> Health | None:
     """What to say where no frames come; None where they do."""
     silences = _of_frames(condition.silence)
     if not silences or any(item.heard and not item.cause for item in silences):
@@ -199,34 +195,25 @@ def _silent_frames(condition: Condition) -> Judgement | None:
         level = Level.STALE if latest.heard else Level.WARN
     since = f" for {latest.seconds:.0f} s" if latest.heard else ""
     message = "; ".join([f"no frame has come{since}", *causes])
-    return Judgement(level, State.WAITING, message, "frames")
+    return Health(level, State.WAITING, message, subject="frames")
 
 
-def _judge_frames(summary: Summary[Answer], oddities: Mapping[str, str]) -> Judgement:
+def _judge_frames(summary: Summary[Answer], oddities: Mapping[str, str]) -> Health:
     last = summary.last
     if last is None or summary.refused_since_answer >= _LOST:
         if summary.refused_since_answer == 0:
             message = "no frame has been localized yet"
-            return Judgement(Level.WARN, State.WAITING, message, "frames")
+            return Health(Level.WARN, State.WAITING, message, subject="frames")
         message = f"the last {summary.refused_since_answer} frames gave no pose"
         if reasons := summary.recently_refused:
             message += f", mostly for {max(reasons, key=lambda reason: reasons[reason])}"
         message = "; ".join(filter(None, [message, one_line(oddities)]))
-        return Judgement(Level.ERROR, State.LOST, message)
+        return Health(Level.ERROR, State.LOST, message)
     state = State.TRACKING if last.tracked else State.LOCALIZED
-    bad, replaced = sum(summary.recently_refused.values()), summary.recently_replaced
-    if bad > SOME * summary.recently_received:
-        message = f"{bad} frames were refused in the last {WINDOW:.0f} s"
-        return Judgement(Level.WARN, state, message)
-    if replaced > SOME * summary.recently_received:
-        message = f"{replaced} frames came while another was localized in the last {WINDOW:.0f} s"
-        return Judgement(Level.WARN, state, message)
-    if summary.recently_missing > SOME * summary.recently_received:
-        return Judgement(Level.WARN, state, lost_on_the_way(summary))
-    if oddities:
-        return Judgement(Level.WARN, state, one_line(oddities))
+    if message := hindrance(summary, "frames", "localized") or one_line(oddities):
+        return Health(Level.WARN, state, message)
     message = f"{state} with {last.inliers} of {last.points} points"
-    return Judgement(Level.OK, state, message)
+    return Health(Level.OK, state, message)
 
 
 def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:

@@ -10,7 +10,6 @@ from typing import Any
 
 from rclpy.lifecycle import LifecycleNode
 from rclpy.serialization import deserialize_message
-from rclpy.service import Service
 from std_srvs.srv import Trigger
 
 from rs_localizer.config import ImuUse, NodeConfig, Px4Odometry, ShutterDepth
@@ -208,14 +207,10 @@ class Outputs:
 
     Args:
         node: creates the publishers, which publish while it is active.
-        afterwards: called with each frame after its messages (to broadcast transforms).
     """
 
-    def __init__(
-        self, node: LifecycleNode, afterwards: Callable[[Localized], None] | None = None
-    ) -> None:
+    def __init__(self, node: LifecycleNode) -> None:
         self._node = node
-        self._afterwards = afterwards
         self._publishers = {
             name: create_output(node, message_class(type_name), f"~/{name}")
             for name, type_name in TYPES.items()
@@ -223,20 +218,14 @@ class Outputs:
 
     def publish(self, frame: Localized) -> None:
         """Publish what somebody listens to; nothing else is built."""
-        wanted = [
-            name
-            for name, publisher in self._publishers.items()
-            if publisher.get_subscription_count()
-        ]
+        publishers = self._publishers.items()
+        wanted = [name for name, it in publishers if it.get_subscription_count()]
         for name, message in each_message(frame, make_message, wanted):
             self._publishers[name].publish(message)
-        if self._afterwards is not None:
-            self._afterwards(frame)
 
     def close(self) -> None:
         for publisher in self._publishers.values():
             self._node.destroy_lifecycle_publisher(publisher)
-        self._publishers = {}
 
 
 # Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
@@ -294,10 +283,8 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def __init__(self, **options: Any) -> None:
         self._localizer: FrameLocalizer | None = None  # the worker's: here only to be read
         self._feed: Feed | None = None
-        self._outputs: Outputs | None = None
-        self._px4: Px4Output | None = None
         self._shutter: ShutterOutput | None = None
-        self._reset_service: Service | None = None
+        self._undo = contextlib.ExitStack()  # of what :meth:`open` has made
         super().__init__(NODE_NAME, NodeConfig, tell, **options)
         self._broadcaster = Broadcaster(self, self.refusals)
         # Triggered by the inputs' thread: subscriptions are the executor's.
@@ -331,40 +318,35 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         if frames.map is not None:
             self.get_logger().info(described(frames.map))
         frames.warm_up()  # what has been set since they were compiled
+        self._undo.callback(self._broadcaster.close)
         self._broadcaster.configure(config)
+        outputs = Outputs(self)
+        publish = [outputs.publish]
+        self._undo.callback(outputs.close)
         if config.px4_odometry != Px4Odometry.NONE:
-            self._px4 = Px4Output(self, frames)
+            px4 = Px4Output(self, frames)
+            publish.append(px4.publish)
+            self._undo.callback(px4.close)
         if config.image_rect_shutter != ShutterDepth.NONE:
             self._shutter = ShutterOutput(self, frames)
-        self._outputs = Outputs(self, afterwards=lambda frame: self._send_on(frame, frames.config))
+            publish.append(self._shutter.add)
+            self._undo.callback(self._shutter.close)
+        publish.append(lambda frame: self._broadcaster.publish(frame, frames.config))
+
+        def publish_all(frame: Localized) -> None:
+            for each in publish:
+                each(frame)
+
         self._localizer = frames
-        worker = self.employ(frames, self._outputs.publish)
+        worker = self.employ(frames, publish_all)
         say, needs_tf = self.get_logger().info, self._imu_came.trigger
         self._feed = Feed(worker, frames, self.refusals, say, needs_tf)
-        self._reset_service = self.create_service(Trigger, "~/reset", self._reset)
-
-    def _send_on(self, frame: Localized, config: NodeConfig) -> None:
-        if self._px4 is not None:
-            self._px4.publish(frame)
-        if self._shutter is not None:
-            self._shutter.add(frame)
-        self._broadcaster.publish(frame, config)
+        reset = self.create_service(Trigger, "~/reset", self._reset)
+        self._undo.callback(self.destroy_service, reset)
 
     def close(self) -> None:
-        self._feed = self._localizer = None
-        self._broadcaster.close()
-        if self._px4 is not None:
-            self._px4.close()
-            self._px4 = None
-        if self._shutter is not None:
-            self._shutter.close()
-            self._shutter = None
-        if self._outputs is not None:
-            self._outputs.close()
-            self._outputs = None
-        if self._reset_service is not None:
-            self.destroy_service(self._reset_service)
-            self._reset_service = None
+        self._feed = self._localizer = self._shutter = None
+        self._undo.close()
 
     def begin(self, config: NodeConfig) -> None:
         assert self._feed is not None

@@ -3,9 +3,9 @@
 """What every node says of itself: a level, a state, one sentence, and numbers by readable names."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
@@ -60,34 +60,25 @@ class Health:
 
     level: Level
     state: State
-    message: str
-    values: dict[str, str]
-
-
-class Judgement(NamedTuple):
-    """What to say first."""
-
-    level: Level
-    state: State
-    message: str
+    message: str  # one sentence
+    values: dict[str, str] = field(default_factory=dict)  # by readable names
     subject: str = ""  # of the state
 
-    @property
-    def state_in_words(self) -> str:
-        """The state with its subject."""
-        return f"{self.state} {self.subject}".strip()
+    def with_values(self, values: dict[str, str]) -> "Health":
+        """With these after the state and its subject."""
+        return replace(self, values={"State": f"{self.state} {self.subject}".strip()} | values)
 
 
-def out_of_service(life_cycle: str) -> Judgement | None:
+def out_of_service(life_cycle: str) -> Health | None:
     """What to say of a node that is not active, by the label of its state; None if it is."""
     if life_cycle in _PREPARING:
         state, what = _PREPARING[life_cycle]
-        return Judgement(Level.WARN, state, f"the node is being configured: kernels are {what}")
+        return Health(Level.WARN, state, f"the node is being configured: kernels are {what}")
     if life_cycle == "active":
         return None
     # Somebody wants it so: no fault, which an aggregator would make of STALE.
     steps = _STEPS.get(life_cycle, "activate it")
-    return Judgement(Level.OK, State.INACTIVE, f"the node is {life_cycle}: {steps}")
+    return Health(Level.OK, State.INACTIVE, f"the node is {life_cycle}: {steps}")
 
 
 def one_line(oddities: Mapping[str, str]) -> str:
@@ -95,13 +86,27 @@ def one_line(oddities: Mapping[str, str]) -> str:
     return "; ".join(f"{name}: {text}" for name, text in oddities.items())
 
 
-def lost_on_the_way(summary: Summary[Any]) -> str:
-    """What to say where stamps have gaps."""
-    sent = summary.recently_received + summary.recently_missing
-    return (
-        f"messages are lost: by their stamps, {summary.recently_missing} of {sent} have not come "
-        f"in the last {WINDOW:.0f} s (is the publisher best effort, or the machine too slow?)"
-    )
+def hindrance(summary: Summary[Any], what: str, worked_on: str) -> str:
+    """Why some of the last messages have no result; empty where nearly all have one.
+
+    Args:
+        summary: of a node that works.
+        what: the messages are.
+        worked_on: is done with them.
+    """
+    worth_it = SOME * summary.recently_received
+    lately = f"in the last {WINDOW:.0f} s"
+    if (bad := sum(summary.recently_refused.values())) > worth_it:
+        return f"{bad} {what} were refused {lately}"
+    if summary.recently_replaced > worth_it:
+        return f"{summary.recently_replaced} {what} came while another was {worked_on} {lately}"
+    if summary.recently_missing > worth_it:
+        sent = summary.recently_received + summary.recently_missing
+        return (
+            f"messages are lost: by their stamps, {summary.recently_missing} of {sent} have not "
+            f"come {lately} (is the publisher best effort, or the machine too slow?)"
+        )
+    return ""
 
 
 def milliseconds(name: str, value: Percentiles | None) -> dict[str, str]:

@@ -39,75 +39,6 @@ from rs_localizer.settings import Config
 _ON_CHANGE_STATE = "_LifecycleNodeMixin__on_change_state"
 
 
-class RobustLifecycleNode(LifecycleNode):
-    """A managed node that answers impossible transitions instead of raising.
-
-    Before it is configured, a thread compiles what it needs (see :meth:`prepare`), which takes up
-    to a minute at the first start on a machine; services and diagnostics answer meanwhile.
-    """
-
-    def __init__(self, name: str, **options: Any) -> None:
-        super().__init__(name, **options)
-        self._prepared: Future | None = None
-        self.compiles = True  # what it prepares; otherwise it loads what has been compiled
-        # A request to configure waits; others shall not wait for it.
-        group = ReentrantCallbackGroup()
-        for service in self.services:
-            service.callback_group = group
-            group.add_entity(service)
-
-    def kernels(self) -> Callable[[], None]:
-        """What compiles the kernels of the present settings, to be called in another thread."""
-        raise NotImplementedError
-
-    @property
-    def state(self) -> str:
-        """Label of the present state; ``compiling`` or ``loading`` while kernels are prepared."""
-        label: str = self._state_machine.current_state[1]
-        if self._prepared is not None and not self._prepared.done() and label == "unconfigured":
-            return "compiling" if self.compiles else "loading"
-        return label
-
-    def prepare(self) -> Future:
-        """Compile in a thread; the result is what failed, or empty."""
-        if self._prepared is None or self._prepared.done():
-            self._prepared = prepared = Future()
-            compiles = self.kernels()
-            in_thread(lambda: prepared.set_result(_failure(compiles)))
-        return self._prepared
-
-    def configure(self, failure: str) -> bool:
-        """Configure after :meth:`prepare`, if nobody else has; whether that worked."""
-        if failure:
-            self.get_logger().error(f"not configured:\n{failure}")
-            return False
-        if self._unconfigured():
-            self.trigger_configure()
-        return not self._unconfigured()
-
-    def _unconfigured(self) -> bool:
-        return bool(self._state_machine.current_state[0] == Label.PRIMARY_STATE_UNCONFIGURED)
-
-    # rclpy (7.x, Jazzy) lets the error of a transition that the present state does not have out of
-    # the service's callback: the client waits for ever and the executor stops. This is the name,
-    # private to its class, under which it registers the callback; where there is none of this name
-    # the override does nothing, and the node's loop still survives the error.
-    async def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
-        wanted = request.transition.label or request.transition.id
-        if wanted in ("configure", Transition.TRANSITION_CONFIGURE) and self._unconfigured():
-            failure = await self.prepare()
-            if failure:
-                response.success = self.configure(failure)
-                return response
-        try:
-            return getattr(super(), _ON_CHANGE_STATE)(request, response)
-        except RuntimeError:  # RCLError; what callbacks raise does not come here
-            _, present = self._state_machine.current_state
-            self.get_logger().warning(f"transition {wanted} is refused: the node is {present}")
-            response.success = False
-            return response
-
-
 def _failure(function: Callable[[], None]) -> str:
     try:
         function()
@@ -169,11 +100,14 @@ Result = TypeVar("Result")
 Kept = TypeVar("Kept")
 
 
-class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Kept]):
+class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
     """Only while active it takes and publishes messages.
 
-    A node says what it does by overriding :meth:`check`, :meth:`open`, :meth:`close`,
-    :meth:`begin`, :meth:`end`, :meth:`change` and :meth:`examine`.
+    A node says what it does by overriding :meth:`kernels`, :meth:`check`, :meth:`open`,
+    :meth:`close`, :meth:`begin`, :meth:`end`, :meth:`change` and :meth:`examine`.
+
+    Before it is configured, a thread compiles what it needs (see :meth:`prepare`), which takes up
+    to a minute at the first start on a machine; services and diagnostics answer meanwhile.
 
     Args:
         name: of the node.
@@ -188,7 +122,6 @@ class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Kept]):
     task: ClassVar[str]  # in the name of the diagnosis
     lack: ClassVar[str]  # the notice of what it waits for
     checked_at_start: ClassVar[bool] = True
-    faults: ClassVar[type[ValueError]] = ValueError  # of :meth:`open` that users can mend
 
     def __init__(
         self,
@@ -198,6 +131,13 @@ class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Kept]):
         **options: Any,
     ) -> None:
         super().__init__(name, **options)
+        self._prepared: Future | None = None
+        self.compiles = True  # what it prepares; otherwise it loads what has been compiled
+        # A request to configure waits; others shall not wait for it.
+        group = ReentrantCallbackGroup()
+        for service in self.services:
+            service.callback_group = group
+            group.add_entity(service)
         self._kind: type[Config] = kind
         # From configuring to cleaning up.
         self.worker: Worker[State, Result] | None = None
@@ -226,6 +166,10 @@ class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Kept]):
 
     # -- what a node does --------------------------------------------------------------------
 
+    def kernels(self) -> Callable[[], None]:
+        """What compiles the kernels of the present settings, to be called in another thread."""
+        raise NotImplementedError
+
     def check(self, config: Config) -> None:
         """Raise ``ValueError`` for settings that cannot be used."""
         raise NotImplementedError
@@ -234,7 +178,7 @@ class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Kept]):
         """Make what lives until :meth:`close`, the worker by :meth:`employ`.
 
         Raises:
-            faults: when it cannot be configured so, saying why.
+            ValueError: when it cannot be configured so, saying why.
         """
         raise NotImplementedError
 
@@ -295,15 +239,59 @@ class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Kept]):
 
     # -- life cycle --------------------------------------------------------------------------
 
+    @property
+    def state(self) -> str:
+        """Label of the present state; ``compiling`` or ``loading`` while kernels are prepared."""
+        label: str = self._state_machine.current_state[1]
+        if self._prepared is not None and not self._prepared.done() and label == "unconfigured":
+            return "compiling" if self.compiles else "loading"
+        return label
+
+    def prepare(self) -> Future:
+        """Compile in a thread; the result is what failed, or empty."""
+        if self._prepared is None or self._prepared.done():
+            self._prepared = prepared = Future()
+            compiles = self.kernels()
+            in_thread(lambda: prepared.set_result(_failure(compiles)))
+        return self._prepared
+
+    def configure(self, failure: str) -> bool:
+        """Configure after :meth:`prepare`, if nobody else has; whether that worked."""
+        if failure:
+            self.get_logger().error(f"not configured:\n{failure}")
+            return False
+        if self._unconfigured():
+            self.trigger_configure()
+        return not self._unconfigured()
+
+    def _unconfigured(self) -> bool:
+        return bool(self._state_machine.current_state[0] == Label.PRIMARY_STATE_UNCONFIGURED)
+
+    # rclpy (7.x, Jazzy) lets the error of a transition that the present state does not have out of
+    # the service's callback: the client waits for ever and the executor stops. This is the name,
+    # private to its class, under which it registers the callback; where there is none of this name
+    # the override does nothing, and the node's loop still survives the error.
+    async def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
+        wanted = request.transition.label or request.transition.id
+        if wanted in ("configure", Transition.TRANSITION_CONFIGURE) and self._unconfigured():
+            failure = await self.prepare()
+            if failure:
+                response.success = self.configure(failure)
+                return response
+        try:
+            return getattr(super(), _ON_CHANGE_STATE)(request, response)
+        except RuntimeError:  # RCLError; what callbacks raise does not come here
+            _, present = self._state_machine.current_state
+            self.get_logger().warning(f"transition {wanted} is refused: the node is {present}")
+            response.success = False
+            return response
+
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             self.open(self.config)
-        except self.faults as error:
-            self.get_logger().error(f"not configured: {error}")
-            self._close()
-            return TransitionCallbackReturn.FAILURE
-        except Exception:  # rclpy would hide it
-            self.get_logger().error(f"not configured:\n{traceback.format_exc()}")
+        except Exception as error:  # rclpy would hide it
+            why = f" {error}" if isinstance(error, ValueError) else f"\n{traceback.format_exc()}"
+            self.get_logger().error(f"not configured:{why}")
             self._close()
             return TransitionCallbackReturn.FAILURE
         return super().on_configure(state)

@@ -9,7 +9,7 @@ parameters and publishes diagnostics.
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -19,96 +19,8 @@ from rs_localizer.ros.node.refusals import describe
 from rs_localizer.ros.node.statistics import Statistics
 
 State = TypeVar("State")
-Item = TypeVar("Item")
-Update = Callable[[State], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Work(Generic[State, Item]):
-    """What is to be done next: the updates, then the frame."""
-
-    updates: Iterable[Update[State]]
-    frame: Item | None
-    session: int  # see :meth:`Mailbox.is_current`
-
-
-class Mailbox(Generic[State, Item]):
-    """Bounded: it holds one frame of each topic and one update of each kind.
-
-    All methods may be called from any thread; only :meth:`take` waits.
-    """
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self._updates: dict[str, Update[State]] = {}
-        self._frames: dict[str, Item] = {}
-        self._session = 0
-        self._closed = self._woken = False
-
-    def update(self, kind: str, update: Update[State]) -> None:
-        """Have this done before the next frame, after all updates of other kinds so far.
-
-        An older one of the same kind that still waits is dropped: an update says how things are
-        now, not what has changed.
-        """
-        with self._changed:
-            self._updates.pop(kind, None)
-            self._updates[kind] = update
-            self._changed.notify()
-
-    def put(self, topic: str, frame: Item) -> bool:
-        """Add a frame; whether it replaced one of its topic, whose place it then takes."""
-        with self._changed:
-            replaced = topic in self._frames
-            self._frames[topic] = frame
-            self._changed.notify()
-            return replaced
-
-    def take(self, timeout: float | None = None) -> Work[State, Item] | None:
-        """Wait for all updates, and the oldest frame if there is any; None once it is closed.
-
-        After ``timeout`` (s), or when it is woken, it may be nothing that is to be done.
-        """
-        with self._changed:
-            self._changed.wait_for(
-                lambda: self._updates or self._frames or self._closed or self._woken, timeout
-            )
-            self._woken = False
-            if self._closed:
-                return None
-            updates, self._updates = self._updates, {}
-            oldest = next(iter(self._frames), None)
-            frame = None if oldest is None else self._frames.pop(oldest)
-            return Work(updates.values(), frame, self._session)
-
-    def wake(self) -> None:
-        """Let :meth:`take` return, whatever there is."""
-        with self._changed:
-            self._woken = True
-            self._changed.notify()
-
-    def drop_frames(self) -> int:
-        """Forget the frames that wait (how many?), and end the session of the current one."""
-        with self._changed:
-            dropped = len(self._frames)
-            self._frames.clear()
-            self._session += 1
-            return dropped
-
-    def is_current(self, work: Work[State, Item]) -> bool:
-        """Whether its result is still wanted."""
-        with self._changed:
-            return work.session == self._session and not self._closed
-
-    def close(self) -> None:
-        """Drop everything; :meth:`take` returns None from now on."""
-        with self._changed:
-            self._closed = True
-            self._updates, self._frames = {}, {}
-            self._changed.notify_all()
-
-
 Result = TypeVar("Result")
+Update = Callable[[State], None]
 Process = Callable[[State, Any], Result | Refusal | Iterator[Result | Refusal] | None]
 """What is done with a message, given what the worker alone touches; a message may have no result,
 or several, which are published as they come.
@@ -129,21 +41,21 @@ class Need(Generic[State]):
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival(Generic[State, Result]):
+class _Arrival(Generic[State, Result]):
     """A frame that has come."""
 
     message: Any
     process: Process[State, Result]
     received: float  # s, time.monotonic()
     need: Need[State] | None
+    session: int  # its result is wanted as long as this is the worker's
 
 
 @dataclass(frozen=True, slots=True)
 class _Late(Generic[State, Result]):
     """A frame whose result waits for something."""
 
-    work: Work[State, Arrival[State, Result]]
-    arrival: Arrival[State, Result]
+    arrival: _Arrival[State, Result]
     result: Waiting
     deadline: float  # s, time.monotonic()
 
@@ -151,8 +63,11 @@ class _Late(Generic[State, Result]):
 class Worker(Generic[State, Result]):
     """A thread, and what it alone touches.
 
+    What waits for it is bounded: one frame of each topic and one update of each kind. All methods
+    may be called from any thread; none of them waits for the work.
+
     Args:
-        state: that; from now on only through updates and arrivals.
+        state: that; from now on only through updates and frames.
         publish: called in the thread with each result, never after :meth:`pause`.
         statistics: told what becomes of each frame.
         failed: told in one sentence of errors in updates that nobody foresaw; the thread goes on.
@@ -170,17 +85,28 @@ class Worker(Generic[State, Result]):
         self._publish = publish
         self._statistics = statistics
         self._failed = failed
-        self._mailbox: Mailbox[State, Arrival[State, Result]] = Mailbox()
-        # Frames that wait for what they need, and results.
-        self._early: deque[Work[State, Arrival[State, Result]]] = deque()
+        self._changed = threading.Condition()  # of the next five
+        self._updates: dict[str, Update[State]] = {}
+        self._frames: dict[str, _Arrival[State, Result]] = {}
+        self._session = 0
+        self._closed = self._woken = False
+        # The thread's: frames that wait for what they need, and results.
+        self._early: deque[_Arrival[State, Result]] = deque()
         self._late: deque[_Late[State, Result]] = deque()
         # Held while publishing: after pause() nothing comes any more.
         self._publishing = threading.Lock()
         in_thread(self._run)
 
     def update(self, kind: str, update: Update[State]) -> None:
-        """Have this done before the next frame (see :meth:`Mailbox.update`)."""
-        self._mailbox.update(kind, update)
+        """Have this done before the next frame, after all updates of other kinds so far.
+
+        An older one of the same kind that still waits is dropped: an update says how things are
+        now, not what has changed.
+        """
+        with self._changed:
+            self._updates.pop(kind, None)
+            self._updates[kind] = update
+            self._changed.notify()
 
     def process(
         self,
@@ -191,82 +117,96 @@ class Worker(Generic[State, Result]):
     ) -> None:
         """Have this frame processed and published, unless a newer one comes first.
 
-        While it needs something it waits, and those behind it, too.
+        That takes its place. While a frame needs something it waits, and those behind it, too.
         """
         self._statistics.received(topic, message)
-        arrival = Arrival(message, process, time.monotonic(), need)
-        if self._mailbox.put(topic, arrival):
+        with self._changed:
+            replaced = topic in self._frames
+            arrival = _Arrival(message, process, time.monotonic(), need, self._session)
+            self._frames[topic] = arrival
+            self._changed.notify()
+        if replaced:
             self._statistics.replaced()
 
     def look(self) -> None:
         """Something has come that a frame may have waited for."""
         if self._early:
-            self._mailbox.wake()
+            with self._changed:
+                self._woken = True
+                self._changed.notify()
 
     def pause(self) -> None:
         """Forget the frames so far, the one that is worked on included."""
-        with self._publishing:
-            self._statistics.dropped(self._mailbox.drop_frames())
+        with self._publishing, self._changed:
+            self._statistics.dropped(len(self._frames))
+            self._frames.clear()
+            self._session += 1
 
     def close(self) -> None:
         """End the thread after the frame that it works on, of which nothing is published."""
-        with self._publishing:
-            self._mailbox.close()
+        with self._publishing, self._changed:
+            self._closed = True
+            self._updates, self._frames = {}, {}
+            self._changed.notify()
 
     # -- in the thread ----------------------------------------------------------------------
 
     def _run(self) -> None:
-        while (work := self._mailbox.take(self._timeout())) is not None:
-            for update in work.updates:
-                self._guarded(update, self._state)
+        while True:
+            timeout = 0.0 if self._is_ready() else None
+            if timeout is None and (self._late or self._early):
+                timeout = _LATE_PERIOD
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: self._updates or self._frames or self._closed or self._woken, timeout
+                )
+                if self._closed:
+                    return
+                self._woken = False
+                updates, self._updates = self._updates, {}
+                oldest = next(iter(self._frames), None)
+                frame = None if oldest is None else self._frames.pop(oldest)
+            for update in updates.values():
+                try:
+                    update(self._state)
+                except Exception as error:  # of one message: the others go on
+                    self._failed(describe(error))
             self._finish_late()
-            if work.frame is not None:
-                self._early.append(work)
+            if frame is not None:
+                self._early.append(frame)
             if self._is_ready():
                 self._begin(self._early.popleft())
 
-    def _timeout(self) -> float | None:
-        """How long nothing has to be done, unless something comes."""
-        if self._is_ready():
-            return 0.0
-        return _LATE_PERIOD if self._late or self._early else None
-
     def _is_ready(self) -> bool:
         """Whether there is a frame that need not wait."""
-        arrival = self._early[0].frame if self._early else None
-        if arrival is None or (need := arrival.need) is None:
-            return arrival is not None
+        if not self._early:
+            return False
+        arrival = self._early[0]
+        if (need := arrival.need) is None:
+            return True
         overdue = time.monotonic() >= arrival.received + need.patience
         if overdue or len(self._early) > _MOST_LATE:
             return True
         return self._attempt(lambda: need.missing(self._state, arrival.message)) is not True
 
-    def _begin(self, work: Work[State, Arrival[State, Result]]) -> None:
-        assert work.frame is not None
-        if self._mailbox.is_current(work):
-            self._process(work, work.frame)
-        else:
+    def _is_wanted(self, arrival: _Arrival[State, Result]) -> bool:
+        with self._changed:
+            return arrival.session == self._session and not self._closed
+
+    def _begin(self, arrival: _Arrival[State, Result]) -> None:
+        if not self._is_wanted(arrival):
             self._statistics.dropped(1)
-
-    def _guarded(self, function: Callable[..., None], *arguments: Any) -> None:
-        try:
-            function(*arguments)
-        except Exception as error:  # of one message: the others go on
-            self._failed(describe(error))
-
-    def _process(
-        self, work: Work[State, Arrival[State, Result]], arrival: Arrival[State, Result]
-    ) -> None:
+            return
         self._statistics.started()
         for each in self._results(arrival):
             if isinstance(each, Waiting) and len(self._late) < _MOST_LATE:
                 deadline = time.monotonic() + each.patience
-                self._late.append(_Late(work, arrival, each, deadline))
+                self._late.append(_Late(arrival, each, deadline))
             else:
-                self._finish(work, arrival, each)
+                self._finish(arrival, each)
         self._statistics.ended()
 
-    def _results(self, arrival: Arrival[State, Result]) -> Iterator[Any]:
+    def _results(self, arrival: _Arrival[State, Result]) -> Iterator[Any]:
         """What comes of a frame."""
         result = self._attempt(lambda: arrival.process(self._state, arrival.message))
         several = result if isinstance(result, Iterator) else iter([result])
@@ -278,11 +218,11 @@ class Worker(Generic[State, Result]):
         while self._late:
             item = self._late[0]
             result = self._attempt(item.result.again)
-            patient = time.monotonic() < item.deadline and self._mailbox.is_current(item.work)
+            patient = time.monotonic() < item.deadline and self._is_wanted(item.arrival)
             if isinstance(result, Waiting) and patient:
                 return
             self._late.popleft()
-            self._finish(item.work, item.arrival, result)
+            self._finish(item.arrival, result)
 
     def _attempt(self, function: Callable[[], Any]) -> Any:
         """What it returns; if it fails, a refusal."""
@@ -291,18 +231,13 @@ class Worker(Generic[State, Result]):
         except Exception as error:  # of one message: the others go on
             return Refusal(Reason.INTERNAL_ERROR, describe(error))
 
-    def _finish(
-        self,
-        work: Work[State, Arrival[State, Result]],
-        arrival: Arrival[State, Result],
-        result: Result | Refusal,
-    ) -> None:
+    def _finish(self, arrival: _Arrival[State, Result], result: Result | Refusal) -> None:
         """Publish it, unless nobody wants it any more, and count it."""
         if isinstance(result, Refusal):
             self._statistics.refused(result)
             return
         with self._publishing:
-            wanted = self._mailbox.is_current(work)
+            wanted = self._is_wanted(arrival)
             if wanted:
                 failure = self._attempt(lambda: self._publish(result))
         if not wanted:

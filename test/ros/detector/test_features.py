@@ -3,7 +3,6 @@
 """The feature detector as its users meet it: its own process, real DDS, the bits of offline."""
 
 import signal
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,6 @@ import cv2
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.srv import SetParametersAtomically
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, PointCloud2
 
 from rs_localizer.cli.main import main
@@ -20,6 +17,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.ros.node.conversion import copy_message
+
+from .talk import Talk
 
 RUN = "import sys; from rs_localizer.ros.main import feature_detector as f; sys.exit(f())"
 CAMERA = Camera(320, 240, np.array([[400.0, 0.0, 159.5], [0.0, 400.0, 119.5], [0.0, 0.0, 1.0]]))
@@ -39,40 +38,6 @@ def image(second: int, **changes: Any) -> Any:
     return make_message(KIND, **(values | changes))
 
 
-class Sender:
-    """Publishes images, and hears what comes of them."""
-
-    def __init__(self, peer: Any) -> None:
-        self.peer = peer
-        self.publisher = peer.node.create_publisher(Image, "/image", 1)
-        self.heard: dict[str, list[Any]] = {}
-
-    def listen(self, kind: type, topic: str) -> Any:
-        kept = self.heard.setdefault(topic, [])
-        return self.peer.node.create_subscription(kind, topic, kept.append, 10)
-
-    def listeners(self, count: int) -> bool:
-        return bool(self.peer.spin_until(lambda: self.publisher.get_subscription_count() == count))
-
-    def send_until(self, message: Any, condition: Callable[[], bool]) -> None:
-        copied = copy_message(message, KIND)
-        for _ in range(30):
-            self.publisher.publish(copied)
-            if self.peer.spin_until(condition, 0.5):
-                return
-        raise AssertionError("nothing comes of the image")
-
-    def ask(self, message: Any, topic: str = "/keypoints") -> Any:
-        """What comes of an image."""
-
-        def answers() -> list[Any]:
-            heard = self.heard[topic]
-            return [m for m in heard if m.header.stamp.sec == message.header.stamp.sec]
-
-        self.send_until(message, lambda: bool(answers()))
-        return answers()[0]
-
-
 @pytest.fixture
 def recording(tmp_path) -> Path:
     with BagWriter(tmp_path / "images") as bag:
@@ -84,13 +49,16 @@ def recording(tmp_path) -> Path:
 
 def test_images_become_keypoints(start_node, peer, recording, tmp_path):
     node = start_node("-p", "features:=orb", "-p", "max_keypoints:=200", run=RUN)
-    camera = Sender(peer)
+    talk = Talk(peer, "feature_detector")
     node.wait_for_log("active with orb, at most 200 keypoints an image")
     # Lazy: nobody listens, so the camera has no listener either.
     peer.spin_until(lambda: False, 0.6)
-    assert camera.publisher.get_subscription_count() == 0
-    clouds = camera.listen(PointCloud2, "/keypoints")
-    assert camera.listeners(1)
+    assert talk.publisher.get_subscription_count() == 0
+    clouds = talk.listen(PointCloud2, "/keypoints")
+    assert talk.listeners(1)
+
+    def ask(second: int, topic: str = "/keypoints", **changes: Any) -> Any:
+        return talk.ask(copy_message(image(second, **changes), KIND), topic)
 
     # The same bits as offline, image by image.
     words = ["--features", "orb", "--max-keypoints", "200", "--out", str(tmp_path / "seen")]
@@ -99,45 +67,33 @@ def test_images_become_keypoints(start_node, peer, recording, tmp_path):
         offline = [m for _, _, m in bag.messages(["/keypoints"])]
     assert len(offline) == 4
     for message in offline:
-        live = camera.ask(image(message.header.stamp.sec))
+        live = ask(message.header.stamp.sec)
         assert live == copy_message(message, "sensor_msgs/msg/PointCloud2")
         assert 100 < live.width <= 200
         assert live.header.frame_id == "eye"
 
     # Whatever comes, the next good image is answered.
-    camera.send_until(image(20, encoding="32FC1"), lambda: "bad_image: the encoding" in node.log)
-    assert camera.ask(image(21)).width > 100
-    black = np.zeros(240 * 320, np.uint8)
-    assert camera.ask(image(22, data=black)).width == 0
+    bad = copy_message(image(20, encoding="32FC1"), KIND)
+    talk.send_until(bad, lambda: "bad_image: the encoding" in node.log)
+    assert ask(21).width > 100
+    assert ask(22, data=np.zeros(240 * 320, np.uint8)).width == 0
 
     # Another kind from now on; one that there is not is refused.
-    def set_features(kind: str) -> Any:
-        parameter = Parameter("features", value=kind).to_parameter_msg()
-        request = SetParametersAtomically.Request(parameters=[parameter])
-        name = "/feature_detector/set_parameters_atomically"
-        return peer.call(SetParametersAtomically, name, request).result
-
-    assert "must be one of sift, orb, akaze; got 'surf'" in set_features("surf").reason
-    assert set_features("sift").successful
-    descriptor = camera.ask(image(30)).fields[-1]
+    assert "must be one of sift, orb, akaze; got 'surf'" in talk.set("features", "surf")[1]
+    assert talk.set("features", "sift")[0]
+    descriptor = ask(30).fields[-1]
     assert (descriptor.name, descriptor.count) == ("descriptor", 128)
 
     # The debug picture has circles; the diagnostics tell of it all.
-    camera.listen(Image, "/feature_detector/debug_image")
-    camera.listen(DiagnosticArray, "/diagnostics")
-    shown = camera.ask(image(31), "/feature_detector/debug_image")
+    pictures = talk.listen(Image, "/feature_detector/debug_image")
+    talk.listen(DiagnosticArray, "/diagnostics")
+    shown = ask(31, "/feature_detector/debug_image")
     pixels = np.frombuffer(shown.data, np.uint8).reshape(240, 320, 3)
     assert (shown.encoding, np.any(pixels[..., 0] != pixels[..., 2])) == ("bgr8", True)
-
-    def reported() -> bool:
-        found = [s for m in camera.heard["/diagnostics"] for s in m.status]
-        values = [{v.key: v.value for v in s.values} for s in found if "feature" in s.name]
-        return any(v.get("Keypoints", "0") != "0" and "Refused: bad_image" in v for v in values)
-
-    assert peer.spin_until(reported)
-    for subscription in list(peer.node.subscriptions):
-        if subscription is clouds or "debug" in subscription.topic_name:
-            peer.node.destroy_subscription(subscription)
-    assert camera.listeners(0)
+    said = {"Keypoints": None, "Refused: bad_image": None}
+    assert peer.spin_until(lambda: talk.reported(said))
+    peer.node.destroy_subscription(clouds)
+    peer.node.destroy_subscription(pictures)
+    assert talk.listeners(0)
     assert node.stop(signal.SIGINT) == 0
     assert "Traceback" not in node.log

@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,6 @@ from rs_localizer.simulation.true_motion import ConstantVelocity
 READOUT_TIME = 0.03
 SHUTTER = ("-p", f"readout_time:={READOUT_TIME}")
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-START_NS = 10**12
 KINDS = {"/camera_info": CameraInfo, "/correspondences": PointCloud2, "/imu": Imu}
 STAND_IN = Path(__file__).parents[1] / "stand_in"
 INSTALLED = importlib.util.find_spec("tf2_ros") is not None
@@ -55,22 +54,19 @@ def tf2_ros() -> Iterator[Any]:
 
 
 def record(
-    path: Path, known: float = 1.0, count: int = 12, more: Sequence[tuple[str, Any]] = ()
-) -> Path:
-    """A flight, a calibration that knows a part of the distortion, and more messages before."""
+    path: Path, known: float = 1.0, noise: float = 0.7, outliers: float = 0.3
+) -> list[np.ndarray]:
+    """A flight, with a calibration that knows a part of the distortion; its true positions."""
     distortion = np.array([-0.2, 0.05, 0.0, 0.0, 0.0])
     camera = Camera(640, 480, K, distortion, readout_time=READOUT_TIME)
-    motion = ConstantVelocity(
-        np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.5, start_ns=START_NS
-    )
+    motion = ConstantVelocity(np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4)
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
-    settings = FrameSettings(points=100, noise=0.7, outliers=0.3)
+    settings = FrameSettings(points=100, noise=noise, outliers=outliers)
+    frames = list(simulate_frames(camera, motion, world, settings))
     with BagWriter(path) as bag:
-        for topic, message in more:
-            bag.write(topic, message, START_NS)
-        for frame in list(simulate_frames(camera, motion, world, settings))[:count]:
+        for frame in frames:
             write_simulated(bag, replace(camera, D=known * distortion), frame)
-    return path
+    return [frame.first_row.positions[0] for frame in frames]
 
 
 def inputs(recording: Path) -> list[tuple[Any, Any]]:
@@ -107,6 +103,7 @@ class Robot:
         self._node = f"{namespace}/rs_localizer"
         self.answers: dict[str, list[bytes]] = {name: [] for name in TYPES}
         self.values: dict[str, str] = {}  # of the diagnostics
+        self.odd: set[str] = set()  # what has ever been odd by them
         for name, kind in TYPES.items():
             peer.node.create_subscription(
                 message_class(kind), f"{self._node}/{name}", self.answers[name].append,
@@ -122,6 +119,7 @@ class Robot:
         for status in message.status:
             if status.name.endswith(": localizer"):
                 self.values = {item.key: item.value for item in status.values}
+                self.odd |= {name for name in self.values if name.startswith("Odd: ")}
 
     def connect(self) -> None:
         def connected() -> bool:

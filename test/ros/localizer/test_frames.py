@@ -1,31 +1,39 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""base_frame and publish_tf of the node in its own process, with tf2_ros or a stand-in for it."""
+"""base_frame, publish_tf and an IMU, in a node of its own, with tf2_ros or a stand-in for it."""
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import robot as around
 from geometry_msgs.msg import TransformStamped
 from rclpy.time import Time
-from robot import ENVIRONMENT, INSTALLED, SHUTTER, START_NS, inputs, record, replayed
 
-from rs_localizer.io.bags import make_message, open_bag, typestore
+from rs_localizer.cli.main import main as command_line
+from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES
-from rs_localizer.ros.node.conversion import message_class
+from rs_localizer.io.recording import CAMERA_FRAME
+from rs_localizer.ros.node.conversion import copy_message
 
-CAMERA = "camera_optical_frame"
+from . import robot as around
+from .robot import ENVIRONMENT, INSTALLED, KINDS, SHUTTER, replayed
+
+FLIGHT = (
+    "--trajectory", "tum_vi_room5", "--start", "20", "--duration", "0.6", "--points", "60",
+    "--noise", "0.3", "--outliers", "0.1", "--imu",
+)  # fmt: skip
 # Numbers that survive any arithmetic: a camera at the front that looks to the left.
-MOUNTING = ("base_link", CAMERA, (0.5, 0.25, 0.875), (-0.5, -0.5, 0.5, 0.5), 0)
-ODOMETRY = [
-    ("odom", "base_link", (0.1 * i, 0.3, 0.0), (0.0, 0.0, 0.6, 0.8), START_NS + i * 20_000_000)
-    for i in range(12)
+MOUNTING = ("base_link", CAMERA_FRAME, (0.5, 0.25, 0.875), (-0.5, -0.5, 0.5, 0.5), 0)
+# The node's inputs are best effort, and a busy machine loses messages: here, none may be lost.
+RELIABLE = [
+    word
+    for topic in KINDS
+    for word in ("-p", f"qos_overrides.{topic}.subscription.reliability:=reliable")
 ]
-FRAMES = 5
 Sample = tuple[str, str, tuple[float, ...], tuple[float, ...], int]
 
 
@@ -45,20 +53,32 @@ def stamped(make: Callable[..., Any], sample: Sample) -> Any:
     )
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Path:
-    more = [
-        (topic, make_message("tf2_msgs/msg/TFMessage", transforms=[stamped(make_message, sample)]))
-        for topic, sample in [("/tf_static", MOUNTING), *(("/tf", s) for s in ODOMETRY)]
+def record(folder: Path) -> Path:
+    """A flight with an IMU, of a robot that knows where its camera is, and has odometry."""
+    assert command_line(["simulate", str(folder / "flight"), *FLIGHT]) == 0
+    with open_bag(folder / "flight") as bag:
+        items = list(bag.messages((*KINDS, "/tf_static")))
+    stamps = [stamp_ns(message) for topic, _, message in items if topic == "/correspondences"]
+    odometry = [
+        ("odom", "base_link", (0.1 * i, 0.3, 0.0), (0.0, 0.0, 0.6, 0.8), ns)
+        for i, ns in enumerate(range(stamps[0] - 50_000_000, stamps[-1] + 100_000_000, 20_000_000))
     ]
-    return record(tmp_path_factory.mktemp("bags") / "flight", count=FRAMES, more=more)
+    with BagWriter(folder / "robot") as bag:
+        for sample in (MOUNTING, *odometry):
+            topic = "/tf" if sample[-1] else "/tf_static"
+            transforms = [stamped(make_message, sample)]
+            message = make_message("tf2_msgs/msg/TFMessage", transforms=transforms)
+            bag.write(topic, message, items[0][1])
+        for topic, recorded_ns, message in items:
+            bag.write(topic, message, recorded_ns)
+    return folder / "robot"
 
 
 class Robot(around.Robot):
-    """One with transforms."""
+    """One with transforms and an IMU."""
 
     def __init__(self, peer: Any, tf2_ros: Any) -> None:
-        super().__init__(peer)
+        super().__init__(peer, "/imu")
         self._tf2_ros = tf2_ros
         self._moving = tf2_ros.TransformBroadcaster(peer.node)
         self._static: list[Any] = []
@@ -73,9 +93,9 @@ class Robot(around.Robot):
         self.buffer = tf2_ros.Buffer()
         self.listener = Listener(self.buffer, peer.node)
 
-    def transform(self, sample: Sample) -> None:
-        item = stamped(lambda kind, **fields: message_class(kind)(**fields), sample)
-        if sample[-1]:
+    def transform(self, recorded: Any) -> None:
+        item = copy_message(recorded, "geometry_msgs/msg/TransformStamped")
+        if stamp_ns(item):
             self._moving.sendTransform(item)
             return
         # tf2_ros of Jazzy sends the first transform of a child for ever.
@@ -87,44 +107,62 @@ class Robot(around.Robot):
         # The listener of this class hears the transforms, too.
         assert self.peer.spin_until(lambda: self._moving.pub_tf.get_subscription_count() >= 2)
 
-    def position(self) -> list[float]:
-        """Of the last pose."""
-        last = typestore().deserialize_cdr(self.answers["pose"][-1], TYPES["pose"])
-        return [last.pose.position.x, last.pose.position.y, last.pose.position.z]
+    def play(self, messages: list[tuple[str, Any]]) -> int:
+        """Send in this order, each frame when the last is answered; how many there were.
+
+        Of frames that wait the newest would win, and one may wait for readings that follow it.
+        """
+        sent, answers = 0, self.answers["inliers"]
+        for topic, message in [*messages, ("/correspondences", None)]:
+            if topic == "/correspondences":
+                assert self.peer.spin_until(lambda sent=sent: len(answers) == sent, 20.0), (
+                    self.values
+                )
+                sent += 1
+            if message is not None:
+                self.publishers[topic].publish(message)
+        return sent - 1
 
 
-@pytest.fixture
-def robot(peer) -> Iterator[Robot]:
-    with around.tf2_ros() as tf2_ros:
-        result = Robot(peer, tf2_ros)
-        yield result
-        result.listener.unregister()
-
-
-def test_node_and_replay_say_the_same_of_the_base(recording, tmp_path, start_node, robot):
+def test_node_and_replay_say_the_same_of_the_base(tmp_path, start_node, peer):
+    recording = record(tmp_path)
+    with open_bag(recording) as bag:
+        transforms = [
+            item for _, _, m in bag.messages(("/tf_static", "/tf")) for item in m.transforms
+        ]
+        found = [(t, copy_message(m, m.__msgtype__)) for t, _, m in bag.messages(tuple(KINDS))]
     settings = [*SHUTTER, "-p", "base_frame:=base_link", "-p", "publish_tf:=map_to_odom"]
-    start_node(*settings, **ENVIRONMENT)
-    robot.connect()
-    for sample in (MOUNTING, *ODOMETRY):
-        robot.transform(sample)
-        robot.peer.spin_until(lambda: False, 0.01)
-    for pair in inputs(recording):
-        robot.localize(*pair)
-    assert robot.peer.spin_until(lambda: len(robot.sent) >= FRAMES)
+    start_node(*settings, *RELIABLE, "-p", "imu.wait:=1.0", **ENVIRONMENT)
+    with around.tf2_ros() as tf2_ros:
+        robot = Robot(peer, tf2_ros)
+        robot.connect()
+        for item in transforms:
+            robot.transform(item)
+            peer.spin_until(lambda: False, 0.01)
+        peer.spin_until(lambda: False, 1.0)
+        frames = robot.play(found)
+        assert peer.spin_until(lambda: len(robot.sent) >= frames)
+        # TF has a way from the map to the camera now, at the last time of odometry.
+        robot.buffer.lookup_transform("map", CAMERA_FRAME, Time())
+        robot.listener.unregister()
     offline = replayed(recording, tmp_path / "out", *settings)
     for name in TYPES:
-        assert len(offline[name]) == FRAMES
+        assert len(offline[name]) == frames
         assert robot.answered(name) == offline[name]
     with open_bag(tmp_path / "out" / "result") as bag:
         corrections = [message.transforms[0] for _, _, message in bag.messages(["/tf"])]
     compare(corrections, {stamp_ns(item): item for item in robot.sent})
-    # TF has a way from the map to the camera now, at the last time of odometry.
-    robot.buffer.lookup_transform("map", CAMERA, Time())
+    assert peer.spin_until(lambda: "IMU" in robot.values)
+    used = (robot.values["IMU"], robot.values["IMU used (share of the last frames)"])
+    assert used == ("used", "100%"), robot.values
+    assert float(robot.values["IMU rate (Hz)"]) == pytest.approx(400.0)
+    assert re.match(r"(-?\d+\.\d+ ){3}\+- ", robot.values["IMU bias (deg/s, camera axes)"])
+    assert re.match(r"-?\d+\.\d+ \+- ", robot.values["IMU time offset (ms)"])
 
 
 def compare(corrections: list[Any], sent: dict[int, Any]) -> None:
     """The replay's corrections of odometry, and the node's by their stamps."""
-    assert len(corrections) == len(sent) == FRAMES
+    assert len(corrections) == len(sent) > 0
     for correction in corrections:
         item = sent[stamp_ns(correction)]
         assert (item.header.frame_id, item.child_frame_id) == ("map", "odom")

@@ -6,125 +6,113 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
-from robot import READOUT_TIME, SHUTTER, Robot, inputs, record, replayed
 
+from rs_localizer.io.maps.files import write_map_file
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import TYPES
+
+from .robot import READOUT_TIME, SHUTTER, Robot, inputs, record, replayed
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
-    return record(tmp_path_factory.mktemp("bags") / "flight")
+    """A flight with a calibration that is off."""
+    path = tmp_path_factory.mktemp("bags") / "flight"
+    record(path, 0.7)
+    return path
 
 
-def state(peer: Any) -> int:
-    return int(peer.call(GetState, "/rs_localizer/get_state", GetState.Request()).current_state.id)
-
-
-def change_state(peer: Any, transition: int) -> bool:
-    request = ChangeState.Request(transition=Transition(id=transition))
-    return bool(peer.call(ChangeState, "/rs_localizer/change_state", request).success)
-
-
-def test_node_and_replay_say_the_same_to_the_last_byte(tmp_path, start_node, peer):
-    """With a calibration that is off, at mid-frame; the other moment is in test_frames.py."""
-    recording = record(tmp_path / "flight", 0.7)
+def test_node_and_replay_say_the_same_to_the_last_byte(recording, tmp_path, start_node, peer):
+    """At mid-frame (the other moment is in test_frames.py); then with other parameters."""
     settings = [*SHUTTER, "-p", "pose_time:=mid_frame", "-p", "solver:=joint"]
     offline = replayed(recording, tmp_path / "out", *settings)
-    start_node(*settings)
+    node = start_node(*settings)
     robot = Robot(peer)
     robot.connect()
     for info, cloud in inputs(recording):
         robot.localize(info, cloud)
-    assert robot.peer.spin_until(lambda: float(robot.values.get("Lens error (px)", "0")) > 1.0)
+    assert peer.spin_until(lambda: float(robot.values.get("Lens error (px)", "0")) > 1.0)
     for name in TYPES:
         assert len(offline[name]) == 12
         assert robot.answered(name) == offline[name]
 
+    def twists_of_one_more() -> int:
+        before = len(robot.answers["odometry"])
+        robot.localize(None, cloud)
+        return len(robot.answers["odometry"]) - before
 
-def test_parameters_of_a_running_node(recording, start_node, peer):
-    node = start_node()
-    robot = Robot(peer)
-    robot.connect()
-    info, cloud = inputs(recording)[0]
-    robot.localize(info, cloud)
-    assert robot.answers["odometry"] == []
-    assert robot.set("readout_time", READOUT_TIME) == (True, "")
-    robot.localize(None, cloud)
-    assert len(robot.answers["odometry"]) > 0
-    changes = [
-        Parameter("solver", value="p3p").to_parameter_msg(),
-        # A single pose fits this motion badly.
-        Parameter("inlier_threshold", value=10.0).to_parameter_msg(),
-        Parameter("pose_time", value="mid_frame").to_parameter_msg(),
-    ]
-    request = SetParametersAtomically.Request(parameters=changes)
+    changes = {"solver": "p3p", "inlier_threshold": 10.0, "pose_time": "stamp"}
+    request = SetParametersAtomically.Request(
+        parameters=[
+            Parameter(name, value=value).to_parameter_msg() for name, value in changes.items()
+        ]
+    )
     service = "/rs_localizer/set_parameters_atomically"
     assert peer.call(SetParametersAtomically, service, request).result.successful
-    before = len(robot.answers["odometry"])
-    robot.localize(None, cloud)
-    assert len(robot.answers["odometry"]) == before  # p3p knows no twist
+    assert twists_of_one_more() == 0  # p3p knows none
+    assert robot.set("solver", "r6p_vcwt") == robot.set("readout_time", 0.0) == (True, "")
+    assert twists_of_one_more() == 0
+    assert robot.set("readout_time", READOUT_TIME) == (True, "")
+    assert twists_of_one_more() > 0
     assert node.stop() == 0
 
 
-def test_life_cycle(recording, start_node, peer):
-    node = start_node("-p", "autostart:=false", *SHUTTER)
-    info, cloud = inputs(recording)[0]
-    assert state(peer) == State.PRIMARY_STATE_UNCONFIGURED
-    robot = Robot(peer)
-    assert peer.node.count_subscribers("/correspondences") == 0
-    assert change_state(peer, Transition.TRANSITION_CONFIGURE)
-    assert state(peer) == State.PRIMARY_STATE_INACTIVE
-    assert peer.node.count_subscribers("/correspondences") == 0
-    assert change_state(peer, Transition.TRANSITION_ACTIVATE)
-    robot.connect()
-    robot.localize(info, cloud)
-    assert change_state(peer, Transition.TRANSITION_DEACTIVATE)
-    assert peer.spin_until(lambda: peer.node.count_subscribers("/correspondences") == 0)
-    assert not robot.send(info, cloud, 0.3)
-    assert change_state(peer, Transition.TRANSITION_CLEANUP)
-    assert peer.spin_until(lambda: peer.node.count_publishers("/rs_localizer/pose") == 0)
-    # Once more from the start.
-    assert change_state(peer, Transition.TRANSITION_CONFIGURE)
-    assert change_state(peer, Transition.TRANSITION_ACTIVATE)
-    robot.connect()
-    robot.localize(info, cloud)
-    assert change_state(peer, Transition.TRANSITION_ACTIVE_SHUTDOWN)
-    assert state(peer) == State.PRIMARY_STATE_FINALIZED
-    assert node.stop() == 0
-    assert "Traceback" not in node.log
-    assert "ignored" not in node.log
-    assert "readout_time is 0" not in node.log
+def test_life_cycle_of_a_node_with_other_names(recording, start_node, peer, tmp_path):
+    """It waits to be configured, its namespace is another, and a QoS is overridden."""
+    override = "qos_overrides./cam/camera_info.subscription.reliability:=best_effort"
+    words = ("-p", "autostart:=false", "-r", "__ns:=/cam", "-p", override)
+    node = start_node(*words, *SHUTTER)
+    robot = Robot(peer, namespace="/cam")
 
+    def state() -> int:
+        answer = peer.call(GetState, "/cam/rs_localizer/get_state", GetState.Request())
+        return int(answer.current_state.id)
 
-def test_what_is_fixed_can_be_set_while_it_is_unconfigured(start_node, peer, tmp_path):
-    node = start_node("-p", "autostart:=false")
-    robot = Robot(peer)
+    def change(transition: int) -> bool:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return bool(peer.call(ChangeState, "/cam/rs_localizer/change_state", request).success)
+
+    def listeners() -> int:
+        return int(peer.node.count_subscribers("/cam/correspondences"))
+
+    assert state() == State.PRIMARY_STATE_UNCONFIGURED
+    # What is fixed can be set as long as it is unconfigured.
     assert robot.set("map_file", str(tmp_path / "no.npz"))[0]
-    assert not change_state(peer, Transition.TRANSITION_CONFIGURE)
+    assert not change(Transition.TRANSITION_CONFIGURE)
     node.wait_for_log("not configured: map_file: ")
-    for name, value in (("map_file", ""), ("map_frame", "hall"), ("odom_frame", "wheels")):
+    write_map_file(tmp_path / "map.npz", Map(np.eye(3), np.arange(3), None, "map"))
+    for name, value in (("map_file", str(tmp_path / "map.npz")), ("map_frame", "hall")):
         assert robot.set(name, value)[0]
-    assert change_state(peer, Transition.TRANSITION_CONFIGURE)
+    # Two clients at once: the transition is made once, and both get an answer.
+    clients = [
+        peer.node.create_client(ChangeState, "/cam/rs_localizer/change_state") for _ in range(2)
+    ]
+    assert peer.spin_until(lambda: all(client.service_is_ready() for client in clients))
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE))
+    for client in clients:  # answers reach a client that the service knows
+        assert any(peer.spin_until(client.call_async(request).done, 2.0) for _ in range(10))
+    request.transition.id = Transition.TRANSITION_CONFIGURE
+    answers = [client.call_async(request) for client in clients]
+    assert peer.spin_until(lambda: all(answer.done() for answer in answers))
+    assert sorted(answer.result().success for answer in answers) == [False, True]
+    assert "is refused: the node is inactive" in node.log
+    assert "the map has 3 landmarks in frame 'hall'" in node.log
+    assert (state(), listeners()) == (State.PRIMARY_STATE_INACTIVE, 0)
     refused = "map_frame cannot be changed while the node is inactive: clean it up first"
     assert robot.set("map_frame", "cellar") == (False, refused)
     assert robot.set("map_frame", "hall")[0]  # as it is
-    assert change_state(peer, Transition.TRANSITION_CLEANUP)
-    assert robot.set("map_frame", "cellar")[0]
-    assert node.stop() == 0
 
-
-def test_names_can_be_remapped_and_qos_overridden(recording, start_node, peer):
-    override = "qos_overrides./cam/camera_info.subscription.reliability"
-    start_node("-r", "__ns:=/cam", "-p", f"{override}:=best_effort", *SHUTTER)
-    robot = Robot(peer, namespace="/cam")
+    assert change(Transition.TRANSITION_ACTIVATE)
     robot.connect()
-    robot.localize(*inputs(recording)[0])
+    info, cloud = inputs(recording)[0]
+    robot.localize(info, cloud)
 
     def reliability(topic: str, infos: Any) -> Any:
         others = [info for info in infos(topic) if info.node_name != "peer"]
@@ -135,9 +123,26 @@ def test_names_can_be_remapped_and_qos_overridden(recording, start_node, peer):
     reliable = ReliabilityPolicy.RELIABLE
     assert peer.spin_until(lambda: reliability("/cam/correspondences", subscriptions) == reliable)
     assert reliability("/cam/camera_info", subscriptions) == ReliabilityPolicy.BEST_EFFORT
-    publishers = peer.node.get_publishers_info_by_topic
     for name in TYPES:
-        assert reliability(f"/cam/rs_localizer/{name}", publishers) == ReliabilityPolicy.RELIABLE
+        topic = f"/cam/rs_localizer/{name}"
+        assert reliability(topic, peer.node.get_publishers_info_by_topic) == reliable
+
+    assert change(Transition.TRANSITION_DEACTIVATE)
+    assert peer.spin_until(lambda: listeners() == 0)
+    assert not robot.send(info, cloud, 0.3)
+    assert change(Transition.TRANSITION_CLEANUP)
+    assert peer.spin_until(lambda: peer.node.count_publishers("/cam/rs_localizer/pose") == 0)
+    assert robot.set("map_file", "")[0]
+    # Once more from the start.
+    assert change(Transition.TRANSITION_CONFIGURE)
+    assert change(Transition.TRANSITION_ACTIVATE)
+    robot.connect()
+    robot.localize(info, cloud)
+    assert change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert state() == State.PRIMARY_STATE_FINALIZED
+    assert node.stop() == 0
+    for word in ("Traceback", "ignored", "readout_time is 0"):
+        assert word not in node.log
 
 
 def test_a_signal_while_a_frame_takes_long(recording, start_node, peer):

@@ -2,16 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A topic is heard as well as its publishers send it, whoever comes first."""
 
-import time
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rclpy.context import Context
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from rs_localizer.ros.node.inputs import Inputs, best
+from rs_localizer.ros.node import inputs as inputs_module
+from rs_localizer.ros.node.inputs import LATCHED as LATCHED_DATA
+from rs_localizer.ros.node.inputs import Inputs, Topic, best
+from rs_localizer.ros.node.refusals import Refusals
 
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 VOLATILE, LATCHED = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
@@ -53,47 +56,63 @@ def test_why_large_messages_are_lost_is_said(kind, quality, large):
     assert ("above half a megabyte are lost" in cause, mismatch) == (large, False)
 
 
-def heard_with(peer: Any, topic: str) -> Callable[[], set[ReliabilityPolicy]]:
-    return lambda: {
-        info.qos_profile.reliability
-        for info in peer.node.get_subscriptions_info_by_topic(topic)
-        if info.node_name == "rs_localizer"
+def test_a_topic_follows_its_publishers(peer):
+    node, told = peer.node, Refusals(lambda text: None)
+    # Once, before anybody listens.
+    node.create_publisher(CameraInfo, "/camera_info", WHOLE).publish(CameraInfo(width=640))
+    heard: dict[str, list[Any]] = {"camera_info": [], "correspondences": []}
+    topics = {
+        "camera_info": Topic(CameraInfo, heard["camera_info"].append, LATCHED_DATA),
+        "correspondences": Topic(PointCloud2, heard["correspondences"].append),
     }
+    inputs = Inputs(node, topics, told)
 
+    def present() -> set[ReliabilityPolicy]:
+        found = node.get_subscriptions_info_by_topic("/correspondences")
+        return {info.qos_profile.reliability for info in found}
 
-def test_the_node_follows_its_publishers(start_node, peer):
-    node = start_node()
-    present = heard_with(peer, "/correspondences")
     assert peer.spin_until(lambda: present() == {BEST_EFFORT})
-    sender = peer.node.create_publisher(PointCloud2, "/correspondences", 10)
+    assert peer.spin_until(lambda: heard["camera_info"])
+    sender = node.create_publisher(PointCloud2, "/correspondences", 10)
     assert peer.spin_until(lambda: present() == {RELIABLE})
-    other = peer.node.create_publisher(
+    other = node.create_publisher(
         PointCloud2, "/correspondences", QoSProfile(depth=1, reliability=BEST_EFFORT)
     )
     assert peer.spin_until(lambda: present() == {BEST_EFFORT})
-    peer.node.destroy_publisher(sender)
-    peer.node.destroy_publisher(other)
-    peer.spin_until(lambda: False, 1.5)
+    assert peer.spin_until(lambda: sender.publish(PointCloud2()) or heard["correspondences"])
+    node.destroy_publisher(sender)
+    node.destroy_publisher(other)
+    peer.spin_until(lambda: False, 0.7)  # it looks twice a second
     assert present() == {BEST_EFFORT}  # nobody there: as it was
-    assert "internal_error" not in node.log
-    assert node.stop() == 0
+    inputs.close()
+    assert not told.counts
 
 
-def test_a_latched_camera_info_is_heard(start_node, peer):
-    info = CameraInfo(width=640, height=480, distortion_model="plumb_bob", d=[0.0] * 5)
-    info.k = [500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0]
-    info.header.frame_id = "camera"
-    publisher = peer.node.create_publisher(CameraInfo, "/camera_info", WHOLE)
-    publisher.publish(info)  # once, before there is a node
-    node = start_node()
-    node.wait_for_log("active with solver")
-    # A cloud is looked at only once there is a camera.
-    cloud = peer.node.create_publisher(PointCloud2, "/correspondences", 10)
-    deadline = time.monotonic() + 30.0
-    message = PointCloud2(height=1, width=0)
-    message.header.frame_id = "map"
-    while "empty_cloud" not in node.log and "bad_cloud" not in node.log:
-        assert time.monotonic() < deadline, node.log
-        cloud.publish(message)
-        peer.spin_until(lambda: False, 0.1)
-    assert node.stop() == 0
+def test_publishers_that_cannot_be_heard_are_named(peer, monkeypatch):
+    monkeypatch.setattr(inputs_module, "_LONG", 0.0)
+    said: list[str] = []
+    qos = {"depth": 1, "reliability": RELIABLE}
+    topics = {name: Topic(PointCloud2, print, qos) for name in ("one", "other", "third")}
+    inputs = Inputs(peer.node, topics, Refusals(said.append))
+    context = Context()
+    context.init(args=[])
+    driver = Node("driver", context=context)
+    driver.create_publisher(PointCloud2, "one", QoSProfile(depth=1, reliability=BEST_EFFORT))
+    driver.create_publisher(CameraInfo, "other", 1)
+    wanted = {
+        "one": "the QoS of /driver does not fit: Best effort publisher and reliable subscription",
+        "other": "/driver publishes sensor_msgs/msg/CameraInfo, not sensor_msgs/msg/PointCloud2",
+        "third": "it has no publisher",
+    }
+
+    def causes() -> bool:
+        return all(item.cause.startswith(wanted[name]) for name, item in inputs.silence().items())
+
+    assert peer.spin_until(causes), inputs.silence()
+    mismatches = {name: item.mismatch for name, item in inputs.silence().items()}
+    assert mismatches == {"one": True, "other": True, "third": False}
+    line = f"incompatible_publisher: no message arrives on /one: {wanted['one']}"
+    assert any(text.startswith(line) for text in said)
+    inputs.close()
+    driver.destroy_node()
+    context.try_shutdown()

@@ -211,6 +211,23 @@ def test_a_frame_that_waits_for_its_mounting_is_dropped_by_a_pause(fake):
     assert fake.published == []
 
 
+def test_a_frame_waits_for_what_it_needs_but_not_for_long(fake):
+    fake.go_on.release(3)
+    fake.awaited = {"one"}
+    fake.send("one")
+    fake.send("two", topic="others")  # those behind it wait, too
+    time.sleep(0.05)
+    assert fake.published == []
+    fake.awaited.clear()
+    fake.worker.look()
+    fake.wait(fake.done)
+    fake.wait(fake.done)
+    fake.awaited = {"three"}
+    fake.send("three", patience=0.05)
+    fake.wait(fake.done)
+    assert fake.published == ["one old", "two old", "three old"]
+
+
 def test_the_end_waits_for_the_last_frame_but_not_for_ever(fake):
     fake.send("one")
     fake.wait(fake.started)

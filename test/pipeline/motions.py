@@ -1,0 +1,28 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Motions with errors."""
+
+from dataclasses import replace
+
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.types import Estimate
+
+
+def disturbed(motion: Estimate, error: Array) -> Estimate:
+    """The motion with errors in the order of its joint covariance, by its definition."""
+    phi, rho, d_omega, d_v, d_alpha, d_a = error[:18].reshape(6, 3)
+    map_from_camera = motion.rotation.T
+    centre = -map_from_camera @ motion.translation + map_from_camera @ rho
+    rotation = Rotation.from_rotvec(-phi).as_matrix() @ motion.rotation
+    return replace(
+        motion,
+        rotation=rotation,
+        translation=-rotation @ centre,
+        angular_velocity=motion.angular_velocity + d_omega,
+        linear_velocity=motion.linear_velocity + d_v,
+        angular_acceleration=motion.angular_acceleration + d_alpha,
+        linear_acceleration=motion.linear_acceleration + d_a,
+        shake=motion.shake + error[18:].reshape(-1, 3),
+    )

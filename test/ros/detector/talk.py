@@ -1,0 +1,69 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A camera before a detector, and somebody who hears it."""
+
+from collections.abc import Callable
+from typing import Any
+
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CompressedImage, Image
+
+TOPICS = {Image: "/image", CompressedImage: "/image/compressed"}
+
+
+class Talk:
+    """Publishes images; listens only when told to."""
+
+    def __init__(self, peer: Any, node: str, kind: type = Image) -> None:
+        self.peer = peer
+        self._node = node
+        self.heard: dict[str, list[Any]] = {}
+        self.open(kind)
+
+    def open(self, kind: type) -> None:
+        """The camera publishes images of this kind."""
+        self.publisher = self.peer.node.create_publisher(kind, TOPICS[kind], 1)
+
+    def listen(self, kind: type, topic: str) -> Any:
+        kept = self.heard.setdefault(topic, [])
+        return self.peer.node.create_subscription(kind, topic, kept.append, 10)
+
+    def listeners(self, count: int) -> bool:
+        return bool(self.peer.spin_until(lambda: self.publisher.get_subscription_count() == count))
+
+    def send_until(self, message: Any, condition: Callable[[], Any]) -> None:
+        for _ in range(30):
+            self.publisher.publish(message)
+            if self.peer.spin_until(condition, 0.5):
+                return
+        raise AssertionError("nothing comes of the image")
+
+    def ask(self, message: Any, topic: str) -> Any:
+        """What comes of an image."""
+
+        def answers() -> list[Any]:
+            heard = self.heard[topic]
+            return [m for m in heard if m.header.stamp.sec == message.header.stamp.sec]
+
+        self.send_until(message, answers)
+        return answers()[0]
+
+    def set(self, name: str, value: object) -> tuple[bool, str]:
+        """Set a parameter: whether it was, and the reason if not."""
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        request = SetParametersAtomically.Request(parameters=[parameter])
+        service = f"/{self._node}/set_parameters_atomically"
+        result = self.peer.call(SetParametersAtomically, service, request).result
+        return result.successful, result.reason
+
+    def reported(self, wanted: dict[str, str | None]) -> bool:
+        """Whether the diagnostics have had these values at once; None: any but 0."""
+        found = [s for m in self.heard["/diagnostics"] for s in m.status if self._node in s.name]
+        return any(
+            all(
+                values.get(k, "0") != "0" if value is None else values.get(k) == value
+                for k, value in wanted.items()
+            )
+            for values in ({item.key: item.value for item in s.values} for s in found)
+        )
