@@ -732,7 +732,8 @@ def _of_scales(
     for i in range(count):
         after[i, i] += 2.0 * decided[first + i]
     volume = log_determinant_of_inverse(before) - log_determinant_of_inverse(after)
-    return cost, volume, np.linalg.inv(after)
+    spread: Array = np.linalg.inv(after)
+    return cost, volume, spread
 
 
 @inlined
