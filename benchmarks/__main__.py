@@ -28,12 +28,9 @@ from benchmarks.experiments import (
     motion,
     noise,
     p3p_initialisation,
-    planes,
     readout_time,
     real,
-    robustness,
     timings,
-    tracking,
     translation,
 )
 from benchmarks.experiments.report import SUMMARY, count_verdicts, write_result, write_summary
@@ -53,11 +50,8 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "linearisation": linearisation.run,
     "p3p-initialisation": p3p_initialisation.run,
     "bound": bound.run,
-    "planes": planes.run,
     "honesty": honesty.run,
-    "tracking": tracking.run,
     "inertial": inertial.run,
-    "robustness": robustness.run,
     "timings": timings.run,
     "matching": matching.run,
     "features": features.run,
@@ -80,7 +74,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   profiling, frame_times           where the time of a frame goes
   size                             lines, modules, constants, and calls of one cloud
   load, load.rig, load.signals     live nodes under load, of a rig, and stopped at random moments
-  image_flight, marker_flight      rendered flights through live nodes and through commands
+  image_flight                     rendered flights through live nodes
   signals                          commands that are stopped at random moments
   rig_calibration                  calibrate --rig against its bounds
   start                            memory and time of a start of the node

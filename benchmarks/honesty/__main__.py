@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
-from benchmarks.honesty.benches import Bench, Recordings, benches
-from benchmarks.honesty.text import heading, line
+from benchmarks.honesty.benches import Bench, Recordings, benches, heading, line
 from rs_localizer import data
 from rs_localizer.cli import integer
 
