@@ -92,25 +92,13 @@ _FACES = np.array(
 PosesAt = Callable[[Array], tuple[Array, Array]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cube:
-    """A cube by its corners (8,3), m in the map frame."""
-
-    corners: Array
-
-
-def cube_on(marker: Marker) -> Cube:
-    """A cube that stands on a marker like a box on a carpet."""
-    return Cube(marker.pose(_SIDE * marker.size * _CORNERS))
-
-
-def corner_pixels(camera: Camera, poses_at: PosesAt, cube: Cube) -> Array:
-    """Raw pixels (8,2) where a moving camera sees the corners; NaN where it does not."""
-    return project_rolling(camera, poses_at, cube.corners)[0]
+def cube_on(marker: Marker) -> Array:
+    """Corners (8,3), m in the map, of a cube that stands on a marker like a box on a carpet."""
+    return marker.pose(_SIDE * marker.size * _CORNERS)
 
 
 def draw_cube(
-    picture: Image, camera: Camera, poses_at: PosesAt, cube: Cube, color: tuple[int, int, int]
+    picture: Image, camera: Camera, poses_at: PosesAt, corners: Array, color: tuple[int, int, int]
 ) -> None:
     """Draw a cube into a picture (height, width, 3), each of its points at its own row's pose.
 
@@ -119,10 +107,10 @@ def draw_cube(
     """
     rotations, translations = poses_at(np.zeros(1))
     centre = -rotations[0].T @ translations[0]
-    outlines = [_outline(camera, poses_at, cube.corners[face]) for face in _FACES]
+    outlines = [_outline(camera, poses_at, corners[face]) for face in _FACES]
     if not all(np.all(np.isfinite(outline)) for outline in outlines):
         return  # partly behind the camera
-    near = [_faces_viewer(cube.corners[face], centre) for face in _FACES]
+    near = [_faces_viewer(corners[face], centre) for face in _FACES]
     fixed = [np.rint(outline * 2**_SHIFT).astype(np.int32) for outline in outlines]
     for outline, near_side in zip(fixed, near, strict=True):
         if not near_side:
@@ -185,8 +173,8 @@ def clip_stamps(walls: MarkerWalls, most: int | None = None) -> list[int]:
     return stamps[first - RUN_UP : first + (whole if most is None else min(most, whole))]
 
 
-def clip_cube(walls: MarkerWalls) -> Cube:
-    """The cube of the clip."""
+def clip_cube(walls: MarkerWalls) -> Array:
+    """Corners (8,3) of the cube of the clip."""
     return cube_on(walls.markers[_MARKER])
 
 
@@ -212,13 +200,13 @@ def draw_clip(
 
 
 def cube_errors(
-    motion: TrueMotion, middle_ns: int, cube: Cube, motions: Motions
+    motion: TrueMotion, middle_ns: int, cube: Array, motions: Motions
 ) -> dict[str, float]:
     """How far the cube's farthest corner is off in the image, px, for each method.
 
     Infinite without a pose; empty when the cube is not all in the image.
     """
-    true = corner_pixels(CAMERA, true_poses_at(CAMERA, motion, middle_ns), cube)
+    true = project_rolling(CAMERA, true_poses_at(CAMERA, motion, middle_ns), cube)[0]
     if not np.all(CAMERA.inside(true)):
         return {}
     errors = {}
@@ -226,12 +214,13 @@ def cube_errors(
         if estimate is None:
             errors[name] = np.inf
         else:
-            off = np.linalg.norm(corner_pixels(CAMERA, estimate.at_rows, cube) - true, axis=1).max()
+            seen = project_rolling(CAMERA, estimate.at_rows, cube)[0]
+            off = np.linalg.norm(seen - true, axis=1).max()
             errors[name] = float(np.nan_to_num(off, nan=np.inf))
     return errors
 
 
-def _picture(image: Image, cube: Cube, motions: Motions, off: Mapping[str, float]) -> Image:
+def _picture(image: Image, cube: Array, motions: Motions, off: Mapping[str, float]) -> Image:
     """The image once for each method, with its cube and what it is off by."""
     pictures: list[Image] = []
     captions: list[Sequence[str]] = []

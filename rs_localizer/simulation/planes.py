@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.video import Image
 
-# Axes of a plane must be unit vectors at right angles, to this.
-_AXES_TOLERANCE = 1e-9
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexturedPlane:
@@ -29,18 +26,6 @@ class TexturedPlane:
     down: Array  # (3,) unit vector along its columns
     texel: float  # m
     texture: Image  # (height, width)
-
-    def __post_init__(self) -> None:
-        axes = np.array([self.right, self.down], dtype=np.float64)
-        if np.abs(axes @ axes.T - np.eye(2)).max() > _AXES_TOLERANCE:
-            raise ValueError(f"right and down must be perpendicular unit vectors, got {axes}")
-        if not 0.0 < self.texel < np.inf:
-            raise ValueError(f"a texel must be more than 0 m wide, got {self.texel}")
-        if self.texture.ndim != 2 or self.texture.dtype != np.uint8 or self.texture.size == 0:
-            raise ValueError(
-                f"a texture must be a grey image of bytes, got {self.texture.shape} "
-                f"of {self.texture.dtype}"
-            )
 
     @property
     def normal(self) -> Array:

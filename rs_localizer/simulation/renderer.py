@@ -164,8 +164,6 @@ class Renderer:
         planes: Sequence[TexturedPlane],
         settings: ImageSettings | None = None,
     ) -> None:
-        if not planes:
-            raise ValueError("a scene needs at least one plane")
         self.camera = camera
         self.planes = tuple(planes)
         self.settings = settings or ImageSettings()
