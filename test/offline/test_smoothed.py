@@ -27,13 +27,15 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 
 CONFIG = NodeConfig(readout_time=0.03)
 SECOND = 10**9
+Recorded = tuple[FrameLocalizer, list[Localized], list[int]]
+"""With what it was localized, the frames, the stamps of all images."""
 
 
 @pytest.fixture(scope="module")
 def recorded(
     tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[FrameLocalizer, list[Localized], list[int]]:
-    """Eight seconds, localized: with what, the frames, the stamps of all images."""
+) -> Recorded:
+    """Eight seconds, localized."""
     path = tmp_path_factory.mktemp("smoothed") / "flight"
     words = "--trajectory tum_vi_room5 --start 20 --duration 8 --points 40 --outliers 0"
     assert main(["simulate", str(path), *words.split(), "--seed", "3"]) == 0
@@ -52,7 +54,7 @@ def in_windows(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
 
 
 def test_windows_say_what_one_piece_says(
-    recorded: tuple[FrameLocalizer, list[Localized], list[int]], monkeypatch: pytest.MonkeyPatch
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     localizer, frames, stamps = recorded
     (whole,) = smooth_frames(localizer, frames, stamps, None)
@@ -73,7 +75,7 @@ def test_windows_say_what_one_piece_says(
 
 
 def test_frames_are_forgotten_with_their_window(
-    recorded: tuple[FrameLocalizer, list[Localized], list[int]], monkeypatch: pytest.MonkeyPatch
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     localizer, frames, stamps = recorded
     in_windows(monkeypatch, 2.0)
@@ -93,7 +95,7 @@ def test_frames_are_forgotten_with_their_window(
 
 
 def test_a_window_without_poses_is_not_determined(
-    recorded: tuple[FrameLocalizer, list[Localized], list[int]], monkeypatch: pytest.MonkeyPatch
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     localizer, frames, stamps = recorded
     in_windows(monkeypatch, 2.0)
@@ -109,7 +111,7 @@ def test_a_window_without_poses_is_not_determined(
 
 
 def test_a_clock_that_jumps_costs_no_memory(
-    recorded: tuple[FrameLocalizer, list[Localized], list[int]],
+    recorded: Recorded,
 ) -> None:
     localizer, frames, stamps = recorded
     early = [1, *stamps]  # half a century before
