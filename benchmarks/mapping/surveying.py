@@ -31,12 +31,12 @@ from rs_localizer.simulation.planes import TexturedPlane
 from rs_localizer.simulation.renderer import Renderer
 from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import TrueState
+from rs_localizer.simulation.walls import PAPER_AND_INK, printed
 from rs_localizer.trajectory.fit import Fit
 from rs_localizer.trajectory.model import Extrinsics, Mounting
 from rs_localizer.trajectory.problem import LIMIT
 
 _CELL_TEXELS = 24
-_PAPER, _INK = 235, 26
 _GREY_NOISE = 2.0
 # What lies within this of the picture's edges may reach into it (tangent).
 _MARGIN = 0.3
@@ -100,8 +100,7 @@ def _hung(of: Family, number: int, pose: tuple[Array, Array], size: float) -> Te
     """A marker with a white rim of a cell."""
     axes, place = pose
     white = np.pad(pattern(of, number), 1, constant_values=True)
-    cells = np.where(white, _PAPER, _INK).astype(np.uint8)
-    texture = cells.repeat(_CELL_TEXELS, axis=0).repeat(_CELL_TEXELS, axis=1)
+    texture = printed(white, PAPER_AND_INK, _CELL_TEXELS)
     texel = size / (of.cells * _CELL_TEXELS)
     half = 0.5 * texel * len(texture)
     corner = place - half * axes[:, 0] + half * axes[:, 1]

@@ -67,21 +67,14 @@ class TexturedPlane:
         return np.stack([*rows, inverse_depth], axis=1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pyramids:
+def pyramids(planes: Sequence[TexturedPlane]) -> tuple[Image, NDArray[np.int64]]:
     """The pictures of several planes with all their reductions, for the kernel.
 
-    ``levels[p, l]`` is where level ``l`` of picture ``p`` begins in ``texels``, its width and
-    height; each level averages two by two texels of the one before. Pictures with fewer levels
-    repeat their last.
+    Returns:
+        texels (n,) and levels (planes, levels, 3): ``levels[p, l]`` is where level ``l`` of picture
+        ``p`` begins, its width and height; each level averages two by two texels of the one before.
+        Pictures with fewer levels repeat their last.
     """
-
-    texels: Image  # (n,)
-    levels: NDArray[np.int64]  # (planes, levels, 3)
-
-
-def pyramids(planes: Sequence[TexturedPlane]) -> Pyramids:
-    """All reductions of the planes' pictures."""
     reduced = [_reductions(plane.texture) for plane in planes]
     depth = max(len(images) for images in reduced)
     levels = np.zeros((len(planes), depth, 3), np.int64)
@@ -90,9 +83,7 @@ def pyramids(planes: Sequence[TexturedPlane]) -> Pyramids:
         for level, image in enumerate(images):
             levels[p, level:] = start, image.shape[1], image.shape[0]
             start += image.size
-    return Pyramids(
-        np.concatenate([image.ravel() for images in reduced for image in images]), levels
-    )
+    return np.concatenate([image.ravel() for images in reduced for image in images]), levels
 
 
 def _reductions(texture: Image) -> list[Image]:
