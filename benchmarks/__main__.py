@@ -17,7 +17,6 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
-from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
 from benchmarks.experiments import (
     augmented_reality,
     bound,
@@ -37,8 +36,6 @@ from benchmarks.experiments.report import SUMMARY, count_verdicts, write_result,
 from benchmarks.experiments.results import Context, Result, Verdict
 from benchmarks.honesty import experiment as honesty
 from benchmarks.inertial import experiment as inertial
-from rs_localizer import data
-from rs_localizer.settings import load_params_file
 
 T = TypeVar("T")
 
@@ -141,7 +138,7 @@ def run(args: argparse.Namespace) -> None:
     seconds: dict[str, float] = {}
     for name in dict.fromkeys(names):
         start = time.perf_counter()
-        results[name] = EXPERIMENTS[name](_context(name, args.trials, args.seed))
+        results[name] = EXPERIMENTS[name](Context(args.trials, args.seed, partial(_track, name)))
         seconds[name] = time.perf_counter() - start
         write_result(args.out, results[name])
         # After each, so that an interrupted run leaves what it found.
@@ -149,21 +146,6 @@ def run(args: argparse.Namespace) -> None:
         _print(name, results[name], seconds[name])
     claims = [claim for result in results.values() for claim in result.claims]
     print(f"{count_verdicts(claims)}; written to {args.out / SUMMARY}")
-
-
-def _context(name: str, trials: int, seed: int) -> Context:
-    webcam = data.path(data.WEBCAM)
-    readout_time = load_params_file(webcam / "parameters.yaml")["readout_time"]
-    return Context(
-        trials,
-        seed,
-        partial(_track, name),
-        webcam,
-        readout_time,
-        data.path(data.HAND_MOTION),
-        SLOW_HAND_MOTION,
-        GLOBAL_SHUTTER_TAGS,
-    )
 
 
 def _track(name: str, items: Iterable[T], total: int) -> Iterator[T]:

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.data import HAND_MOTION
 from benchmarks.experiments import charts
 from benchmarks.experiments import methods as m
 from benchmarks.experiments.methods import available
@@ -21,18 +22,20 @@ from benchmarks.experiments.uncertainty import Interval, bootstrap, share
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.evaluation.cube_clip import (
+    CAMERA,
     CLIP_SENSOR,
     OURS,
     P3P,
     RUN_UP,
     Clip,
+    MarkerFrame,
+    MarkerWalls,
     clip_stamps,
     draw_clip,
 )
 from rs_localizer.io.trajectories import Trajectory, read_tum
 from rs_localizer.localizer import Localizer
 from rs_localizer.simulation.frames import true_poses_at
-from rs_localizer.simulation.marker_frames import CAMERA, MarkerFrame, MarkerWalls
 from rs_localizer.solvers.table import SOLVERS
 from rs_localizer.tracking import Tracker
 
@@ -310,7 +313,7 @@ class _Estimates:
 
 def run(context: Context) -> Result:
     """The experiment."""
-    trajectory = read_tum(context.hand_motion)
+    trajectory = read_tum(HAND_MOTION)
     walls = MarkerWalls(trajectory, context.seed)
     stamps = walls.stamps()
     count = int(np.clip(_FRAMES_PER_TRIAL * context.trials, _LEAST_FRAMES, len(stamps)))

@@ -26,10 +26,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.data import HAND_MOTION
 from benchmarks.experiments.errors import angles
-from rs_localizer import data
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
+from rs_localizer.evaluation.cube_clip import CAMERA, SENSOR
 from rs_localizer.evaluation.map_pictures import save_pictures
 from rs_localizer.evaluation.room_mapping import Piece, Room, without_refinement
 from rs_localizer.io.camera_info import read_camera_info
@@ -41,7 +42,6 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.mapping.report import rows
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.simulation.frames import middle_stamp
-from rs_localizer.simulation.marker_frames import CAMERA, SENSOR
 
 _WALK = Piece(28.0, 11.8, 15.0)
 _FLIGHTS = {"another walk": Piece(40.0, 8.0), "quick turns": Piece(54.8, 6.0)}
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
-    room = Room(read_tum(data.path(data.HAND_MOTION)), CAMERA, SENSOR, _KEYPOINTS)
+    room = Room(read_tum(HAND_MOTION), CAMERA, SENSOR, _KEYPOINTS)
     with TemporaryDirectory() as images, TemporaryDirectory() as folder:
         with _bar("look", len(room.stamps(_WALK))) as step:
             views = room.look(_WALK, Path(images), lambda: step(1))

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.data import HAND_MOTION
 from benchmarks.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.config import Matching, NodeConfig
 from rs_localizer.core.arrays import Array
@@ -133,7 +134,7 @@ class Run:
 def run(context: Context) -> Result:
     """The experiment."""
     wanted = int(np.clip(_FRAMES_PER_TRIAL * context.trials, _FEWEST, _MOST))
-    motion = RecordedMotion(read_tum(context.hand_motion))
+    motion = RecordedMotion(read_tum(HAND_MOTION))
     first, last = motion.intervals_ns[0]
     way = motion.state(first, np.linspace(0.0, (last - first) * 1e-9, 400)).positions
     rng = np.random.default_rng(context.seed)

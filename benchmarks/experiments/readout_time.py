@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.data import HAND_MOTION
 from benchmarks.experiments import charts
 from benchmarks.experiments.results import Claim, Context, Result, Statement, Table
 from benchmarks.experiments.uncertainty import share
@@ -155,7 +156,7 @@ class Trial:
 def run(context: Context) -> Result:
     """The experiment."""
     count = int(np.clip(context.trials // _TRIALS_PER_RECORDING, _LEAST, _MOST))
-    motion = RecordedMotion(read_tum(context.hand_motion))
+    motion = RecordedMotion(read_tum(HAND_MOTION))
     seconds = float(np.clip(context.trials / _TRIALS_PER_SECOND, _SHORTEST, _LONGEST))
     trials = [_trial(motion, seconds, k, context.seed) for k in context.track(range(count), count)]
     points = _map(motion, "room", np.random.default_rng([context.seed, count]))

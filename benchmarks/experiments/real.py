@@ -204,10 +204,10 @@ def run(context: Context) -> Result:
     """The experiment."""
     frames = int(np.clip(_FRAMES_PER_TRIAL * context.trials, _LEAST_FRAMES, _MOST_FRAMES))
     sequences = [
-        phone(context.hand_motion, frames, context.seed),
-        action_camera(context.hand_motion, frames, context.seed),
+        phone(frames, context.seed),
+        action_camera(frames, context.seed),
         hard(frames, context.seed),
-        webcam(context.webcam, context.webcam_readout_time, frames),
+        webcam(frames),
     ]
     total = sum(len(sequence.frames) for sequence in sequences)
     numbered = [(s, index) for s in sequences for index in range(len(s.frames))]

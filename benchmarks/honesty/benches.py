@@ -81,26 +81,16 @@ class Bench(Generic[C, F]):
             yield condition.name, self.measure(condition, frames, seed)
 
 
-@dataclass(frozen=True, slots=True)
-class Recordings:
-    """What was recorded, and where rendered images' corners are kept."""
-
-    tags: Path
-    trajectories: dict[str, Path]  # by the names of ``rendered.MOTIONS``
-    folder: Path
-
-
-def benches(recordings: Recordings) -> dict[str, Bench[Any, Any]]:
-    """All of them."""
+def benches(folder: Path) -> dict[str, Bench[Any, Any]]:
+    """All of them; the corners of rendered images are kept in the folder."""
 
     def replay_tags(condition: tags.Condition, frames: int, _: int) -> tags.Replayed:
         share = min(1.0, frames / _FULL)
-        return tags.measure(condition, recordings.tags, max(1, round(share * tags.FRAMES)))
+        return tags.measure(condition, max(1, round(share * tags.FRAMES)))
 
     def replay_rendered(condition: rendered.Condition, frames: int, _: int) -> Found:
         seconds = rendered.SECONDS * min(1.0, frames / _FULL)
-        trajectory = recordings.trajectories[condition.motion]
-        return rendered.measure(condition, trajectory, recordings.folder, seconds)
+        return rendered.measure(condition, folder, seconds)
 
     return {
         "p3p": Bench(

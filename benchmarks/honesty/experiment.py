@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.experiments.results import Claim, Context, Result, Statement, Table
 from benchmarks.experiments.uncertainty import IntArray, Interval, share, together
 from benchmarks.honesty.against_p3p import MOST_RATIO, Pair
-from benchmarks.honesty.benches import Bench, Recordings, benches, table
+from benchmarks.honesty.benches import Bench, benches, table
 from benchmarks.honesty.estimating import Found
 from benchmarks.honesty.scores import Scores, percent
 from benchmarks.honesty.tags import Replayed
@@ -217,12 +217,7 @@ def run(context: Context) -> Result:
     judged: list[Claim] = []
     tables: dict[str, Table] = {}
     with tempfile.TemporaryDirectory() as folder:
-        recordings = Recordings(
-            context.tags,
-            {"tum_vi_room5": context.hand_motion, "tum_rgbd_fr1_xyz": context.slow_hand_motion},
-            Path(folder),
-        )
-        all_of_them = benches(recordings)
+        all_of_them = benches(Path(folder))
         for name, judge in _JUDGE.items():
             bench = all_of_them[name]
             found = _run(bench, context, frames)

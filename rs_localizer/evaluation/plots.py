@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
-from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import median_filter
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.scanning import ScanDirection
@@ -216,18 +216,11 @@ def _draw_series(
         t, values, linestyle="none", marker=style.marker, markersize=3.0, markeredgewidth=0.6,
         color=style.color, alpha=0.35, zorder=style.layer,
     )  # fmt: skip
-    x, y = _broken(stamps_ns, t, _running_median(values))
+    running = median_filter(values, _WINDOW, mode="mirror") if len(values) >= _WINDOW else values
+    x, y = _broken(stamps_ns, t, running)
     counted = values if counted is None else counted
     label = f"{name}: median {np.median(counted):.3g} {unit}".rstrip() if len(counted) else name
     axes.plot(x, y, style.line, color=style.color, linewidth=2.0, zorder=style.layer, label=label)
-
-
-def _running_median(values: Array) -> Array:
-    if len(values) < _WINDOW:
-        return values
-    half = _WINDOW // 2
-    padded = np.pad(values, half, mode="reflect")
-    return np.asarray(np.median(sliding_window_view(padded, _WINDOW), axis=1))
 
 
 def inlier_picture(

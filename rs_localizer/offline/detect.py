@@ -104,9 +104,6 @@ def record(
 
     Args:
         shots: the images, and what else of their recording is to be kept.
-        detector: looks for markers.
-        bag: where they are written.
-        options: what is written, and how it was seen.
         done: called after each image.
         tell: called when many images in the beginning show nothing, with what they show instead.
 
@@ -306,13 +303,6 @@ def record_features(
     done: Callable[[], object] = lambda: None,
 ) -> Extraction:
     """Write the keypoints of all images that have any, each with its CameraInfo.
-
-    Args:
-        shots: the images, and what else of their recording is to be kept.
-        extractor: looks for keypoints.
-        bag: where they are written.
-        options: what is written.
-        done: called after each image.
 
     Raises:
         DetectError: when no image has keypoints, or images and calibration differ in size.

@@ -324,8 +324,6 @@ def prepare(
     """What :func:`replay` needs: where the inputs are, and a localizer with its map.
 
     Args:
-        bag: the recording.
-        config: the settings.
         given: topics, as for :func:`find_topics`.
         notice: told of what is odd.
 

@@ -5,7 +5,6 @@
 import csv
 import sys
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.experiments.results import Verdict
 from benchmarks.honesty import __main__ as command
-from benchmarks.honesty.benches import Recordings, benches
 from benchmarks.honesty.estimating import Found
 from benchmarks.honesty.experiment import rendered_claims
 from benchmarks.honesty.scores import Score, Scores, Truth, score
 from rs_localizer.io.outputs import Pose, Twist
-
-BENCHES = benches(Recordings(Path("tags"), {}, Path("nowhere")))
 
 
 def published(rng: np.random.Generator, wider: float = 1.0) -> Score:

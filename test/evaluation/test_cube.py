@@ -12,6 +12,7 @@ from PIL import Image as Pillow
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.evaluation import cube_clip
 from rs_localizer.evaluation.cube_clip import (
     clip_cube,
     clip_stamps,
@@ -24,7 +25,6 @@ from rs_localizer.evaluation.cube_clip import (
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
-from rs_localizer.simulation import marker_frames
 from rs_localizer.simulation.frames import middle_stamp
 
 CAMERA = Camera(
@@ -96,10 +96,10 @@ def test_animation_can_be_played():
 
 
 def test_a_turned_pose_puts_the_cube_off():
-    walls = marker_frames.MarkerWalls(read_tum(data.path(data.HAND_MOTION)), 0)
-    middle, away = (middle_stamp(marker_frames.CAMERA, clip_stamps(walls)[k]) for k in (90, 60))
+    walls = cube_clip.MarkerWalls(read_tum(data.path(data.HAND_MOTION)), 0)
+    middle, away = (middle_stamp(cube_clip.CAMERA, clip_stamps(walls)[k]) for k in (90, 60))
     state, cube = walls.motion.state(middle, np.zeros(1)), clip_cube(walls)
-    rotation, readout = state.rotations[0].T, marker_frames.CAMERA.readout_time
+    rotation, readout = state.rotations[0].T, cube_clip.CAMERA.readout_time
     true = Motion(
         rotation, -rotation @ state.positions[0],
         readout * state.angular[0], readout * state.linear[0],

@@ -14,14 +14,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.__main__ import EXPERIMENTS
-from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
 from benchmarks.experiments import augmented_reality, readout_time
 from benchmarks.experiments.results import Context, Result, Verdict
 from benchmarks.experiments.trials import Setting, Trials, draw_trials
 from benchmarks.experiments.views import View, synthetic_views
 from benchmarks.honesty import against_p3p
 from benchmarks.inertial import experiment as inertial
-from rs_localizer import data
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.estimation.refine import apply_step
 
@@ -101,11 +99,7 @@ def some(whole: Callable[[], Sequence], every: int) -> Callable[[], Sequence]:
 
 
 def result(name: str) -> Result:
-    context = Context(
-        FEW.get(name, TRIALS), 0, untracked, data.path(data.WEBCAM), 0.011,
-        data.path(data.HAND_MOTION), SLOW_HAND_MOTION,
-        GLOBAL_SHUTTER_TAGS,
-    )  # fmt: skip
+    context = Context(FEW.get(name, TRIALS), 0, untracked)
     with pytest.MonkeyPatch.context() as patch:
         # Of some 500 conditions even a single frame takes long.
         patch.setattr(against_p3p, "conditions", some(against_p3p.conditions, 9))
