@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Offline detection: images -> a recording of correspondences or keypoints, as the nodes do."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -63,23 +65,6 @@ class Recorded:
     period: float  # s from one image to the next, median; NaN for a single one
     carried: dict[str, int]  # messages of each other topic that replay may need
     faults: tuple[str, ...]  # what speaks against map or calibration
-
-
-@dataclass(slots=True)
-class Extraction:
-    """What became of the images."""
-
-    images: int = 0
-    counts: list[int] = field(default_factory=list)  # keypoints or corners, where there are any
-    refused: dict[str, str] = field(default_factory=dict)  # the first detail of each reason
-    carried: Counter[str] = field(default_factory=Counter)  # messages of other topics
-    stamps_ns: list[int] = field(default_factory=list)
-
-    @property
-    def period(self) -> float:
-        """s from one image to the next, median; NaN for a single one."""
-        steps = np.diff(np.array(self.stamps_ns, np.int64))
-        return float(np.median(steps)) * 1e-9 if len(steps) else np.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,6 +278,23 @@ def static_residual(camera: Camera, detected: Detected) -> float:
     if pose is None:
         return np.nan
     return rms(still_errors(camera, pose, detections.points, detections.pixels))
+
+
+@dataclass(slots=True)
+class Extraction:
+    """What became of the images."""
+
+    images: int = 0
+    counts: list[int] = field(default_factory=list)  # keypoints or corners, where there are any
+    refused: dict[str, str] = field(default_factory=dict)  # the first detail of each reason
+    carried: Counter[str] = field(default_factory=Counter)  # messages of other topics
+    stamps_ns: list[int] = field(default_factory=list)
+
+    @property
+    def period(self) -> float:
+        """s from one image to the next, median; NaN for a single one."""
+        steps = np.diff(np.array(self.stamps_ns, np.int64))
+        return float(np.median(steps)) * 1e-9 if len(steps) else np.nan
 
 
 def record_features(

@@ -44,17 +44,15 @@ def write_simulated(
         bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, frame.stamp_ns), frame.stamp_ns)
         cloud = make_cloud(make_message, frame.stamp_ns, CAMERA_FRAME, keypoints)
         bag.write(KEYPOINTS_TOPIC, cloud, frame.stamp_ns)
-    _write_truths(bag, frame)
+    write_truth(bag, frame.stamp_ns, frame.first_row)
+    if frame.middle_ns != frame.stamp_ns:
+        write_truth(bag, frame.middle_ns, frame.middle_row)
 
 
 def write_rendered(bag: BagWriter, camera: Camera, frame: RenderedFrame) -> None:
     """Camera info, image, and the truth at the first and at the middle row."""
     bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, frame.stamp_ns), frame.stamp_ns)
     write_image(bag, RAW_IMAGE_TOPIC, frame.stamp_ns, frame.format, frame.data)
-    _write_truths(bag, frame)
-
-
-def _write_truths(bag: BagWriter, frame: SimulatedFrame | RenderedFrame) -> None:
     write_truth(bag, frame.stamp_ns, frame.first_row)
     if frame.middle_ns != frame.stamp_ns:
         write_truth(bag, frame.middle_ns, frame.middle_row)

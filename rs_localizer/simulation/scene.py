@@ -42,7 +42,13 @@ def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generato
     Outliers of the frame have the mark of a landmark and the pixel of something else, as wrong
     matches do.
     """
-    rows = _rows(len(frame.ids), [("u", "<f4"), ("v", "<f4")], landmarks)
+    kinds: list[tuple[Any, ...]] = [("u", "<f4"), ("v", "<f4")]
+    if landmarks.ids is not None:
+        kinds.append(("id", landmarks.id_type))
+    if landmarks.descriptors is not None:
+        descriptors = landmarks.descriptors
+        kinds.append(("descriptor", descriptors.dtype, descriptors.shape[1:]))
+    rows = np.empty(len(frame.ids), kinds)
     rows["u"], rows["v"] = frame.pixels.T
     if landmarks.ids is not None:
         rows["id"] = landmarks.ids[frame.ids]
@@ -53,22 +59,19 @@ def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generato
 
 def map_rows(landmarks: Map) -> NDArray[Any]:
     """Rows (n,) of a cloud of landmarks."""
-    rows = _rows(len(landmarks), [(name, "<f8") for name in "xyz"], landmarks)
-    rows["x"], rows["y"], rows["z"] = landmarks.points.T
+    kinds: list[tuple[Any, ...]] = [(name, "<f8") for name in "xyz"]
+    if landmarks.ids is not None:
+        kinds.append(("id", landmarks.id_type))
+    if landmarks.descriptors is not None:
+        kinds.append(("descriptor", landmarks.descriptors.dtype, landmarks.descriptors.shape[1:]))
+    rows = np.empty(len(landmarks), kinds)
+    for name, column in zip("xyz", landmarks.points.T, strict=True):
+        rows[name] = column
     if landmarks.ids is not None:
         rows["id"] = landmarks.ids
     if landmarks.descriptors is not None:
         rows["descriptor"] = landmarks.descriptors
     return rows
-
-
-def _rows(count: int, kinds: list[tuple[Any, ...]], landmarks: Map) -> NDArray[Any]:
-    """Rows (count,) with fields for what the landmarks are known by."""
-    if landmarks.ids is not None:
-        kinds.append(("id", landmarks.id_type))
-    if landmarks.descriptors is not None:
-        kinds.append(("descriptor", landmarks.descriptors.dtype, landmarks.descriptors.shape[1:]))
-    return np.empty(count, kinds)
 
 
 # Points of the map; enough that a narrow camera close to a wall still sees some hundreds.
