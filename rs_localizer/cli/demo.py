@@ -26,6 +26,7 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer import data
+    from rs_localizer.evaluation import plots
     from rs_localizer.evaluation.comparison import Recording, Result, compare, load_recording, table
     from rs_localizer.evaluation.cube_clip import (
         CAMERA,
@@ -172,7 +173,7 @@ def play_room(
         )
     results = {names[name]: compare(answers[name], recording.truth) for name in methods}
     print(f"\n{table('A room mapped without markers', recording, results)}", flush=True)
-    room.picture(recording, results).savefig(out / ROOM)
+    plots.save(room.picture(recording, results), out / ROOM)
     print(out / ROOM)
 
 
@@ -299,7 +300,7 @@ def run(args: argparse.Namespace) -> None:
         print(f"\n{args.out / CUBE}")
         for name, figure in _pictures(*acts[:2]).items():
             if figure is not None:
-                figure.savefig(args.out / name)
+                plots.save(figure, args.out / name)
                 print(args.out / name)
     print(f"done in {time.monotonic() - started:.0f} s")
 

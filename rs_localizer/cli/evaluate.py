@@ -237,7 +237,7 @@ def _plot(
     )
     for name, figure in zip(("trajectories.png", "errors.png"), drawn, strict=True):
         with atomic_files(directory / name) as (part,):
-            figure.savefig(part)
+            plots.save(figure, part)
         print(f"{directory / name}")
 
 

@@ -8,6 +8,7 @@ too, so that a print in black and white can be read.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -50,6 +51,11 @@ _DPI = 130
 _WIDTH, _TITLES = 10.0, 1.1  # inches
 # A pause of more frames than this breaks the lines.
 _LONGEST_GAP = 4.0
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a PNG file; no display is needed."""
+    figure.savefig(path)
 
 
 def _new_figure(title: str, height: float) -> Figure:
