@@ -32,60 +32,37 @@ FEW = {
     "readout-time": 40,
 }
 
-HELD = {
-    "motion.r6p_vcwt_equals_r6p",
-    "motion.two_step_poor",
-    "motion.r9p_ahead_exact",
-    "motion.r9p_fixed_ahead_noisy",
-    "translation.vct_ahead",
-    "noise.joint_solvers_alike",
-    "noise.six_point_bound",
-    "noise.refined_reaches_bound",
-    "noise.few_inliers_seen",
-    "convergence.others_slow",
-    "convergence.basin_30",
-    "convergence.basin_60",
-    "linearisation.r6p_vcwt_equals_r6p",
-    "linearisation.useful_orientation",
-    "linearisation.useful_centre",
-    "linearisation.relinearized_flat",
-    "p3p-initialisation.r6p_vcwt_equals_r6p",
-    "p3p-initialisation.relinearized",
-    "readout-time.coverage",
-    "readout-time.direction",
-    "readout-time.faults",
-    "readout-time.global",
-    "real.vcwt_equals_r6p",
-    "real.vcwt_ahead_of_p3p",
-    "real.vct_often_more",
-    "real.r9p_hardest",
-    "real.localizer_most",
-    "bound.fast",
-    "bound.fast_gross",
-    "bound.outliers",
-    "bound.outliers_gross",
-    "bound.faster",
-    "bound.faster_gross",
-    "bound.slow",
-    "bound.slow_gross",
-    "bound.rest_gross",
-    "bound.none_hidden",
-    "augmented-reality.localizer",
-    "augmented-reality.position",
-    "augmented-reality.reprojection",
-    "augmented-reality.cube",
-    "matching.localized",
-    "matching.alike",
-    "matching.scores",
-    "features.localized",
-    "features.better",
-}
-NOT_HELD = {
-    "motion.r9p_ahead_noisy",
-    "motion.r9p_no_velocity",
-    "noise.all_alike",
-    "convergence.flat_after_eight",
-}
+
+def _names(claims: dict[str, str]) -> set[str]:
+    return {f"{name}.{claim}" for name, listed in claims.items() for claim in listed.split()}
+
+
+HELD = _names(
+    {
+        "motion": "r6p_vcwt_equals_r6p two_step_poor r9p_ahead_exact r9p_fixed_ahead_noisy",
+        "translation": "vct_ahead",
+        "noise": "joint_solvers_alike six_point_bound refined_reaches_bound few_inliers_seen",
+        "convergence": "others_slow basin_30 basin_60",
+        "linearisation": "r6p_vcwt_equals_r6p useful_orientation useful_centre relinearized_flat",
+        "p3p-initialisation": "r6p_vcwt_equals_r6p relinearized",
+        "readout-time": "coverage direction faults global",
+        "real": "vcwt_equals_r6p vcwt_ahead_of_p3p vct_often_more r9p_hardest localizer_most",
+        "bound": (
+            "fast fast_gross outliers outliers_gross faster faster_gross slow slow_gross "
+            "rest_gross none_hidden"
+        ),
+        "augmented-reality": "localizer position reprojection cube",
+        "matching": "localized alike scores",
+        "features": "localized better",
+    }
+)
+NOT_HELD = _names(
+    {
+        "motion": "r9p_ahead_noisy r9p_no_velocity",
+        "noise": "all_alike",
+        "convergence": "flat_after_eight",
+    }
+)
 
 
 def untracked(items: Iterable, total: int) -> Iterator:
