@@ -17,7 +17,6 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
-from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
 from benchmarks.experiments import (
     augmented_reality,
     bound,
@@ -28,20 +27,15 @@ from benchmarks.experiments import (
     motion,
     noise,
     p3p_initialisation,
-    planes,
     readout_time,
     real,
-    robustness,
     timings,
-    tracking,
     translation,
 )
 from benchmarks.experiments.report import SUMMARY, count_verdicts, write_result, write_summary
 from benchmarks.experiments.results import Context, Result, Verdict
 from benchmarks.honesty import experiment as honesty
 from benchmarks.inertial import experiment as inertial
-from rs_localizer import data
-from rs_localizer.settings import load_params_file
 
 T = TypeVar("T")
 
@@ -53,11 +47,8 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "linearisation": linearisation.run,
     "p3p-initialisation": p3p_initialisation.run,
     "bound": bound.run,
-    "planes": planes.run,
     "honesty": honesty.run,
-    "tracking": tracking.run,
     "inertial": inertial.run,
-    "robustness": robustness.run,
     "timings": timings.run,
     "matching": matching.run,
     "features": features.run,
@@ -80,7 +71,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   profiling, frame_times           where the time of a frame goes
   size                             lines, modules, constants, and calls of one cloud
   load, load.rig, load.signals     live nodes under load, of a rig, and stopped at random moments
-  image_flight, marker_flight      rendered flights through live nodes and through commands
+  image_flight                     rendered flights through live nodes
   signals                          commands that are stopped at random moments
   rig_calibration                  calibrate --rig against its bounds
   start                            memory and time of a start of the node
@@ -147,7 +138,7 @@ def run(args: argparse.Namespace) -> None:
     seconds: dict[str, float] = {}
     for name in dict.fromkeys(names):
         start = time.perf_counter()
-        results[name] = EXPERIMENTS[name](_context(name, args.trials, args.seed))
+        results[name] = EXPERIMENTS[name](Context(args.trials, args.seed, partial(_track, name)))
         seconds[name] = time.perf_counter() - start
         write_result(args.out, results[name])
         # After each, so that an interrupted run leaves what it found.
@@ -155,21 +146,6 @@ def run(args: argparse.Namespace) -> None:
         _print(name, results[name], seconds[name])
     claims = [claim for result in results.values() for claim in result.claims]
     print(f"{count_verdicts(claims)}; written to {args.out / SUMMARY}")
-
-
-def _context(name: str, trials: int, seed: int) -> Context:
-    webcam = data.path(data.WEBCAM)
-    readout_time = load_params_file(webcam / "parameters.yaml")["readout_time"]
-    return Context(
-        trials,
-        seed,
-        partial(_track, name),
-        webcam,
-        readout_time,
-        data.path(data.HAND_MOTION),
-        SLOW_HAND_MOTION,
-        GLOBAL_SHUTTER_TAGS,
-    )
 
 
 def _track(name: str, items: Iterable[T], total: int) -> Iterator[T]:

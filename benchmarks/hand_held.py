@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer import data
+from benchmarks.data import HAND_MOTION
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
@@ -58,4 +58,4 @@ class HandHeld:
 
 def hand_motion() -> RecordedMotion:
     """Recorded, of a camera in its own axes."""
-    return RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
+    return RecordedMotion(read_tum(HAND_MOTION))

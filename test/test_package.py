@@ -10,9 +10,8 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from configparser import ConfigParser
-from email import message_from_string
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -53,8 +52,10 @@ def test_versions_agree():
     assert f'\n  version: "{version}"' in recipe
 
 
-def build_wheel(directory: Path, **environment: str) -> Path:
-    """Build the wheel from a copy of the sources."""
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Iterator[zipfile.ZipFile]:
+    """Built from a copy of the sources."""
+    directory = tmp_path_factory.mktemp("wheel")
     source, result = directory / "source", directory / "result"
     result.mkdir()
     for name in "rs_localizer config launch resource".split():
@@ -67,25 +68,14 @@ def build_wheel(directory: Path, **environment: str) -> Path:
     made = subprocess.run(
         command,
         cwd=source,
-        env=inherited | environment,
+        env=inherited,
         text=True,
         capture_output=True,
         check=False,
     )
     assert made.returncode == 0, made.stderr
-    return next(result.iterdir())
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Iterator[zipfile.ZipFile]:
-    with zipfile.ZipFile(build_wheel(tmp_path_factory.mktemp("wheel"))) as archive:
+    with zipfile.ZipFile(next(result.iterdir())) as archive:
         yield archive
-
-
-def metadata(wheel: zipfile.ZipFile, name: str) -> str:
-    """A text of the wheel's .dist-info directory."""
-    path = next(n for n in wheel.namelist() if n.endswith(f".dist-info/{name}"))
-    return wheel.read(path).decode()
 
 
 def test_wheel_holds_every_file_of_the_package(wheel):
@@ -107,7 +97,8 @@ def test_wheel_puts_shared_files_where_ros_looks(wheel):
 
 def test_declared_commands_can_be_imported(wheel):
     declared = ConfigParser()
-    declared.read_string(metadata(wheel, "entry_points.txt"))
+    path = next(n for n in wheel.namelist() if n.endswith(".dist-info/entry_points.txt"))
+    declared.read_string(wheel.read(path).decode())
     assert declared.sections() == ["console_scripts"]
     assert set(declared["console_scripts"]) == {
         "localizer",
@@ -117,23 +108,6 @@ def test_declared_commands_can_be_imported(wheel):
     }
     for name, value in declared["console_scripts"].items():
         assert callable(EntryPoint(name, value, "console_scripts").load()), value
-
-
-def requirements(text: str) -> set[str]:
-    """Names of the requirements in METADATA that are not behind an extra."""
-    required = message_from_string(text).get_all("Requires-Dist") or []
-    return {re.split(r"[ <>=;]", line)[0] for line in required if "extra ==" not in line}
-
-
-def test_pip_brings_the_libraries(wheel):
-    required = requirements(metadata(wheel, "METADATA"))
-    assert {"numpy", "numba", "opencv-python-headless", "rosbags"} <= required
-
-
-def test_nothing_is_required_of_pip_in_a_ros_environment(tmp_path):
-    # Ubuntu's OpenCV is no pip package: a requirement would stop the installed executables.
-    with zipfile.ZipFile(build_wheel(tmp_path, AMENT_PREFIX_PATH="/opt/ros/jazzy")) as wheel:
-        assert requirements(metadata(wheel, "METADATA")) == {"setuptools"}
 
 
 def ros_modules() -> list[str]:
@@ -181,24 +155,24 @@ CONDA = {"opencv-python-headless": "py-opencv", "PyYAML": "pyyaml"}
 
 
 @pytest.fixture
-def declared(monkeypatch) -> dict[str, Any]:
-    """What setup.py says."""
-    said: dict[str, Any] = {}
+def setup_says(monkeypatch) -> Callable[[Path], dict[str, Any]]:
+    """What setup.py says in a folder."""
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
-    monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(setuptools, "setup", lambda **options: said.update(options))
-    exec(compile((ROOT / "setup.py").read_text(), "setup.py", "exec"), {"__name__": "__main__"})
-    return said
+
+    def says(folder: Path) -> dict[str, Any]:
+        said: dict[str, Any] = {}
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(setuptools, "setup", lambda **options: said.update(options))
+        code = compile((ROOT / "setup.py").read_text(), "setup.py", "exec")
+        exec(code, {"__name__": "__main__"})
+        return said
+
+    return says
 
 
-@pytest.fixture
-def recipe() -> dict[str, Any]:
-    found: dict[str, Any] = yaml.safe_load((ROOT / "packaging/conda/recipe.yaml").read_text())
-    return found
-
-
-def test_conda_brings_what_pip_brings(declared, recipe):
-    wanted = {}
+def test_conda_brings_what_pip_brings(setup_says):
+    declared, wanted = setup_says(ROOT), {}
+    recipe = yaml.safe_load((ROOT / "packaging/conda/recipe.yaml").read_text())
     for line in declared["install_requires"]:
         name, bound = re.fullmatch(r"([\w-]+)(.*)", line).groups()
         # With machine code in the tree setup.py pins Numba, which conda compiles itself.
@@ -234,28 +208,26 @@ def test_the_container_is_built_of_files_that_exist():
     assert named <= copied
 
 
-def test_machine_code_makes_a_wheel_of_this_python_and_this_numba(tmp_path, monkeypatch):
+def test_machine_code_makes_a_wheel_of_this_python_and_this_numba(
+    tmp_path, monkeypatch, setup_says
+):
     (tmp_path / "rs_localizer" / "compiled").mkdir(parents=True)
     about = tmp_path / "rs_localizer" / "compiled" / "about.json"
-    monkeypatch.chdir(tmp_path)
-    said: dict[str, Any] = {}
-    monkeypatch.setattr(setuptools, "setup", lambda **options: said.update(options))
-    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
-    code = compile((ROOT / "setup.py").read_text(), "setup.py", "exec")
-    exec(code, {"__name__": "__main__"})
+    said = setup_says(tmp_path)
     assert said["distclass"] is setuptools.Distribution
     assert "numba" in said["install_requires"]
     version = "{}.{}".format(*sys.version_info)
     about.write_text(json.dumps({"python": version, "numba": "0.99.1", "cpus": ["x86-64-v3"]}))
-    exec(code, {"__name__": "__main__"})
+    said = setup_says(tmp_path)
     assert said["distclass"]().has_ext_modules()
     assert "numba==0.99.1" in said["install_requires"]
     about.write_text(json.dumps({"python": "3.9", "numba": "0.99.1", "cpus": []}))
     with pytest.raises(SystemExit, match=r"is for Python 3\.9: compile again"):
-        exec(code, {"__name__": "__main__"})
-    monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy")  # rosdep brings all there
-    exec(code, {"__name__": "__main__"})
-    assert said["install_requires"] == ["setuptools"]
+        setup_says(tmp_path)
+    # rosdep brings all there; Ubuntu's OpenCV is no pip package: a requirement would stop the
+    # installed executables.
+    monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy")
+    assert setup_says(tmp_path)["install_requires"] == ["setuptools"]
 
 
 def test_rosdep_knows_every_key():

@@ -128,18 +128,6 @@ def test_new_accelerations_are_those_of_singers_process(dt, exact):
     assert not found.any()
 
 
-def test_new_accelerations_take_over_from_those_that_fade():
-    """In the long run their variance is the configured one, whatever it was at the start."""
-    acceleration, dt = Acceleration(3.0, 2.0), 0.05
-    spread = np.zeros((18, 18))
-    motion = motion_of(np.concatenate([np.eye(3).ravel(), np.zeros(15)]))
-    for _ in range(40):
-        _, spread = predict(motion, spread, dt / READOUT, FADING / READOUT)
-        spread += acceleration_covariance(acceleration, dt, READOUT)
-    deviations = np.sqrt(np.diag(spread)[12:]) / READOUT**2
-    np.testing.assert_allclose(deviations, [3.0] * 3 + [2.0] * 3, rtol=1e-6)
-
-
 def shaking(seed=0, size=0.003):
     rng = np.random.default_rng(seed)
     sizes = np.concatenate([np.ones(18), np.repeat(SIZES, 3)])
@@ -321,13 +309,6 @@ def test_turns_and_moves_surprise_apart(of, raised):
     jolts = followed(10.0, of=of).process_noise_scale
     assert jolts[raised] == pytest.approx(10.0, rel=0.02)
     assert jolts[1 - raised] <= 1.0
-
-
-def test_a_first_frame_is_taken_as_it_is():
-    found = at(np.zeros(18), np.eye(18))
-    track = _followed(None, None, found, 7)
-    assert track.experience.scales is found.scales
-    assert (track.time_ns, track.share, *track.process_noise_scale) == (7, 1.0, 1.0, 1.0)
 
 
 def test_the_share_of_inliers_follows_tracked_frames_slowly():

@@ -111,15 +111,13 @@ def moving_residuals(recording, still, direction):
 
 
 def test_the_neighbours_velocities_explain_the_shear_of_the_image(recording, still):
+    """The right way; with the scan direction reversed, worse than a global shutter."""
     moving, standing = moving_residuals(recording, still, "top_to_bottom")
     assert np.mean(standing) > 0.1
     assert np.mean(moving) < 0.09
     assert np.median(moving) < 0.09
-
-
-def test_the_reversed_scan_direction_makes_it_worse_than_a_global_shutter(recording, still):
-    moving, standing = moving_residuals(recording, still, "bottom_to_top")
-    assert np.mean(moving) > 1.2 * np.mean(standing)
+    reversed_moving, _ = moving_residuals(recording, still, "bottom_to_top")
+    assert np.mean(reversed_moving) > 1.2 * np.mean(standing)
 
 
 def test_the_tracked_twist_is_that_of_the_poses(recording):
@@ -145,6 +143,7 @@ def squared_normalized(error, covariance):
     return np.einsum("...i,...i->...", error, np.linalg.solve(covariance, error[..., None])[..., 0])
 
 
+@pytest.mark.bench
 def test_frames_lie_where_the_frames_before_predict_them(recording):
     calibration, clouds = recording
     localizer = rsl.Localizer(calibration.camera(READOUT, "top_to_bottom"))

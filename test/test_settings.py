@@ -16,7 +16,7 @@ from rs_localizer.config import (
 )
 from rs_localizer.settings import SettingsError, build, load_params_file, parse_assignment, settings
 
-SHIPPED = Path(__file__).parents[1] / "config" / "rs_localizer.yaml"
+SHIPPED = Path(__file__).parents[1] / "config"
 
 
 def params(tmp_path: Path, text: str) -> Path:
@@ -25,40 +25,30 @@ def params(tmp_path: Path, text: str) -> Path:
     return path
 
 
-def test_the_shipped_file_holds_exactly_the_defaults():
-    values = load_params_file(SHIPPED)
-    assert values == {name: setting.default for name, setting in settings().items()}
+@pytest.mark.parametrize(
+    ("file", "kind"),
+    [
+        ("rs_localizer.yaml", NodeConfig),
+        ("marker_detector.yaml", DetectorConfig),
+        ("feature_detector.yaml", FeatureConfig),
+    ],
+)
+def test_the_shipped_files_hold_exactly_the_defaults_and_name_all_choices(file, kind):
+    path = SHIPPED / file
+    values, known = load_params_file(path, kind), settings(kind)
+    assert values == {name: setting.default for name, setting in known.items()}
     assert [type(value) for value in values.values()] == [
-        type(settings()[name].default) for name in values
+        type(known[name].default) for name in values
     ]
-    assert build(values) == NodeConfig()
-
-
-def test_the_shipped_file_names_all_choices():
-    lines = [line.strip() for line in SHIPPED.read_text().splitlines()]
-    for name, setting in settings().items():
+    assert build(values, kind) == kind()
+    lines = [line.strip() for line in path.read_text().splitlines()]
+    for name, setting in known.items():
+        assert setting.description, name
         if name == "solver":  # of which there is one list, and one page
             continue
         leaf = name.rsplit(".", 1)[-1]
         line = next((line for line in lines if line.startswith(f"{leaf}:")), "")
         assert all(choice in line for choice in setting.choices), name
-
-
-@pytest.mark.parametrize(
-    ("file", "kind"),
-    [("marker_detector.yaml", DetectorConfig), ("feature_detector.yaml", FeatureConfig)],
-)
-def test_the_detectors_files_hold_exactly_their_defaults_and_choices(file, kind):
-    path = SHIPPED.with_name(file)
-    values = load_params_file(path, kind)
-    known = settings(kind)
-    assert values == {name: setting.default for name, setting in known.items()}
-    assert build(values, kind) == kind()
-    lines = [line.strip() for line in path.read_text().splitlines()]
-    for name, setting in known.items():
-        line = next(line for line in lines if line.startswith(f"{name}:"))
-        assert all(choice in line for choice in setting.choices), name
-        assert setting.description, name
 
 
 @pytest.mark.parametrize(

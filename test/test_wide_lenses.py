@@ -135,17 +135,3 @@ def test_a_wide_lens_that_is_off_is_mended_by_what_is_seen_all_around(lens, off)
         assert result.inliers[angle > math.radians(92.0)].mean() > 0.9
         off_by = errors(result, motion)[:6]
         assert off_by @ np.linalg.solve(result.covariance[:6, :6], off_by) < chi2.ppf(0.999, 6)
-
-
-def test_a_wide_camera_of_a_rig_and_one_that_looks_ahead():
-    rng = np.random.default_rng(9)
-    points, pixels, motion, _ = frame(rng, "ds", 120, 0.5)
-    wide, back = camera("ds"), np.diag([-1.0, 1.0, -1.0])
-    straight = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 240.0], [0.0, 0.0, 1.0]])
-    pinhole = rsl.Camera(640, 480, straight, readout_time=READOUT)
-    rig = rsl.Rig({"ahead": pinhole, "wide": wide},
-                  {"wide": (np.eye(3), np.zeros(3)), "ahead": (back, np.zeros(3))})  # fmt: skip
-    result = rsl.Localizer(rig).localize({"wide": (points, pixels)})
-    assert result
-    assert result.inliers["wide"].mean() > 0.95
-    assert np.degrees(np.linalg.norm(errors(result, motion)[:3])) < 0.5

@@ -1,13 +1,17 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings that only benchmarks and tests use; each folder has an ATTRIBUTION.md."""
+"""Recordings that benchmarks use; each folder beside this has an ATTRIBUTION.md."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from rs_localizer import data
+
 _FOLDER = Path(__file__).parent
 
+HAND_MOTION, WEBCAM = data.path(data.HAND_MOTION), data.path(data.WEBCAM)
+"""Of the package: a trajectory of a hand, and a camera before a chessboard."""
 SLOW_HAND_MOTION = _FOLDER / "motion" / "tum_rgbd_fr1_xyz.txt.gz"
 """TUM trajectory at 100 Hz of a hand-held camera that moves slowly; optical axes."""
 GLOBAL_SHUTTER_TAGS = _FOLDER / "global_shutter_tags" / "recording"

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from benchmarks.data import HAND_MOTION
 from benchmarks.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.config import FeatureConfig, FeatureKind, NodeConfig
 from rs_localizer.core import so3
@@ -74,7 +75,7 @@ class Run:
 def run(context: Context) -> Result:
     """The experiment."""
     count = int(np.clip(_FRAMES_PER_TRIAL * context.trials, _FEWEST, _MOST))
-    motion = RecordedMotion(read_tum(context.hand_motion))
+    motion = RecordedMotion(read_tum(HAND_MOTION))
     planes = room(sampled_states(motion)).planes
     camera = Camera(640, 480, _K, readout_time=_READOUT_TIME)
     stamps = frame_stamps(motion, camera, _RATE)[:count]

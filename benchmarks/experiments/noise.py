@@ -12,16 +12,49 @@ from matplotlib.figure import Figure
 
 from benchmarks.experiments import charts
 from benchmarks.experiments import methods as m
-from benchmarks.experiments.bounds import median_bound
 from benchmarks.experiments.charts import Look
 from benchmarks.experiments.errors import ORIENTATION, motion_errors
-from benchmarks.experiments.kernels import frame_errors
-from benchmarks.experiments.methods import Method
+from benchmarks.experiments.kernels import frame_errors, informations
+from benchmarks.experiments.methods import Method, states, view_arguments
 from benchmarks.experiments.results import Claim, Context, Result, Statement, Table
 from benchmarks.experiments.sweeps import Curves, sampled, sweep
 from benchmarks.experiments.trials import POINTS, Setting, Trials, draw_trials
 from benchmarks.experiments.uncertainty import share
 from rs_localizer.core.arrays import Array
+
+
+def median_bound(trials: Trials, points: int, noise: float, seed: int) -> Array:
+    """Medians (2,) of the orientation (deg) and relative position error of the bound.
+
+    Errors are drawn from the normal distribution whose covariance is the inverse Fisher
+    information of the first so many points at the true motion.
+
+    Args:
+        noise: px.
+    """
+    world, rays, tau, by_ray, mounts = view_arguments(trials)
+    information = informations(
+        states(trials.truth), _first(world, points), _first(rays, points), _first(tau, points),
+        by_ray[:points], mounts,
+    )  # fmt: skip
+    scale = 1.0 / np.sqrt(np.einsum("hii->hi", information))
+    scaled = information * scale[:, :, None] * scale[:, None, :]
+    values, vectors = np.linalg.eigh(scaled)
+    half = scale[:, :, None] * vectors / np.sqrt(np.maximum(values, 1e-15))[:, None, :]
+    draws = np.random.default_rng([seed, 2]).normal(size=(len(trials), half.shape[2]))
+    errors = noise * np.einsum("hij,hj->hi", half, draws)
+    distance = np.linalg.norm(trials.truth.position, axis=1)
+    return np.array(
+        [
+            np.median(np.degrees(np.linalg.norm(errors[:, 0:3], axis=1))),
+            np.median(np.linalg.norm(errors[:, 3:6], axis=1) / distance),
+        ]
+    )
+
+
+def _first(values: Array, points: int) -> Array:
+    return np.ascontiguousarray(values[:, :points])
+
 
 _NOISES = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
 _SPEED, _TRANSLATION = 20.0, 0.2  # deg and units per frame

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from pathlib import Path
 from typing import Protocol, TypeVar
 
 from matplotlib.figure import Figure
@@ -122,8 +121,3 @@ class Context:
     trials: int
     seed: int
     track: Track
-    webcam: Path  # recording of a chessboard
-    webcam_readout_time: float
-    hand_motion: Path  # trajectory
-    slow_hand_motion: Path  # trajectory
-    tags: Path  # recording of a global shutter

@@ -24,9 +24,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from rs_localizer import data
+from benchmarks.data import HAND_MOTION
 from rs_localizer.cli import integer, number
 from rs_localizer.core.arrays import Array
+from rs_localizer.evaluation.cube_clip import CAMERA, SENSOR
 from rs_localizer.evaluation.room_mapping import Piece, Room
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.mapping.anchors import Anchors
@@ -36,7 +37,6 @@ from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.inertial_metres import inertial_metres
 from rs_localizer.mapping.refine import RefinedMap
 from rs_localizer.simulation.imu import Lever, simulate_imu
-from rs_localizer.simulation.marker_frames import CAMERA, SENSOR
 from rs_localizer.simulation.settings import ImuSettings
 from rs_localizer.simulation.true_motion import TrueMotion
 from rs_localizer.trajectory.imu import ImuRecording
@@ -125,7 +125,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--imus", type=integer(1), default=6, metavar="N", help="of each walk")
     options = parser.parse_args(arguments)
-    room = Room(read_tum(data.path(data.HAND_MOTION)), CAMERA, SENSOR, _KEYPOINTS)
+    room = Room(read_tum(HAND_MOTION), CAMERA, SENSOR, _KEYPOINTS)
     for start in options.start:
         sys.stdout.write(f"walk from {start:g} s\n")
         for line in table(room.motion, _mapped(room, start), options.imus):

@@ -6,10 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks.data import HAND_MOTION, WEBCAM
 from benchmarks.experiments.views import direction, seen_at, uniform_pixels
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
@@ -21,6 +21,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
 from rs_localizer.io.trajectories import read_tum
+from rs_localizer.settings import load_params_file
 from rs_localizer.simulation.frames import frame_stamps, simulate_frames
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.settings import FrameSettings
@@ -53,26 +54,26 @@ class Sequence:
     threshold: float  # px
 
 
-def phone(trajectory: Path, frames: int, seed: int) -> Sequence:
+def phone(frames: int, seed: int) -> Sequence:
     """A phone of 1280x720 in a hand: the recorded motion, simulated points, 2 px."""
     camera = _camera(1280, 720, focal=1000.0)
     return Sequence(
         "phone",
         "phone, 1280x720, 2 px (simulated along a hand's motion)",
         camera,
-        tuple(_fly(camera, trajectory, frames, seed, noise=0.5, speed=1.0)),
+        tuple(_fly(camera, frames, seed, noise=0.5, speed=1.0)),
         2.0,
     )
 
 
-def action_camera(trajectory: Path, frames: int, seed: int) -> Sequence:
+def action_camera(frames: int, seed: int) -> Sequence:
     """A wide action camera of 1920x1080 at three times the speed, 8 px."""
     camera = _camera(1920, 1080, focal=900.0)
     return Sequence(
         "action_camera",
         "action camera, 1920x1080, 8 px (simulated, three times as fast)",
         camera,
-        tuple(_fly(camera, trajectory, frames, seed, noise=2.0, speed=3.0)),
+        tuple(_fly(camera, frames, seed, noise=2.0, speed=3.0)),
         8.0,
     )
 
@@ -93,9 +94,9 @@ def hard(frames: int, seed: int) -> Sequence:
     )
 
 
-def webcam(recording: Path, readout_time: float, frames: int) -> Sequence:
+def webcam(frames: int) -> Sequence:
     """The bundled webcam over a chessboard, 2 px: a plane, and few points."""
-    found = list(_recorded(recording, readout_time))
+    found = list(_recorded())
     chosen = [found[i] for i in _evenly(len(found), frames)]
     return Sequence(
         "webcam",
@@ -106,9 +107,10 @@ def webcam(recording: Path, readout_time: float, frames: int) -> Sequence:
     )
 
 
-def _recorded(recording: Path, readout_time: float) -> Iterator[tuple[Camera, Frame]]:
+def _recorded() -> Iterator[tuple[Camera, Frame]]:
     camera = None
-    with open_bag(recording) as bag:
+    readout_time = load_params_file(WEBCAM / "parameters.yaml")["readout_time"]
+    with open_bag(WEBCAM) as bag:
         for topic, _, message in bag.messages([CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC]):
             if topic == CAMERA_INFO_TOPIC:
                 camera = read_camera_info(message).camera(readout_time, ScanDirection.TOP_TO_BOTTOM)
@@ -124,10 +126,8 @@ def _camera(width: int, height: int, focal: float) -> Camera:
     return Camera(width=width, height=height, K=K, readout_time=_READOUT_TIME)
 
 
-def _fly(
-    camera: Camera, trajectory: Path, frames: int, seed: int, noise: float, speed: float
-) -> Iterator[Frame]:
-    poses = read_tum(trajectory)
+def _fly(camera: Camera, frames: int, seed: int, noise: float, speed: float) -> Iterator[Frame]:
+    poses = read_tum(HAND_MOTION)
     motion = RecordedMotion(
         replace(poses, stamps_ns=(poses.stamps_ns / speed).astype(np.int64)),
         knot_spacing=0.05 / speed,

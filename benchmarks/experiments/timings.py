@@ -4,20 +4,157 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import importlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from types import ModuleType
 
+import cv2
 import numpy as np
 
-from benchmarks.experiments.competitors import p3p_subjects
-from benchmarks.experiments.results import Claim, Context, Result, Statement, Table
-from benchmarks.experiments.startup import Startup, cold_and_warm
-from benchmarks.experiments.stopwatch import Subject, interleaved, ratio
-from benchmarks.experiments.trials import Setting, Trials, draw_trials
+from benchmarks.experiments.results import Claim, Context, Result, Statement, Table, Track
+from benchmarks.experiments.trials import Setting, Trials, camera, draw_trials
 from rs_localizer.core.arrays import Array
 from rs_localizer.solvers.batch import MODEL_SIZE
 from rs_localizer.solvers.minimal import solve_minimal
 from rs_localizer.solvers.table import SOLVERS, find_solver
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """Something to be timed: ``run`` does its work ``count`` times."""
+
+    run: Callable[[], object]
+    count: int
+
+
+def interleaved(subjects: Mapping[str, Subject], repeats: int, track: Track) -> dict[str, Array]:
+    """Times (repeats,) per piece of work of each subject, in microseconds.
+
+    All subjects take turns, so that a slow moment of the machine hits all of them alike: compare
+    them turn by turn, see :func:`ratio`.
+    """
+    for subject in subjects.values():
+        subject.run()  # compiles, fills caches
+    times: dict[str, list[float]] = {name: [] for name in subjects}
+    rounds: Iterable[int] = range(repeats)
+    for _ in track(rounds, repeats):
+        for name, subject in subjects.items():
+            start = time.perf_counter()
+            subject.run()
+            times[name].append(time.perf_counter() - start)
+    return {name: 1e6 * np.array(times[name]) / subjects[name].count for name in subjects}
+
+
+def ratio(one: Array, other: Array) -> float:
+    """Median of what one subject took in units of what the other took in the same turn."""
+    return float(np.median(one / other))
+
+
+def poselib() -> ModuleType | None:
+    """The module, or None where it is not installed."""
+    try:
+        return importlib.import_module("poselib")
+    except ImportError:
+        return None
+
+
+def p3p_subjects(trials: Trials) -> dict[str, Subject]:
+    """P3P on the first three points of each frame, one call per frame."""
+    K = camera().K
+    triplets = [np.ascontiguousarray(x[:3]) for x in trials.points]
+    pixels = [np.ascontiguousarray(r[:3] * K[0, 0] + K[:2, 2]) for r in trials.rays]
+
+    def opencv() -> None:
+        for points, seen in zip(triplets, pixels, strict=True):
+            cv2.solveP3P(points, seen, K, None, cv2.SOLVEPNP_P3P)
+
+    subjects = {"OpenCV solveP3P": Subject(opencv, len(trials))}
+    module = poselib()
+    if module is not None:
+        bearings = []
+        for rays in trials.rays[:, :3]:
+            bearing = np.column_stack([rays, np.ones(3)])
+            bearings.append(list(bearing / np.linalg.norm(bearing, axis=1, keepdims=True)))
+        lists = [list(points) for points in triplets]
+
+        def with_poselib() -> None:
+            for bearing, points in zip(bearings, lists, strict=True):
+                module.p3p(bearing, points)
+
+        subjects["PoseLib p3p"] = Subject(with_poselib, len(trials))
+    return subjects
+
+
+# Runs in a new interpreter: seconds until the first pose and until every kernel is there, by the
+# clock and of the processor.
+_SCRIPT = """
+import time
+start = time.perf_counter()
+start_of_work = time.process_time()
+import json
+import numpy as np
+import rs_localizer as rsl
+from rs_localizer.solvers.table import SOLVERS, find_solver
+
+def passed():
+    return time.perf_counter() - start, time.process_time() - start_of_work
+
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+rsl.Localizer(rsl.Camera(width=640, height=480, K=K)).warm_up()
+first = passed()
+rng = np.random.default_rng(0)
+for name in SOLVERS:
+    n = find_solver(name).sample_size
+    sample = rng.normal(size=(1, n, 3)), rng.normal(size=(1, n, 2)), rng.uniform(-0.5, 0.5, (1, n))
+    for as_published in (False, True):
+        rsl.solve_minimal(name, *sample, as_published=as_published)
+print(json.dumps([*first, *passed()]))
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Startup:
+    """Seconds since the import. Work: of the processor, which other processes do not lengthen."""
+
+    first_pose: float
+    first_pose_work: float
+    all_kernels: float
+    all_kernels_work: float
+
+
+def cold_and_warm() -> tuple[Startup, Startup]:
+    """A process that finds nothing compiled, and one that finds everything in the cache.
+
+    Raises:
+        OSError: a new interpreter could not import or run the package.
+    """
+    with tempfile.TemporaryDirectory() as cache:
+        environment = dict(os.environ)
+        environment["NUMBA_CACHE_DIR"] = cache
+        environment["PYTHONPATH"] = os.pathsep.join(sys.path)
+        return _measure(environment), _measure(environment)
+
+
+def _measure(environment: dict[str, str]) -> Startup:
+    done = subprocess.run(
+        [sys.executable, "-c", _SCRIPT],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        last = done.stderr.strip().splitlines()[-1:] or ["no message"]
+        raise OSError(f"a new interpreter could not run the package: {last[0]}")
+    return Startup(*json.loads(done.stdout))
+
 
 _BATCH = 4096
 _REFERENCE = "numpy.linalg.solve of 12x12"

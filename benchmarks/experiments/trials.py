@@ -84,9 +84,6 @@ class Setting:
     # the scene.
     drifting: bool = False
     points: int = POINTS
-    # deg between the optical axis and the normal of the plane through the centre, all of whose
-    # square [-1, 1]^2 holds points; None: they fill the cube.
-    tilt: float | None = None
 
 
 # Half of the points that leave the image are seen by no row, which takes the search for their row
@@ -116,8 +113,6 @@ def _draw(count: int, rng: np.random.Generator, setting: Setting) -> Trials:
     velocity = setting.linear * _directions(count, rng)
     t = velocity if setting.drifting else np.cross(w, translation) - velocity
     points = rng.uniform(-1.0, 1.0, (count, candidates, 3))
-    if setting.tilt is not None:
-        points = _on_planes(points, rotation, math.radians(setting.tilt), rng)
     owner = np.repeat(np.arange(count), candidates)
 
     def poses_at(tau: Array) -> tuple[Array, Array]:
@@ -148,16 +143,6 @@ def _looking_at_the_centre(count: int, rng: np.random.Generator) -> tuple[Array,
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     rotation = np.stack([x, np.cross(z, x), z], axis=1)
     return rotation, -np.einsum("hij,hj->hi", rotation, position)
-
-
-def _on_planes(points: Array, rotation: Array, tilt: float, rng: np.random.Generator) -> Array:
-    """The points (h,n,3) of each camera on a plane through the centre, tilted about any axis."""
-    around = rng.uniform(0.0, 2.0 * math.pi, len(points))
-    axes = np.stack([np.cos(around), np.sin(around), np.zeros(len(points))], axis=1)
-    axes_in_camera = so3.exp_many(tilt * axes)
-    flat = points * np.array([1.0, 1.0, 0.0])
-    placed: Array = flat @ np.swapaxes(axes_in_camera, 1, 2) @ rotation
-    return placed
 
 
 def _directions(count: int, rng: np.random.Generator) -> Array:

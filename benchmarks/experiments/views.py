@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -83,10 +83,6 @@ class Outcome:
         """Published, and wrong."""
         return self.localized and self.bound > GROSS**2
 
-    @property
-    def correct(self) -> bool:
-        return self.bound <= GROSS**2
-
 
 NO_POSE = Outcome(*[np.inf] * 5)
 
@@ -116,10 +112,7 @@ def synthetic_views(
     view = camera()
     # The same frames with and without noise: the noise is drawn in either case.
     noisy = draw_trials(count, seed, setting)
-    exact = draw_trials(
-        count, seed, Setting(setting.angular, setting.linear, 0.0, setting.drifting,
-                             setting.points, setting.tilt)
-    )  # fmt: skip
+    exact = draw_trials(count, seed, replace(setting, noise=0.0))
     rng = np.random.default_rng([seed, 3])
     wrong = round(outliers * setting.points)
     for i, state in enumerate(states(noisy.truth)):

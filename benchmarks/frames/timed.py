@@ -59,6 +59,14 @@ CONDITIONS = (
 """What is timed."""
 
 
+def localizer_of(condition: Condition) -> rsl.Localizer:
+    """A localizer of a condition's camera, as it truly is."""
+    true = camera_of(condition, 0)
+    return rsl.Localizer(
+        rsl.Camera(true.width, true.height, true.K, readout_time=true.readout_time)
+    )
+
+
 def times(options: argparse.Namespace) -> int:
     """The command: CPU time of both in turns, and the calls of one frame."""
     try:
@@ -69,13 +77,11 @@ def times(options: argparse.Namespace) -> int:
     heads = ("ours, ms", "PoseLib, ms", "ratio", "calls", "kernels", "files")
     sys.stdout.write(f"{'':32}" + "".join(f"{head:>13}" for head in heads) + "\n")
     for condition in CONDITIONS:
-        true = camera_of(condition, 0)
-        camera = rsl.Camera(true.width, true.height, true.K, readout_time=true.readout_time)
-        localizer = rsl.Localizer(camera)
+        localizer = localizer_of(condition)
         frames = list(generate(condition, options.frames, _SEED))
         methods: list[Callable[[Frame], object]] = [_ours(localizer)]
         if poselib is not None:
-            methods.append(_poselib(poselib, camera))
+            methods.append(_poselib(poselib, localizer.camera))
         spent = in_turns(methods, frames, options.rounds)
         each = [1e3 * statistics.fmean(one) for one in spent]
         figures = [each[0], *(each[1:] or [np.nan])]
@@ -102,12 +108,9 @@ def gate(_: argparse.Namespace) -> int:
     search, if fewer than 99 % are localized, or fewer than 95 % of the truths are inside their
     regions, beyond chance.
     """
-    true = camera_of(_GATED, 0)
-    localizer = rsl.Localizer(
-        rsl.Camera(true.width, true.height, true.K, readout_time=true.readout_time)
-    )
+    localizer = localizer_of(_GATED)
     frames = list(generate(_GATED, _FRAMES_TIMED, _SEED))
-    ours, theirs = in_turns([_ours(localizer), _opencv(true.K)], frames, 5)
+    ours, theirs = in_turns([_ours(localizer), _opencv(localizer.camera.K)], frames, 5)
     ratio = statistics.median(np.divide(ours, theirs).tolist()) / _STORED_RATIO
     sys.stdout.write(f"frame time over the stored one, both beside OpenCV's: {ratio:.2f}\n")
     judged = judge(_GATED, _COUNTED, _SEED, {})

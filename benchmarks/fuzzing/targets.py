@@ -14,7 +14,7 @@ from random import Random
 from types import SimpleNamespace
 from typing import Any
 
-from benchmarks.fuzzing import calibrations, seeds
+from benchmarks.fuzzing import seeds
 from benchmarks.fuzzing.mutations import damaged, damaged_message
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import BagError, open_bag
@@ -142,7 +142,7 @@ def targets(folder: Path) -> dict[str, Target]:
             _bytes((_TUM,)), _file(folder / "poses.txt", read_tum), (TrajectoryError,)
         ),
         "calibration": Target(
-            _bytes(calibrations.SEEDS),
+            _bytes(seeds.CALIBRATIONS),
             _file(folder / "camera.yaml", read_calibration),
             (CalibrationError,),
         ),

@@ -16,10 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
-from benchmarks.honesty.benches import Bench, Recordings, benches
-from benchmarks.honesty.text import heading, line
-from rs_localizer import data
+from benchmarks.honesty.benches import Bench, benches, heading, line
 from rs_localizer.cli import integer
 
 _NAMES = ("p3p", "tags", "rendered")
@@ -47,12 +44,7 @@ def main() -> int:
     parser.add_argument("--csv", type=Path, metavar="DIR", help="write the tables there, too")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        recordings = Recordings(
-            GLOBAL_SHUTTER_TAGS,
-            {"tum_vi_room5": data.path(data.HAND_MOTION), "tum_rgbd_fr1_xyz": SLOW_HAND_MOTION},
-            options.cache or Path(folder),
-        )
-        found = benches(recordings)
+        found = benches(options.cache or Path(folder))
         return max(_run(name, found[name], options) for name in options.names)
 
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,36 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from benchmarks.honesty import against_p3p, rendered, tags
 from benchmarks.honesty.estimating import Found
+
+_CELL = 9  # characters of a figure
+
+
+def heading(columns: Sequence[str], first: int) -> str:
+    """The names of the columns; ``first``: width of the first one."""
+    return line(columns, columns, first)
+
+
+def line(columns: Sequence[str], row: Sequence[str | float | int], first: int) -> str:
+    """One row: its name to the left, figures with three digits, words at the end."""
+    cells = [f"{row[0]:{first}}"]
+    cells += [
+        f"{_text(value):>{max(_CELL, len(name) + 1)}}" if name != "reasons" else f"  {value}"
+        for name, value in zip(columns[1:], row[1:], strict=True)
+    ]
+    return "".join(cells).rstrip()
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[str | float | int]]) -> str:
+    """All of it."""
+    width = max([len(str(row[0])) for row in rows], default=0)
+    return "\n".join([heading(columns, width), *(line(columns, row, width) for row in rows)])
+
+
+def _text(value: str | float | int) -> str:
+    if isinstance(value, float):
+        return "-" if math.isnan(value) else f"{value:.3g}" if value < 100 else f"{value:.0f}"
+    return str(value)
+
 
 _FULL = 100  # frames of a condition at which recordings are replayed in full
 
@@ -50,26 +81,16 @@ class Bench(Generic[C, F]):
             yield condition.name, self.measure(condition, frames, seed)
 
 
-@dataclass(frozen=True, slots=True)
-class Recordings:
-    """What was recorded, and where rendered images' corners are kept."""
-
-    tags: Path
-    trajectories: dict[str, Path]  # by the names of ``rendered.MOTIONS``
-    folder: Path
-
-
-def benches(recordings: Recordings) -> dict[str, Bench[Any, Any]]:
-    """All of them."""
+def benches(folder: Path) -> dict[str, Bench[Any, Any]]:
+    """All of them; the corners of rendered images are kept in the folder."""
 
     def replay_tags(condition: tags.Condition, frames: int, _: int) -> tags.Replayed:
         share = min(1.0, frames / _FULL)
-        return tags.measure(condition, recordings.tags, max(1, round(share * tags.FRAMES)))
+        return tags.measure(condition, max(1, round(share * tags.FRAMES)))
 
     def replay_rendered(condition: rendered.Condition, frames: int, _: int) -> Found:
         seconds = rendered.SECONDS * min(1.0, frames / _FULL)
-        trajectory = recordings.trajectories[condition.motion]
-        return rendered.measure(condition, trajectory, recordings.folder, seconds)
+        return rendered.measure(condition, folder, seconds)
 
     return {
         "p3p": Bench(

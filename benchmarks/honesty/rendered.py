@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.data import HAND_MOTION, SLOW_HAND_MOTION
 from benchmarks.honesty.estimating import Found
 from benchmarks.honesty.scores import Score, Scores, Truth, percent, score
 from rs_localizer.config import NodeConfig, PoseTime
@@ -34,7 +35,10 @@ from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.simulation.walls import three_walls
 
-MOTIONS = {"tum_vi_room5": "forward_left_up", "tum_rgbd_fr1_xyz": "optical"}
+MOTIONS = {
+    "tum_vi_room5": (HAND_MOTION, "forward_left_up"),
+    "tum_rgbd_fr1_xyz": (SLOW_HAND_MOTION, "optical"),
+}
 """Trajectories by name, and the axes of the body whose poses they hold."""
 SECONDS = 10.0
 _RATE = 30.0
@@ -59,13 +63,11 @@ def conditions() -> Sequence[Condition]:
     return [Condition(*point) for point in product(MOTIONS, (False, True))]
 
 
-def measure(
-    condition: Condition, trajectory: Path, folder: Path, seconds: float = SECONDS
-) -> Found:
+def measure(condition: Condition, folder: Path, seconds: float = SECONDS) -> Found:
     """The scores of the frames that show three markers or more, at both moments."""
     recording = folder / f"{condition.motion}_{seconds:g}s"
     if not recording.exists():
-        _render(trajectory, MOTIONS[condition.motion], recording, seconds)
+        _render(*MOTIONS[condition.motion], recording, seconds)
     stamp, middle = (
         _scores(recording, condition.tracking, moment)
         for moment in (PoseTime.STAMP, PoseTime.MID_FRAME)

@@ -8,10 +8,10 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks.data import GLOBAL_SHUTTER_TAGS
 from benchmarks.experiments.uncertainty import IntArray, Interval, bootstrap
 from benchmarks.frames.judged import REGION
 from benchmarks.honesty.scores import motion_evidence, percent
@@ -69,11 +69,11 @@ def conditions() -> Sequence[Condition]:
     ]
 
 
-def measure(condition: Condition, recording: Path, frames: int = FRAMES) -> Replayed:
+def measure(condition: Condition, frames: int = FRAMES) -> Replayed:
     """Replay the first frames of the recording as the node would see them."""
     localizer = FrameLocalizer(condition.config)
     results: list[Localized | Refusal] = []
-    with open_bag(recording) as bag:
+    with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
         for topic, _, message in bag.messages((CAMERA_INFO, CORRESPONDENCES)):
             if topic == CAMERA_INFO:
                 localizer.calibrate(read_camera_info(message))

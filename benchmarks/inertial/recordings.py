@@ -18,7 +18,6 @@ from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import Moving
 from benchmarks.independent.scenes import Scene
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
@@ -153,18 +152,9 @@ def alone_and_aided(
     recorded: Recorded, localizer: Localizer, frame: int, points: Array, pixels: Array
 ) -> tuple[Estimate | Failure, Estimate | Failure]:
     """Results of a single frame without and with a gyroscope that is known by now."""
-    turn = turn_of_frame(recorded, frame, localizer.camera.readout_time)
-    return localizer.localize(points, pixels), localizer.localize(points, pixels, turn=turn)
-
-
-def turn_of_frame(recorded: Recorded, frame: int, readout_time: float) -> GyroRotation:
-    """How the camera turned during a frame, by a gyroscope that is known by now."""
-    samples, errors = recorded.around(frame), _known_errors(recorded)
-    within = turn_within(samples, recorded.frames.middle_ns(frame), readout_time, errors)
-    assert within is not None
-    return within.known
-
-
-def _known_errors(recorded: Recorded) -> GyroscopeErrors:
     deviations = [*3 * [_BIAS_DEVIATION], _OFFSET_DEVIATION]
-    return GyroscopeErrors(np.zeros(3), 0.0, np.diag(np.square(deviations)), recorded.imu.noise)
+    errors = GyroscopeErrors(np.zeros(3), 0.0, np.diag(np.square(deviations)), recorded.imu.noise)
+    middle_ns, readout_time = recorded.frames.middle_ns(frame), localizer.camera.readout_time
+    within = turn_within(recorded.around(frame), middle_ns, readout_time, errors)
+    assert within is not None
+    return localizer.localize(points, pixels), localizer.localize(points, pixels, turn=within.known)

@@ -29,10 +29,12 @@ if WORKING:
     from rs_localizer.evaluation import plots
     from rs_localizer.evaluation.comparison import Recording, Result, compare, load_recording, table
     from rs_localizer.evaluation.cube_clip import (
+        CAMERA,
         CLIP_SENSOR,
         OURS,
         P3P,
         RUN_UP,
+        MarkerWalls,
         clip_stamps,
         draw_clip,
     )
@@ -54,7 +56,6 @@ if WORKING:
     from rs_localizer.process.missing import explain
     from rs_localizer.settings import build, load_params_file
     from rs_localizer.simulation.frames import frame_stamps, middle_stamp, simulate_frames
-    from rs_localizer.simulation.marker_frames import CAMERA, MarkerWalls
     from rs_localizer.simulation.recording import write_simulated, write_truth
     from rs_localizer.simulation.scene import room
     from rs_localizer.simulation.true_motion import RecordedMotion

@@ -4,7 +4,8 @@
 
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -94,7 +95,6 @@ class Result:
 
     answers: dict[int, Answer]  # by the stamp of the frame
     poses: Trajectory
-    twists: Twists | None
     errors: Errors | None  # of the poses; with the true angular rate
     twist_errors: Errors | None
 
@@ -123,24 +123,20 @@ def compare(answers: dict[int, Answer], truth: Motions | None) -> Result:
         np.array([a.position for a in listed]).reshape(-1, 3),
         np.array([a.quaternion for a in listed]).reshape(-1, 4),
     )
+    if truth is None:
+        return Result(answers, poses, None, None)
+    errors = pose_errors(poses, truth.poses, _TOLERANCE_NS)
+    errors = replace(errors, true_angular_rate=_rates(errors.stamps_ns, truth.twists))
     moving = [a for a in listed if a.angular is not None and a.linear is not None]
-    twists = None
-    if moving:
+    off = None
+    if moving and truth.twists is not None:
         twists = Twists(
             _stamps(moving),
             np.array([a.angular for a in moving]),
             np.array([a.linear for a in moving]),
         )
-    if truth is None:
-        return Result(answers, poses, twists, None, None)
-    errors = pose_errors(poses, truth.poses, _TOLERANCE_NS)
-    errors = Errors(
-        errors.stamps_ns, errors.linear, errors.angular, _rates(errors.stamps_ns, truth.twists)
-    )
-    off = None
-    if twists is not None and truth.twists is not None:
         off = twist_errors(twists, truth.twists, _TOLERANCE_NS)
-    return Result(answers, poses, twists, errors, off)
+    return Result(answers, poses, errors, off)
 
 
 def counts_at(result: Result, stamps_ns: Sequence[int]) -> Array:
@@ -208,47 +204,32 @@ def _latency(_: Recording, result: Result) -> str:
     return f"{p50:.1f} / {p95:.1f}"
 
 
-def _pose_error(kind: Callable[[Errors], Array], digits: int, least_rate: float = 0.0) -> Cell:
+def _error(
+    of: Callable[[Result], Errors | None], kind: str, digits: int, *, unit: float = 1.0,
+    least_rate: float = 0.0,
+) -> Cell:  # fmt: skip
     """Median over the frames in which the camera turns faster than ``least_rate`` (deg/s)."""
 
     def cell(_: Recording, result: Result) -> str:
-        return _error(result.errors, kind, digits, least_rate)
+        errors = of(result)
+        if errors is None:
+            return _NONE
+        values = unit * getattr(errors, kind)
+        if least_rate > 0.0:
+            values = values[errors.true_angular_rate > least_rate]
+        return _median(values, digits)
 
     return cell
-
-
-def _twist_error(kind: Callable[[Errors], Array], digits: int, least_rate: float = 0.0) -> Cell:
-    def cell(_: Recording, result: Result) -> str:
-        return _error(result.twist_errors, kind, digits, least_rate)
-
-    return cell
-
-
-def _error(
-    errors: Errors | None, kind: Callable[[Errors], Array], digits: int, least_rate: float
-) -> str:
-    if errors is None:
-        return _NONE
-    values = kind(errors)
-    chosen = values if least_rate == 0.0 else values[errors.true_angular_rate > least_rate]
-    return _median(chosen, digits)
 
 
 def _median(values: Array, digits: int) -> str:
     return f"{np.median(values):.{digits}f}" if len(values) else _NONE
 
 
-def _millimetres(errors: Errors) -> Array:
-    return np.multiply(1e3, errors.linear)
-
-
-def _linear(errors: Errors) -> Array:
-    return errors.linear
-
-
-def _angular(errors: Errors) -> Array:
-    return errors.angular
-
+_POSITION = partial(_error, lambda result: result.errors, "linear", 1, unit=1e3)
+_ORIENTATION = partial(_error, lambda result: result.errors, "angular", 3)
+_TURN_RATE = partial(_error, lambda result: result.twist_errors, "angular", 1)
+_VELOCITY = partial(_error, lambda result: result.twist_errors, "linear", 2)
 
 _ROWS: tuple[tuple[str, Cell], ...] = (
     ("frames", lambda recording, _: str(len(recording.stamps_ns))),
@@ -259,14 +240,14 @@ _ROWS: tuple[tuple[str, Cell], ...] = (
     ),
     ("inliers, median", lambda _, result: _median(result.inlier_counts, 0)),
     ("residual of the inliers, median (px rms)", lambda _, result: _median(result.residuals, 3)),
-    ("position error, median (mm)", _pose_error(_millimetres, 1)),
-    ("  where the camera turns > 60 deg/s", _pose_error(_millimetres, 1, 60.0)),
-    ("  where the camera turns > 150 deg/s", _pose_error(_millimetres, 1, 150.0)),
-    ("orientation error, median (deg)", _pose_error(_angular, 3)),
-    ("  where the camera turns > 60 deg/s", _pose_error(_angular, 3, 60.0)),
-    ("  where the camera turns > 150 deg/s", _pose_error(_angular, 3, 150.0)),
-    ("angular velocity error, median (deg/s)", _twist_error(_angular, 1)),
-    ("  where the camera turns > 150 deg/s", _twist_error(_angular, 1, 150.0)),
-    ("linear velocity error, median (m/s)", _twist_error(_linear, 2)),
+    ("position error, median (mm)", _POSITION()),
+    ("  where the camera turns > 60 deg/s", _POSITION(least_rate=60.0)),
+    ("  where the camera turns > 150 deg/s", _POSITION(least_rate=150.0)),
+    ("orientation error, median (deg)", _ORIENTATION()),
+    ("  where the camera turns > 60 deg/s", _ORIENTATION(least_rate=60.0)),
+    ("  where the camera turns > 150 deg/s", _ORIENTATION(least_rate=150.0)),
+    ("angular velocity error, median (deg/s)", _TURN_RATE()),
+    ("  where the camera turns > 150 deg/s", _TURN_RATE(least_rate=150.0)),
+    ("linear velocity error, median (m/s)", _VELOCITY()),
     ("latency, 50 / 95 % (ms)", _latency),
 )

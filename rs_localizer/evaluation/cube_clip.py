@@ -1,9 +1,12 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cube in a few seconds of a shaking hand, drawn by P3P and by the localizer: an animation."""
+"""Walls of markers along a recorded hand, rendered and detected, and an animation of a cube there.
+
+The cube is drawn by the poses of P3P and by those of the localizer.
+"""
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,12 +16,61 @@ from PIL import Image as Pillow
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.io.video import Image
+from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.prints import Marker
-from rs_localizer.simulation.frames import true_poses_at
-from rs_localizer.simulation.marker_frames import CAMERA, RATE, MarkerWalls
+from rs_localizer.simulation.frames import frame_stamps, middle_stamp, true_poses_at
+from rs_localizer.simulation.renderer import Renderer, in_order
 from rs_localizer.simulation.settings import ImageSettings
-from rs_localizer.simulation.true_motion import TrueMotion
+from rs_localizer.simulation.true_motion import RecordedMotion, TrueMotion, sampled_states
+from rs_localizer.simulation.walls import three_walls
+
+CAMERA = Camera(
+    640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]),
+    readout_time=0.03,
+)  # fmt: skip
+RATE = 30.0
+SENSOR = ImageSettings(exposure=0.005, noise=2.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerFrame:
+    """What is detected in one image."""
+
+    stamp_ns: int
+    middle_ns: int
+    points: Array  # (n,3) m, corners of the detected markers
+    pixels: Array  # (n,2) raw
+
+
+class MarkerWalls:
+    """Three walls around a recorded motion, and the camera before them."""
+
+    def __init__(self, trajectory: Trajectory, seed: int, sensor: ImageSettings = SENSOR) -> None:
+        self.motion = RecordedMotion(trajectory)
+        scene = three_walls(sampled_states(self.motion))
+        assert scene.marker_map is not None
+        self.markers: Sequence[Marker] = scene.marker_map.markers
+        self._renderer = Renderer(CAMERA, scene.planes, sensor)
+        self._detector = MarkerDetector(scene.marker_map)
+        self._seed = seed
+
+    def stamps(self) -> list[int]:
+        """Of all frames within the motion."""
+        return frame_stamps(self.motion, CAMERA, RATE)
+
+    def frames(self, stamps_ns: Sequence[int]) -> Iterator[tuple[MarkerFrame, Image]]:
+        """The frames with these stamps, and their images (height, width)."""
+
+        def frame(stamp_ns: int) -> tuple[MarkerFrame, Image]:
+            image = self._renderer.image(self.motion, stamp_ns, (self._seed, stamp_ns))
+            found = self._detector.detect(image)
+            middle_ns = middle_stamp(CAMERA, stamp_ns)
+            return MarkerFrame(stamp_ns, middle_ns, found.points, found.pixels), image
+
+        return in_order(frame, stamps_ns)
+
 
 _BAR, _GAP = 30, 6  # px
 _FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.55
@@ -92,25 +144,13 @@ _FACES = np.array(
 PosesAt = Callable[[Array], tuple[Array, Array]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cube:
-    """A cube by its corners (8,3), m in the map frame."""
-
-    corners: Array
-
-
-def cube_on(marker: Marker) -> Cube:
-    """A cube that stands on a marker like a box on a carpet."""
-    return Cube(marker.pose(_SIDE * marker.size * _CORNERS))
-
-
-def corner_pixels(camera: Camera, poses_at: PosesAt, cube: Cube) -> Array:
-    """Raw pixels (8,2) where a moving camera sees the corners; NaN where it does not."""
-    return project_rolling(camera, poses_at, cube.corners)[0]
+def cube_on(marker: Marker) -> Array:
+    """Corners (8,3), m in the map, of a cube that stands on a marker like a box on a carpet."""
+    return marker.pose(_SIDE * marker.size * _CORNERS)
 
 
 def draw_cube(
-    picture: Image, camera: Camera, poses_at: PosesAt, cube: Cube, color: tuple[int, int, int]
+    picture: Image, camera: Camera, poses_at: PosesAt, corners: Array, color: tuple[int, int, int]
 ) -> None:
     """Draw a cube into a picture (height, width, 3), each of its points at its own row's pose.
 
@@ -119,10 +159,10 @@ def draw_cube(
     """
     rotations, translations = poses_at(np.zeros(1))
     centre = -rotations[0].T @ translations[0]
-    outlines = [_outline(camera, poses_at, cube.corners[face]) for face in _FACES]
+    outlines = [_outline(camera, poses_at, corners[face]) for face in _FACES]
     if not all(np.all(np.isfinite(outline)) for outline in outlines):
         return  # partly behind the camera
-    near = [_faces_viewer(cube.corners[face], centre) for face in _FACES]
+    near = [_faces_viewer(corners[face], centre) for face in _FACES]
     fixed = [np.rint(outline * 2**_SHIFT).astype(np.int32) for outline in outlines]
     for outline, near_side in zip(fixed, near, strict=True):
         if not near_side:
@@ -185,8 +225,8 @@ def clip_stamps(walls: MarkerWalls, most: int | None = None) -> list[int]:
     return stamps[first - RUN_UP : first + (whole if most is None else min(most, whole))]
 
 
-def clip_cube(walls: MarkerWalls) -> Cube:
-    """The cube of the clip."""
+def clip_cube(walls: MarkerWalls) -> Array:
+    """Corners (8,3) of the cube of the clip."""
     return cube_on(walls.markers[_MARKER])
 
 
@@ -212,13 +252,13 @@ def draw_clip(
 
 
 def cube_errors(
-    motion: TrueMotion, middle_ns: int, cube: Cube, motions: Motions
+    motion: TrueMotion, middle_ns: int, cube: Array, motions: Motions
 ) -> dict[str, float]:
     """How far the cube's farthest corner is off in the image, px, for each method.
 
     Infinite without a pose; empty when the cube is not all in the image.
     """
-    true = corner_pixels(CAMERA, true_poses_at(CAMERA, motion, middle_ns), cube)
+    true = project_rolling(CAMERA, true_poses_at(CAMERA, motion, middle_ns), cube)[0]
     if not np.all(CAMERA.inside(true)):
         return {}
     errors = {}
@@ -226,12 +266,13 @@ def cube_errors(
         if estimate is None:
             errors[name] = np.inf
         else:
-            off = np.linalg.norm(corner_pixels(CAMERA, estimate.at_rows, cube) - true, axis=1).max()
+            seen = project_rolling(CAMERA, estimate.at_rows, cube)[0]
+            off = np.linalg.norm(seen - true, axis=1).max()
             errors[name] = float(np.nan_to_num(off, nan=np.inf))
     return errors
 
 
-def _picture(image: Image, cube: Cube, motions: Motions, off: Mapping[str, float]) -> Image:
+def _picture(image: Image, cube: Array, motions: Motions, off: Mapping[str, float]) -> Image:
     """The image once for each method, with its cube and what it is off by."""
     pictures: list[Image] = []
     captions: list[Sequence[str]] = []

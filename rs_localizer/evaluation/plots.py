@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
-from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import median_filter
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.scanning import ScanDirection
@@ -222,40 +222,26 @@ def _draw_series(
         t, values, linestyle="none", marker=style.marker, markersize=3.0, markeredgewidth=0.6,
         color=style.color, alpha=0.35, zorder=style.layer,
     )  # fmt: skip
-    x, y = _broken(stamps_ns, t, _running_median(values))
+    running = median_filter(values, _WINDOW, mode="mirror") if len(values) >= _WINDOW else values
+    x, y = _broken(stamps_ns, t, running)
     counted = values if counted is None else counted
     label = f"{name}: median {np.median(counted):.3g} {unit}".rstrip() if len(counted) else name
     axes.plot(x, y, style.line, color=style.color, linewidth=2.0, zorder=style.layer, label=label)
 
 
-def _running_median(values: Array) -> Array:
-    if len(values) < _WINDOW:
-        return values
-    half = _WINDOW // 2
-    padded = np.pad(values, half, mode="reflect")
-    return np.asarray(np.median(sliding_window_view(padded, _WINDOW), axis=1))
-
-
-def inliers(
-    stamps_ns: Stamps,
-    counts: Mapping[str, Array],
-    most: Array,
-    angular_rate: Array,
-    most_label: str,
+def inlier_picture(
+    recording: Recording, results: Mapping[str, Result], true_matches: Array
 ) -> Figure:
-    """Inliers of each frame, and how fast the camera turned; medians of the localized frames.
+    """Inliers of each frame, ``true_matches`` (n,) of which there are, and the angular rate.
 
-    Args:
-        stamps_ns: (n,) of all frames.
-        counts: (n,) inliers per method; 0 where a frame was not localized.
-        most: (n,) correspondences that could be inliers.
-        angular_rate: (n,) deg/s.
-        most_label: what ``most`` is.
+    Medians are of the localized frames.
     """
+    stamps_ns = np.array(recording.stamps_ns)
+    counts = {name: counts_at(result, recording.stamps_ns) for name, result in results.items()}
     figure = _new_figure("Matches that fit the pose of their frame", 5.7)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.0, 1.0))
     t = _seconds(stamps_ns, int(stamps_ns[0]))
-    upper.fill_between(t, most, step="mid", color="#ececec", zorder=0, label=most_label)
+    upper.fill_between(t, true_matches, step="mid", color="#ececec", zorder=0, label="true matches")
     for (name, style), values in zip(_methods(counts), counts.values(), strict=True):
         # As in the table: what a refused frame would have had, nobody knows.
         localized = values[values > 0.0]
@@ -264,7 +250,7 @@ def inliers(
     upper.set_ylim(bottom=0.0)
     upper.set_ylabel("inliers (0: frame refused)")
     _legend(upper, 3)
-    lower.fill_between(t, angular_rate, color="#8a8a8a", linewidth=0.0)
+    lower.fill_between(t, true_rates(recording), color="#8a8a8a", linewidth=0.0)
     lower.set_ylim(bottom=0.0)
     lower.set_ylabel("the camera turns\nat (deg/s)")
     lower.set_xlabel("time (s)")
@@ -273,7 +259,7 @@ def inliers(
     return figure
 
 
-def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title: str) -> Figure:
+def _residuals(image: Image, pixels: Array, predicted: Mapping[str, Array]) -> Figure:
     """Residuals as arrows on the image they belong to, one picture per method.
 
     All arrows are enlarged alike, as far as all stay inside.
@@ -282,7 +268,6 @@ def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title
         image: (height, width) grey.
         pixels: (n,2) where the corners were seen.
         predicted: (n,2) where each method's pose puts them.
-        title: what image it is.
     """
     longest = max(
         float(np.linalg.norm(pixels - projections, axis=1).max())
@@ -299,7 +284,10 @@ def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title
     wide, tall = np.maximum(high - low, 1.0)
     # As high as the pictures are, side by side, with their titles: no band stays blank.
     height = float(np.clip(_WIDTH / len(predicted) * tall / wide, 1.0, _WIDTH)) + _TITLES
-    figure = _new_figure(f"{title}: from where the pose puts points to where they are seen", height)
+    title = (
+        "The frame where they differ most: from where the pose puts points to where they are seen"
+    )
+    figure = _new_figure(title, height)
     panels = figure.subplots(1, len(predicted), squeeze=False)[0]
     for axes, (name, style), projections in zip(
         panels, _methods(predicted), predicted.values(), strict=True
@@ -326,29 +314,19 @@ def _round_down(value: float) -> float:
     return float(power * max(digit for digit in (1.0, 2.0, 5.0) if digit * power <= value))
 
 
-_RESIDUAL_TITLE = "The frame where they differ most"
-
-
 def trajectory_picture(recording: Recording, results: Mapping[str, Result]) -> Figure:
     """Positions of all methods over the truth."""
-    return trajectories(
-        _truth_during(recording), {name: result.poses for name, result in results.items()}
-    )
+    truth = None
+    if recording.truth is not None:
+        poses = recording.truth.poses
+        first, last = recording.stamps_ns[0], recording.stamps_ns[-1]
+        truth = poses.part((poses.stamps_ns >= first) & (poses.stamps_ns <= last))
+    return trajectories(truth, {name: result.poses for name, result in results.items()})
 
 
 def error_picture(results: Mapping[str, Result]) -> Figure:
     """Errors over time; the recording has to hold the truth."""
     return errors({name: r.errors for name, r in results.items() if r.errors is not None}, {})
-
-
-def inlier_picture(
-    recording: Recording, results: Mapping[str, Result], true_matches: Array
-) -> Figure:
-    """Inliers of each frame, ``true_matches`` (n,) of which there are, and the angular rate."""
-    counts = {name: counts_at(result, recording.stamps_ns) for name, result in results.items()}
-    return inliers(
-        np.array(recording.stamps_ns), counts, true_matches, true_rates(recording), "true matches"
-    )
 
 
 def residual_picture(
@@ -378,18 +356,6 @@ def residual_picture(
         if best is None or difference > best[0]:
             data = np.frombuffer(recording.images[stamp].data, np.uint8)
             image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-            best = (
-                difference,
-                residuals(
-                    np.asarray(image, np.uint8), correspondences.pixels, predicted, _RESIDUAL_TITLE
-                ),
-            )
+            picture = _residuals(np.asarray(image, np.uint8), correspondences.pixels, predicted)
+            best = difference, picture
     return None if best is None else best[1]
-
-
-def _truth_during(recording: Recording) -> Trajectory | None:
-    if recording.truth is None:
-        return None
-    poses = recording.truth.poses
-    first, last = recording.stamps_ns[0], recording.stamps_ns[-1]
-    return poses.part((poses.stamps_ns >= first) & (poses.stamps_ns <= last))

@@ -1,34 +1,27 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A rendered room that is mapped from one walk, and flights that are localized in the map."""
+"""A rendered room that is mapped from one walk, and what other walks in it see."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from rs_localizer.config import FeatureConfig, NodeConfig, PoseTime
-from rs_localizer.core.arrays import Array
+from rs_localizer.config import FeatureConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
-from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.images import Image
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.io.outputs import Localized
-from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
+from rs_localizer.io.recording import CAMERA_FRAME
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.mapping.anchors import Anchors
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map
 from rs_localizer.mapping.colmap import Effort, Stage
 from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.views import Looker, View
-from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
-from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.simulation.frames import frame_stamps, middle_stamp
+from rs_localizer.simulation.frames import frame_stamps
 from rs_localizer.simulation.renderer import Renderer, in_order
 from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
@@ -42,19 +35,6 @@ class Piece:
     start: float  # s
     duration: float  # s
     rate: float = 30.0  # Hz
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Errors:
-    """How far poses are from the truth."""
-
-    frames: int
-    positions: Array  # (k,) m, of the localized frames
-    angles: Array  # (k,) deg
-
-    @property
-    def share(self) -> float:
-        return len(self.positions) / self.frames
 
 
 class Room:
@@ -124,36 +104,6 @@ class Room:
             clouds.append(keypoints(extractor.extract(image), make_message))
             done()
         return clouds
-
-    def localized(
-        self, clouds: Iterable[Any], landmarks: Map, solver: str
-    ) -> dict[int, Localized | Refusal]:
-        """The poses of the middle rows by the stamps of the images, as ``replay`` gives them."""
-        config = NodeConfig(
-            solver=solver, readout_time=self.camera.readout_time, pose_time=PoseTime.MID_FRAME
-        )
-        localizer = FrameLocalizer(config)
-        localizer.use_map(landmarks)
-        answers = {}
-        for cloud in clouds:
-            stamp = cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec
-            localizer.calibrate(read_camera_info(make_camera_info(self.camera, stamp)))
-            answers[stamp] = localizer.localize_keypoints(cloud)
-        return answers
-
-    def errors(self, answers: dict[int, Localized | Refusal]) -> Errors:
-        """Of poses for the middle rows."""
-        positions, angles = [], []
-        for stamp, answer in answers.items():
-            if isinstance(answer, Refusal):
-                continue
-            true = self.motion.state(middle_stamp(self.camera, stamp), np.zeros(1))
-            positions.append(np.linalg.norm(answer.pose.position - true.positions[0]))
-            turn = true.rotations[0].T @ answer.pose.rotation
-            # Of half the angle: the trace says little of small ones.
-            sine = np.linalg.norm(turn - np.eye(3)) / np.sqrt(8.0)
-            angles.append(2.0 * np.degrees(np.arcsin(min(sine, 1.0))))
-        return Errors(len(answers), np.array(positions), np.array(angles))
 
 
 def without_refinement(built: Built) -> Map:

@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Offline detection: images -> a recording of correspondences or keypoints, as the nodes do."""
 
+from __future__ import annotations
+
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -87,67 +89,64 @@ def record(
 
     Args:
         shots: the images, and what else of their recording is to be kept.
-        detector: looks for markers.
-        bag: where they are written.
-        options: what is written, and how it was seen.
         done: called after each image.
         tell: called when many images in the beginning show nothing, with what they show instead.
 
     Raises:
         DetectError: when no image shows anything, or images and calibration differ in size.
     """
-    tally = _Tally(detector.map)
+    found = Extraction()
+    tally = _Tally(detector.map, found)
     cameras = Cameras(options.scan_direction)
-    for shot in shots:
-        if isinstance(shot, Carried):
-            tally.carried[shot.topic] += 1
-            bag.write(shot.topic, shot.message, shot.recorded_ns)
-            continue
-        if isinstance(shot.image, Refusal):
-            tally.refuse(shot.image)
-        else:
-            detected = detector.detect(shot.image)
-            tally.add(cameras.of(shot, shot.image), detected)
-            if len(detected.detections.ids):
-                corners = correspondences(detected, make_message)
-                _write(bag, shot, CORRESPONDENCES_TOPIC, corners, options)
-            if tally.images == _PATIENCE and tally.are_few:
-                count = len(tally.counts) or "none"
-                tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
-        done()
-    if not tally.counts:
+    for shot, image in _readable(shots, bag, found, done):
+        detected = detector.detect(image)
+        tally.add(cameras.of(shot, image), detected)
+        if len(detected.detections.ids):
+            corners = correspondences(detected, make_message)
+            _write(bag, shot, CORRESPONDENCES_TOPIC, corners, options)
+        if found.images == _PATIENCE and tally.are_few:
+            count = len(found.counts) or "none"
+            tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
+    if not found.counts:
         of = f" of {options.camera}" if options.camera else ""
-        raise DetectError(f"none of the {tally.images} images{of} {tally.nothing()}")
+        raise DetectError(f"none of the {found.images} images{of} {tally.nothing()}")
     return tally.recorded()
 
 
-class _Tally:
-    """Counts what became of the images."""
+def _readable(
+    shots: Iterable[Shot | Carried], bag: BagWriter, found: Extraction, done: Callable[[], object]
+) -> Iterator[tuple[Shot, Image]]:
+    """The images that can be read, counted; what else is to be kept is written."""
+    for shot in shots:
+        if isinstance(shot, Carried):
+            found.carried[shot.topic] += 1
+            bag.write(shot.topic, shot.message, shot.recorded_ns)
+            continue
+        found.images += 1
+        if isinstance(shot.image, Refusal):
+            found.refused.setdefault(shot.image.reason, shot.image.detail)
+        else:
+            found.stamps_ns.append(shot.image.stamp_ns)
+            yield shot, shot.image
+        done()
 
-    def __init__(self, marker_map: MarkerMap) -> None:
-        self.images = 0
-        self.counts: list[int] = []
-        self.carried: Counter[str] = Counter()
-        self._map = marker_map
-        self._refused: dict[str, str] = {}
+
+class _Tally:
+    """Counts what the images show of a map."""
+
+    def __init__(self, marker_map: MarkerMap, found: Extraction) -> None:
+        self._map, self._found = marker_map, found
         self._others: Counter[str] = Counter()
         self._residuals: list[float] = []
-        self._stamps: list[int] = []
         self._empty: list[Image] = []  # some that show nothing
         self._empties = 0
         self._markers = LeaveOneOut(marker_map, _RollingFit())
 
-    def refuse(self, refusal: Refusal) -> None:
-        self.images += 1
-        self._refused.setdefault(refusal.reason, refusal.detail)
-
     def add(self, camera: Camera, detected: Detected) -> None:
-        self.images += 1
-        self._stamps.append(detected.image.stamp_ns)
         detections = detected.detections
         self._others.update(detections.unknown)
         if len(detections.ids):
-            self.counts.append(len(detections.ids))
+            self._found.counts.append(len(detections.ids))
             self._residuals.append(static_residual(camera, detected))
             self._markers.add(camera, detections)
             return
@@ -158,21 +157,21 @@ class _Tally:
     @property
     def are_few(self) -> bool:
         """Whether so few images show anything that it may be another board, seen in part."""
-        return len(self.counts) < _FEW * self.images
+        return len(self._found.counts) < _FEW * self._found.images
 
     def nothing(self) -> str:
         """What is to be said of images that show nothing of the map."""
         families = sorted({marker.family.name for marker in self._map.markers})
         wanted = ", ".join([*families, *(board.name for board in self._map.boards)])
         text = f"shows anything of the map ({wanted})"
-        if self._refused:
-            text += f"; {'; '.join(self._refused.values())}"
+        if self._found.refused:
+            text += f"; {'; '.join(self._found.refused.values())}"
         if self._others:
             names = ", ".join(name for name, _ in self._others.most_common(5))
             return f"{text}; they show {names}, which the map does not have"
         boards = self.instead()
         if boards:
-            return f"{text}; {'others' if self.counts else 'they'} show {'; '.join(boards)}"
+            return f"{text}; {'others' if self._found.counts else 'they'} show {'; '.join(boards)}"
         if self._empty:
             text += "; nor any other marker or chessboard that OpenCV knows"
         return text
@@ -193,15 +192,14 @@ class _Tally:
             )
         if self.are_few and (names := self.instead()):
             faults.append(f"images that show nothing of the map show {'; '.join(names)}")
-        period = np.diff(np.array(self._stamps, np.int64))
         return Recorded(
-            self.images,
-            len(self.counts),
-            float(np.median(self.counts)),
-            self._refused,
+            self._found.images,
+            len(self._found.counts),
+            float(np.median(self._found.counts)),
+            self._found.refused,
             float(np.median(known)) if known else np.nan,
-            float(np.median(period)) * 1e-9 if len(period) else np.nan,
-            dict(self.carried),
+            self._found.period,
+            dict(self._found.carried),
             tuple(faults),
         )
 
@@ -285,7 +283,7 @@ class Extraction:
     """What became of the images."""
 
     images: int = 0
-    counts: list[int] = field(default_factory=list)  # keypoints of the images that have any
+    counts: list[int] = field(default_factory=list)  # keypoints or corners, where there are any
     refused: dict[str, str] = field(default_factory=dict)  # the first detail of each reason
     carried: Counter[str] = field(default_factory=Counter)  # messages of other topics
     stamps_ns: list[int] = field(default_factory=list)
@@ -306,34 +304,17 @@ def record_features(
 ) -> Extraction:
     """Write the keypoints of all images that have any, each with its CameraInfo.
 
-    Args:
-        shots: the images, and what else of their recording is to be kept.
-        extractor: looks for keypoints.
-        bag: where they are written.
-        options: what is written.
-        done: called after each image.
-
     Raises:
         DetectError: when no image has keypoints, or images and calibration differ in size.
     """
     extraction = Extraction()
     cameras = Cameras(options.scan_direction)
-    for shot in shots:
-        if isinstance(shot, Carried):
-            extraction.carried[shot.topic] += 1
-            bag.write(shot.topic, shot.message, shot.recorded_ns)
-            continue
-        extraction.images += 1
-        if isinstance(shot.image, Refusal):
-            extraction.refused.setdefault(shot.image.reason, shot.image.detail)
-        else:
-            cameras.of(shot, shot.image)
-            extraction.stamps_ns.append(shot.image.stamp_ns)
-            extracted = extractor.extract(shot.image)
-            if len(extracted.features):
-                extraction.counts.append(len(extracted.features))
-                _write(bag, shot, KEYPOINTS_TOPIC, keypoints(extracted, make_message), options)
-        done()
+    for shot, image in _readable(shots, bag, extraction, done):
+        cameras.of(shot, image)
+        extracted = extractor.extract(image)
+        if len(extracted.features):
+            extraction.counts.append(len(extracted.features))
+            _write(bag, shot, KEYPOINTS_TOPIC, keypoints(extracted, make_message), options)
     if not extraction.counts:
         reasons = "".join(f"; {detail}" for detail in extraction.refused.values())
         raise DetectError(f"none of the {extraction.images} images has any keypoint{reasons}")

@@ -5,7 +5,6 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -77,7 +76,8 @@ def from_video(
             lost = Refusal(Reason.NO_TIME, "it has no presentation time")
             yield Shot(lost, _info(camera, 0, frame), None, 0)
         else:
-            yield _shot(Image(now, frame, gray), camera, jpeg, "jpeg")
+            compressed = _compressed(now, frame, jpeg, "jpeg")
+            yield Shot(Image(now, frame, gray), _info(camera, now, frame), compressed, now)
 
 
 def with_telemetry(
@@ -106,16 +106,12 @@ def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> I
     for file in files:
         now = clock.absolute(int(file.stem)) if timed else clock.relative(None)
         assert now is not None  # a clock without a rate has refused
-        data = file.read_bytes()
         name = "png" if file.suffix.lower() == ".png" else "jpeg"
-        seconds, nanoseconds = divmod(now, 10**9)
-        stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
-        header = SimpleNamespace(stamp=stamp, frame_id=CAMERA_FRAME)
-        message = SimpleNamespace(header=header, format=name, data=data)
-        image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
+        compressed = _compressed(now, CAMERA_FRAME, file.read_bytes(), name)
+        image = read_or_refuse(read_any_image, compressed, Reason.BAD_IMAGE)
         if isinstance(image, Refusal):
             image = Refusal(image.reason, f"{file.name}: {image.detail}")
-        yield _shot(image, camera, data, name, now)
+        yield Shot(image, _info(camera, now, CAMERA_FRAME), compressed, now)
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -202,20 +198,13 @@ def from_bag(
             yield Shot(image, info, compressed, recorded_ns)
 
 
-def _shot(
-    image: Image | Refusal, camera: Camera | None, data: bytes, format_: str, stamp: int = 0
-) -> Shot:
-    """An image of a file."""
-    frame = CAMERA_FRAME
-    if isinstance(image, Image):
-        stamp, frame = image.stamp_ns, image.frame
-    compressed = make_message(
+def _compressed(stamp: int, frame: str, data: bytes, format_: str) -> Any:
+    return make_message(
         IMAGE_TYPES[1],
         header=make_header(make_message, stamp, frame),
         format=format_,
         data=np.frombuffer(data, np.uint8),
     )
-    return Shot(image, _info(camera, stamp, frame), compressed, stamp)
 
 
 def _info(camera: Camera | None, stamp: int, frame: str) -> Any:

@@ -9,7 +9,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from rs_localizer.config import ImuUse, NodeConfig, PublishTf
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagError, BagReader, make_message
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
@@ -321,8 +324,6 @@ def prepare(
     """What :func:`replay` needs: where the inputs are, and a localizer with its map.
 
     Args:
-        bag: the recording.
-        config: the settings.
         given: topics, as for :func:`find_topics`.
         notice: told of what is odd.
 
@@ -374,6 +375,11 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
     for result in last_results(localizer):
         assert last is not None  # which waits
         yield Answer(last[1], stamp_ns(last[2]), result)
+
+
+def inlier_columns(frame: Localized, names: str) -> Array:
+    """Fields (k, len(names)) of the inliers of a frame."""
+    return np.stack([frame.inliers[name].astype(np.float64) for name in names], axis=1)
 
 
 def _each(results: Results) -> Iterable[Localized | Refusal]:

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_localizer.config import PoseTime
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.rig import RigEstimate
 from rs_localizer.io.outputs import Localized
+from rs_localizer.offline.replay import inlier_columns
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.pose_at_time import pose_at, published_moment, twist_at
 from rs_localizer.pipeline.refusal import Refusal
@@ -209,7 +209,7 @@ def _motion(
     assert calibration is not None
     camera = calibration.camera(config.readout_time, config.scan_direction)
     images = [
-        Observed(frame.input_stamp_ns, _columns(frame, "xyz"), _columns(frame, "uv"))
+        Observed(frame.input_stamp_ns, inlier_columns(frame, "xyz"), inlier_columns(frame, "uv"))
         for frame in frames
     ]
     motion = smooth(camera, images, [frame.estimate for frame in frames], config.stamp_offset)
@@ -219,7 +219,7 @@ def _motion(
 def _rig_frame(frame: Localized) -> RigFrame:
     assert isinstance(frame.estimate, RigEstimate)
     counts = np.cumsum([share.inliers for share in frame.cameras])[:-1]
-    points, pixels = (np.split(_columns(frame, names), counts) for names in ("xyz", "uv"))
+    points, pixels = (np.split(inlier_columns(frame, names), counts) for names in ("xyz", "uv"))
     images = {
         share.name: Observed(share.start_ns, *own)
         for share, *own in zip(frame.cameras, points, pixels, strict=True)
@@ -227,7 +227,3 @@ def _rig_frame(frame: Localized) -> RigFrame:
     # Times of a rig's estimate count from its first image.
     time_ns = frame.cameras[0].start_ns + round(1e9 * frame.estimate.time)
     return RigFrame(time_ns, images, frame.estimate)
-
-
-def _columns(frame: Localized, names: str) -> NDArray[np.float64]:
-    return np.stack([frame.inliers[name].astype(np.float64) for name in names], axis=1)

@@ -87,8 +87,12 @@ class FrameTable:
 
     def add(self, stamp_ns: int, result: Localized | Refusal) -> None:
         """Take what became of the frame with this stamp."""
-        row = {"recording": self._recording, "stamp_ns": stamp_ns}
-        self._rows.append(row | (_localized(result) if result else _refused(result)))
+        row: dict[str, Any] = {"recording": self._recording, "stamp_ns": stamp_ns}
+        if result:
+            row |= _localized(result)
+        else:
+            row |= {"state": REFUSED, "reason": str(result.reason)}
+        self._rows.append(row)
         if len(self._rows) == _ROWS:
             self._flush()
 
@@ -104,10 +108,6 @@ class FrameTable:
 
         self._flush()
         return pa.Table.from_batches(self._batches, self._schema).sort_by("stamp_ns")
-
-
-def _refused(refusal: Refusal) -> dict[str, Any]:
-    return {"state": REFUSED, "reason": str(refusal.reason)}
 
 
 def _localized(frame: Localized) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.remote import is_url, url_name
 from rs_localizer.io.topics import COMPRESSED_IMAGE, CORRESPONDENCES
 from rs_localizer.offline.image_sources import image_topics
-from rs_localizer.offline.replay import Topics
+from rs_localizer.offline.replay import Topics, inlier_columns
 from rs_localizer.pipeline.frames import FrameLocalizer
 
 TIMELINE = "stamp"
@@ -68,21 +68,17 @@ _SEEN, _STEPS = 15.0, (1, 2, 5, 10, 20, 50, 100, 200, 500)
 _INSTANTS = np.linspace(-0.5, 0.5, 9)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Ellipsoid:
-    """Where a position lies with a probability of 95 %."""
+def ellipsoid(covariance: Array) -> tuple[Array, Array]:
+    """Where a position lies with a probability of 95 %, of its covariance (3,3), m^2.
 
-    half_sizes: Array  # (3,) m, ascending
-    quaternion: Array  # (4,) x y z w, of its axes in the map
-
-
-def ellipsoid(covariance: Array) -> Ellipsoid:
-    """Of the covariance (3,3) of a position, m^2."""
+    Returns:
+        half its sizes (3,) m, ascending; quaternion (4,) x y z w of its axes in the map.
+    """
     values, axes = np.linalg.eigh(covariance)
     if np.linalg.det(axes) < 0.0:
         axes[:, 0] *= -1.0
     half_sizes = _WITHIN * np.sqrt(np.maximum(values, 0.0))
-    return Ellipsoid(half_sizes, so3.quaternion(np.ascontiguousarray(axes)))
+    return half_sizes, so3.quaternion(np.ascontiguousarray(axes))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +93,7 @@ class Reprojection:
 
 def reproject(frame: Localized, camera: Camera) -> Reprojection:
     """Project the inliers through the shutter that the frame was localized with."""
-    points, pixels = columns(frame, "xyz"), columns(frame, "uv")
+    points, pixels = inlier_columns(frame, "xyz"), inlier_columns(frame, "uv")
     predicted, tau = project_rolling(camera, frame.estimate.at_rows, points)
     visible = np.isfinite(tau)
     return Reprojection(
@@ -146,23 +142,18 @@ def eye(frames: Sequence[Localized]) -> Eye:
     rotation, translation = frame.estimate.at(0.0)
     centre = -rotation.T @ translation
     right, down, ahead = rotation
-    points = columns(frame, "xyz") if len(frame.inliers) else centre + ahead[None]
+    points = inlier_columns(frame, "xyz") if len(frame.inliers) else centre + ahead[None]
     target = np.median(points, axis=0)
     depth = float(np.linalg.norm(target - centre))
     position = centre + depth * (0.6 * right - 0.5 * down - 0.7 * ahead)
     return Eye(position, 0.5 * (target + centre), -down, depth)
 
 
-def columns(frame: Localized, names: str) -> Array:
-    """Fields (k, len(names)) of the inliers."""
-    return np.stack([frame.inliers[name].astype(np.float64) for name in names], axis=1)
-
-
 def others(pixels: Array, frame: Localized | None) -> Array:
     """The pixels (m,2) of an image that are no inliers of its frame."""
     if frame is None or len(frame.inliers) == 0:
         return pixels
-    kept = {tuple(pixel) for pixel in columns(frame, "uv").tolist()}
+    kept = {tuple(pixel) for pixel in inlier_columns(frame, "uv").tolist()}
     out = [tuple(pixel) not in kept for pixel in pixels.tolist()]
     rest: Array = pixels[np.array(out, np.bool_)]
     return rest
@@ -229,8 +220,7 @@ def _cloud(message: Any, matched: bool) -> Cloud:
 
 
 Series = dict[str, tuple[list[str], Array]]
-_COMPONENTS = ["x", "y", "z"]
-_UNKNOWN = np.full(3, np.nan)
+_COMPONENTS, _UNKNOWN = ["x", "y", "z"], np.full(3, np.nan)
 
 
 def series(frames: Sequence[Localized]) -> Series:
@@ -238,31 +228,25 @@ def series(frames: Sequence[Localized]) -> Series:
     estimates = [frame.estimate for frame in frames]
     spread = [np.sqrt(np.diag(frame.pose.covariance)) for frame in frames]
     twists = [frame.twist for frame in frames]
-    return {
-        ANGULAR: (_COMPONENTS, _rows([t.angular if t else _UNKNOWN for t in twists])),
-        LINEAR: (_COMPONENTS, _rows([t.linear if t else _UNKNOWN for t in twists])),
+    # A sample of a smoothed motion between images has no residual.
+    rms = [e.residual_rms if np.any(e.inliers) else np.nan for e in estimates]
+    curves: dict[str, tuple[list[str], list[Any]]] = {
+        ANGULAR: (_COMPONENTS, [t.angular if t else _UNKNOWN for t in twists]),
+        LINEAR: (_COMPONENTS, [t.linear if t else _UNKNOWN for t in twists]),
         RESIDUAL: (
             ["residual of the inliers", "model error"],
-            _rows([[_rms(frame), frame.estimate.model_error] for frame in frames]),
+            [[of, e.model_error] for of, e in zip(rms, estimates, strict=True)],
         ),
         COUNTS: (
             ["points", "inliers, rolling shutter", "inliers, global shutter"],
-            _rows([[len(e.inliers), e.inliers.sum(), e.global_shutter_inliers] for e in estimates]),
+            [[len(e.inliers), e.inliers.sum(), e.global_shutter_inliers] for e in estimates],
         ),
         DEVIATION: (
             ["position", "orientation"],
-            1e3 * _rows([[np.linalg.norm(s[:3]), np.linalg.norm(s[3:])] for s in spread]),
+            [[1e3 * np.linalg.norm(s[:3]), 1e3 * np.linalg.norm(s[3:])] for s in spread],
         ),
     }
-
-
-def _rms(frame: Localized) -> float:
-    """NaN for a sample of a smoothed motion between images."""
-    return frame.estimate.residual_rms if np.any(frame.estimate.inliers) else np.nan
-
-
-def _rows(values: Sequence[Any]) -> Array:
-    return np.array(values, dtype=np.float64)
+    return {path: (names, np.array(rows, float)) for path, (names, rows) in curves.items()}
 
 
 def blueprint(with_images: bool, eye: Eye) -> Any:
@@ -334,10 +318,9 @@ def write_view(
     # The viewer keeps what its user has arranged by application: for each recording on its own.
     stream = rr.RecordingStream(f"{_APPLICATION} {name}", recording_id=name)
     items = list(shown(bag, topics))
-    look, longer = eye(frames), enlargement(frames)
+    look = eye(frames)
     arranged = blueprint(any(isinstance(item, Picture) for item in items), look)
-    by_stamp = {frame.input_stamp_ns: frame for frame in frames}
-    scene = _Scene(stream, camera, by_stamp, Sizes(look.depth, longer))
+    scene = _Scene(stream, camera, frames, look.depth)
     landmarks = np.zeros((0, 3)) if localizer.map is None else localizer.map.points
     if file is None:
         _start_viewer(stream, arranged)
@@ -374,25 +357,21 @@ def _start_viewer(stream: Any, arranged: Any) -> None:
         ) from error
 
 
-@dataclass(frozen=True, slots=True)
-class Sizes:
-    """How large things are drawn."""
-
-    depth: float  # m from the camera to its points
-    longer: int  # than they are, residuals
-
-
 class _Scene:
-    """Logs to one stream."""
+    """Logs to one stream.
+
+    Args:
+        depth: m from the camera to its points, by which things are drawn large or small.
+    """
 
     def __init__(
-        self, stream: Any, camera: Camera, frames: dict[int, Localized], sizes: Sizes
+        self, stream: Any, camera: Camera, frames: Sequence[Localized], depth: float
     ) -> None:
-        self._stream = stream
-        self._camera = camera
-        self._sizes = sizes
-        self._residuals = RESIDUALS.format(sizes.longer)
-        self._frames = {stamp: frames[stamp] for stamp in sorted(frames)}
+        self._stream, self._camera, self._depth = stream, camera, depth
+        self._longer = enlargement(frames)
+        self._residuals = RESIDUALS.format(self._longer)
+        by_stamp = {frame.input_stamp_ns: frame for frame in frames}
+        self._frames = {stamp: by_stamp[stamp] for stamp in sorted(by_stamp)}
 
     def log(self, items: Sequence[Picture | Cloud], landmarks: Array) -> None:
         self._log_still(items, landmarks)
@@ -423,7 +402,7 @@ class _Scene:
                 image_from_camera=camera.K,
                 resolution=camera.size,
                 camera_xyz=rr.ViewCoordinates.RDF,
-                image_plane_distance=_PLANE * self._sizes.depth,
+                image_plane_distance=_PLANE * self._depth,
             ),
             static=True,
         )
@@ -450,7 +429,7 @@ class _Scene:
             self._stream.log(REFUSED, rr.TextLog("no pose", level=rr.TextLogLevel.WARN))
             return
         pairs = reproject(frame, self._camera)
-        ends = pairs.pixels + self._sizes.longer * (pairs.predicted - pairs.pixels)
+        ends = pairs.pixels + self._longer * (pairs.predicted - pairs.pixels)
         strips = np.stack([_centred(pairs.pixels), _centred(ends)], axis=1)
         self._stream.log(
             MATCHES, rr.Points2D(_centred(pairs.predicted), colors=pairs.colours, radii=-3.0)
@@ -468,15 +447,15 @@ class _Scene:
         self._stream.log(
             BODY,
             rr.Transform3D(translation=frame.pose.position, mat3x3=frame.pose.rotation),
-            rr.TransformAxes3D(_AXES * self._sizes.depth),
+            rr.TransformAxes3D(_AXES * self._depth),
         )
-        shape = ellipsoid(frame.pose.covariance[:3, :3])
+        half_sizes, quaternion = ellipsoid(frame.pose.covariance[:3, :3])
         self._stream.log(
             COVARIANCE,
             rr.Ellipsoids3D(
                 centers=[frame.pose.position],
-                half_sizes=[shape.half_sizes],
-                quaternions=[rr.Quaternion(xyzw=shape.quaternion)],
+                half_sizes=[half_sizes],
+                quaternions=[rr.Quaternion(xyzw=quaternion)],
                 colors=_ORANGE,
             ),
         )

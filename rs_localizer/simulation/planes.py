@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.video import Image
 
-# Axes of a plane must be unit vectors at right angles, to this.
-_AXES_TOLERANCE = 1e-9
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexturedPlane:
@@ -29,18 +26,6 @@ class TexturedPlane:
     down: Array  # (3,) unit vector along its columns
     texel: float  # m
     texture: Image  # (height, width)
-
-    def __post_init__(self) -> None:
-        axes = np.array([self.right, self.down], dtype=np.float64)
-        if np.abs(axes @ axes.T - np.eye(2)).max() > _AXES_TOLERANCE:
-            raise ValueError(f"right and down must be perpendicular unit vectors, got {axes}")
-        if not 0.0 < self.texel < np.inf:
-            raise ValueError(f"a texel must be more than 0 m wide, got {self.texel}")
-        if self.texture.ndim != 2 or self.texture.dtype != np.uint8 or self.texture.size == 0:
-            raise ValueError(
-                f"a texture must be a grey image of bytes, got {self.texture.shape} "
-                f"of {self.texture.dtype}"
-            )
 
     @property
     def normal(self) -> Array:
@@ -82,21 +67,14 @@ class TexturedPlane:
         return np.stack([*rows, inverse_depth], axis=1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pyramids:
+def pyramids(planes: Sequence[TexturedPlane]) -> tuple[Image, NDArray[np.int64]]:
     """The pictures of several planes with all their reductions, for the kernel.
 
-    ``levels[p, l]`` is where level ``l`` of picture ``p`` begins in ``texels``, its width and
-    height; each level averages two by two texels of the one before. Pictures with fewer levels
-    repeat their last.
+    Returns:
+        texels (n,) and levels (planes, levels, 3): ``levels[p, l]`` is where level ``l`` of picture
+        ``p`` begins, its width and height; each level averages two by two texels of the one before.
+        Pictures with fewer levels repeat their last.
     """
-
-    texels: Image  # (n,)
-    levels: NDArray[np.int64]  # (planes, levels, 3)
-
-
-def pyramids(planes: Sequence[TexturedPlane]) -> Pyramids:
-    """All reductions of the planes' pictures."""
     reduced = [_reductions(plane.texture) for plane in planes]
     depth = max(len(images) for images in reduced)
     levels = np.zeros((len(planes), depth, 3), np.int64)
@@ -105,9 +83,7 @@ def pyramids(planes: Sequence[TexturedPlane]) -> Pyramids:
         for level, image in enumerate(images):
             levels[p, level:] = start, image.shape[1], image.shape[0]
             start += image.size
-    return Pyramids(
-        np.concatenate([image.ravel() for images in reduced for image in images]), levels
-    )
+    return np.concatenate([image.ravel() for images in reduced for image in images]), levels
 
 
 def _reductions(texture: Image) -> list[Image]:

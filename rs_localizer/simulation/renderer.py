@@ -54,7 +54,7 @@ def render_lines(
         rays: (lines, pixels, 4, 2) float32, bearings of two by two rays in each pixel, the
             second beside the first and the third below it; a NaN meets nothing.
         homographies: (lines, instants, planes, 3, 3) float32, see TexturedPlane.homographies.
-        texels, levels: see Pyramids.
+        texels, levels: see pyramids.
         background: float32, grey level of what meets no plane.
         image: (lines, pixels) float32, written.
     """
@@ -164,12 +164,10 @@ class Renderer:
         planes: Sequence[TexturedPlane],
         settings: ImageSettings | None = None,
     ) -> None:
-        if not planes:
-            raise ValueError("a scene needs at least one plane")
         self.camera = camera
         self.planes = tuple(planes)
         self.settings = settings or ImageSettings()
-        self._pyramids = pyramids(planes)
+        self._texels, self._levels = pyramids(planes)
         # Lines of the shutter first: a sideways shutter sees the transposed image.
         self._sideways = camera.row_time_gradient[0] != 0.0
         self._rays = _rays(camera, self._sideways)
@@ -197,8 +195,8 @@ class Renderer:
         render_lines(
             self._rays,
             homographies.reshape(shape).astype(np.float32),
-            self._pyramids.texels,
-            self._pyramids.levels,
+            self._texels,
+            self._levels,
             np.float32(_BACKGROUND),
             0,
             len(lines),

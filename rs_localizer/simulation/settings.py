@@ -38,16 +38,6 @@ class FrameSettings:
     outliers: float = 0.3  # share of the points whose pixel is uniform in the image
     rate: float = 30.0  # frames per second
 
-    def __post_init__(self) -> None:
-        if self.points < 0:
-            raise ValueError(f"points must be 0 or more, got {self.points}")
-        if not 0.0 <= self.noise < math.inf:
-            raise ValueError(f"noise must be 0 or more pixels, got {self.noise}")
-        if not 0.0 <= self.outliers <= 1.0:
-            raise ValueError(f"outliers must lie between 0 and 1, got {self.outliers}")
-        if not 0.0 < self.rate < math.inf:
-            raise ValueError(f"rate must be more than 0 frames per second, got {self.rate}")
-
 
 @dataclass(frozen=True, slots=True)
 class ImageSettings:
@@ -56,14 +46,6 @@ class ImageSettings:
     exposure: float = 0.0  # s that each row is exposed, around its row time; 0: an instant
     noise: float = 0.0  # standard deviation of a grey level (of 255)
     vignetting: float = 0.0  # share of the light that is lost in the corners
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.exposure < math.inf:
-            raise ValueError(f"exposure must be 0 or more seconds, got {self.exposure}")
-        if not 0.0 <= self.noise < math.inf:
-            raise ValueError(f"noise must be 0 or more grey levels, got {self.noise}")
-        if not 0.0 <= self.vignetting <= 1.0:
-            raise ValueError(f"vignetting must lie between 0 and 1, got {self.vignetting}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -112,8 +112,6 @@ class RecordedMotion:
         axes: str = "forward_left_up",
         knot_spacing: float = KNOT_SPACING,
     ) -> None:
-        if axes not in BODY_FROM_CAMERA:
-            raise ValueError(f"axes must be one of {', '.join(BODY_FROM_CAMERA)}; got {axes!r}")
         self._body_from_camera = BODY_FROM_CAMERA[axes]
         spacings = np.diff(trajectory.stamps_ns) * 1e-9
         if knot_spacing < _SAMPLES_PER_KNOT * (np.median(spacings) if len(spacings) else 0.0):

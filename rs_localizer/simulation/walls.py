@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.video import Image
@@ -186,19 +187,21 @@ def _marker_plane(
     side = drawn.cells * _CELL_TEXELS
     pitch = round((1.0 + _GAP) * side)
     margin = (pitch - side) // 2
-    paper, ink = light
-    texture = np.full((rows * pitch, columns * pitch), paper, np.uint8)
+    texture = np.full((rows * pitch, columns * pitch), light[0], np.uint8)
     for index in range(columns * rows):
         row, column = (margin + pitch * place for place in divmod(index, columns))
-        white = pattern(drawn, first_id + index)
-        cells = np.where(white, paper, ink).astype(np.uint8)
-        texture[row : row + side, column : column + side] = cells.repeat(
-            _CELL_TEXELS, axis=0
-        ).repeat(_CELL_TEXELS, axis=1)
+        cells = printed(pattern(drawn, first_id + index), light, _CELL_TEXELS)
+        texture[row : row + side, column : column + side] = cells
     texel = size / side
     right, up, _ = pose.rotation.T
     corner = pose.position + 0.5 * texel * pitch * (rows * up - columns * right)
     return TexturedPlane(corner, right, -up, texel, texture)
+
+
+def printed(white: NDArray[np.bool_], light: tuple[int, int], texels: int) -> Image:
+    """The cells of a marker, each so many texels wide, in the greys of paper and ink."""
+    cells = np.where(white, *light).astype(np.uint8)
+    return cells.repeat(texels, axis=0).repeat(texels, axis=1)
 
 
 def _picture(
@@ -215,7 +218,7 @@ def _picture(
 _POSTER_TEXELS = 14
 # Where along a wall its markers hang, in shares of its width.
 _PLACES = (0.3, 0.7)
-_PAPER, _INK = 235, 26
+PAPER_AND_INK = (235, 26)
 
 
 def marked_room(path: TrueState) -> Scene:
@@ -247,8 +250,7 @@ def _hang(texture: Image, plane: TexturedPlane, share: float, number: int, viewe
     side = drawn.cells * _POSTER_TEXELS
     sheet = side + 2 * _POSTER_TEXELS
     white = np.pad(pattern(drawn, number), 1, constant_values=True)
-    cells = np.where(white, _PAPER, _INK).astype(np.uint8)
-    paper = cells.repeat(_POSTER_TEXELS, axis=0).repeat(_POSTER_TEXELS, axis=1)
+    paper = printed(white, PAPER_AND_INK, _POSTER_TEXELS)
     # From inside the room, half of the walls are read from behind.
     mirrored = float(plane.normal @ (viewer - plane.corner)) > 0.0
     height, width = texture.shape

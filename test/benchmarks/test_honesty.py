@@ -5,7 +5,6 @@
 import csv
 import sys
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.experiments.results import Verdict
 from benchmarks.honesty import __main__ as command
-from benchmarks.honesty import claims
-from benchmarks.honesty.benches import Recordings, benches
 from benchmarks.honesty.estimating import Found
+from benchmarks.honesty.experiment import rendered_claims
 from benchmarks.honesty.scores import Score, Scores, Truth, score
 from rs_localizer.io.outputs import Pose, Twist
-
-BENCHES = benches(Recordings(Path("tags"), {}, Path("nowhere")))
 
 
 def published(rng: np.random.Generator, wider: float = 1.0) -> Score:
@@ -61,33 +57,13 @@ def test_truths_drawn_from_the_covariance_lie_inside():
 def test_too_small_and_too_large_covariances_are_seen(wider, verdict):
     some = scores(wider)
     found = {f"{motion}/all": Found(some, some) for motion in ("rest", "hand")}
-    judged = {claim.name: claim.verdict for claim in claims.rendered_claims(found)}
+    judged = {claim.name: claim.verdict for claim in rendered_claims(found)}
     assert judged == {"honesty.rendered_pose": verdict, "honesty.rendered_twist": verdict}
 
 
-@pytest.mark.bench
-def test_a_condition_against_p3p():
-    bench = BENCHES["p3p"]
-    condition = bench.conditions[-1]
-    ((found, result),) = bench.run([condition], 5, 0)
-    row = bench.row(found, result)
-    assert len(row) == len(bench.columns)
-    assert row[:2] == (condition.name, 5)
-
-
 def test_the_command(tmp_path, capsys, monkeypatch):
-    words = [
-        "honesty",
-        "p3p",
-        "--only",
-        "markers",
-        "lens 30%",
-        "0.5px",
-        "30ms/set",
-        "--frames",
-        "3",
-    ]
-    monkeypatch.setattr(sys, "argv", [*words, "--csv", str(tmp_path)])
+    only = ["--only", "markers", "lens 30%", "0.5px", "30ms/set", "--frames", "3"]
+    monkeypatch.setattr(sys, "argv", ["honesty", "p3p", *only, "--csv", str(tmp_path)])
     assert command.main() == 0
     assert "markers/lens 30% bend 0mm/0.5px/30ms/set" in capsys.readouterr().out
     with (tmp_path / "p3p.csv").open() as file:

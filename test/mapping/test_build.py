@@ -15,11 +15,12 @@ from felt import Felt
 from scenes import imu_of, refined_of
 from scipy.spatial.transform import Rotation
 
+from benchmarks.experiments.mapped_room import Errors, localized
 from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.evaluation.room_mapping import Errors, Piece, Room, without_refinement
+from rs_localizer.evaluation.room_mapping import Piece, Room, without_refinement
 from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
@@ -123,7 +124,7 @@ def test_other_images_are_localized(room, views, built):
     def errors(landmarks: Map, solver: str) -> Errors:
         points = turn.apply(landmarks.points - positions.mean(axis=0)) + true.mean(axis=0)
         laid = Map(points, None, landmarks.descriptors, "map")
-        return room.errors(room.localized(clouds, laid, solver))
+        return localized(room, clouds, laid, solver)
 
     ours = errors(built.landmarks, "r6p_vcwt")
     theirs = errors(without_refinement(built), "p3p")

@@ -163,21 +163,6 @@ def test_px4_gets_the_same_in_its_axes(flight, frames):
     assert np.median(np.abs(rates)) < np.deg2rad(5.0)
 
 
-def test_px4s_own_laws_of_motion_hold(frames):
-    """Velocities in the body are how positions and attitudes change: without any truth."""
-    fields = [vehicle_odometry(frame, "ned", 0, frame.stamp_ns) for frame in frames][SETTLED]
-    seconds = np.diff([1e-6 * item["timestamp_sample"] for item in fields])[:, None]
-    attitude = Rotation.from_quat([np.roll(item["q"].astype(float), -1) for item in fields])
-    velocity = attitude.apply([item["velocity"] for item in fields])
-    steps = np.diff([item["position"].astype(float) for item in fields], axis=0)
-    way = 0.5 * (velocity[1:] + velocity[:-1]) * seconds
-    assert np.sqrt(np.mean((steps - way) ** 2)) < 0.4 * np.sqrt(np.mean(steps**2))
-    rates = np.array([item["angular_velocity"] for item in fields], dtype=float)
-    turned = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
-    expected = 0.5 * (rates[1:] + rates[:-1]) * seconds
-    assert np.sqrt(np.mean((turned - expected) ** 2)) < 0.4 * np.sqrt(np.mean(turned**2))
-
-
 def test_nav2_finds_the_robot_by_its_odometry(flight):
     """With config/nav2.yaml: map -> odom, with odom -> base_link of that moment, is the pose."""
     config = build(load_params_file(CONFIG / "nav2.yaml") | {"readout_time": 0.03})

@@ -4,14 +4,10 @@
 
 from __future__ import annotations
 
-import os
 import pickle
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +26,7 @@ from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.remote import RemoteError, fingerprint, local_copy
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.offline.table import COLUMNS, read_parquet, schema, write_parquet
+from rs_localizer.offline.table import COLUMNS, read_parquet, schema
 
 SETTINGS = {"readout_time": 0.03}
 SHUTTER = ["-p", "readout_time:=0.03"]
@@ -57,11 +53,6 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
             writer.write(topic, message, stamp_ns)
     made[0] = folder / "changed"
     return made
-
-
-def replay(words: list[Any], **more: Any) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rs_localizer", "replay", *map(str, words), *SHUTTER]
-    return subprocess.run(command, capture_output=True, text=True, check=False, **more)
 
 
 def test_rows_say_what_the_messages_say(flights: list[Path], tmp_path: Path) -> None:
@@ -102,8 +93,6 @@ def test_rows_say_what_the_messages_say(flights: list[Path], tmp_path: Path) -> 
 def test_a_result_goes_to_a_url(
     flights: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import fsspec
-
     files, url = fsspec.filesystem("memory"), "memory://results/poses"
     words = ["replay", str(flights[1]), *SHUTTER, "--out"]
     assert main([*words, url]) == 0
@@ -149,45 +138,18 @@ write_parquet((function(place, None, settings) for place in places), file)
 """
 
 
-def test_the_same_bytes_from_one_process_from_dask_and_after_a_kill(
-    flights: list[Path], tmp_path: Path
-) -> None:
-    distributed = pytest.importorskip("distributed", reason="needs Dask")
-    one, killed, cluster = (tmp_path / f"{name}.parquet" for name in "abc")
+def test_the_same_bytes_from_one_process_and_from_dask(flights: list[Path], tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="needs Dask")
+    one, two = tmp_path / "one.parquet", tmp_path / "two.parquet"
     given = pickle.dumps((rsl.localize_recording, flights, SETTINGS, one))
-    words = [sys.executable, "-c", _ALONE]
-    done = subprocess.run(words, input=given, capture_output=True, check=False)
-    assert done.returncode == 0, done.stderr
-    # The command, killed as soon as some recordings are done, then again by two workers.
-    batch = [*flights, "--out", tmp_path / "half", "--workers", "1", "--parquet", killed]
-    command = [sys.executable, "-m", "rs_localizer", "replay", *map(str, batch), *SHUTTER]
-    with subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    ) as process:
-        while not list((tmp_path / "half").glob("*/fleet.json")):
-            assert process.poll() is None
-            time.sleep(0.01)
-        os.killpg(process.pid, signal.SIGKILL)
-    assert not killed.exists()
-    batch[batch.index("1")] = "2"
-    again = replay(batch)
-    assert again.returncode == 0
-    assert "have been done before" in again.stdout
-    # Dask's own workers, as an engine that is somebody else's.
-    with (
-        distributed.LocalCluster(
-            n_workers=1, threads_per_worker=1, dashboard_address=None
-        ) as workers,
-        distributed.Client(workers) as client,
-    ):
-        futures = [
-            client.submit(rsl.localize_recording, flight, None, SETTINGS) for flight in flights
-        ]
-        write_parquet((future.result() for future in futures), cluster)
+    words = [*map(str, flights), "--out", str(tmp_path / "out"), "--parquet", str(two), *SHUTTER]
+    command = [sys.executable, "-m", "rs_localizer", "replay", *words, "--workers", "2"]
+    for called, standard_input in (([sys.executable, "-c", _ALONE], given), (command, None)):
+        done = subprocess.run(called, input=standard_input, capture_output=True, check=False)
+        assert done.returncode == 0, done.stderr
     assert one.read_bytes().startswith(b"PAR1")
     assert read_parquet(one).num_rows > 3 * 5
-    for other in (killed, cluster):
-        assert other.read_bytes() == one.read_bytes()
+    assert two.read_bytes() == one.read_bytes()
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ def steady(duration: float) -> ConstantVelocity:
 
 def test_the_motion_comes_back_when_it_is_integrated():
     """Dead reckoning by the midpoint rule, over a second of a hand that shakes."""
-    hand = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
+    hand = RecordedMotion(read_tum(data.path(data.HAND_MOTION)).part(slice(0, 300)))
     motion = Shaken(hand, math.radians(0.3), 60.0, np.array([0.6, 0.0, 0.8]), 1.0)
     first = hand.intervals_ns[0][0]
     track = simulate_imu(motion, PERFECT, LEVER, RNG)
@@ -52,16 +52,6 @@ def test_the_motion_comes_back_when_it_is_integrated():
     there = end.positions[0] + end.rotations[0] @ LEVER.position
     assert np.linalg.norm(place - there) < 1e-3
     assert np.linalg.norm(there - start.positions[0]) > 0.1  # it has been somewhere
-
-
-def test_a_steady_turn_pulls_towards_its_centre():
-    track = simulate_imu(steady(0.5), PERFECT, LEVER, RNG)
-    turn = np.array([0.3, -1.0, 0.7])
-    np.testing.assert_allclose(track.angular_velocities @ CAMERA_FROM_IMU.T - turn, 0.0, atol=1e-12)
-    state = steady(0.5).state(10**18, (track.times_ns - 10**18) * 1e-9)
-    up = state.rotations[:, 2] * 9.80665  # third row: the map's z in camera axes
-    inwards = np.cross(turn, np.cross(turn, LEVER.position))
-    np.testing.assert_allclose(track.specific_forces @ CAMERA_FROM_IMU.T, up + inwards, atol=1e-6)
 
 
 def test_noise_bias_and_clock_are_those_that_were_asked_for():

@@ -110,39 +110,6 @@ def test_every_line_is_seen_from_its_own_pose(lens, direction):
     assert np.abs((late - expected)[compared]).mean() > 2.0 * np.abs(difference).mean()
 
 
-def chessboard(cell: int = 24, cells: int = 12) -> TexturedPlane:
-    squares = np.kron(np.indices((cells, cells)).sum(0) % 2, np.ones((cell, cell)))
-    texture = (30 + 200 * squares).astype(np.uint8)
-    return TexturedPlane(
-        np.array([-0.6, -0.6, 0.0]), np.eye(3)[0], np.eye(3)[1], 0.1 / cell, texture
-    )
-
-
-def test_corners_are_where_they_project_to():
-    """Near and far, upright and slanted: no offset, and what the search for a corner can do."""
-    camera = Camera(640, 480, np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]]))
-    plane, rng, errors = chessboard(), np.random.default_rng(0), []
-    grid = 24.0 * np.stack(np.meshgrid(np.arange(1, 12), np.arange(1, 12)), -1).reshape(-1, 2)
-    for _ in range(12):
-        rotation = so3.exp(rng.uniform(-0.8, 0.8, 3))
-        position = -rotation[:, 2] * rng.uniform(1.2, 5.0) + 0.05 * rng.normal(size=3)
-        pose = ConstantVelocity(np.zeros(3), np.zeros(3), 1.0, rotation=rotation, position=position)
-        image = Renderer(camera, [plane], ImageSettings(noise=2.0)).image(pose, 0)
-        true = camera.project((plane.points(grid) - position) @ rotation)
-        spacing = np.linalg.norm(np.diff(true.reshape(11, 11, 2), axis=0), axis=2).min()
-        window = int(np.clip(spacing / 3.0, 2, 5))
-        true = true[np.all((true > 12) & (true < np.array([627, 467])), axis=1)]
-        found = cv2.cornerSubPix(
-            image, np.array(true[:, None], np.float32), (window, window), (-1, -1), (3, 50, 1e-4)
-        )
-        errors.append(found[:, 0] - true)
-    all_errors = np.concatenate(errors)
-    distances = np.linalg.norm(all_errors, axis=1)
-    assert len(distances) > 1000
-    assert np.median(distances) < 0.06
-    assert np.abs(all_errors[distances < 1.0].mean(axis=0)).max() < 0.01
-
-
 def test_exposure_blurs_along_the_motion_and_shifts_nothing():
     """An edge that passes by at v px per exposure is a ramp of that width, in the same place."""
     edge = np.full((400, 800), 20, np.uint8)

@@ -227,14 +227,17 @@ def compiled_elsewhere(kernels: str, warm: Callable[[Any], None], arguments: Any
 
 
 def _complete(task: Task, inner: Path, figures: Figures) -> None:
-    """Give a finished result its place, at once."""
+    """Mark a finished result as complete, and give it its place, at once."""
     about = {
+        "identity": task.identity,
         "program": task.program,
         "command": task.kind.command,
         "recording": str(task.recording),
         "settings": readable(task.arguments),
+        "figures": figures,
     }
-    write_marker(inner, task.identity, about, figures)
+    text = json.dumps(about, indent=2, default=str)
+    (inner / MARKER).write_text(f"{text}\n", encoding="utf-8")
     if finished(task) is None and read_marker(task.folder) is not None:
         task.folder.rename(inner.with_name("replaced"))  # of other settings
     try:
@@ -300,23 +303,8 @@ def _fingerprint(place: Location) -> list[tuple[str, int, int]] | str:
     return entries
 
 
-def write_marker(
-    folder: Path, of: str, about: Mapping[str, Any], figures: Mapping[str, Any]
-) -> None:
-    """Say of a result's folder that it is complete.
-
-    Args:
-        folder: the result's.
-        of: its :func:`identity`.
-        about: what readers want to know of its making.
-        figures: of the summary.
-    """
-    text = json.dumps({"identity": of, **about, "figures": figures}, indent=2, default=str)
-    (folder / MARKER).write_text(f"{text}\n", encoding="utf-8")
-
-
 def read_marker(folder: Path) -> dict[str, Any] | None:
-    """What :func:`write_marker` wrote; None: the folder is no complete result."""
+    """What is written into a complete result; None: the folder is none."""
     try:
         content = json.loads((folder / MARKER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
