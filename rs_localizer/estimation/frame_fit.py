@@ -732,8 +732,7 @@ def _of_scales(
     for i in range(count):
         after[i, i] += 2.0 * decided[first + i]
     volume = log_determinant_of_inverse(before) - log_determinant_of_inverse(after)
-    spread: Array = np.linalg.inv(after)
-    return cost, volume, spread
+    return cost, volume, inverted(after)
 
 
 @inlined
