@@ -33,7 +33,12 @@ _PARTS = {
         "images", "p3p_localized", "solvepnp_localized", *(f"{name}_localized" for name in METHODS),
     ),
     "jitter over that of P3P": tuple(
-        f"{name}_{what}" for name in METHODS for what in ("turn50", "turn95", "move50", "move95")
+        f"{name}_{what}"
+        for name in METHODS
+        for what in (
+            *("turn50", "turn50_low", "turn50_high", "turn95", "turn95_low", "turn95_high"),
+            *("move50", "move95"),
+        )
     ),
     "poses of the two sides of the board, at the same motion": (
         *(

@@ -114,9 +114,13 @@ def _jitter(clip: Clip, poses: Poses, others: Poses) -> dict[str, float]:
     found = {}
     for name, pairs in (("turn", turns), ("move", moves)):
         values = np.array(pairs or [(math.nan, math.nan)])
+        drawn = [values[chosen] for chosen in _resampled(np.arange(len(values)))]
         for part in (50, 95):
             own, other = np.percentile(values, part, axis=0)
             found[f"{name}{part}"] = float(own / other)
+            ratios = np.divide(*np.array([np.percentile(v, part, axis=0) for v in drawn]).T)
+            low, high = np.percentile(ratios, [2.5, 97.5])
+            found |= {f"{name}{part}_low": float(low), f"{name}{part}_high": float(high)}
     return found
 
 
@@ -298,9 +302,14 @@ def _ratio(errors: Array, others: Array) -> tuple[float, float, float]:
     common = np.flatnonzero(np.isfinite(errors) & np.isfinite(others))
     if len(common) == 0:
         return math.nan, math.nan, math.nan
-    blocks = np.array_split(common, max(len(common) // _BLOCK, 1))
-    sums = np.array([[errors[block].sum(), others[block].sum()] for block in blocks])
-    picks = np.random.default_rng(0).integers(len(sums), size=(_RESAMPLES, len(sums)))
-    drawn = sums[picks].sum(axis=1)
-    low, high = np.percentile(np.sqrt(drawn[:, 0] / drawn[:, 1]), [2.5, 97.5])
-    return float(low), float(np.sqrt(sums[:, 0].sum() / sums[:, 1].sum())), float(high)
+    own, other = errors[common], others[common]
+    drawn = [np.sqrt(errors[k].sum() / others[k].sum()) for k in _resampled(common)]
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return float(low), float(np.sqrt(own.sum() / other.sum())), float(high)
+
+
+def _resampled(frames: IntArray) -> list[IntArray]:
+    """Frames of a bootstrap: blocks of them, drawn with replacement."""
+    blocks = np.array_split(frames, max(len(frames) // _BLOCK, 1))
+    picks = np.random.default_rng(0).integers(len(blocks), size=(_RESAMPLES, len(blocks)))
+    return [np.concatenate([blocks[k] for k in pick]) for pick in picks]
