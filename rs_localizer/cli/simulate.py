@@ -31,9 +31,9 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer import data
-    from rs_localizer.core.arrays import Array
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.maps.files import write_map_file
+    from rs_localizer.io.maps.landmarks import Map
     from rs_localizer.io.rigs import RigParts, make_mounts, read_camchain
     from rs_localizer.io.topics import TF_STATIC
     from rs_localizer.io.trajectories import read_tum
@@ -211,24 +211,17 @@ def camera_of(args: argparse.Namespace) -> Camera:
     )
     try:
         return Camera(
-            width=args.width,
-            height=args.height,
-            K=K,
-            D=np.array(args.distortion),
-            distortion_model=args.distortion_model,
-            readout_time=args.readout_time,
-            scan_direction=args.scan_direction,
-        )
+            args.width, args.height, K, np.array(args.distortion), args.distortion_model,
+            args.readout_time, args.scan_direction,
+        )  # fmt: skip
     except ValueError as error:  # the other arguments are checked already
         raise UsageError(f"--distortion: {error}") from error
 
 
 def motion_of(args: argparse.Namespace) -> TrueMotion:
     """The recorded motion, or one at constant velocity, with its vibrations."""
-    vibrations = [(degrees, hertz) for degrees, hertz in args.vibration]
-    return shaken(
-        _unshaken(args), vibrations, np.random.default_rng([args.seed, _VIBRATION_STREAM])
-    )
+    rng = np.random.default_rng([args.seed, _VIBRATION_STREAM])
+    return shaken(_unshaken(args), args.vibration, rng)
 
 
 def _unshaken(args: argparse.Namespace) -> TrueMotion:
@@ -401,27 +394,18 @@ def _write_rig(args: argparse.Namespace) -> dict[str, object]:
         name: [stamp for stamp in all_ if min(some) <= stamp <= max(some)]
         for name, all_ in camera_stamps(parts, motion, args.rate, args.seed, args.triggered).items()
     }
-    scene, rng = None, np.random.default_rng(args.seed)
-    see: Callable[[str, TrueMotion, int], Iterator[Frame]]
-    if args.images:
-        scene, encoding = SCENES[args.walls](sampled_states(motion)), _encoding(args)
-        renderers = {
-            name: Renderer(camera, scene.planes, _pictures(args))
-            for name, camera in parts.cameras.items()
-        }
+    scene = SCENES[args.walls](sampled_states(motion)) if args.images else None
+    rng = np.random.default_rng(args.seed)
+    landmarks = None if args.images else _landmarks(motion, rng)
 
-        def see(name: str, mounted: TrueMotion, place: int) -> Iterator[Frame]:
-            seed = args.seed + place
-            return rendered_frames(renderers[name], mounted, stamps[name], encoding, seed)
-    else:
-        landmarks = described(room(_positions(motion), rng), MAP_FRAME, rng)
-        settings = FrameSettings(args.points, args.noise, args.outliers, args.rate)
-
-        def see(name: str, mounted: TrueMotion, place: int) -> Iterator[Frame]:
-            return simulate_frames(
-                parts.cameras[name], mounted, landmarks.points, settings, stamps_ns=stamps[name],
-                seed=args.seed + place,
-            )  # fmt: skip
+    def see(name: str, mounted: TrueMotion, place: int) -> Iterator[Frame]:
+        camera, seed = parts.cameras[name], args.seed + place
+        if scene is not None:
+            renderer = Renderer(camera, scene.planes, _pictures(args))
+            return rendered_frames(renderer, mounted, stamps[name], _encoding(args), seed)
+        assert landmarks is not None
+        points, seen = landmarks.points, _frames(args)
+        return simulate_frames(camera, mounted, points, seen, stamps_ns=stamps[name], seed=seed)
 
     total, counts = sum(map(len, stamps.values())), 0
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
@@ -430,14 +414,14 @@ def _write_rig(args: argparse.Namespace) -> dict[str, object]:
             images = simulate_rig(parts, motion, see)
             for image in tqdm(images, total=total, unit="image", desc="simulate", disable=None):
                 rows = None
-                if isinstance(image.frame, SimulatedFrame):
+                if landmarks is not None and isinstance(image.frame, SimulatedFrame):
                     counts += len(image.frame.points)
                     rows = keypoint_rows(image.frame, landmarks, rng) if args.keypoints else None
                 write_rig_frame(bag, parts, motion, image, rows)
         if scene is None and not counts:
             raise ValueError(f"no image sees any point; nothing is written to {args.out}")
         write_parameters(built / PARAMETERS, rig_parameters(parts))
-        if args.keypoints:
+        if args.keypoints and landmarks is not None:
             write_map_file(built / MAP, landmarks)
         if scene is not None and scene.marker_map is not None:
             write_marker_map(built / MARKER_MAP, scene.marker_map)
@@ -452,22 +436,19 @@ def _write_rig(args: argparse.Namespace) -> dict[str, object]:
 
 def _write_points(args: argparse.Namespace) -> dict[str, object]:
     camera, motion = camera_of(args), motion_of(args)
-    frame_settings = FrameSettings(args.points, args.noise, args.outliers, args.rate)
     stamps = stamps_of(args, camera, motion)
     rng = np.random.default_rng(args.seed)
-    landmarks = described(room(_positions(motion), rng), MAP_FRAME, rng)
+    landmarks = _landmarks(motion, rng)
     counts: list[int] = []
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
         with bag_of(args, built, motion) as bag:
             frames = simulate_frames(
-                camera, motion, landmarks.points, frame_settings, stamps_ns=stamps, seed=args.seed
+                camera, motion, landmarks.points, _frames(args), stamps_ns=stamps, seed=args.seed
             )
             total = len(stamps)
             for frame in tqdm(frames, total=total, unit="frame", desc="simulate", disable=None):
-                if args.keypoints:
-                    write_simulated(bag, camera, frame, keypoint_rows(frame, landmarks, rng))
-                else:
-                    write_simulated(bag, camera, frame)
+                rows = keypoint_rows(frame, landmarks, rng) if args.keypoints else None
+                write_simulated(bag, camera, frame, rows)
                 counts.append(len(frame.points))
         if not any(counts):
             raise ValueError(
@@ -511,7 +492,6 @@ def _write_images(args: argparse.Namespace) -> dict[str, object]:
 
 
 def _tell_scene(args: argparse.Namespace, said: str, scene: Scene) -> dict[str, object]:
-    """Say what was rendered, and what comes next."""
     if scene.marker_map is None:
         print(said)
         return {}
@@ -520,6 +500,10 @@ def _tell_scene(args: argparse.Namespace, said: str, scene: Scene) -> dict[str, 
     markers = shlex.quote(f"{args.out}_markers")
     print(f"next: rs_localizer detect {out} --map {out}/{MARKER_MAP} --out {markers}")
     return {"markers": len(scene.marker_map.markers)}
+
+
+def _frames(args: argparse.Namespace) -> FrameSettings:
+    return FrameSettings(args.points, args.noise, args.outliers, args.rate)
 
 
 def _pictures(args: argparse.Namespace) -> ImageSettings:
@@ -542,11 +526,10 @@ def _fewer(counts: list[int], wanted: int) -> str:
     return f" (of {wanted} asked for; {few} frames see fewer, {none} of them none)"
 
 
-def _positions(motion: TrueMotion) -> Array:
-    """Camera positions (n,3) all along a motion, for the room to be built around."""
-    return np.concatenate(
-        [
-            motion.state(first, np.linspace(0.0, (last - first) * 1e-9, 200)).positions
-            for first, last in motion.intervals_ns
-        ]
-    )
+def _landmarks(motion: TrueMotion, rng: np.random.Generator) -> Map:
+    """A room that is built around a motion."""
+    ways = [
+        motion.state(first, np.linspace(0.0, (last - first) * 1e-9, 200)).positions
+        for first, last in motion.intervals_ns
+    ]
+    return described(room(np.concatenate(ways), rng), MAP_FRAME, rng)
