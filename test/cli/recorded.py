@@ -58,14 +58,16 @@ def write_mp4(path: Path, images: Iterable[Any], rate: float) -> Path:
     return path
 
 
-def write_phone_log(folder: Path, times: Any, rates: Any, stamps: Any, readout: float) -> None:
+def write_phone_log(
+    folder: Path, times: Any, rates: Any, stamps: Any, readout: float, exposure: float = 0.0
+) -> None:
     """What MARS Logger writes: rates (n,3) in the phone's axes at times (n,) ns; images' stamps."""
     heading = "Timestamp[nanosec],gx[rad/s],gy[rad/s],gz[rad/s],ax[m/s^2],ay[m/s^2],az[m/s^2]\n"
     rows = zip(np.asarray(times), np.asarray(rates).tolist(), strict=True)
     lines = [f"{time:.0f},{x!r},{y!r},{z!r},0,0,9.8\n" for time, (x, y, z) in rows]
     (folder / "gyro_accel.csv").write_text(heading + "".join(lines))
     heading = "Timestamp[nanosec],Exposure time[nanosec],Frame readout time[nanosec]\n"
-    lines = [f"{stamp:.0f},4000000,{1e9 * readout:.0f}\n" for stamp in stamps]
+    lines = [f"{stamp:.0f},{1e9 * exposure:.0f},{1e9 * readout:.0f}\n" for stamp in stamps]
     (folder / "movie_metadata.csv").write_text(heading + "".join(lines))
 
 

@@ -65,7 +65,7 @@ def test_poses_are_those_of_detect_and_replay(kind: str, walls: Path, tmp_path: 
 
 def test_what_a_phones_log_says_is_exported(walls: Path, tmp_path: Path) -> None:
     video = shutil.copy(walls.parent / "walls.mp4", tmp_path)
-    write_phone_log(tmp_path, [0, 9e6], np.zeros((2, 3)), [0, 0], READOUT)
+    write_phone_log(tmp_path, [0, 9e6], np.zeros((2, 3)), [0, 0], READOUT, 0.004)
     words = ["--calibration", str(walls.parent / "camera.yaml"), "--nerfstudio", "--no-imu"]
     words += ["--map", str(walls / "marker_map.yaml"), "--out", str(tmp_path / "scene")]
     assert main(["replay", str(video), *words]) == 0
