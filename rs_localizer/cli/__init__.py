@@ -10,13 +10,14 @@ import math
 import os
 import shutil
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.remote import check_writable
 
 # Bars are shown by one process. tqdm's own lock for several is a semaphore, of which Python 3.14
@@ -112,6 +113,21 @@ def refuse_existing(args: argparse.Namespace, *beside: str) -> None:
         if path.exists() and not args.overwrite:
             raise ValueError(f"{path} exists; choose another OUT, or --overwrite")
     check_writable(args.out)
+
+
+def with_values(args: argparse.Namespace, **values: Any) -> argparse.Namespace:
+    """The arguments with some of them changed, or added."""
+    return argparse.Namespace(**vars(args) | values)
+
+
+def write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
+    """Write files, all at once or none, and say which."""
+    next(iter(writers)).parent.mkdir(parents=True, exist_ok=True)
+    with atomic_files(*writers) as parts:
+        for part, write in zip(parts, writers.values(), strict=True):
+            write(part)
+    for path in writers:
+        print(f"written: {path}")
 
 
 def import_ros(name: str, what: str) -> Any:

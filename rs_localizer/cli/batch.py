@@ -9,13 +9,12 @@ import contextlib
 import csv
 import fcntl
 import importlib.util
-import io
 import os
 import shutil
 import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,21 +78,22 @@ def is_batch(args: Namespace) -> bool:
     return len(args.recordings) > 1 or args.workers is not None or args.scheduler is not None
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What one command does with many recordings."""
-
-    kind: Kind
-    # What a result depends on beside the recording and the settings.
-    inputs: Callable[[Any], Sequence[Location]]
-    # Whether results of other settings are replaced; None: the command has no such option.
-    overwrite: bool | None = None
-    # What is made of all complete results, in the order of the recordings.
-    gather: Callable[[Sequence[Path]], object] | None = None
-
-
-def run_batch(args: Namespace, plan: Plan) -> None:
+def run_batch(
+    args: Namespace,
+    kind: Kind,
+    inputs: Callable[[Any], Sequence[Location | None]],
+    overwrite: bool | None = None,
+    gather: Callable[[Sequence[Path]], object] | None = None,
+) -> None:
     """Do all recordings that are not done yet, and write the summary.
+
+    Args:
+        args: of the command.
+        kind: what is done with each recording.
+        inputs: what a result depends on beside the recording and the settings.
+        overwrite: whether results of other settings are replaced; None: the command has no such
+            option.
+        gather: what is made of the folders of all complete results, in the order of the recordings.
 
     Raises:
         UsageError: for options that do not go together.
@@ -108,8 +108,8 @@ def run_batch(args: Namespace, plan: Plan) -> None:
             "many recordings need Dask, which is not installed: pip install 'rs_localizer[fleet]'"
         )
     out = args.out.resolve()
-    tasks = _tasks(args, plan, out)
-    _check(tasks, plan)
+    tasks = _tasks(args, kind, inputs, out)
+    _check(tasks, overwrite)
     with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     with only_one(out):
@@ -119,15 +119,17 @@ def run_batch(args: Namespace, plan: Plan) -> None:
         finally:
             shutil.rmtree(out / PARTIAL, ignore_errors=True)
             _find_finished(tasks, rows)
-            write_summary(out, plan.kind.command, list(rows.values()))
-        if plan.gather is not None:
-            plan.gather([task.folder for task in tasks if rows[task.name].state == DONE])
+            write_summary(out, kind.command, list(rows.values()))
+        if gather is not None:
+            gather([task.folder for task in tasks if rows[task.name].state == DONE])
     print(f"written to {args.out}: {CSV}, {MARKDOWN}, {PICTURE}")
     if failed := sum(row.state == FAILED for row in rows.values()):
         raise ValueError(f"{failed} of {len(rows)} recordings failed; {args.out / CSV} says why")
 
 
-def _tasks(args: Namespace, plan: Plan, out: Path) -> list[Task]:
+def _tasks(
+    args: Namespace, kind: Kind, inputs: Callable[[Any], Sequence[Location | None]], out: Path
+) -> list[Task]:
     recordings = list(dict.fromkeys(map(_absolute, args.recordings)))
     kept = {name: value for name, value in vars(args).items() if name not in _OF_THE_FLEET}
     arguments = Namespace(
@@ -135,18 +137,12 @@ def _tasks(args: Namespace, plan: Plan, out: Path) -> list[Task]:
     )
     settings = readable(arguments)
     names = folder_names(recordings, (CSV, MARKDOWN, PICTURE, PARTIAL, _LOCK))
-    return [
-        Task(
-            plan.kind,
-            arguments,
-            recording,
-            out,
-            name,
-            identity(plan.kind.command, settings, [recording, *plan.inputs(recording)]),
-            program(),
-        )
-        for recording, name in zip(recordings, names, strict=True)
-    ]
+    tasks = []
+    for recording, name in zip(recordings, names, strict=True):
+        files = [file if is_url(file) else Path(file) for file in inputs(recording) if file]
+        own = identity(kind.command, settings, [recording, *files])
+        tasks.append(Task(kind, arguments, recording, out, name, own, program()))
+    return tasks
 
 
 def _absolute(place: Location) -> Location:
@@ -154,20 +150,20 @@ def _absolute(place: Location) -> Location:
     return place if is_url(place) else Path(os.path.abspath(place))
 
 
-def _check(tasks: list[Task], plan: Plan) -> None:
+def _check(tasks: list[Task], overwrite: bool | None) -> None:
     """Refuse what would be overwritten, before hours of work."""
     for task in tasks:
         if not task.folder.exists() or finished(task) is not None:
             continue
         made = read_marker(task.folder)
         # What another command made may be the only one there is, or even the recording itself.
-        if made is None or made.get("command") != plan.kind.command:
+        if made is None or made.get("command") != task.kind.command:
             raise ValueError(
-                f"{task.folder} exists and is no result of {plan.kind.command}; choose another "
+                f"{task.folder} exists and is no result of {task.kind.command}; choose another "
                 "--out, or remove it"
             )
-        if not plan.overwrite:
-            way_out = "remove it" if plan.overwrite is None else "--overwrite"
+        if not overwrite:
+            way_out = "remove it" if overwrite is None else "--overwrite"
             raise ValueError(
                 f"{task.folder} is a result of other settings, another recording or another "
                 f"version; choose another --out, or {way_out}"
@@ -194,14 +190,14 @@ def _work(tasks: list[Task], where: Where, rows: dict[str, Row]) -> None:
     with bar, contextlib.closing(perform_all(open_tasks, where)) as outcomes:
         for outcome in outcomes:
             state = FAILED if outcome.figures is None else DONE
-            recording, figures = rows[outcome.name].recording, outcome.figures or {}
-            row = Row(recording, outcome.name, state, figures, outcome.reason)
+            figures = outcome.figures or {}
+            row = replace(rows[outcome.name], state=state, figures=figures, reason=outcome.reason)
             rows[outcome.name] = row
             busy += outcome.seconds
             bar.update()
             bar.write(f"{row.folder}: {_said(row)}")
     wall = time.perf_counter() - started
-    print(f"{counted(list(rows.values()))}")
+    print(_counted(list(rows.values())))
     if open_tasks:
         print(f"{wall:.1f} s for {busy:.1f} s of work")
 
@@ -215,7 +211,7 @@ def _find_finished(tasks: list[Task], rows: dict[str, Row]) -> list[Task]:
         if (figures := finished(task)) is None:
             open_tasks.append(task)
         else:
-            rows[task.name] = Row(task.recording, task.name, DONE, figures)
+            rows[task.name] = replace(rows[task.name], state=DONE, figures=figures)
     return open_tasks
 
 
@@ -243,10 +239,6 @@ def folder_name(option: str, folder: Path | None) -> str | None:
     return folder.name
 
 
-def inputs(*files: Location | None) -> list[Location]:
-    return [file if is_url(file) else Path(file) for file in files if file]
-
-
 CSV, MARKDOWN, PICTURE = "summary.csv", "summary.md", "summary.png"
 
 DONE, FAILED, OPEN = "done", "failed", "not done"
@@ -270,7 +262,8 @@ class Row:
 
     def cells(self, columns: Sequence[str]) -> list[str]:
         """The texts of these columns of figures, what is known of all before and behind."""
-        figures = [_text(self.figures.get(name, "")) for name in columns]
+        values = (self.figures.get(name, "") for name in columns)
+        figures = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values]
         return [str(self.recording), self.folder, self.state, *figures, self.reason]
 
 
@@ -280,39 +273,29 @@ def write_summary(out: Path, command: str, rows: Sequence[Row]) -> None:
     They say the same whoever did the work, in whatever order it was done.
     """
     columns = list(dict.fromkeys(name for row in rows for name in row.figures))
+    cells = [row.cells(columns) for row in rows]
+    names = [*_FIRST, *columns, *_LAST]
     with atomic_files(*(out / name for name in (CSV, MARKDOWN, PICTURE))) as (table, text, picture):
-        table.write_bytes(_as_csv(rows, columns))
-        text.write_bytes(_as_markdown(command, rows, columns))
+        with table.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(names)
+            writer.writerows(map(_plain, row) for row in cells)
+        lines = [
+            f"# {command}: {_counted(rows)}",
+            "",
+            f"| {' | '.join(names)} |",
+            f"|{'---|' * len(names)}",
+            *(f"| {' | '.join(cell.replace('|', _BAR) for cell in row)} |" for row in cells),
+        ]
+        text.write_text("\n".join(lines) + "\n", encoding="utf-8")
         # Without the version of Matplotlib, which would change the bytes.
         _draw(rows, columns).savefig(picture, dpi=110, metadata={"Software": None})
 
 
-def counted(rows: Sequence[Row]) -> str:
-    """How many of each state."""
+def _counted(rows: Sequence[Row]) -> str:
     states = [row.state for row in rows]
     some = [f"{states.count(state)} {state}" for state in (DONE, FAILED, OPEN) if state in states]
     return f"{len(rows)} recordings: {', '.join(some)}"
-
-
-def _as_csv(rows: Sequence[Row], columns: Sequence[str]) -> bytes:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*_FIRST, *columns, *_LAST])
-    writer.writerows(map(_plain, row.cells(columns)) for row in rows)
-    return text.getvalue().encode()
-
-
-def _as_markdown(command: str, rows: Sequence[Row], columns: Sequence[str]) -> bytes:
-    names = [*_FIRST, *columns, *_LAST]
-    cells = [row.cells(columns) for row in rows]
-    lines = [
-        f"# {command}: {counted(rows)}",
-        "",
-        f"| {' | '.join(names)} |",
-        f"|{'---|' * len(names)}",
-        *(f"| {' | '.join(cell.replace('|', _BAR) for cell in row)} |" for row in cells),
-    ]
-    return ("\n".join(lines) + "\n").encode()
 
 
 def _plain(cell: str) -> str:
@@ -323,32 +306,26 @@ def _plain(cell: str) -> str:
     return f"'{cell}" if cell.startswith(("=", "+", "-", "@", "\t", "\r")) else cell
 
 
-def _text(value: float | int | str) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
 def _draw(rows: Sequence[Row], columns: Sequence[str]) -> Figure:
     """The first figures that are numbers, recording by recording; what failed is marked below."""
     from matplotlib.figure import Figure
 
-    numbers = [name for name in columns if any(_is_number(row, name) for row in rows)]
-    shown = numbers[:_MOST_PANELS] or [""]
+    numbers = {
+        name: [k for k, row in enumerate(rows) if isinstance(row.figures.get(name), (int, float))]
+        for name in columns
+    }
+    shown = [name for name, known in numbers.items() if known][:_MOST_PANELS] or [""]
     figure = Figure((_WIDTH, 0.6 + _PANEL * len(shown)), layout="constrained")
     panels = figure.subplots(len(shown), sharex=True, squeeze=False)[:, 0]
     without = [k for k, row in enumerate(rows) if row.state != DONE]
     for panel, name in zip(panels, shown, strict=True):
-        known = [k for k, row in enumerate(rows) if _is_number(row, name)]
+        known = numbers.get(name, [])
         panel.plot(known, [float(rows[k].figures[name]) for k in known], "o", ms=3, color="#0072b2")
         bottom = panel.get_xaxis_transform()
         panel.plot(without, [0.04] * len(without), "x", color="#d55e00", transform=bottom)
         panel.set_ylabel(name, fontsize=8)
         panel.tick_params(labelsize=8)
         panel.grid(alpha=0.3)
-    figure.suptitle(counted(rows), fontsize=9)
+    figure.suptitle(_counted(rows), fontsize=9)
     panels[-1].set_xlabel(f"recording, in the order of {CSV}; x: without a result", fontsize=8)
     return figure
-
-
-def _is_number(row: Row, name: str) -> bool:
-    value = row.figures.get(name)
-    return isinstance(value, (int, float)) and not isinstance(value, bool)

@@ -13,27 +13,17 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, add_overwrite, number, refuse_existing
-from rs_localizer.cli.batch import (
-    Plan,
-    add_batch_arguments,
-    folder_name,
-    inputs,
-    is_batch,
-    run_batch,
+from rs_localizer.cli import (
+    WORKING,
+    UsageError,
+    add_overwrite,
+    image_input,
+    number,
+    refuse_existing,
+    with_values,
+    write_all,
 )
-from rs_localizer.cli.image_input import (
-    add_telemetry,
-    clock_of,
-    clock_of_lens,
-    of_bag,
-    of_files,
-    replay_command,
-    telemetry_of,
-    tell_telemetry,
-    tell_times,
-    video_imu,
-)
+from rs_localizer.cli.batch import add_batch_arguments, folder_name, is_batch, run_batch
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.rig_input import cameras_of, mounting_lines, numbers
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
@@ -204,7 +194,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="find how the IMU of a bag goes with the camera: offset of its stamps, rotation, bias "
         "(default: the only topic of its type); of a video, that inside it or in a log beside it",
     )
-    add_telemetry(parser)
+    image_input.add_telemetry(parser)
     parser.add_argument(
         "--rate", type=above, metavar="HZ", help="images per second of a video or of files"
     )
@@ -243,11 +233,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Source:
-    """Images with correspondences, and their camera; without a lens, its size only."""
+    """Images with correspondences, and their camera."""
 
     images: list[Observed]
-    camera: Camera | None
-    size: tuple[int, int]
+    camera: Camera
+    new_lens: bool = False  # it is a first guess of this command
     imu: ImuRecording | None = None
     map: MarkerMap | None = None  # of images
     own_stamps: bool = True
@@ -260,8 +250,7 @@ def run(args: argparse.Namespace) -> Figures | None:
         given_settings(args)  # refuses wrong ones before there are workers
         _calibrate_batch(args)
     else:
-        alone = argparse.Namespace(**vars(args), recording=args.recordings[0])
-        return _figures(calibrate_one(alone))
+        return calibrate_one(with_values(args, recording=args.recordings[0]))
     return None
 
 
@@ -269,7 +258,7 @@ def _finds_lens(args: argparse.Namespace, recording: Path) -> bool:
     return args.intrinsics or (args.calibration is None and not is_bag(recording))
 
 
-def calibrate_one(args: argparse.Namespace) -> Calibration:
+def calibrate_one(args: argparse.Namespace) -> Figures:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
         lens = _finds_lens(args, args.recording)
@@ -277,8 +266,9 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
         refuse_existing(args, *(name for name, written in beside.items() if written))
     config = _config(args)
     source = _read(args, config)
-    intrinsics = args.intrinsics or source.camera is None
-    found = _calibrated(args, source, _first_camera(source, config), config)
+    intrinsics = args.intrinsics or source.new_lens
+    camera = replace(source.camera, scan_direction=config.scan_direction)
+    found = _calibrated(args, source, camera, config)
     refusal = verdict.refusal(found)
     if args.out is not None and (args.force or not verdict.lens_refusal(found)):
         refused = "" if args.force else refusal
@@ -292,29 +282,29 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
         raise ValueError(refusal)
     if args.share:
         _share(args, found)
-    return found
-
-
-def _first_camera(source: _Source, config: NodeConfig) -> Camera:
-    camera = source.camera
-    if camera is None:
-        camera = first_lens(source.size, in_order(source.images))
-    return replace(camera, scan_direction=config.scan_direction)
+    return {
+        "readout time (ms)": 1e3 * verdict.readout_time(found),
+        "deviation (ms)": 1e3 * found.deviation,
+        "scan direction": str(verdict.scan_direction(found)),
+        "images": found.images,
+        "with a pose": len(found.posed.times),
+        "noise (px)": float(found.fit.deviation),
+    }
 
 
 def _calibrated(
     args: argparse.Namespace, source: _Source, camera: Camera, config: NodeConfig
 ) -> Calibration:
     """What the images of a camera say, printed."""
-    intrinsics = args.intrinsics or source.camera is None
+    intrinsics = args.intrinsics or source.new_lens
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
         found = calibrate(
             camera, source.images, intrinsics=intrinsics, imu=source.imu,
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
     _tell(found, args.rate)
-    tell_telemetry(
-        argparse.Namespace(images=args.recording, no_telemetry=args.no_telemetry),
+    image_input.tell_telemetry(
+        with_values(args, images=args.recording),
         verdict.readout_time(found),
         found.fit.camera,
         lens=False,
@@ -331,7 +321,6 @@ def _calibrated(
 
 
 def _share(args: argparse.Namespace, found: Calibration) -> None:
-    """The row of the table that this recording gives."""
     width, height = found.fit.camera.size
     mode = f"{width}x{height} {1.0 / found.stamps.interval:.4g} Hz"
     values = [(verdict.readout_time(found), found.deviation)]
@@ -380,13 +369,10 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
         raise ValueError(f"{path} does not exist")
     if not is_bag(path):
         imu = _imu_of_video(args, path)
-        known = args.calibration is not None
-        camera = read_calibration(args.calibration) if known else _unknown((2, 2))
-        lens: int | None = getattr(args, "lens", None)
-        clock = clock_of(path, args.rate) if lens is None else clock_of_lens()
-        source = of_files(path, camera, clock, lens)
+        camera = None if args.calibration is None else read_calibration(args.calibration)
+        source = image_input.of_files(args, path, camera)
         found = _detected(args, source.shots)
-        tell_times(source.clock)
+        image_input.tell_times(source.clock)
         return replace(found, own_stamps=path.is_dir() and args.rate is None, imu=imu)
     with open_bag(path) as bag:
         imu = None
@@ -395,20 +381,19 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
         if args.image is None and has_frames(bag):
             return replace(_correspondences(args, bag, config), imu=imu)
         given = None if args.calibration is None else read_calibration(args.calibration)
-        return replace(_detected(args, of_bag(bag, given, args).shots), imu=imu)
+        return replace(_detected(args, image_input.of_bag(bag, given, args).shots), imu=imu)
 
 
 def _imu_of_video(args: argparse.Namespace, path: Path) -> ImuRecording | None:
-    """What went along with a video, if it is asked for."""
     if args.imu is None:
         return None
-    telemetry = telemetry_of(path, args)
+    telemetry = image_input.telemetry_of(path, args)
     if args.imu or telemetry is None or args.rate is not None:
         raise UsageError(
             "--imu TOPIC is for bags, and --imu for videos with a gyroscope of their own clock "
             "(without --rate): this one has none that is known"
         )
-    return video_imu(telemetry)
+    return image_input.video_imu(telemetry)
 
 
 def _correspondences(args: argparse.Namespace, bag: BagReader, config: NodeConfig) -> _Source:
@@ -421,24 +406,17 @@ def _correspondences(args: argparse.Namespace, bag: BagReader, config: NodeConfi
     if args.calibration is not None:
         camera = read_calibration(args.calibration)
     images = [Observed(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in recorded.clouds]
-    return _Source(images, camera, camera.size)
-
-
-# Stands in where no lens is known: only the size of images is asked of it.
-def _unknown(size: tuple[int, int]) -> Camera:
-    width, height = size
-    K = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
-    return Camera(width=width, height=height, K=K)
+    return _Source(images, camera)
 
 
 def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Source:
-    """Markers or a board in images."""
     marker_map = find_map(args)
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
     detector.warm_up()
     sizes = BoardSizes(marker_map)
     images: list[Observed] = []
-    camera, size = None, (0, 0)
+    camera: Camera | None = None
+    size = (0, 0)
     for shot in tqdm(shots, unit="image", desc="detect", disable=None):
         if isinstance(shot, Carried) or not isinstance(shot.image, Image):
             continue
@@ -458,11 +436,12 @@ def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Sou
     print(f"{seen} of {len(images)} images show the map")
     if fault := sizes.fault():
         print(f"warning: {fault}", file=sys.stderr)
-    return _Source(images, camera, size, map=marker_map)
+    new_lens = camera is None
+    camera = first_lens(size, in_order(images)) if camera is None else camera
+    return _Source(images, camera, new_lens, map=marker_map)
 
 
 def _tell(found: Calibration, rate: float | None) -> None:
-    """Values, the parts of the recording, and what is odd."""
     direction = verdict.scan_direction(found)
     rows = [
         ("readout time", f"{1e3 * verdict.readout_time(found):.3f} ms"),
@@ -494,7 +473,6 @@ def _tell(found: Calibration, rate: float | None) -> None:
 
 
 def _tell_lens(found: Calibration) -> None:
-    """The numbers of the lens."""
     state = found.fit.state
     deviations = np.sqrt(np.diag(found.fit.border_covariance)[1 : 1 + len(state.lens)])
     names = ("fx", "fy", "cx", "cy")
@@ -552,12 +530,7 @@ def _write(
     if refused and not writers:
         return False
     writers[path] = lambda part: part.write_text(text, encoding="utf-8")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_files(*writers) as parts:
-        for part, write in zip(parts, writers.values(), strict=True):
-            write(part)
-    for file in writers:
-        print(f"written: {file}")
+    write_all(writers)
     print(f"next: {_next(args, path, lens, shape)}")
     return True
 
@@ -569,11 +542,8 @@ def _next(args: argparse.Namespace, out: Path, lens: Path | None, shape: Path | 
     if shape is None:  # a recording of correspondences
         return shlex.join(["rs_localizer", "replay", recording, *params, "--out", poses])
     options = {"--map": shape, "--calibration": lens, "--rate": args.rate, "--image": args.image}
-    given = [
-        word for name, value in options.items() if value is not None for word in (name, str(value))
-    ]
-    detect = ["rs_localizer", "detect", recording, *given, *params, "--out", str(seen)]
-    return f"{shlex.join(detect)} && {replay_command(seen)}"
+    detect = ["rs_localizer", "detect", recording, *_words(options), *params, "--out", str(seen)]
+    return f"{shlex.join(detect)} && {image_input.replay_command(seen)}"
 
 
 def _calibrate_rig(args: argparse.Namespace) -> None:
@@ -594,11 +564,11 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
         axis = config.of_cameras.get(name, config).scan_direction
         of_camera = replace(config, scan_direction=axis)
         plots = None if args.plots is None else args.plots / name
-        of_args = argparse.Namespace(**vars(own.args) | {"plots": plots})
+        of_args = with_values(own.args, plots=plots)
         source = _read(of_args, of_camera)
-        intrinsics |= source.camera is None
+        intrinsics |= source.new_lens
         maps += [] if source.map is None else [source.map]
-        camera = _without_k3(_first_camera(source, of_camera))
+        camera = _without_k3(replace(source.camera, scan_direction=axis))
         recordings[name] = Recording(camera, _calibrated(of_args, source, camera, config))
     refusals = {name: verdict.refusal(each.calibration) for name, each in recordings.items()}
     refusals = {name: text for name, text in refusals.items() if text}
@@ -682,7 +652,6 @@ def _write_rig(
     comments: Sequence[str], intrinsics: bool,
 ) -> None:  # fmt: skip
     """FILE.yaml, and beside it the transforms, the camchain, and lenses that were found."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     transforms, chain = (path.with_name(f"{path.stem}_{what}") for what in (_TRANSFORMS, _CAMCHAIN))
     writers: dict[Path, Callable[[Path], object]] = {
         transforms: partial(write_static_transforms, parts=parts, frames=frames),
@@ -703,11 +672,7 @@ def _write_rig(
         part.write_text("".join(f"# {line}\n" for line in comments) + text, "utf-8")
 
     writers[path] = write_values
-    with atomic_files(*writers) as files:
-        for file, write in zip(files, writers.values(), strict=True):
-            write(file)
-    for file in writers:
-        print(f"written: {file}")
+    write_all(writers)
 
 
 def _next_of_rig(args: argparse.Namespace) -> str:
@@ -717,27 +682,28 @@ def _next_of_rig(args: argparse.Namespace) -> str:
         return shlex.join(["ros2", "launch", str(path.with_name(f"{stem}_transforms.launch.xml"))])
     chain, poses = path.with_name(f"{stem}_camchain.yaml"), path.with_name(f"{stem}_poses")
     files = {"--map": args.map, "--calibration": chain, "--params": path, "--out": poses}
-    words = [word for name, value in files.items() for word in (name, str(value))]
-    return shlex.join(["rs_localizer", "replay", str(recording), *words])
+    return shlex.join(["rs_localizer", "replay", str(recording), *_words(files)])
+
+
+def _words(options: Mapping[str, object]) -> list[str]:
+    given = {name: str(value) for name, value in options.items() if value is not None}
+    return [word for option in given.items() for word in option]
 
 
 def _calibrate_batch(args: argparse.Namespace) -> None:
-    """``calibrate`` with each of many recordings."""
-    plots = folder_name("--plots", args.plots)
     options = ("intrinsics", "imu", "board", "map")
     given = [name for name in options if getattr(args, name) not in (None, False)]
-    files = inputs(args.map, args.calibration, args.params)
     kind = Kind("calibrate", _calibrate_of_many, " ".join(["calibrate", *given]), _calibrate_warm)
     run_batch(
-        argparse.Namespace(**vars(args) | {"plots": plots}),
-        Plan(
-            kind, lambda _: files, args.overwrite, partial(share_all, args) if args.share else None
-        ),
+        with_values(args, plots=folder_name("--plots", args.plots)),
+        kind,
+        lambda _: (args.map, args.calibration, args.params),
+        args.overwrite,
+        partial(share_all, args) if args.share else None,
     )
 
 
 def _calibrate_warm(_: argparse.Namespace) -> None:
-    """Compile what images of any kind, and many at once, need."""
     from rs_localizer.markers.detection import warm_up as warm_up_markers
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.trajectory.warm_up import warm_up
@@ -748,19 +714,7 @@ def _calibrate_warm(_: argparse.Namespace) -> None:
 
 
 def _calibrate_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
-    """One of them: its result in ``out``, and figures for the summary."""
     out.mkdir(parents=True)
     plots = None if args.plots is None else out / args.plots
-    own = {"recording": recording, "out": out / _SHUTTER, "plots": plots}
-    return _figures(calibrate_one(argparse.Namespace(**vars(args) | own)))
-
-
-def _figures(found: Calibration) -> Figures:
-    return {
-        "readout time (ms)": 1e3 * verdict.readout_time(found),
-        "deviation (ms)": 1e3 * found.deviation,
-        "scan direction": str(verdict.scan_direction(found)),
-        "images": found.images,
-        "with a pose": len(found.posed.times),
-        "noise (px)": float(found.fit.deviation),
-    }
+    own = with_values(args, recording=recording, out=out / _SHUTTER, plots=plots)
+    return calibrate_one(own)

@@ -26,6 +26,7 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer import data
+    from rs_localizer.core.shutter import Motion
     from rs_localizer.evaluation import plots
     from rs_localizer.evaluation.comparison import Recording, Result, compare, load_recording, table
     from rs_localizer.evaluation.cube_clip import (
@@ -39,12 +40,6 @@ if WORKING:
         draw_clip,
     )
     from rs_localizer.evaluation.map_pictures import localized_picture
-    from rs_localizer.evaluation.plots import (
-        error_picture,
-        inlier_picture,
-        residual_picture,
-        trajectory_picture,
-    )
     from rs_localizer.evaluation.room_mapping import Piece, Room, without_refinement
     from rs_localizer.io.bags import BagWriter
     from rs_localizer.io.maps.files import write_npz
@@ -73,75 +68,31 @@ _SENSOR = ImageSettings(noise=2.0)
 _KEYPOINTS = 300
 
 
-def _missing() -> str:
-    """Why there can be no map; empty: there can."""
-    try:
-        require()
-    except ImportError as error:
-        return explain(error)
-    return ""
+def _second_walk(room: Room) -> Recording:
+    """The keypoints that it sees, and the truth at the middle rows."""
+    stamps = room.stamps(_FLIGHT)
+    with stage("Walking there again", len(stamps)) as step:
+        clouds = room.clouds(_FLIGHT, lambda: step(1))
+    middles = np.array([middle_stamp(_CAMERA, stamp) for stamp in stamps], np.int64)
+    states = [room.motion.state(int(middle), np.zeros(1)) for middle in middles]
+    rotations, positions, angular, linear = (
+        np.concatenate([getattr(state, name) for state in states])
+        for name in ("rotations", "positions", "angular", "linear")
+    )
+    turns = Rotation.from_matrix(rotations).as_quat()
+    truth = Motions(Trajectory(middles, positions, turns), Twists(middles, angular, linear))
+    infos = [make_camera_info(_CAMERA, stamp) for stamp in stamps]
+    return Recording(stamps, infos, clouds, {}, truth)
 
 
-class RoomScene:
-    """The room, its maps and the keypoints of the second walk.
-
-    Args:
-        directory: for the maps.
-    """
-
-    readout_time = _CAMERA.readout_time
-
-    def __init__(self, directory: Path) -> None:
-        self.map_file, self.global_map_file = directory / "room.npz", directory / "global.npz"
-        self._room = Room(read_tum(data.path(data.HAND_MOTION)), _CAMERA, _SENSOR, _KEYPOINTS)
-        folder = directory / "colmap"
-        folder.mkdir()
-        with TemporaryDirectory() as images:
-            with stage("Walking through a room", len(self._room.stamps(_WALK))) as step:
-                views = self._room.look(_WALK, Path(images), lambda: step(1))
-            built = self._room.build(views, folder, stage, _EFFORT)
-        self._landmarks = built.landmarks
-        write_npz(self.map_file, built.landmarks)
-        write_npz(self.global_map_file, without_refinement(built))
-
-    def record(self) -> Recording:
-        """The keypoints of the second walk, and the truth at the middle rows."""
-        stamps = self._room.stamps(_FLIGHT)
-        with stage("Walking there again", len(stamps)) as step:
-            clouds = self._room.clouds(_FLIGHT, lambda: step(1))
-        middles = np.array([middle_stamp(_CAMERA, stamp) for stamp in stamps], np.int64)
-        states = [self._room.motion.state(int(middle), np.zeros(1)) for middle in middles]
-        rotations = np.concatenate([state.rotations for state in states])
-        truth = Motions(
-            Trajectory(
-                middles,
-                np.concatenate([state.positions for state in states]),
-                Rotation.from_matrix(rotations).as_quat(),
-            ),
-            Twists(
-                middles,
-                np.concatenate([state.angular for state in states]),
-                np.concatenate([state.linear for state in states]),
-            ),
-        )
-        infos = [make_camera_info(_CAMERA, stamp) for stamp in stamps]
-        return Recording(stamps, infos, clouds, {}, truth)
-
-    def picture(self, recording: Recording, results: Mapping[str, Result]) -> Figure:
-        """Where the camera was, among the landmarks."""
-        assert recording.truth is not None
-        poses = {name: result.poses for name, result in results.items()}
-        return localized_picture(self._landmarks.points, recording.truth.poses, poses)
-
-
-def play_room(
+def _play_room(
     session: Any,
     methods: Mapping[str, Mapping[str, Any]],
     names: Mapping[str, str],
     out: Path,
     directory: Path,
 ) -> None:
-    """Let the nodes of several methods localize the second walk; print and draw what they said.
+    """Let the nodes of several methods localize a second walk; print and draw what they said.
 
     Args:
         session: of the live nodes.
@@ -150,30 +101,37 @@ def play_room(
         out: for the picture.
         directory: for what is passing.
     """
-    if reason := _missing():
-        print(f"\nA room without markers is left out: {reason}")
+    try:
+        require()
+    except ImportError as error:
+        print(f"\nA room without markers is left out: {explain(error)}")
         return
-    room = RoomScene(directory)
-    recording = room.record()
-    maps = (room.map_file, room.global_map_file)
-    with_maps = {
-        name: {**settings, "map_file": str(file)}
-        for (name, settings), file in zip(methods.items(), maps, strict=True)
-    }
+    room = Room(read_tum(data.path(data.HAND_MOTION)), _CAMERA, _SENSOR, _KEYPOINTS)
+    folder = directory / "colmap"
+    folder.mkdir()
+    with TemporaryDirectory() as images:
+        with stage("Walking through a room", len(room.stamps(_WALK))) as step:
+            views = room.look(_WALK, Path(images), lambda: step(1))
+        built = room.build(views, folder, stage, _EFFORT)
+    maps, with_maps = (built.landmarks, without_refinement(built)), {}
+    for (name, settings), landmarks in zip(methods.items(), maps, strict=True):
+        file = directory / f"{name}.npz"
+        write_npz(file, landmarks)
+        with_maps[name] = {**settings, "map_file": str(file)}
+    recording = _second_walk(room)
     with tqdm(
         total=len(recording.clouds), unit="frame", desc="Room without markers", disable=None
     ) as bar:
         answers = session.play(
-            recording,
-            room.readout_time,
-            with_maps,
-            bar.update,
-            lossless=(next(iter(methods)),),
-            topic=KEYPOINTS,
-        )
+            recording, _CAMERA.readout_time, with_maps, bar.update,
+            lossless=(next(iter(methods)),), topic=KEYPOINTS,
+        )  # fmt: skip
     results = {names[name]: compare(answers[name], recording.truth) for name in methods}
     print(f"\n{table('A room mapped without markers', recording, results)}", flush=True)
-    plots.save(room.picture(recording, results), out / ROOM)
+    assert recording.truth is not None
+    poses = {name: result.poses for name, result in results.items()}
+    picture = localized_picture(built.landmarks.points, recording.truth.poses, poses)
+    plots.save(picture, out / ROOM)
     print(out / ROOM)
 
 
@@ -209,16 +167,12 @@ class CubeScene:
     ) -> str:
         """Write the animated picture; a sentence on where the cube is."""
         stamps = recording.stamps_ns[RUN_UP:]
-        motions = [
-            {
-                name: answer.motion(CAMERA.readout_time) if answer is not None else None
-                for name, answer in (
-                    (P3P, results[p3p].answers.get(stamp)),
-                    (OURS, results[ours].answers.get(stamp)),
-                )
-            }
-            for stamp in stamps
-        ]
+
+        def motion(name: str, stamp: int) -> Motion | None:
+            answer = results[name].answers.get(stamp)
+            return None if answer is None else answer.motion(CAMERA.readout_time)
+
+        motions = [{P3P: motion(p3p, stamp), OURS: motion(ours, stamp)} for stamp in stamps]
         clip = draw_clip(
             self._walls,
             [self._middles[stamp] for stamp in stamps],
@@ -276,12 +230,13 @@ def run(args: argparse.Namespace) -> None:
         most = _QUICK_FRAMES if args.quick else None
         print("starting them; the first time on a machine, this compiles the solvers", flush=True)
         webcam = load_recording(data.path(data.WEBCAM), most)
+        shown = build(load_params_file(data.path(data.WEBCAM) / "parameters.yaml"))
         flight = load_recording(_fly(Path(directory), most))
         scene = CubeScene()
         cube = load_recording(scene.record(Path(directory) / "cube", most))
         acts = []
         for title, recording, readout_time in (
-            ("Webcam over a board", webcam, _webcam_readout_time()),
+            ("Webcam over a board", webcam, shown.readout_time),
             ("Simulated hand-held flight", flight, _FLIGHT_CAMERA.readout_time),
             ("Rendered walls of markers", cube, CAMERA.readout_time),
         ):
@@ -294,7 +249,7 @@ def run(args: argparse.Namespace) -> None:
             acts.append(Act(recording, readout_time, results))
             print(f"\n{table(title, recording, results)}", flush=True)
         if not args.quick:
-            play_room(session, methods, names, args.out, Path(directory))
+            _play_room(session, methods, names, args.out, Path(directory))
         by_us, by_p3p = names[_ROLLING], names[_GLOBAL]
         print(scene.draw(cube, acts[2].results, by_us, by_p3p, args.out / CUBE))
         print(f"\n{args.out / CUBE}")
@@ -305,12 +260,7 @@ def run(args: argparse.Namespace) -> None:
     print(f"done in {time.monotonic() - started:.0f} s")
 
 
-def _webcam_readout_time() -> float:
-    return build(load_params_file(data.path(data.WEBCAM) / "parameters.yaml")).readout_time
-
-
 def _fly(directory: Path, most: int | None) -> Path:
-    """Simulate the flight into a bag."""
     motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
     start_ns = motion.intervals_ns[0][0] + round(_FLIGHT_START * 1e9)
     end_ns = start_ns + round(_FLIGHT_DURATION * 1e9)
@@ -335,10 +285,10 @@ def _pictures(webcam: Act, flight: Act) -> dict[str, Figure | None]:
     recording, results = flight.recording, flight.results
     true_matches = np.array([(1.0 - _SEEN.outliers) * cloud.width for cloud in recording.clouds])
     return {
-        "flight_trajectories.png": trajectory_picture(recording, results),
-        "flight_errors.png": error_picture(results),
-        "flight_inliers.png": inlier_picture(recording, results, true_matches),
-        "webcam_residuals.png": residual_picture(
+        "flight_trajectories.png": plots.trajectory_picture(recording, results),
+        "flight_errors.png": plots.error_picture(results),
+        "flight_inliers.png": plots.inlier_picture(recording, results, true_matches),
+        "webcam_residuals.png": plots.residual_picture(
             webcam.recording, webcam.results, webcam.readout_time
         ),
     }

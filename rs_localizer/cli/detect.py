@@ -7,14 +7,21 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any, TypeVar
 
-from rs_localizer.cli import WORKING, UsageError, add_overwrite, integer, number, replaced
-from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
+from rs_localizer.cli import (
+    WORKING,
+    UsageError,
+    add_overwrite,
+    integer,
+    number,
+    replaced,
+    with_values,
+)
+from rs_localizer.cli.batch import add_batch_arguments, is_batch, run_batch
 from rs_localizer.cli.image_input import (
-    Source,
     add_source_arguments,
     opened,
     shutter_values,
@@ -28,7 +35,7 @@ from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.rig_input import cameras_of
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
 from rs_localizer.io.bags import STORAGES, BagWriter, is_bag
-from rs_localizer.io.image_clock import DEFAULT_START_NS
+from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock
 from rs_localizer.settings import build, settings
 
 if WORKING:
@@ -38,11 +45,16 @@ if WORKING:
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.rigs import make_mounts, read_camchain
     from rs_localizer.io.topics import TF_STATIC
+    from rs_localizer.markers import detection
     from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
     from rs_localizer.offline.fleet.task import Figures, Kind
     from rs_localizer.offline.image_sources import Carried, Shot
     from rs_localizer.pipeline.images import FrameDetector
     from rs_localizer.pipeline.keypoints import FrameExtractor
+
+    Shots = Iterable[Shot | Carried]
+
+Seen = TypeVar("Seen")
 
 # Options of markers and boards.
 _OF_MARKERS = ("map", "board", "pattern", "square", "min_side")
@@ -85,92 +97,101 @@ def run(args: argparse.Namespace) -> Figures | None:
         raise UsageError("--max-keypoints goes with --features")
     if args.features is None and args.map is None and args.board is None:
         raise UsageError("give --map, --board or --features")
-    if not is_batch(args):
-        alone = argparse.Namespace(**vars(args), images=args.recordings[0])
-        if args.features is None:
-            recorded = detect_one(alone)
-            tell_next(alone)
-            return _figures(*recorded)
-        detect_features(alone)
-        tell_next(alone, " --map MAP")
+    if is_batch(args):
+        if args.features is not None:
+            raise UsageError("--features takes one recording")
+        if args.timing:
+            raise UsageError("--timing is for one recording: beside others it means little")
+        find_map(args)  # refuses wrong ones before there are workers
+        kind = Kind("detect", _detect_of_many, "detect", _warm)
+        run_batch(args, kind, lambda _: (args.map, args.calibration, args.params), args.overwrite)
         return None
-    if args.features is not None:
-        raise UsageError("--features takes one recording")
-    find_map(args)  # refuses wrong ones before there are workers
-    _detect_batch(args)
+    alone = with_values(args, images=args.recordings[0])
+    if args.features is None:
+        figures = detect_one(alone)
+        tell_next(alone)
+        return figures
+    detect_features(alone)
+    tell_next(alone, " --map MAP")
     return None
 
 
-def detect_one(args: argparse.Namespace) -> list[Recorded]:
+def detect_one(args: argparse.Namespace) -> Figures:
     """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
     marker_map = find_map(args)
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
-    recordings = []
-    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
-        with BagWriter(out, args.storage) as bag:
-            for name, own in _cameras(args, bag).items():
-                notices: Counter[str] = Counter()
-                detector = FrameDetector(config, partial(_count, notices), marker_map)
-                detector.warm_up()
-                with opened(own, args.images, args.start) as source:
-                    recorded = _record(own, name, source, detector, bag)
-                recordings.append((name, recorded, notices, detector.seconds, source.clock))
-        write_shutter(args, out, marker_map.settings)
-    for name, recorded, notices, seconds, clock in recordings:
-        _tell(f"{args.out}{f', {name}' if name else ''}", recorded, notices)
+
+    def look(
+        shots: Shots, bag: BagWriter, options: Options, bar: Any
+    ) -> tuple[Recorded, Counter[str], tuple[float, float]]:
+        notices: Counter[str] = Counter()
+        detector = FrameDetector(config, lambda _, text: notices.update([text]), marker_map)
+        detector.warm_up()
+        recorded = record(
+            shots, detector, bag, options, done=bar.update,
+            tell=lambda text: bar.write(f"note: {text}", file=sys.stderr),
+        )  # fmt: skip
+        return recorded, notices, detector.seconds
+
+    every = []
+    for name, (recorded, notices, seconds), clock in _look(args, look, marker_map.settings):
+        _tell(_place(args, name), recorded, notices)
         for fault in (*recorded.faults, *time_faults(args, clock, recorded.period, name)):
             print(f"warning: {fault}")
         if args.timing:
-            _tell_times(recorded.images, *seconds)
+            whole, in_opencv = seconds
+            print(
+                f"time per image: {1e3 * whole / recorded.images:.2f} ms, of which OpenCV's search "
+                f"took {1e3 * in_opencv / recorded.images:.2f} ms and all else "
+                f"{100 * (1 - in_opencv / whole):.1f} %"
+            )
+        every.append(recorded)
     tell_telemetry(args)
-    return [recorded for _, recorded, *_ in recordings]
+    return {
+        "images": sum(one.images for one in every),
+        "with corners": sum(one.with_corners for one in every),
+        "corners": min(one.corners for one in every),
+        "residual of a still pose (px)": max(one.residual for one in every),
+        "warnings": "; ".join(fault for one in every for fault in one.faults),
+    }
 
 
-def _cameras(args: argparse.Namespace, bag: BagWriter) -> dict[str, argparse.Namespace]:
-    """The arguments of each camera of a rig by its name, or of one that is alone, by "".
+def _look(
+    args: argparse.Namespace,
+    look: Callable[[Shots, BagWriter, Options, Any], Seen],
+    of_map: Mapping[str, float] | None = None,
+) -> list[tuple[str, Seen, ImageClock | None]]:
+    """Record what ``look`` finds in the images of each camera of a rig, or of one without a name.
 
     Where the lenses of one video are goes into the bag.
     """
-    settings = build(shutter_values(args))
-    if not settings.is_rig:
-        return {"": args}
-    rig = cameras_of(argparse.Namespace(**vars(args) | {"recordings": [args.images]}), settings)
-    if args.calibration is not None and not is_bag(args.images):
-        start = DEFAULT_START_NS if args.start is None else round(1e9 * args.start)
-        bag.write(TF_STATIC, make_mounts(read_camchain(args.calibration)), start)
-    return {name: own.args for name, own in rig.items()}
+    settings, seen = build(shutter_values(args)), []
+    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
+        with BagWriter(out, args.storage) as bag:
+            cameras = {"": args}
+            if settings.is_rig:
+                rig = cameras_of(with_values(args, recordings=[args.images]), settings)
+                cameras = {name: own.args for name, own in rig.items()}
+                if args.calibration is not None and not is_bag(args.images):
+                    start = DEFAULT_START_NS if args.start is None else round(1e9 * args.start)
+                    bag.write(TF_STATIC, make_mounts(read_camchain(args.calibration)), start)
+            for name, own in cameras.items():
+                with (
+                    opened(own, args.images, args.start) as source,
+                    tqdm(total=source.total, unit="image", desc="detect", disable=None) as bar,
+                ):
+                    shots: Shots = source.shots
+                    if name not in ("", settings.cameras[0]):  # what goes along is of the first
+                        shots = (shot for shot in shots if not isinstance(shot, Carried))
+                    direction = settings.of_cameras.get(name, settings).scan_direction
+                    options = Options(args.with_images, direction, name)
+                    seen.append((name, look(shots, bag, options, bar), source.clock))
+        write_shutter(args, out, of_map)
+    return seen
 
 
-def _count(notices: Counter[str], _: str, text: str) -> None:
-    notices[text] += 1
-
-
-def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
-    print(
-        f"time per image: {1e3 * seconds / images:.2f} ms, of which OpenCV's search took "
-        f"{1e3 * in_opencv / images:.2f} ms and all else {100 * (1 - in_opencv / seconds):.1f} %"
-    )
-
-
-def _record(
-    args: argparse.Namespace, name: str, source: Source, detector: FrameDetector, bag: BagWriter
-) -> Recorded:
-    with tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress:
-        return record(
-            _shots(args, name, source),
-            detector,
-            bag,
-            _options(args, name),
-            done=progress.update,
-            tell=lambda text: progress.write(f"note: {text}", file=sys.stderr),
-        )
-
-
-def _shots(args: argparse.Namespace, name: str, source: Source) -> Iterator[Shot | Carried]:
-    """The images of a camera; what goes along comes with the first of a rig only."""
-    if name in ("", build(shutter_values(args)).cameras[0]):
-        return iter(source.shots)
-    return (shot for shot in source.shots if not isinstance(shot, Carried))
+def _place(args: argparse.Namespace, name: str) -> str:
+    return f"{args.out}, {name}" if name else str(args.out)
 
 
 def _tell(what: str, recorded: Recorded, notices: Counter[str]) -> None:
@@ -188,14 +209,7 @@ def _tell(what: str, recorded: Recorded, notices: Counter[str]) -> None:
         print(f"note ({count} images): {text}")
 
 
-def _options(args: argparse.Namespace, name: str = "") -> Options:
-    settings = build(shutter_values(args))
-    own = settings.of_cameras.get(name, settings)
-    return Options(args.with_images, own.scan_direction, name)
-
-
 def _add_feature_arguments(parser: argparse._ActionsContainer) -> None:
-    """For :func:`detect_features`."""
     parser.add_argument(
         "--features",
         choices=[kind.value for kind in FeatureKind],
@@ -218,69 +232,32 @@ def detect_features(args: argparse.Namespace) -> None:
     config = FeatureConfig(features=args.features)
     if args.max_keypoints is not None:
         config = FeatureConfig(features=args.features, max_keypoints=args.max_keypoints)
-    extractor = FrameExtractor(config)
-    of_cameras = []
-    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
-        with BagWriter(out, args.storage) as bag:
-            for name, own in _cameras(args, bag).items():
-                with (
-                    opened(own, args.images, args.start) as source,
-                    tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress,
-                ):
-                    shots, options = _shots(args, name, source), _options(args, name)
-                    extraction = record_features(shots, extractor, bag, options, progress.update)
-                of_cameras.append((name, extraction, source.clock))
-        write_shutter(args, out)
-    for name, extraction, clock in of_cameras:
-        _tell_features(args, f"{args.out}{f', {name}' if name else ''}", extraction)
+    extractor, images = FrameExtractor(config), 0
+
+    def look(shots: Shots, bag: BagWriter, options: Options, bar: Any) -> Extraction:
+        return record_features(shots, extractor, bag, options, bar.update)
+
+    for name, extraction, clock in _look(args, look):
+        with_any = len(extraction.counts)
+        print(
+            f"{_place(args, name)}: {with_any} of {extraction.images} images, "
+            f"{np.median(extraction.counts):.0f} keypoints ({args.features}) each (median)"
+        )
+        if bare := len(extraction.stamps_ns) - with_any:
+            print(f"{bare} images have no keypoint")
+        tell_left_out(extraction.refused, extraction.carried)
         for fault in time_faults(args, clock, extraction.period, name):
             print(f"warning: {fault}")
+        images += len(extraction.stamps_ns)
     tell_telemetry(args)
     if args.timing:
-        images = sum(len(extraction.stamps_ns) for _, extraction, _ in of_cameras)
         milliseconds = 1e3 * extractor.seconds / images
         print(f"time per image: {milliseconds:.1f} ms, {1e3 / milliseconds:.0f} images/s")
 
 
-def _tell_features(args: argparse.Namespace, what: str, extraction: Extraction) -> None:
-    with_any = len(extraction.counts)
-    print(
-        f"{what}: {with_any} of {extraction.images} images, "
-        f"{np.median(extraction.counts):.0f} keypoints ({args.features}) each (median)"
-    )
-    if bare := len(extraction.stamps_ns) - with_any:
-        print(f"{bare} images have no keypoint")
-    tell_left_out(extraction.refused, extraction.carried)
-
-
-def _detect_batch(args: argparse.Namespace) -> None:
-    """``detect`` in many recordings."""
-    if args.timing:
-        raise UsageError("--timing is for one recording: beside others it means little")
-    files = inputs(args.map, args.calibration, args.params)
-    kind = Kind("detect", _detect_of_many, "detect", _detect_warm)
-    run_batch(args, Plan(kind, lambda _: files, args.overwrite))
-
-
-def _detect_warm(_: argparse.Namespace) -> None:
-    """Compile what the search needs."""
-    from rs_localizer.markers.detection import warm_up
-
-    warm_up()
+def _warm(_: argparse.Namespace) -> None:
+    detection.warm_up()
 
 
 def _detect_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
-    """One of them: its result in ``out``, and figures for the summary."""
-    return _figures(
-        *detect_one(argparse.Namespace(**vars(args), images=recording, out=out, overwrite=False))
-    )
-
-
-def _figures(*recorded: Recorded) -> Figures:
-    return {
-        "images": sum(one.images for one in recorded),
-        "with corners": sum(one.with_corners for one in recorded),
-        "corners": min(one.corners for one in recorded),
-        "residual of a still pose (px)": max(one.residual for one in recorded),
-        "warnings": "; ".join(fault for one in recorded for fault in one.faults),
-    }
+    return detect_one(with_values(args, images=recording, out=out, overwrite=False))

@@ -7,28 +7,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, number
-from rs_localizer.cli.batch import Plan, add_batch_arguments, folder_name, run_batch
+from rs_localizer.cli import WORKING, UsageError, number, with_values
+from rs_localizer.cli.batch import add_batch_arguments, folder_name, run_batch
 
 if WORKING:
     import numpy as np
     from scipy.spatial.transform import Rotation
 
-    from rs_localizer.core.arrays import Array
-    from rs_localizer.evaluation.metrics import (
-        Errors,
-        Summary,
-        TimeOffset,
-        aligned,
-        associate,
-        estimate_offset,
-        interpolated,
-        interpolated_twists,
-        pose_errors,
-        shifted,
-        summarize,
-        twist_errors,
-    )
+    from rs_localizer.evaluation import metrics
+    from rs_localizer.evaluation.metrics import Errors, TimeOffset, associate
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import BagError, open_bag
     from rs_localizer.io.recording import CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC
@@ -42,10 +29,8 @@ _ANOTHER_FRAME, _EXPLAINED = 10.0, 0.2
 _WORSE = 1.5
 
 
-def _offset_argument(text: str) -> str:
-    if text != _AUTO:
-        number()(text)
-    return text
+def _offset_argument(text: str) -> str | float:
+    return text if text == _AUTO else number()(text)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -110,15 +95,18 @@ def run(args: argparse.Namespace) -> Figures | None:
     if args.out is not None or args.workers is not None or args.scheduler is not None:
         raise UsageError("--out, --workers and --scheduler go with --truths")
     estimate, truth = args.recordings
-    alone = argparse.Namespace(**vars(args), estimate=estimate, truth=truth)
-    return _figures(*evaluate_one(alone))
+    return evaluate_one(with_values(args, estimate=estimate, truth=truth))
 
 
-def evaluate_one(args: argparse.Namespace) -> tuple[Errors, Errors | None]:
-    """Compare one estimate with its truth; print and draw it."""
-    estimate = _read(args.estimate, args.pose_topic, args.twist_topic, args.twists)
-    truth = _read(args.truth, args.truth_pose_topic, args.truth_twist_topic, args.truth_twists)
-    offset = estimate_offset(estimate.poses, truth.poses)
+def evaluate_one(args: argparse.Namespace) -> Figures:
+    """Compare one estimate with its truth; print and draw it, and give its figures."""
+    estimate = read_motions(args.estimate, args.pose_topic, args.twist_topic)
+    truth = read_motions(args.truth, args.truth_pose_topic, args.truth_twist_topic)
+    if args.twists is not None:
+        estimate = Motions(estimate.poses, read_twists(args.twists))
+    if args.truth_twists is not None:
+        truth = Motions(truth.poses, read_twists(args.truth_twists))
+    offset = metrics.estimate_offset(estimate.poses, truth.poses)
     tolerance_ns = round(args.tolerance * 1e9)
     whole = len(estimate.poses)
     if args.offset is not None:
@@ -126,15 +114,18 @@ def evaluate_one(args: argparse.Namespace) -> tuple[Errors, Errors | None]:
         estimate, truth = _moved(estimate, truth, seconds)
         tolerance_ns = 0
         print(f"{seconds:+.4f} s are added to the times of {args.estimate}")
-    poses = pose_errors(estimate.poses, truth.poses, tolerance_ns)
+    poses = metrics.pose_errors(estimate.poses, truth.poses, tolerance_ns)
     if len(poses.stamps_ns) == 0:
         raise ValueError(
             f"no pose of {args.estimate} is within {args.tolerance:g} s of one of {args.truth}: "
             f"{_span(estimate.poses)} against {_span(truth.poses)}{_hint(offset)}"
         )
+    errors = [("position (m)", poses.linear), ("orientation (deg)", poses.angular)]
     twists = None
     if estimate.twists is not None and truth.twists is not None:
-        twists = twist_errors(estimate.twists, truth.twists, tolerance_ns)
+        twists = metrics.twist_errors(estimate.twists, truth.twists, tolerance_ns)
+        errors.append(("angular velocity (deg/s)", twists.angular))
+        errors.append(("linear velocity (m/s)", twists.linear))
     print(f"{len(poses.stamps_ns)} of {whole} poses compared")
     if args.offset is None:
         print(_coverage(args.truth, estimate.poses, truth.poses, tolerance_ns))
@@ -142,17 +133,23 @@ def evaluate_one(args: argparse.Namespace) -> tuple[Errors, Errors | None]:
     if text := _other_frames(estimate.poses, truth.poses, tolerance_ns):
         print(f"warning: {text}")
     print()
-    _print_table(poses, twists)
+    print(f"{'error':26}{'count':>8}{'median':>11}{'mean':>11}{'95 %':>11}{'largest':>11}")
+    figures: Figures = {"poses": len(poses.stamps_ns)}
+    for name, values in errors:
+        of = metrics.summarize(values)
+        columns = "".join(f"{each:11.5f}" for each in (of.median, of.mean, of.p95, of.maximum))
+        print(f"{name:26}{of.count:8}{columns}")
+        figures |= {f"{name} median": of.median, f"{name} 95 %": of.p95}
     if args.ate:
         _print_ate(estimate.poses, truth.poses, tolerance_ns)
     if args.plot is not None:
         _plot(args.plot, estimate.poses, truth.poses, poses, twists)
-    return poses, twists
+    return figures
 
 
-def _offset(text: str, estimated: TimeOffset | None) -> float:
-    if text != _AUTO:
-        return float(number()(text))
+def _offset(given: str | float, estimated: TimeOffset | None) -> float:
+    if not isinstance(given, str):
+        return given
     if estimated is None:
         raise ValueError(
             "the motion does not determine a time offset: too short, too little turning, or not "
@@ -163,13 +160,13 @@ def _offset(text: str, estimated: TimeOffset | None) -> float:
 
 def _moved(estimate: Motions, truth: Motions, seconds: float) -> tuple[Motions, Motions]:
     """The estimate at other times, and the truth at just these."""
-    poses = shifted(estimate.poses, seconds)
-    inside, true = interpolated(truth.poses, poses.stamps_ns)
+    poses = metrics.shifted(estimate.poses, seconds)
+    inside, true = metrics.interpolated(truth.poses, poses.stamps_ns)
     twists, true_twists = estimate.twists, truth.twists
     if twists is not None and true_twists is not None:
         stamps = twists.stamps_ns + round(seconds * 1e9)
         twists = Twists(stamps, twists.angular, twists.linear)
-        true_twists = interpolated_twists(true_twists, stamps)
+        true_twists = metrics.interpolated_twists(true_twists, stamps)
     return Motions(poses.part(inside), twists), Motions(true, true_twists)
 
 
@@ -228,7 +225,7 @@ def _other_frames(estimate: Trajectory, truth: Trajectory, tolerance_ns: int) ->
 def _plot(
     directory: Path, estimate: Trajectory, truth: Trajectory, poses: Errors, twists: Errors | None
 ) -> None:
-    from rs_localizer.evaluation import plots
+    from rs_localizer.evaluation import plots  # half a second
 
     directory.mkdir(parents=True, exist_ok=True)
     drawn = (
@@ -256,38 +253,10 @@ def _coverage(path: Path, estimate: Trajectory, truth: Trajectory, tolerance_ns:
     return f"{len(set(true_rows.tolist()))} of {len(truth)} true poses have an estimate"
 
 
-def _read(
-    path: Path, pose_topic: str | None, twist_topic: str | None, twists: Path | None
-) -> Motions:
-    motions = read_motions(path, pose_topic, twist_topic)
-    return motions if twists is None else Motions(motions.poses, read_twists(twists))
-
-
-def named_errors(poses: Errors, twists: Errors | None) -> list[tuple[str, Array]]:
-    """The errors (n,) of each quantity by its name and unit."""
-    rows = [("position (m)", poses.linear), ("orientation (deg)", poses.angular)]
-    if twists is not None:
-        rows += [
-            ("angular velocity (deg/s)", twists.angular),
-            ("linear velocity (m/s)", twists.linear),
-        ]
-    return rows
-
-
-def _print_table(poses: Errors, twists: Errors | None) -> None:
-    print(f"{'error':26}{'count':>8}{'median':>11}{'mean':>11}{'95 %':>11}{'largest':>11}")
-    for name, errors in named_errors(poses, twists):
-        print(_row(name, summarize(errors)))
-
-
-def _row(name: str, summary: Summary) -> str:
-    figures = (summary.median, summary.mean, summary.p95, summary.maximum)
-    return f"{name:26}{summary.count:8}" + "".join(f"{figure:11.5f}" for figure in figures)
-
-
 def _print_ate(estimate: Trajectory, truth: Trajectory, tolerance_ns: int) -> None:
     try:
-        from evo.core import metrics, trajectory
+        from evo.core import metrics as evo
+        from evo.core import trajectory
     except ImportError as error:
         raise ValueError(
             "--ate needs the package evo, which is not installed: pip install evo"
@@ -300,17 +269,17 @@ def _print_ate(estimate: Trajectory, truth: Trajectory, tolerance_ns: int) -> No
             np.roll(poses.quaternions, 1, axis=1),  # evo puts w first
             (poses.stamps_ns - part.stamps_ns[0]) * 1e-9,
         )
-        for poses in (true_part, aligned(part, true_part))
+        for poses in (true_part, metrics.aligned(part, true_part))
     )
-    parts = metrics.PoseRelation
+    parts = evo.PoseRelation
     for name, metric in (
-        ("ATE (m rms)", metrics.APE(parts.translation_part)),
-        ("ATE (deg rms)", metrics.APE(parts.rotation_angle_deg)),
-        ("RPE, next frame (m rms)", metrics.RPE(parts.translation_part)),
-        ("RPE, next frame (deg rms)", metrics.RPE(parts.rotation_angle_deg)),
+        ("ATE (m rms)", evo.APE(parts.translation_part)),
+        ("ATE (deg rms)", evo.APE(parts.rotation_angle_deg)),
+        ("RPE, next frame (m rms)", evo.RPE(parts.translation_part)),
+        ("RPE, next frame (deg rms)", evo.RPE(parts.rotation_angle_deg)),
     ):
         metric.process_data((true, estimated))
-        print(f"{name:34}{metric.get_statistic(metrics.StatisticsType.rmse):11.5f}")
+        print(f"{name:34}{metric.get_statistic(evo.StatisticsType.rmse):11.5f}")
 
 
 def _span(poses: Trajectory) -> str:
@@ -322,30 +291,18 @@ def _evaluate_batch(args: argparse.Namespace) -> None:
     """``evaluate`` of many estimates, each with the truth of its name."""
     if args.twists or args.truth_twists:
         raise UsageError("--twists and --truth-twists are of one recording")
-    truths = args.truths.absolute()
-    own = {"truths": truths, "plot": folder_name("--plot", args.plot)}
-    kind = Kind("evaluate", _evaluate_of_many, "evaluate")
-    plan = Plan(kind, lambda estimate: [_truth_of(estimate, truths)])
-    run_batch(argparse.Namespace(**vars(args) | own), plan)
+    truths, kind = args.truths.absolute(), Kind("evaluate", _evaluate_of_many, "evaluate")
+    own = with_values(args, truths=truths, plot=folder_name("--plot", args.plot))
+    run_batch(own, kind, lambda estimate: [_truth_of(estimate, truths)])
 
 
 def _evaluate_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
-    """One of them: its result in ``out``, and figures for the summary."""
     truth = _truth_of(recording, args.truths)
     if not truth.exists():
         raise ValueError(f"there is no truth of {recording}: no {truth}, with or without a suffix")
     out.mkdir(parents=True)
     plot = None if args.plot is None else out / args.plot
-    own = {"estimate": recording, "truth": truth, "plot": plot}
-    return _figures(*evaluate_one(argparse.Namespace(**vars(args) | own)))
-
-
-def _figures(poses: Errors, twists: Errors | None) -> Figures:
-    figures: Figures = {"poses": len(poses.stamps_ns)}
-    for name, errors in named_errors(poses, twists):
-        summary = summarize(errors)
-        figures |= {f"{name} median": summary.median, f"{name} 95 %": summary.p95}
-    return figures
+    return evaluate_one(with_values(args, estimate=recording, truth=truth, plot=plot))
 
 
 def _truth_of(estimate: Path, truths: Path) -> Path:

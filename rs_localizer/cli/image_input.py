@@ -163,7 +163,7 @@ def tell_telemetry(
         return
     is_rig = measured is None and build(shutter_values(args)).is_rig
     if path.suffix == ".insv" and importlib.util.find_spec("av") is not None:
-        names = lenses_of(path)
+        names = LENSES[: count_lenses(path)]
         if len(names) > 1 and measured is None and not is_rig:
             print(f"note: of {', '.join(names)} the first one is used; calibrate --rig takes all")
     telemetry = _telemetry(path)
@@ -284,15 +284,14 @@ def opened(
         for name in ("image", "camera_info"):
             if getattr(args, name) is not None:
                 raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
-        lens: int | None = getattr(args, "lens", None)  # one of several that filmed into one file
-        if lens is not None:
+        if getattr(args, "lens", None) is not None:
             if args.rate is not None:
                 raise UsageError("--rate is for one camera: leave it out with cameras")
             if args.calibration is None:
                 raise UsageError(
                     "cameras in one file: --calibration FILE_camchain.yaml of calibrate --rig"
                 )
-            yield of_files(path, read_calibration(args.calibration), clock_of_lens(start), lens)
+            yield of_files(args, path, read_calibration(args.calibration), start)
             return
         telemetry = telemetry_of(path, args)
         camera = None if args.calibration is None else read_calibration(args.calibration)
@@ -300,7 +299,7 @@ def opened(
             camera = None if telemetry is None else telemetry.profile
             if camera is None:
                 raise UsageError("a video or folder has no camera_info: give --calibration")
-        source = of_files(path, camera, clock_of(path, args.rate, start))
+        source = of_files(args, path, camera, start)
         if telemetry is not None and source.clock is not None:
             moving = with_telemetry(source.shots, telemetry, source.clock)
             source = replace(source, shots=moving)
@@ -314,16 +313,6 @@ def opened(
         yield of_bag(bag, camera, args, calibrated)
 
 
-def lenses_of(path: Path) -> tuple[str, ...]:
-    """The names of the cameras that filmed into one file."""
-    return LENSES[: count_lenses(path)]
-
-
-def clock_of_lens(start: float | None = None) -> ImageClock:
-    """One of several: their common zero is the first image of the first one."""
-    return ImageClock(None, None if start is None else round(start * 1e9), zero_ns=0)
-
-
 def of_bag(
     bag: BagReader, camera: Camera | None, args: argparse.Namespace, calibrated: bool = True
 ) -> Source:
@@ -335,27 +324,29 @@ def of_bag(
     return Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
 
 
-def clock_of(path: Path, rate: float | None, start: float | None = None) -> ImageClock:
-    """What gives the images of a video or folder their times.
+def of_files(
+    args: argparse.Namespace, path: Path, camera: Camera | None, start: float | None = None
+) -> Source:
+    """The images of a folder, of a video, or of its lens ``args.lens``, if there is one.
 
     Raises:
-        UsageError: when they have none, and there is no rate.
+        UsageError: when they have no times, and there is no ``args.rate``.
     """
-    if rate is None and not path.is_dir() and not has_times(path):
-        raise UsageError("this video has no presentation times: give --rate; the readout time "
-                         "scales with it")  # fmt: skip
-    if rate is None and path.is_dir() and not have_times(image_files(path)):
-        raise UsageError("the names of the files are not times in ns: give --rate")
-    return ImageClock(rate, None if start is None else round(start * 1e9))
-
-
-def of_files(
-    path: Path, camera: Camera | None, clock: ImageClock, lens: int | None = None
-) -> Source:
-    """The images of a video, of one of its lenses, or of a folder."""
-    if not path.is_dir():
+    rate, lens = args.rate, getattr(args, "lens", None)
+    start_ns = None if start is None else round(start * 1e9)
+    if lens is not None:  # their common zero is the first image of the first one
+        clock = ImageClock(None, start_ns, zero_ns=0)
         return Source(from_video(path, camera, clock, lens), None, clock)
+    if not path.is_dir():
+        if rate is None and not has_times(path):
+            raise UsageError("this video has no presentation times: give --rate; the readout time "
+                             "scales with it")  # fmt: skip
+        clock = ImageClock(rate, start_ns)
+        return Source(from_video(path, camera, clock), None, clock)
     files = image_files(path)
+    if rate is None and not have_times(files):
+        raise UsageError("the names of the files are not times in ns: give --rate")
+    clock = ImageClock(rate, start_ns)
     return Source(from_files(files, camera, clock), len(files), clock)
 
 

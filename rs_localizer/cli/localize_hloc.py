@@ -20,17 +20,8 @@ if WORKING:
     from rs_localizer.core import so3
     from rs_localizer.core.types import Estimate
     from rs_localizer.io.atomic_files import OutputError, atomic_files
-    from rs_localizer.offline.hloc import (
-        Answer,
-        HlocError,
-        Reference,
-        localize_queries,
-        open_h5,
-        read_pairs,
-        read_queries,
-        result_line,
-        result_name,
-    )
+    from rs_localizer.offline import hloc
+    from rs_localizer.offline.hloc import Answer
     from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
     from rs_localizer.solvers.table import find_solver
 
@@ -76,17 +67,17 @@ def run(args: argparse.Namespace) -> None:
     for path in (args.results, motion):
         if path.exists() and not args.overwrite:
             raise OutputError(f"{path} exists already; it is replaced with --overwrite")
-    reference = Reference(args.reference_sfm)
-    queries, pairs = read_queries(args.queries), read_pairs(args.retrieval)
+    reference = hloc.Reference(args.reference_sfm)
+    queries, pairs = hloc.read_queries(args.queries), hloc.read_pairs(args.retrieval)
     paired = {image for images in pairs.values() for image in images}
     unknown = sorted(paired - reference.images.keys())
     if len(unknown) == len(paired):
-        raise HlocError(
+        raise hloc.HlocError(
             f"no image of {args.retrieval} is in the model: {unknown[0]} is not one of "
             f"{', '.join(sorted(reference.images)[:3])} ..."
         )
-    with open_h5(args.features) as features, open_h5(args.matches) as matches:
-        answers = localize_queries(reference, queries, pairs, features, matches, config)
+    with hloc.open_h5(args.features) as features, hloc.open_h5(args.matches) as matches:
+        answers = hloc.localize_queries(reference, queries, pairs, features, matches, config)
         bar = tqdm(answers, total=len(queries), unit="image", desc="localize", disable=None)
         localized = list(bar)
     if not any(isinstance(answer.result, Estimate) for answer in localized):
@@ -106,8 +97,8 @@ def _lines(answers: list[Answer], args: argparse.Namespace) -> list[str]:
     for answer in answers:
         if isinstance(answer.result, Estimate):
             rotation, translation = answer.result.at(args.row)
-            name = result_name(answer.name, args.prepend_camera_name)
-            lines.append(f"{result_line(name, so3.quaternion(rotation), translation)}\n")
+            name = hloc.result_name(answer.name, args.prepend_camera_name)
+            lines.append(f"{hloc.result_line(name, so3.quaternion(rotation), translation)}\n")
     return lines
 
 

@@ -178,7 +178,12 @@ def _run(
         command = COMMANDS[name]
         with importing(f"rs_localizer {name}"):
             module = importlib.import_module(command.module)
-        parser = _command_parser(name)
+        summary = command.summary
+        parser = _described(
+            f"rs_localizer {name}", f"{summary[0].upper()}{summary[1:]}.",
+            f"example:\n  {command.example}",
+        )  # fmt: skip
+        add_common(parser)
         module.add_arguments(parser)
         arguments = parser.parse_args(words[1:])
     except SystemExit as end:  # argparse has said all there is to say
@@ -231,20 +236,6 @@ def _common_options(words: Sequence[str]) -> tuple[set[str], list[str]]:
     return common, [*words[:1], *(word for word in first if word not in names), *rest]
 
 
-def _command_parser(name: str) -> argparse.ArgumentParser:
-    command = COMMANDS[name]
-    summary = command.summary
-    parser = argparse.ArgumentParser(
-        prog=f"rs_localizer {name}",
-        description=f"{summary[0].upper()}{summary[1:]}.",
-        epilog=f"example:\n  {command.example}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    add_common(parser)
-    return parser
-
-
 @contextlib.contextmanager
 def _output(name: str, common: Collection[str], shown: Callable[[str], str]) -> Iterator[None]:
     """Within ``with``, what is printed cannot steer the terminal, and goes where options say."""
@@ -256,8 +247,12 @@ def _output(name: str, common: Collection[str], shown: Callable[[str], str]) -> 
         with contextlib.redirect_stdout(io.StringIO()):
             yield
     else:
-        with _plain_output(shown):
+        output, write = sys.stdout, sys.stdout.write
+        output.write = lambda text: write(shown(text).translate(_STEERING))  # type: ignore
+        try:
             yield
+        finally:
+            output.write = write  # type: ignore[method-assign]
 
 
 _NEXT = "next: "
@@ -304,22 +299,6 @@ def _fail(name: str, text: str, code: int) -> int:
     return code
 
 
-@contextlib.contextmanager
-def _plain_output(shown: Callable[[str], str]) -> Iterator[None]:
-    """Within ``with``, what is printed cannot steer the terminal."""
-    write = sys.stdout.write
-    output = sys.stdout
-
-    def plain(text: str) -> int:
-        return write(shown(text).translate(_STEERING))
-
-    output.write = plain  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        output.write = write  # type: ignore[method-assign]
-
-
 def _unheard() -> int:
     """Nobody reads the output any more; to say so would be heard by nobody either."""
     with contextlib.suppress(OSError, ValueError):
@@ -328,18 +307,23 @@ def _unheard() -> int:
     return _SIGPIPE
 
 
+def _described(name: str, description: str, end: str) -> argparse.ArgumentParser:
+    return argparse.ArgumentParser(
+        prog=name, description=description, epilog=end, allow_abbrev=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+
+
 def _parser() -> argparse.ArgumentParser:
     width = max(map(len, COMMANDS))
     lines = [
         f"  {name:{width}}  {command.summary}\n  {'':{width}}  $ {command.example}"
         for name, command in COMMANDS.items()
     ]
-    parser = argparse.ArgumentParser(
-        prog="rs_localizer",
-        description="Position, orientation and velocity of a rolling-shutter camera.",
-        epilog="\n".join(["commands:", *lines, "", "rs_localizer COMMAND --help says more."]),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
+    parser = _described(
+        "rs_localizer",
+        "Position, orientation and velocity of a rolling-shutter camera.",
+        "\n".join(["commands:", *lines, "", "rs_localizer COMMAND --help says more."]),
     )
     parser.add_argument(
         "--version", action="version", version=f"rs_localizer {rs_localizer.__version__}"

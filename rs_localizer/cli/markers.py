@@ -94,8 +94,6 @@ def run(args: argparse.Namespace) -> dict[str, object]:
 def _make(args: argparse.Namespace) -> dict[str, object]:
     try:
         marker_map = _map(args)
-    except UsageError:
-        raise
     except ValueError as error:  # the arguments are all that can be wrong with it
         raise UsageError(str(error)) from error
     faults = problems(marker_map)

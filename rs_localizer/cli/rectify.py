@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, UsageError, add_overwrite, replaced
@@ -14,7 +14,6 @@ from rs_localizer.cli.image_input import add_source_arguments, opened, shutter_v
 if WORKING:
     import cv2
     import numpy as np
-    from numpy.typing import NDArray
     from scipy.spatial.transform import Rotation
     from tqdm import tqdm
 
@@ -27,7 +26,7 @@ if WORKING:
     from rs_localizer.io.trajectories import Trajectory, read_tum
     from rs_localizer.markers.map_files import read_marker_map
     from rs_localizer.offline.fleet.task import Figures
-    from rs_localizer.offline.image_sources import Carried, Shot
+    from rs_localizer.offline.image_sources import Carried
     from rs_localizer.offline.rectified import (
         Depths,
         map_depths,
@@ -97,7 +96,10 @@ def run(args: argparse.Namespace) -> Figures:
             camera = read_camera_info(shot.camera_info).camera(
                 config.readout_time, config.scan_direction
             )
-            image, known = rectified(camera, _pixels(shot), motion, depths)
+            pixels = shot.image.pixels
+            if shot.compressed is not None:
+                pixels = in_color(shot.compressed, shot.image)  # where the image has any
+            image, known = rectified(camera, pixels, motion, depths)
             name = f"{shot.image.stamp_ns}.png"
             (out / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
             shares[name] = float(known.mean())
@@ -140,12 +142,6 @@ def _motions(folder: Path, offset_ns: int) -> Callable[[int], Motion | None]:
     return motion
 
 
-def _poses(trajectory: Trajectory) -> Sequence[tuple[Array, Array]]:
+def _poses(trajectory: Trajectory) -> Iterable[tuple[Array, Array]]:
     rotations = Rotation.from_quat(trajectory.quaternions).as_matrix()
-    return list(zip(rotations, trajectory.positions, strict=True))
-
-
-def _pixels(shot: Shot) -> NDArray[np.uint8]:
-    """In colour, where the image has any."""
-    assert isinstance(shot.image, Image)
-    return shot.image.pixels if shot.compressed is None else in_color(shot.compressed, shot.image)
+    return zip(rotations, trajectory.positions, strict=True)

@@ -16,8 +16,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NoReturn
 
-from rs_localizer.cli import WORKING, UsageError, detect, import_ros
-from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
+from rs_localizer.cli import WORKING, UsageError, detect, import_ros, with_values
+from rs_localizer.cli.batch import add_batch_arguments, is_batch, run_batch
 from rs_localizer.cli.image_input import add_telemetry, telemetry_of
 from rs_localizer.cli.replay_result import (
     BRIDGED,
@@ -32,7 +32,6 @@ from rs_localizer.cli.replay_result import (
     figures,
     fresh,
     print_summary,
-    write_bridged,
     write_frame,
 )
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
@@ -167,17 +166,12 @@ def run(args: argparse.Namespace) -> Figures | None:
         with open_bag(recording) as bag:
             only_images = not has_frames(bag) and not (args.correspondences or args.keypoints)
             topics = None if only_images else find_topics(bag, given_topics(args))
-            _play(bag, topics, args.rate or 1.0, _played_imus(bag, args))
+            imus = imu_topics(bag) if args.imu is None else [args.imu]
+            _play(bag, topics, args.rate or 1.0, [] if args.no_imu else imus)
         return None
     out = args.out or Path(f"{_name(recording)}_replay")
     check_places(args, out)
     return {"out": str(out)} | figures(_replay_one(args, recording, out))
-
-
-def _replayed(args: argparse.Namespace) -> NodeConfig:
-    """The settings, with what the topics say of them."""
-    config = _settings(args)
-    return replace(config, imu=replace(config.imu, use=ImuUse.NONE)) if args.no_imu else config
 
 
 def _settings(args: argparse.Namespace) -> NodeConfig:
@@ -225,11 +219,12 @@ def _replay_one(
         (detect.detect_one if by_markers else detect.detect_features)(of_images)
         # What was given is in the file beside the matches now, with what the video says.
         own = matches / PARAMETERS
-        alone = argparse.Namespace(**vars(args))
-        alone.params, alone.assignments = own if own.exists() else None, []
-        alone.map = None if by_markers else _map_file(Path(args.map))
         telemetry = telemetry_of(Path(recording), args)
-        alone.exposure = None if telemetry is None else telemetry.exposure
+        alone = with_values(
+            args, params=own if own.exists() else None, assignments=[],
+            map=None if by_markers else _map_file(Path(args.map)),
+            exposure=None if telemetry is None else telemetry.exposure,
+        )  # fmt: skip
         return _replay_matches(alone, matches, recording, out, timed)
 
 
@@ -263,11 +258,6 @@ def _detection(args: argparse.Namespace, recording: Path, out: Path) -> list[str
 
 
 def _features_of(landmarks: Map) -> str:
-    """The kind of the descriptors of a map.
-
-    Raises:
-        ValueError: when it has none.
-    """
     if landmarks.descriptors is None:
         raise ValueError("the map has no descriptors: keypoints of images cannot be matched to it")
     if landmarks.descriptors.dtype == np.float32:
@@ -280,7 +270,9 @@ def _replay_matches(
     args: argparse.Namespace, path: Location, recording: Location, out: Path, timed: bool
 ) -> Tally:
     """Replay the bag ``path``, whose images or matches are those of ``recording``."""
-    config = _replayed(args)
+    config = _settings(args)
+    if args.no_imu:
+        config = replace(config, imu=replace(config.imu, use=ImuUse.NONE))
     notices: dict[str, tuple[int, str]] = {}
 
     def notice(name: str, text: str) -> None:
@@ -318,7 +310,6 @@ def _replay_matches(
 
 
 def _refuse_for_rigs(args: argparse.Namespace, config: NodeConfig) -> None:
-    """Name what there is of one camera only."""
     options = ("nerfstudio", "gsplat", "ncore", "rerun", "view", "parquet", "zarr")
     given = [name for name in options if getattr(args, name)] + (["row"] if args.rows else [])
     if config.is_rig and given:
@@ -346,13 +337,6 @@ def _detect_command(path: Location) -> str:
         "6x4 --square 0.03, or --features sift, instead of --map), then: rs_localizer replay "
         f"{out}"
     )
-
-
-def _played_imus(bag: BagReader, args: argparse.Namespace) -> list[str]:
-    """Topics of IMUs that live nodes shall hear."""
-    if args.no_imu:
-        return []
-    return imu_topics(bag) if args.imu is None else [args.imu]
 
 
 def _check_usage(args: argparse.Namespace) -> None:
@@ -456,7 +440,7 @@ def _replay(
             if keep:
                 whole.append(frame)
     if tally.smoothed is not None:
-        write_bridged(out, tally.smoothed.bridged)
+        tally.write_bridged(out)
     if tally.table is not None:
         for answer in refused:
             if answer.stamp_ns not in smoothed:
@@ -477,19 +461,15 @@ def _replay(
 def _tell(tally: Tally, config: NodeConfig, out: Path, timed: bool) -> None:
     print_summary(tally, config, timed)
     if tally.localized and not tally.moving:
-        print(f"no twists: {_why_no_twists(config)}")
+        why = f"solver {config.solver} estimates no velocities"
+        if config.readout_time == 0.0:
+            why = "readout_time is 0 (unknown); give it with -p readout_time:=SECONDS"
+        print(f"no twists: {why}")
     bridged = f", {BRIDGED}" if tally.smoothed else ""
     print(f"written to {out}: {POSES}, {f'{TWISTS}, ' if tally.moving else ''}{RESULT}{bridged}")
 
 
-def _why_no_twists(config: NodeConfig) -> str:
-    if config.readout_time == 0.0:
-        return "readout_time is 0 (unknown); give it with -p readout_time:=SECONDS"
-    return f"solver {config.solver} estimates no velocities"
-
-
 def _add_view_arguments(parser: argparse.ArgumentParser) -> None:
-    """Where to look at the result."""
     group = parser.add_argument_group(
         "to look at, with Rerun (pip install 'rs_localizer[view]')",
         "Path, covariance, landmarks, inliers, images, residuals and velocities on one time line.",
@@ -506,12 +486,7 @@ def _add_view_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _check_view(args: argparse.Namespace) -> None:
-    """Refuse what cannot be shown before there is anything to show.
-
-    Raises:
-        UsageError: for options that do not go together.
-        ValueError: without the Rerun SDK or, for the viewer, a screen.
-    """
+    """Refuse what cannot be shown before there is anything to show."""
     if args.rerun is None and not args.view:
         return
     if is_batch(args) or args.ros:
@@ -550,14 +525,7 @@ def _write_view(
 def _play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) -> None:
     """Publish the inputs of the nodes: matches or keypoints, images, their camera_info, and TF.
 
-    Args:
-        bag: the recording.
-        topics: of the localizer's inputs; None: it has none, only images.
-        rate: times real time.
-        imus: topics of inertial measurements.
-
-    Raises:
-        ValueError: without ROS, without anything to play, or when nobody listens.
+    ``topics`` are those of the localizer's inputs; None: it has none, only images.
     """
     player = import_ros("player", "--ros")
     images = image_topics(bag)
@@ -597,32 +565,28 @@ def _transforms(bag: BagReader) -> list[str]:
 
 
 def _replay_batch(args: argparse.Namespace, config: NodeConfig) -> None:
-    """``replay`` of many recordings."""
     kernels = f"replay {config.solver}{' smooth' if args.smooth else ''}"
     if config.map_file:  # where it is from here, whatever directory a worker is in
-        args = argparse.Namespace(**vars(args) | {"map": location(config.map_file)})
-    files = inputs(args.params, args.map, args.calibration)
+        args = with_values(args, map=location(config.map_file))
+    files = args.params, args.map, args.calibration
     kind = Kind("replay", _replay_of_many, kernels, _replay_warm)
     wanted = args.parquet is not None or args.zarr is not None
     if wanted:
         schema()  # what is not installed is said before hours of work
-    own = argparse.Namespace(**vars(args) | {"parquet": wanted, "zarr": None})
+    own = with_values(args, parquet=wanted, zarr=None)
 
     def gather(folders: Sequence[Path]) -> None:
         _write_table(args, (read_parquet(folder / TABLE) for folder in folders))
 
-    run_batch(own, Plan(kind, lambda _: files, args.overwrite, gather if wanted else None))
+    run_batch(own, kind, lambda _: files, args.overwrite, gather if wanted else None)
 
 
 def _replay_warm(args: argparse.Namespace) -> None:
-    """Compile what the settings need."""
     frame_localizer(_settings(args)).warm_up()
     if args.smooth:
         warm_up()
 
 
 def _replay_of_many(args: argparse.Namespace, recording: Location, out: Path) -> Figures:
-    """One of them: its result in ``out``, and figures for the summary."""
-    own = {"overwrite": False, "parquet": out / TABLE if args.parquet else None}
-    alone = argparse.Namespace(**vars(args) | own)
+    alone = with_values(args, overwrite=False, parquet=out / TABLE if args.parquet else None)
     return figures(_replay_one(alone, recording, out, timed=False))

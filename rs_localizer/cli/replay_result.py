@@ -14,7 +14,7 @@ import shutil
 import textwrap
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -29,19 +29,12 @@ if WORKING:
     from rs_localizer.core import so3
     from rs_localizer.core.arrays import Array, IntArray
     from rs_localizer.core.camera import Camera
+    from rs_localizer.io import neural_reconstruction as neural
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.bags import BagReader, BagWriter
     from rs_localizer.io.image_clock import readout_fault
     from rs_localizer.io.messages import stamp_ns
-    from rs_localizer.io.neural_reconstruction import (
-        View,
-        exposed_rows,
-        middle_of_image,
-        sequence,
-        transforms,
-        write_gsplat,
-    )
-    from rs_localizer.io.outputs import Localized, Pose, messages
+    from rs_localizer.io.outputs import Localized, messages
     from rs_localizer.io.topics import TF
     from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
     from rs_localizer.io.transforms import TransformError, make_transform
@@ -148,11 +141,6 @@ def check_places(args: argparse.Namespace, out: Path | None) -> None:
             raise ValueError(f"{path} exists; choose another --{option}, or --overwrite")
 
 
-def written_names(out: Path) -> list[Path]:
-    """What an earlier result holds of these."""
-    return [*out.glob(_ROW_FILES.format("*")), *out.glob(TRANSFORMS), *out.glob(f"{IMAGES}/*")]
-
-
 class Track:
     """Poses and twists by their stamps."""
 
@@ -217,43 +205,34 @@ class Exports:
     """
 
     def __init__(self, args: argparse.Namespace, localizer: FrameLocalizer, out: Path) -> None:
-        self._localizer, self._out = localizer, out
-        self._named: dict[str, float] = dict(args.rows)
-        self._wants_views: bool = args.nerfstudio
-        self._gsplat: Path | None = args.gsplat
-        self._ncore: Path | None = args.ncore
-        self._args = args
-        self._smoothed: bool = args.smooth
-        self._exposure: float = getattr(args, "exposure", None) or 0.0
-        self._rows = {name: Track() for name in self._named}
-        self._views: dict[int, View] = {}
+        self._args, self._localizer, self._out = args, localizer, out
+        self._rows = {name: (tau, Track()) for name, tau in args.rows}
+        self._views: dict[int, neural.View] = {}
         self._rolling: dict[int, Array] = {}  # (3,4,4) at the first, middle and last row
         self._exposed: dict[int, tuple[int, int]] = {}  # ns, the first and the last row
 
     def add(self, frame: Localized) -> None:
         """Take a frame."""
-        if self._gsplat is not None or self._ncore is not None:
-            first, last = exposed_rows(self._camera)
+        stamp = frame.input_stamp_ns
+        if self._args.gsplat is not None or self._args.ncore is not None:
+            first, last = neural.exposed_rows(self._camera)
             rows = [self._of_camera(frame, tau) for tau in (first, 0.0, last)]
-            self._rolling[frame.input_stamp_ns] = np.stack([_matrix(row.pose) for row in rows])
-            self._exposed[frame.input_stamp_ns] = rows[0].stamp_ns, rows[2].stamp_ns
-        for name, tau in self._named.items():
+            poses = [np.column_stack([row.pose.rotation, row.pose.position]) for row in rows]
+            self._rolling[stamp] = np.stack([np.vstack([pose, np.eye(4)[3]]) for pose in poses])
+            self._exposed[stamp] = rows[0].stamp_ns, rows[2].stamp_ns
+        for tau, track in self._rows.values():
             then = self._localizer.mounted(self._of_camera(frame, tau))
             if isinstance(then, Localized):
-                self._rows[name].add(then)
-        if self._wants_views:
-            then = self._of_camera(frame, middle_of_image(self._camera))
-            self._views[frame.input_stamp_ns] = View(
-                f"{IMAGES}/{frame.input_stamp_ns}.jpg",
-                then.pose.rotation,
-                then.pose.position,
-                None if then.twist is None else then.twist.linear,
-                None if then.twist is None else then.twist.angular,
-            )
+                track.add(then)
+        if self._args.nerfstudio:
+            then = self._of_camera(frame, neural.middle_of_image(self._camera))
+            speeds = (None, None) if then.twist is None else (then.twist.linear, then.twist.angular)
+            file = f"{IMAGES}/{stamp}.jpg"
+            self._views[stamp] = neural.View(file, then.pose.rotation, then.pose.position, *speeds)
 
     def write(self, bag: BagReader) -> None:
         """Write the files, with images of the recording."""
-        for name, track in self._rows.items():
+        for name, (_, track) in self._rows.items():
             stamps, rows = track.once()
             if len(stamps):
                 write_tum(
@@ -267,14 +246,14 @@ class Exports:
             return
         images, landmarks = sorted(self._rolling), self._localizer.map
         poses = np.stack([self._rolling[stamp] for stamp in images])
-        if self._gsplat is not None:
+        if self._args.gsplat is not None:
             points = np.zeros((0, 3)) if landmarks is None else landmarks.points
             with self._folder("gsplat", bag, images) as (folder, names):
-                write_gsplat(folder, self._camera, names, poses, points)
-        if self._ncore is not None:
+                neural.write_gsplat(folder, self._camera, names, poses, points)
+        if self._args.ncore is not None:
             exposed = np.array([self._exposed[stamp] for stamp in images], np.int64)
             with self._folder("ncore", bag, images) as (folder, names):
-                content = sequence(self._camera, names, exposed, poses[:, [0, 2]])
+                content = neural.sequence(self._camera, names, exposed, poses[:, [0, 2]])
                 (folder / NCORE).write_text(json.dumps(content, indent=1), encoding="utf-8")
 
     @contextlib.contextmanager
@@ -301,17 +280,15 @@ class Exports:
         middle = middle_row_ns(config, self._camera, frame.input_stamp_ns)
         stamp = middle + round(1e9 * config.readout_time * tau)
         # A sample of a smoothed motion is centred on its own moment instead of the middle row.
-        if self._smoothed:
+        if self._args.smooth:
             tau = (stamp - frame.stamp_ns) * 1e-9 / config.readout_time
-        twist = None
-        if frame.twist is not None:
-            twist = twist_at(frame.estimate, tau, config.readout_time)
+        known, readout_time = frame.twist is not None, config.readout_time
         return replace(
             frame,
             stamp_ns=stamp,
             body_frame=self._localizer.camera_frame,
             pose=pose_at(frame.estimate, tau),
-            twist=twist,
+            twist=twist_at(frame.estimate, tau, readout_time) if known else None,
         )
 
     def _write_transforms(self, bag: BagReader) -> None:
@@ -320,18 +297,14 @@ class Exports:
             replace(view, file=files.get(stamp, view.file))
             for stamp, view in sorted(self._views.items())
         ]
-        text = json.dumps(transforms(self._camera, views, self._exposure), indent=1)
+        exposure = getattr(self._args, "exposure", None) or 0.0
+        text = json.dumps(neural.transforms(self._camera, views, exposure), indent=1)
         (self._out / TRANSFORMS).write_text(text, encoding="utf-8")
         if missing := len(views) - len(files):
             print(
                 f"{missing} images of {TRANSFORMS} are not in the recording (detect --images keeps "
                 f"them): put them to {IMAGES}/STAMP_IN_NS.jpg"
             )
-
-
-def _matrix(pose: Pose) -> Array:
-    """(4,4) map_from_camera."""
-    return np.block([[pose.rotation, pose.position[:, None]], [np.eye(4)[3:]]])
 
 
 def _named_row(text: str) -> tuple[str, float]:
@@ -370,7 +343,7 @@ def fresh(out: Path, overwrite: bool) -> Iterator[Path]:
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         if not overwrite:
             raise ValueError(f"{out} exists; choose another --out, or --overwrite")
-        if not _is_ours(out):
+        if not (out / RESULT / "metadata.yaml").is_file():
             raise ValueError(f"{out} is not a result of replay; --overwrite leaves it as it is")
     with atomic_directory(out, _remove_results if overwrite else None) as built:
         built.mkdir()
@@ -381,16 +354,10 @@ def _remove_results(out: Path) -> None:
     if (out / MARKER).exists():  # of many recordings: what follows is no result of what it says
         (out / MARKER).unlink()
         (out / LOG).unlink(missing_ok=True)
-    for name in (POSES, TWISTS, BRIDGED, VIEW):
-        (out / name).unlink(missing_ok=True)
-    for path in written_names(out):
+    own = (POSES, TWISTS, BRIDGED, VIEW, _ROW_FILES.format("*"), TRANSFORMS, f"{IMAGES}/*")
+    for path in [path for name in own for path in out.glob(name)]:
         path.unlink(missing_ok=True)
     shutil.rmtree(out / RESULT, ignore_errors=True)
-
-
-def _is_ours(out: Path) -> bool:
-    """Whether a directory holds an earlier result, or nothing."""
-    return out.is_dir() and ((out / RESULT / "metadata.yaml").is_file() or not any(out.iterdir()))
 
 
 def write_frame(
@@ -399,13 +366,6 @@ def write_frame(
     """Write all messages of a frame; whether its transform could be told."""
     for name, message in messages(frame, writer.make).items():
         writer.write(f"/{NODE_NAME}/{name}", message, recorded_ns)
-    return _write_transform(writer, frame, localizer, recorded_ns)
-
-
-def _write_transform(
-    writer: BagWriter, frame: Localized, localizer: FrameLocalizer, recorded_ns: int
-) -> bool:
-    """Write what publish_tf asks for; whether it could be told."""
     try:
         item = broadcast(frame, localizer.config, localizer.transforms)
     except TransformError:
@@ -418,27 +378,11 @@ def _write_transform(
     return True
 
 
-def write_bridged(out: Path, stamps_ns: Iterable[int]) -> None:
-    """Write the stamps (b,) of poses without an image of their own, in s, one a line."""
-    text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in stamps_ns)
-    (out / BRIDGED).write_text(text, encoding="utf-8")
-
-
 # Of each frame with a pose.
 _COLUMNS = (
     *("residual", "model_error", "inliers", "global_shutter_inliers", "points", "tracked"),
     *("dropped", "twist"),
 )
-
-
-@dataclass(slots=True)
-class Smoothed:
-    """What became of the moments of a recording that was smoothed."""
-
-    samples: int = 0
-    bridged: array[int] = field(default_factory=lambda: array("q"))  # stamps, ns
-    undetermined: int = 0
-    shaken: int = 0
 
 
 @dataclass(slots=True)
@@ -455,7 +399,8 @@ class Tally:
     repeated: int = 0
     seconds: float = 0.0
     moving: bool = False  # whether there are twists
-    smoothed: Smoothed | None = None
+    smoothed: Counter[str] | None = None  # what became of the moments of one that was smoothed
+    bridged: array[int] = field(default_factory=lambda: array("q"))  # ns
     imu: ImuState | None = None
     readout: tuple[float, float] | None = None  # s, as the motion shows it, and its deviation
     _stamps_ns: array[int] = field(default_factory=lambda: array("q"))  # of the images
@@ -473,12 +418,17 @@ class Tally:
 
     def smooth(self, part: SmoothedFrames) -> list[Localized]:
         """Count the frames of a window that was smoothed, and give them."""
-        self.smoothed = self.smoothed or Smoothed()
-        self.smoothed.samples += len(part.frames)
-        self.smoothed.bridged.extend(part.bridged.tolist())
-        self.smoothed.undetermined += part.undetermined
-        self.smoothed.shaken += part.shaken
+        self.smoothed = Counter() if self.smoothed is None else self.smoothed
+        self.smoothed.update(
+            samples=len(part.frames), undetermined=part.undetermined, shaken=part.shaken
+        )
+        self.bridged.extend(part.bridged.tolist())
         return part.frames
+
+    def write_bridged(self, out: Path) -> None:
+        """Write the stamps of poses without an image of their own, in s, one a line."""
+        text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in self.bridged)
+        (out / BRIDGED).write_text(text, encoding="utf-8")
 
     def refuse(self, refusal: Refusal) -> None:
         """Count a message without one."""
@@ -525,10 +475,7 @@ def figures(tally: Tally) -> Figures:
 def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:
     """Print it as a table, the reasons of refusals explained below.
 
-    Args:
-        tally: what became of the frames.
-        config: the settings.
-        timed: whether to say how fast, which is never the same twice.
+    ``timed``: whether to say how fast, which is never the same twice.
     """
     rows = [("frames", str(tally.total)), ("localized", str(tally.localized))]
     rows += [(f"  refused: {reason}", str(n)) for reason, n in tally.refused.most_common()]
@@ -545,8 +492,13 @@ def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:
     rows += _quality(tally, config) + _inertial(tally.imu)
     if timed:
         rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
-    if tally.smoothed:
-        rows += _smoothing(tally.smoothed)
+    if (smoothed := tally.smoothed) is not None:
+        rows += [
+            ("samples of the smoothed motion", str(smoothed["samples"])),
+            (f"  bridged, listed in {BRIDGED}", str(len(tally.bridged))),
+            ("  left out, not determined", str(smoothed["undetermined"])),
+            ("  shaken faster than it follows, left as they were", str(smoothed["shaken"])),
+        ]
     for name, text in rows:
         print(f"{name:40} {text:>8}")
     for reason in (*tally.refused, *(tally.imu.reasons if tally.imu else ())):
@@ -571,15 +523,6 @@ def _inertial(imu: ImuState | None) -> list[tuple[str, str]]:
             ("  time offset of the IMU (ms)", f"{offset:.2f}"),
         ]
     return rows
-
-
-def _smoothing(smoothed: Smoothed) -> list[tuple[str, str]]:
-    return [
-        ("samples of the smoothed motion", str(smoothed.samples)),
-        (f"  bridged, listed in {BRIDGED}", str(len(smoothed.bridged))),
-        ("  left out, not determined", str(smoothed.undetermined)),
-        ("  shaken faster than it follows, left as they were", str(smoothed.shaken)),
-    ]
 
 
 def _quality(tally: Tally, config: NodeConfig) -> list[tuple[str, str]]:

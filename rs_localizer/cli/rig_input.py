@@ -11,8 +11,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, UsageError, number
-from rs_localizer.cli.image_input import lenses_of
+from rs_localizer.cli import WORKING, UsageError, number, with_values
 
 if WORKING:
     import numpy as np
@@ -23,6 +22,8 @@ if WORKING:
     from rs_localizer.io.bags import is_bag, open_bag
     from rs_localizer.io.rigs import read_camchain
     from rs_localizer.io.transforms import Transform
+    from rs_localizer.io.video import count_lenses
+    from rs_localizer.offline.image_sources import LENSES
     from rs_localizer.offline.recordings import camera_topics, optical_frame, transform_between
     from rs_localizer.trajectory.model import Extrinsics, Mounting
     from rs_localizer.trajectory.rig import DETERMINED
@@ -60,15 +61,12 @@ def cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, OfRig]
     if len(set(frames)) < len(frames):  # as of single recordings put together
         frames = [""] * len(frames)
     lens = args.calibration
-    return {
-        name: OfRig(
-            argparse.Namespace(**vars(args) | own | {
-                "calibration": None if lens is None else lens.with_name(f"{lens.name}#{name}"),
-            }),
-            frame or f"{name}_optical_frame",
-        )
-        for name, own, frame in zip(names, topics, frames, strict=True)
-    }  # fmt: skip
+    cameras = {}
+    for name, own, frame in zip(names, topics, frames, strict=True):
+        calibration = None if lens is None else lens.with_name(f"{lens.name}#{name}")
+        of_camera = with_values(args, **own, calibration=calibration)
+        cameras[name] = OfRig(of_camera, frame or f"{name}_optical_frame")
+    return cameras
 
 
 def _in_one_file(
@@ -80,7 +78,7 @@ def _in_one_file(
             by_name = camera_topics(bag, given)
             frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
         return list(by_name), [{"recording": path, **own} for own in by_name.values()], frames
-    lenses = () if path.is_dir() or not path.exists() else lenses_of(path)
+    lenses = () if path.is_dir() or not path.exists() else LENSES[: count_lenses(path)]
     if len(lenses) < 2:
         raise UsageError(
             f"--rig needs the recordings of several cameras, one bag or a video of several lenses; "
@@ -142,16 +140,13 @@ def map_cameras(args: argparse.Namespace, config: NodeConfig) -> list[MapCamera]
     """
     if len(args.recordings) == 1 and not config.is_rig:
         check_there(args.recordings)
-        alone = argparse.Namespace(**vars(args), recording=args.recordings[0])
+        alone = with_values(args, recording=args.recordings[0])
         return [MapCamera("", alone, config, None)]
     sources = cameras_of(args, config)
     if args.calibration is not None:
         parts = read_camchain(args.calibration)
-        given = {
-            name: Transform(*parts.camera_from_rig[name])
-            for name in sources
-            if name in parts.cameras
-        }
+        known = [name for name in sources if name in parts.cameras]
+        given = {name: Transform(*parts.camera_from_rig[name]) for name in known}
         shutters = {
             name: CameraSettings(
                 camera.readout_time, camera.scan_direction, parts.time_offset.get(name, 0.0)
@@ -168,15 +163,15 @@ def map_cameras(args: argparse.Namespace, config: NodeConfig) -> list[MapCamera]
     if lacking := [name for name in sources if not shutters[name].readout_time > 0.0]:
         raise UsageError(f"no readout_time of {', '.join(lacking)}: calibrate --rig finds it")
     first = given[next(iter(sources))].inverse()
-    known = DETERMINED  # rad, m, s
+    deviations = DETERMINED  # rad, m, s
     if args.mounting is not None:
-        known = tuple(np.multiply(args.mounting, [np.radians(1.0), 1.0, 1.0]))
+        deviations = tuple(np.multiply(args.mounting, [np.radians(1.0), 1.0, 1.0]))
     cameras = list[MapCamera]()
     for name, own in sources.items():
         pose, mounting = given[name] @ first, None
         if cameras:
             extrinsics = Extrinsics(pose.rotation, -pose.rotation.T @ pose.translation, 0.0)
-            mounting = Mounting(extrinsics, np.repeat(known, [3, 3, 1]))
+            mounting = Mounting(extrinsics, np.repeat(deviations, [3, 3, 1]))
         shutter = {each.name: getattr(shutters[name], each.name) for each in fields(CameraSettings)}
         cameras.append(MapCamera(name, own.args, replace(config, **shutter), mounting))
     return cameras

@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from rs_localizer.cli import WORKING, UsageError, add_overwrite, integer, number, replaced
 from rs_localizer.core.camera import Camera, DistortionModel
@@ -28,12 +29,13 @@ from rs_localizer.simulation.walls import SCENES, Scene
 
 if WORKING:
     import numpy as np
+    from numpy.typing import NDArray
     from tqdm import tqdm
 
     from rs_localizer import data
-    from rs_localizer.core.arrays import Array
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.maps.files import write_map_file
+    from rs_localizer.io.maps.landmarks import Map
     from rs_localizer.io.rigs import RigParts, make_mounts, read_camchain
     from rs_localizer.io.topics import TF_STATIC
     from rs_localizer.io.trajectories import read_tum
@@ -41,7 +43,7 @@ if WORKING:
     from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
     from rs_localizer.simulation.imu import ImuBagWriter, Lever, simulate_imu
     from rs_localizer.simulation.recording import write_rendered, write_simulated
-    from rs_localizer.simulation.renderer import Renderer, rendered_frames
+    from rs_localizer.simulation.renderer import RenderedFrame, Renderer, rendered_frames
     from rs_localizer.simulation.rig import (
         Frame,
         camera_stamps,
@@ -211,24 +213,17 @@ def camera_of(args: argparse.Namespace) -> Camera:
     )
     try:
         return Camera(
-            width=args.width,
-            height=args.height,
-            K=K,
-            D=np.array(args.distortion),
-            distortion_model=args.distortion_model,
-            readout_time=args.readout_time,
-            scan_direction=args.scan_direction,
-        )
+            args.width, args.height, K, np.array(args.distortion), args.distortion_model,
+            args.readout_time, args.scan_direction,
+        )  # fmt: skip
     except ValueError as error:  # the other arguments are checked already
         raise UsageError(f"--distortion: {error}") from error
 
 
 def motion_of(args: argparse.Namespace) -> TrueMotion:
     """The recorded motion, or one at constant velocity, with its vibrations."""
-    vibrations = [(degrees, hertz) for degrees, hertz in args.vibration]
-    return shaken(
-        _unshaken(args), vibrations, np.random.default_rng([args.seed, _VIBRATION_STREAM])
-    )
+    rng = np.random.default_rng([args.seed, _VIBRATION_STREAM])
+    return shaken(_unshaken(args), args.vibration, rng)
 
 
 def _unshaken(args: argparse.Namespace) -> TrueMotion:
@@ -385,153 +380,129 @@ def run(args: argparse.Namespace) -> dict[str, object]:
         )
     if args.rig is None and args.triggered:
         raise UsageError("--triggered is for --rig")
-    write = _write_points
-    if args.rig is not None:
-        write = _write_rig
-    elif args.images:
-        write = _write_images
+    write = _write_alone if args.rig is None else _write_rig
     return {"recording": str(args.out), **write(args)}
+
+
+def _write_alone(args: argparse.Namespace) -> dict[str, object]:
+    camera, motion = camera_of(args), motion_of(args)
+    stamps, rng = stamps_of(args, camera, motion), np.random.default_rng(args.seed)
+    world, counts = _world(args, motion, rng), list[int]()
+    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
+        with bag_of(args, built, motion) as bag:
+            frames = _see(args, world, camera, motion, stamps)
+            for frame in tqdm(frames, "simulate", len(stamps), unit="frame", disable=None):
+                if isinstance(frame, RenderedFrame):
+                    write_rendered(bag, camera, frame)
+                else:
+                    write_simulated(bag, camera, frame, _keypoints(args, world, frame, rng))
+                    counts.append(len(frame.points))
+        shutter = {"readout_time": args.readout_time, "scan_direction": args.scan_direction}
+        _save(args, world, built, shutter, counts)
+    what, lasted = "images" if args.images else "frames", (stamps[-1] - stamps[0]) * 1e-9
+    said = f"{args.out}: {len(stamps)} {what} in {lasted:.1f} s"
+    return {"images": len(stamps)} | _tell(args, world, said, counts)
 
 
 def _write_rig(args: argparse.Namespace) -> dict[str, object]:
     parts, motion = rig_of(args), motion_of(args)
-    first = next(iter(parts.cameras.values()))
-    some = set(stamps_of(args, first, motion))
+    some = stamps_of(args, next(iter(parts.cameras.values())), motion)
     stamps = {
-        name: [stamp for stamp in all_ if min(some) <= stamp <= max(some)]
+        name: [stamp for stamp in all_ if some[0] <= stamp <= some[-1]]
         for name, all_ in camera_stamps(parts, motion, args.rate, args.seed, args.triggered).items()
     }
-    scene, rng = None, np.random.default_rng(args.seed)
-    see: Callable[[str, TrueMotion, int], Iterator[Frame]]
-    if args.images:
-        scene, encoding = SCENES[args.walls](sampled_states(motion)), _encoding(args)
-        renderers = {
-            name: Renderer(camera, scene.planes, _pictures(args))
-            for name, camera in parts.cameras.items()
-        }
+    rng, total = np.random.default_rng(args.seed), sum(map(len, stamps.values()))
+    world, counts = _world(args, motion, rng), list[int]()
 
-        def see(name: str, mounted: TrueMotion, place: int) -> Iterator[Frame]:
-            seed = args.seed + place
-            return rendered_frames(renderers[name], mounted, stamps[name], encoding, seed)
-    else:
-        landmarks = described(room(_positions(motion), rng), MAP_FRAME, rng)
-        settings = FrameSettings(args.points, args.noise, args.outliers, args.rate)
+    def see(name: str, mounted: TrueMotion, place: int) -> Iterator[Frame]:
+        return _see(args, world, parts.cameras[name], mounted, stamps[name], place)
 
-        def see(name: str, mounted: TrueMotion, place: int) -> Iterator[Frame]:
-            return simulate_frames(
-                parts.cameras[name], mounted, landmarks.points, settings, stamps_ns=stamps[name],
-                seed=args.seed + place,
-            )  # fmt: skip
-
-    total, counts = sum(map(len, stamps.values())), 0
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
         with BagWriter(built, args.storage) as bag:
-            bag.write(TF_STATIC, make_mounts(parts), min(some))
+            bag.write(TF_STATIC, make_mounts(parts), some[0])
             images = simulate_rig(parts, motion, see)
-            for image in tqdm(images, total=total, unit="image", desc="simulate", disable=None):
+            for image in tqdm(images, "simulate", total, unit="image", disable=None):
                 rows = None
                 if isinstance(image.frame, SimulatedFrame):
-                    counts += len(image.frame.points)
-                    rows = keypoint_rows(image.frame, landmarks, rng) if args.keypoints else None
+                    rows = _keypoints(args, world, image.frame, rng)
+                    counts.append(len(image.frame.points))
                 write_rig_frame(bag, parts, motion, image, rows)
-        if scene is None and not counts:
-            raise ValueError(f"no image sees any point; nothing is written to {args.out}")
-        write_parameters(built / PARAMETERS, rig_parameters(parts))
-        if args.keypoints:
-            write_map_file(built / MAP, landmarks)
-        if scene is not None and scene.marker_map is not None:
-            write_marker_map(built / MARKER_MAP, scene.marker_map)
+        _save(args, world, built, rig_parameters(parts), counts)
     said = f"{args.out}: {total} images of {', '.join(parts.cameras)}"
-    figures: dict[str, object] = {"images": total, "cameras": list(parts.cameras)}
-    if scene is not None:
-        return figures | _tell_scene(args, said, scene)
-    print(f"{said}, {counts / total:.0f} points each")
-    _tell_next(args)
-    return figures | {"points_per_image": counts / total}
+    figures = _tell(args, world, said, counts)
+    return {"images": total, "cameras": list(parts.cameras)} | figures
 
 
-def _write_points(args: argparse.Namespace) -> dict[str, object]:
-    camera, motion = camera_of(args), motion_of(args)
-    frame_settings = FrameSettings(args.points, args.noise, args.outliers, args.rate)
-    stamps = stamps_of(args, camera, motion)
-    rng = np.random.default_rng(args.seed)
-    landmarks = described(room(_positions(motion), rng), MAP_FRAME, rng)
-    counts: list[int] = []
-    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
-        with bag_of(args, built, motion) as bag:
-            frames = simulate_frames(
-                camera, motion, landmarks.points, frame_settings, stamps_ns=stamps, seed=args.seed
-            )
-            total = len(stamps)
-            for frame in tqdm(frames, total=total, unit="frame", desc="simulate", disable=None):
-                if args.keypoints:
-                    write_simulated(bag, camera, frame, keypoint_rows(frame, landmarks, rng))
-                else:
-                    write_simulated(bag, camera, frame)
-                counts.append(len(frame.points))
-        if not any(counts):
-            raise ValueError(
-                f"none of the {len(stamps)} frames sees any point; nothing is written to {args.out}"
-            )
-        write_parameters(built / PARAMETERS, _shutter(args))
-        if args.keypoints:
-            write_map_file(built / MAP, landmarks)
-    print(
-        f"{args.out}: {len(stamps)} frames in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s, "
-        f"{np.mean(counts):.0f} points each{_fewer(counts, args.points)}"
-    )
-    _tell_next(args)
-    return {"images": len(stamps), "points_per_image": float(np.mean(counts))}
+def _world(args: argparse.Namespace, motion: TrueMotion, rng: np.random.Generator) -> Scene | Map:
+    """What is around a motion: a scene to be rendered, or the landmarks of a room."""
+    if args.images:
+        return SCENES[args.walls](sampled_states(motion))
+    ways = [
+        motion.state(first, np.linspace(0.0, (last - first) * 1e-9, 200)).positions
+        for first, last in motion.intervals_ns
+    ]
+    return described(room(np.concatenate(ways), rng), MAP_FRAME, rng)
 
 
-def _tell_next(args: argparse.Namespace) -> None:
+def _see(
+    args: argparse.Namespace, world: Scene | Map, camera: Camera, motion: TrueMotion,
+    stamps: list[int], place: int = 0,
+) -> Iterator[Frame]:  # fmt: skip
+    """What a camera sees; ``place`` is its own among the random numbers."""
+    seed = args.seed + place
+    if isinstance(world, Scene):
+        pictures = ImageSettings(args.exposure, args.grey_noise, args.vignetting)
+        renderer = Renderer(camera, world.planes, pictures)
+        encoding = Encoding(args.format, round(args.quality))
+        return rendered_frames(renderer, motion, stamps, encoding, seed)
+    seen = FrameSettings(args.points, args.noise, args.outliers, args.rate)
+    return simulate_frames(camera, motion, world.points, seen, stamps_ns=stamps, seed=seed)
+
+
+def _keypoints(
+    args: argparse.Namespace, world: Scene | Map, frame: SimulatedFrame, rng: np.random.Generator
+) -> NDArray[Any] | None:
+    """Rows in the place of correspondences, where they are wanted."""
+    if args.keypoints and isinstance(world, Map):
+        return keypoint_rows(frame, world, rng)
+    return None
+
+
+def _save(
+    args: argparse.Namespace, world: Scene | Map, folder: Path, shutter: Mapping[str, Any],
+    counts: list[int],
+) -> None:  # fmt: skip
+    """Write what a recording does not hold itself: the shutter, and the map."""
+    if isinstance(world, Map) and not any(counts):
+        raise ValueError(
+            f"none of the {len(counts)} images sees any point; nothing is written to {args.out}"
+        )
+    write_parameters(folder / PARAMETERS, shutter)
+    if isinstance(world, Scene):
+        if world.marker_map is not None:
+            write_marker_map(folder / MARKER_MAP, world.marker_map)
+    elif args.keypoints:
+        write_map_file(folder / MAP, world)
+
+
+def _tell(
+    args: argparse.Namespace, world: Scene | Map, said: str, counts: list[int]
+) -> dict[str, object]:
+    """Say what was written, and what comes next."""
     out = shlex.quote(str(args.out))
-    poses = shlex.quote(f"{args.out}_poses")
-    settings_words = f"--params {out}/{PARAMETERS}"
-    if args.keypoints:
-        settings_words += f" --map {out}/{MAP}"
-    print(f"next: rs_localizer replay {out} {settings_words} --out {poses}")
-
-
-def _write_images(args: argparse.Namespace) -> dict[str, object]:
-    camera, motion = camera_of(args), motion_of(args)
-    stamps = stamps_of(args, camera, motion)
-    scene = SCENES[args.walls](sampled_states(motion))
-    renderer, encoding = Renderer(camera, scene.planes, _pictures(args)), _encoding(args)
-    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
-        with bag_of(args, built, motion) as bag:
-            frames = rendered_frames(renderer, motion, stamps, encoding, seed=args.seed)
-            for frame in tqdm(frames, total=len(stamps), unit="frame", desc="render", disable=None):
-                write_rendered(bag, camera, frame)
-        write_parameters(built / PARAMETERS, _shutter(args))
-        if scene.marker_map is not None:
-            write_marker_map(built / MARKER_MAP, scene.marker_map)
-    said = f"{args.out}: {len(stamps)} images in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"
-    return {"images": len(stamps)} | _tell_scene(args, said, scene)
-
-
-def _tell_scene(args: argparse.Namespace, said: str, scene: Scene) -> dict[str, object]:
-    """Say what was rendered, and what comes next."""
-    if scene.marker_map is None:
+    if isinstance(world, Map):
+        fewer = _fewer(counts, args.points) if args.rig is None else ""
+        print(f"{said}, {np.mean(counts):.0f} points each{fewer}")
+        words = f"--params {out}/{PARAMETERS}" + (f" --map {out}/{MAP}" if args.keypoints else "")
+        print(f"next: rs_localizer replay {out} {words} --out {shlex.quote(f'{args.out}_poses')}")
+        return {"points_per_image": float(np.mean(counts))}
+    if world.marker_map is None:
         print(said)
         return {}
-    print(f"{said}, {len(scene.marker_map.markers)} markers on the walls")
-    out = shlex.quote(str(args.out))
+    print(f"{said}, {len(world.marker_map.markers)} markers on the walls")
     markers = shlex.quote(f"{args.out}_markers")
     print(f"next: rs_localizer detect {out} --map {out}/{MARKER_MAP} --out {markers}")
-    return {"markers": len(scene.marker_map.markers)}
-
-
-def _pictures(args: argparse.Namespace) -> ImageSettings:
-    return ImageSettings(args.exposure, args.grey_noise, args.vignetting)
-
-
-def _encoding(args: argparse.Namespace) -> Encoding:
-    return Encoding(args.format, round(args.quality))
-
-
-def _shutter(args: argparse.Namespace) -> dict[str, object]:
-    return {"readout_time": args.readout_time, "scan_direction": args.scan_direction}
+    return {"markers": len(world.marker_map.markers)}
 
 
 def _fewer(counts: list[int], wanted: int) -> str:
@@ -540,13 +511,3 @@ def _fewer(counts: list[int], wanted: int) -> str:
     if few == 0:
         return ""
     return f" (of {wanted} asked for; {few} frames see fewer, {none} of them none)"
-
-
-def _positions(motion: TrueMotion) -> Array:
-    """Camera positions (n,3) all along a motion, for the room to be built around."""
-    return np.concatenate(
-        [
-            motion.state(first, np.linspace(0.0, (last - first) * 1e-9, 200)).positions
-            for first, last in motion.intervals_ns
-        ]
-    )

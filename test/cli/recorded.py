@@ -1,11 +1,12 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What tests of commands put into recordings: a flight, transforms, an IMU; and ROS 1 bags."""
+"""What tests of commands read: a flight, transforms, an IMU, ROS 1 bags, videos, a phone's log."""
 
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -43,6 +44,31 @@ def tf(parent: str, child: str, position: Any, turn: Rotation, stamp_ns: int = 0
 def imu(stamp_ns: int, rate: Any = (0.0, 0.0, 0.0)) -> Any:
     """A reading of an IMU that is held level."""
     return make_imu(stamp_ns, np.array(rate), np.array([0.0, 0.0, 9.81]), ImuSettings(), "imu")
+
+
+def write_mp4(path: Path, images: Iterable[Any], rate: float) -> Path:
+    """Grey images as a video."""
+    writer: Any = None
+    for image in images:
+        if writer is None:
+            size = image.shape[::-1]
+            writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), rate, size)
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    return path
+
+
+def write_phone_log(
+    folder: Path, times: Any, rates: Any, stamps: Any, readout: float, exposure: float = 0.0
+) -> None:
+    """What MARS Logger writes: rates (n,3) in the phone's axes at times (n,) ns; images' stamps."""
+    heading = "Timestamp[nanosec],gx[rad/s],gy[rad/s],gz[rad/s],ax[m/s^2],ay[m/s^2],az[m/s^2]\n"
+    rows = zip(np.asarray(times), np.asarray(rates).tolist(), strict=True)
+    lines = [f"{time:.0f},{x!r},{y!r},{z!r},0,0,9.8\n" for time, (x, y, z) in rows]
+    (folder / "gyro_accel.csv").write_text(heading + "".join(lines))
+    heading = "Timestamp[nanosec],Exposure time[nanosec],Frame readout time[nanosec]\n"
+    lines = [f"{stamp:.0f},{1e9 * exposure:.0f},{1e9 * readout:.0f}\n" for stamp in stamps]
+    (folder / "movie_metadata.csv").write_text(heading + "".join(lines))
 
 
 def write_ros1(path: Path, messages: Iterable[tuple[str, int, Any]]) -> Path:

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recorded import imu, tf
+from recorded import tf
 from scipy.spatial.transform import Rotation
 
 from rs_localizer import data
@@ -23,14 +23,14 @@ from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.calibration import read_calibration
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import load_params_file
-from rs_localizer.simulation.true_motion import RecordedMotion
+
+MOVING = "--trajectory tum_vi_room5 --duration 3 --points 60 --noise 0.5 --readout-time 0.02"
 
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("flight") / "flight"
-    words = "--trajectory tum_vi_room5 --duration 3 --points 60 --noise 0.5 --readout-time 0.02"
-    assert main(["simulate", str(out), *words.split()]) == 0
+    assert main(["simulate", str(out), *MOVING.split()]) == 0
     return out
 
 
@@ -101,82 +101,65 @@ def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path, caps
     assert (tmp_path / "share.csv").read_text().count("\n") == 2
 
 
-@pytest.fixture(scope="module")
-def inertial_flight(flight, tmp_path_factory) -> Path:
-    """The flight with a gyroscope whose stamps are 5 ms early, and TF that is 20 degrees off."""
-    out, offset_ns = tmp_path_factory.mktemp("flight") / "inertial", 5_000_000
-    motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
-    axes = Rotation.from_euler("xyz", [90.0, 0.0, 30.0], degrees=True)
-    said = axes * Rotation.from_rotvec([0.0, np.radians(20.0), 0.0])
-    with open_bag(flight) as bag, BagWriter(out) as copy:
-        stamps = []
+def test_an_imu(flight, tmp_path, capsys):
+    """Its stamps are 5 ms early, and TF is 20 degrees off."""
+    true, off, out = (tmp_path / name for name in ("true", "off", "camera.yaml"))
+    words = [*MOVING.split(), "--imu", "--imu-offset", "0.005"]
+    assert main(["simulate", str(true), *words]) == 0
+    with open_bag(true) as bag, BagWriter(off) as copy:
         for topic, stamp_ns, message in bag.messages(tuple(bag.topics)):
+            if topic == "/tf_static":
+                q = message.transforms[0].transform.rotation
+                turn = Rotation.from_rotvec([0.0, np.radians(20.0), 0.0])
+                said = Rotation.from_quat([q.x, q.y, q.z, q.w]) * turn
+                message = tf("camera_optical_frame", "imu_link", np.zeros(3), said)
             copy.write(topic, message, stamp_ns)
-            stamps.append(stamp_ns)
-            camera = message.header.frame_id if topic == "/camera_info" else "camera_optical_frame"
-        times = np.arange(min(stamps), max(stamps), 5_000_000)
-        rates = motion.state(int(times[0]), (times - times[0]) * 1e-9).angular @ axes.as_matrix()
-        rates = rates + np.random.default_rng(0).normal([0.02, 0.0, -0.01], 0.01, rates.shape)
-        for stamp_ns, rate in zip(times.tolist(), rates, strict=True):
-            copy.write("/imu", imu(stamp_ns - offset_ns, rate), stamp_ns)
-        copy.write("/tf_static", tf(camera, "imu", np.zeros(3), said), min(stamps))
-    return out
-
-
-def test_an_imu(inertial_flight, flight, tmp_path, capsys):
-    out = tmp_path / "camera.yaml"
-    assert main(["calibrate", str(inertial_flight), "--imu", "--out", str(out)]) == 0
-    (line,) = [row for row in out.read_text().splitlines() if "imu.time_offset" in row]
-    assert float(line.partition(": ")[2]) == pytest.approx(5e-3, abs=1e-3)  # 3 s of slow motion
+    assert main(["calibrate", str(off), "--imu", "--out", str(out)]) == 0
+    # 3 s of slow motion
+    assert load_params_file(out)["imu.time_offset"] == pytest.approx(5e-3, abs=1e-3)
     said = capsys.readouterr().out
     assert "imu: TF, or the axes of a video, has another rotation" in said
     assert "gyroscope bias" in said
-    assert main(["calibrate", str(inertial_flight), "--imu", "/nothing"]) == 1
+    assert main(["calibrate", str(off), "--imu", "/nothing"]) == 1
     assert "has no topic /nothing" in capsys.readouterr().err
     assert main(["calibrate", str(flight), "--imu"]) == 1
     assert "has no topic of type sensor_msgs/msg/Imu" in capsys.readouterr().err
 
 
 def test_faults(flight, tmp_path, capsys):
-    assert main(["calibrate", str(tmp_path / "nothing")]) == 1
-    assert main(["calibrate", str(flight), "--out", str(tmp_path / "x.txt")]) == 2
-    assert main(["calibrate", str(flight), "--share", "Maker One"]) == 2
-    assert main(["calibrate", str(flight), "--board", "5x4", "--square", "0.1"]) == 2
     video, nothing = tmp_path / "video.mjpeg", tmp_path / "nothing.mp4"
     video.write_bytes(2 * cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes())
-    assert main(["calibrate", str(video), "--board", "5x4", "--square", "0.1"]) == 2
     nothing.touch()
-    assert main(["calibrate", str(nothing), "--board", "5x4", "--square", "0.1"]) == 1
-    assert "Traceback" not in capsys.readouterr().err
+    board = ["--board", "5x4", "--square", "0.1"]
+    for code, words in (
+        (1, [str(tmp_path / "none")]), (2, [str(flight), "--out", str(tmp_path / "x.txt")]),
+        (2, [str(flight), "--share", "Maker One"]), (2, [str(flight), *board]),
+        (2, [str(video), *board]), (1, [str(nothing), *board]),
+    ):  # fmt: skip
+        assert main(["calibrate", *words]) == code
     earlier = tmp_path / "earlier.yaml"
     earlier.write_text("mine")
-    assert main(["calibrate", str(flight), "--out", str(earlier)]) == 1
-    assert f"{earlier} exists; choose another OUT, or --overwrite" in capsys.readouterr().err
+    lens = tmp_path / "other_camera_info.yaml"
+    lens.touch()
+    for words, text in (
+        (["--out", str(earlier)], f"{earlier} exists; choose another OUT, or --overwrite"),
+        (["--out", str(earlier / "a.yaml")], "a.yaml cannot be written: Not a directory"),
+        (["--out", str(tmp_path / "other.yaml"), "--intrinsics"], f"{lens} exists"),
+    ):
+        capsys.readouterr()
+        assert main(["calibrate", str(flight), *words]) == 1
+        told = capsys.readouterr()  # before the work
+        assert text in told.err
+        assert told.out == ""
     assert earlier.read_text() == "mine"
-    assert main(["calibrate", str(flight), "--out", str(earlier / "a.yaml")]) == 1
-    told = capsys.readouterr()  # before the work
-    assert "a.yaml cannot be written: Not a directory" in told.err
-    assert "scan direction" not in told.out
-    earlier.rename(tmp_path / "other_camera_info.yaml")
-    other = ["--out", str(tmp_path / "other.yaml")]
-    assert main(["calibrate", str(flight), "--intrinsics", *other]) == 1
-    assert "other_camera_info.yaml exists" in capsys.readouterr().err
 
 
 def test_smooth(flight, tmp_path, capsys):
+    out, words = tmp_path / "out", ["replay", str(flight), "--smooth", "--out"]
     params = ["--params", str(flight / "parameters.yaml")]
-    plain, smooth, fast = (tmp_path / name for name in ("plain", "smooth", "fast"))
-    assert main(["replay", str(flight), *params, "--out", str(plain)]) == 0
-    assert main(["replay", str(flight), *params, "--smooth", "--out", str(smooth)]) == 0
-    more = ["--smooth", "--rate", "200", "--out", str(fast)]
-    assert main(["replay", str(flight), *params, *more]) == 0
-    one, other = read_tum(plain / "poses.txt"), read_tum(smooth / "poses.txt")
-    np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
-    assert 0.0 < np.abs(one.positions - other.positions).max() < 0.1
-    dense = read_tum(fast / "poses.txt")
-    assert np.diff(dense.stamps_ns).min() == pytest.approx(5e6, abs=2)
-    assert (fast / "bridged.txt").read_text() == ""
-    capsys.readouterr()
-    assert main(["replay", str(flight), "--smooth", "--out", str(tmp_path / "none")]) == 1
-    assert "readout time" in capsys.readouterr().err
+    assert main([*words, str(out), *params, "--rate", "200"]) == 0
+    assert np.diff(read_tum(out / "poses.txt").stamps_ns).min() == pytest.approx(5e6, abs=2)
+    assert (out / "bridged.txt").read_text() == ""
+    assert main([*words, str(tmp_path / "none")]) == 1
+    assert "--smooth needs the readout time" in capsys.readouterr().err
     assert main(["replay", str(flight), "--rate", "10", "--out", str(tmp_path / "none")]) == 2

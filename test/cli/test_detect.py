@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Videos, folders and bags of rendered prints become recordings of their corners."""
+"""Videos, folders and bags of rendered prints, or of anything, become recordings for replay."""
 
 import re
 from pathlib import Path
@@ -10,100 +10,137 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from recorded import imu, tf, write_mp4
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
-from rs_localizer.config import DetectorConfig
+from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.clouds import read_correspondences, read_keypoints
 from rs_localizer.io.recording import make_camera_info
+from rs_localizer.io.trajectories import read_motions
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.offline import detect as detecting
 from rs_localizer.pipeline.images import FrameDetector, correspondences
+from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.settings import build, load_params_file
 
 K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(320, 240, K)
-CALIBRATION = """
-image_width: 320
-image_height: 240
-camera_matrix: {data: [300.0, 0, 159.5, 0, 300.0, 119.5, 0, 0, 1]}
-distortion_model: plumb_bob
-distortion_coefficients: {data: [0, 0, 0, 0, 0]}
-"""
-SQUARE = 0.03
+LENS = '{"width": 320, "height": 240, "fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5}'
+SQUARE, DEPTH = 0.03, 0.45
+TURN = Rotation.from_euler("YX", [25.0, -20.0], degrees=True).as_matrix()  # camera_from_print
 MARKERS = MarkerMap(wall("5x5_50", (2, 1), 0.07, 0.03), map_frame="hall")  # cells of 1 cm
+PIXELS, FINE = 20, 4  # of a cell as drawn, and of an image before it is shrunk
 
 
-def render(cells: Any, corners: Any, x: float = 0.0) -> Any:
-    """A print of cells (true: white) with corners (4,3), seen from the front and a bit aside."""
-    turn = Rotation.from_euler("ZYX", [3.0, 15.0, -10.0], degrees=True).as_matrix()
-    seen = (corners @ (turn @ np.diag([1.0, -1.0, -1.0])).T + [x, 0.0, 0.35]) @ K.T
-    rows, columns = cells.shape
-    drawn = np.kron(np.pad(np.where(cells, 230, 20), 1, constant_values=230), np.ones((20, 20)))
-    inner = np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]]) + 1.0
-    source = (inner * 20 - 0.5).astype(np.float32)
-    to_image = cv2.getPerspectiveTransform(source, (seen[:, :2] / seen[:, 2:]).astype(np.float32))
-    fine = np.array([[4, 0, 1.5], [0, 4, 1.5], [0, 0, 1.0]])
-    big = cv2.warpPerspective(drawn.astype(np.uint8), fine @ to_image, (1280, 960), borderValue=230)
-    return cv2.resize(big, (320, 240), interpolation=cv2.INTER_AREA)
+def render(cells: Any, size: float, x: float = 0.0) -> Any:
+    """A print of cells (true: white), m; its middle is before the camera, or x m beside it."""
+    drawn = np.pad(np.where(cells, 230, 20).astype(np.uint8), 1, constant_values=230)
+    drawn = np.kron(drawn, np.ones((PIXELS, PIXELS), np.uint8))
+    scale, (height, width) = size / PIXELS, drawn.shape
+    metres = np.array([[scale, 0, -scale * (width - 1) / 2],
+                       [0, scale, -scale * (height - 1) / 2], [0, 0, 1]])  # fmt: skip
+    to_image = K @ np.column_stack([TURN[:, :2], [x, 0.0, DEPTH]]) @ metres
+    half = (FINE - 1) / 2
+    fine = np.array([[FINE, 0, half], [0, FINE, half], [0, 0, 1.0]])
+    large = cv2.warpPerspective(drawn, fine @ to_image, (320 * FINE, 240 * FINE), borderValue=230)
+    small = cv2.resize(large, (320, 240), interpolation=cv2.INTER_AREA)
+    return cv2.GaussianBlur(small, (0, 0), 0.5)
 
 
-def board(x: float = 0.0) -> Any:
-    """A chessboard with 6x4 inner corners."""
-    v, u = np.mgrid[:5, :7]
-    w, h = 3.5 * SQUARE, 2.5 * SQUARE
-    return render((u + v) % 2 == 1, np.array([[-w, h, 0], [w, h, 0], [w, -h, 0], [-w, -h, 0]]), x)
+def board(columns: int = 6, rows: int = 4, x: float = 0.0) -> Any:
+    """A chessboard by its inner corners."""
+    v, u = np.mgrid[: rows + 1, : columns + 1]
+    return render((u + v) % 2 == 1, SQUARE, x)
+
+
+def first_corner(columns: int, rows: int) -> Any:
+    """Where it is in the camera."""
+    return np.array([0.0, 0.0, DEPTH]) - TURN @ [*np.array([columns - 1, rows - 1]) * SQUARE / 2, 0]
 
 
 def markers(x: float = 0.0) -> Any:
     """Both markers of the map, in one print."""
     cells = np.ones((7, 17), bool)
     cells[:, :7], cells[:, 10:] = (pattern(m.family, m.id) for m in MARKERS.markers)
-    x0, y0 = 0.085, 0.035
-    corners = np.array([[-x0, y0, 0], [x0, y0, 0], [x0, -y0, 0], [-x0, -y0, 0]])
-    return render(cells, corners, x)
-
-
-def jpeg(image: Any) -> bytes:
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
+    return render(cells, 0.01, x)
 
 
 @pytest.fixture
-def files(tmp_path) -> SimpleNamespace:
-    (tmp_path / "camera.yaml").write_text(CALIBRATION)
+def here(tmp_path) -> SimpleNamespace:
+    (tmp_path / "camera.json").write_text(LENS)
     write_marker_map(tmp_path / "map.yaml", MARKERS)
-    images = [board(x) for x in (0.0, 0.01, 0.16, 0.02, 5.0, 0.03)]
-    (tmp_path / "board.mjpeg").write_bytes(b"".join(map(jpeg, images)))
+    # The third image cuts the board off, in the fifth there is none.
+    images = [board(x=x) for x in (0.0, 0.01, 0.25, 0.02, 5.0, 0.03)]
+    jpegs = [cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 98])[1] for image in images]
+    (tmp_path / "board.mjpeg").write_bytes(b"".join(jpeg.tobytes() for jpeg in jpegs))
     return SimpleNamespace(
-        video=str(tmp_path / "board.mjpeg"),
-        calibration=["--calibration", str(tmp_path / "camera.yaml")],
-        board=["--board", "6x4", "--square", str(SQUARE)],
-        map=["--map", str(tmp_path / "map.yaml")],
+        path=tmp_path,
         out=tmp_path / "out",
+        video=str(tmp_path / "board.mjpeg"),
+        calibration=("--calibration", str(tmp_path / "camera.json")),
+        board=("--board", "6x4", "--square", str(SQUARE)),
+        map=("--map", str(tmp_path / "map.yaml")),
     )
 
 
-def detect(files: Any, source: str, *words: str) -> int:
-    return main(["detect", source, *words, "--out", str(files.out)])
+def detect(here: Any, source: Any, *words: str) -> int:
+    return main(["detect", str(source), *words, "--out", str(here.out)])
+
+
+def folder(path: Path, images: list[Any]) -> str:
+    path.mkdir()
+    for k, image in enumerate(images):
+        cv2.imwrite(str(path / f"{k:04}.png"), image)
+    return str(path)
+
+
+def raw(pixels: Any, ns: int) -> Any:
+    header = make_camera_info(CAMERA, ns, "eye").header
+    return make_message(
+        "sensor_msgs/msg/Image", header=header, height=240, width=320, encoding="mono8",
+        is_bigendian=0, step=320, data=pixels.ravel(),
+    )  # fmt: skip
+
+
+def image_bag(path: Path, images: list[Any]) -> list[Any]:
+    """Raw images from 5 s on, the second one damaged, with the camera's info."""
+    messages = [raw(image, 10**9 * (k + 5)) for k, image in enumerate(images)]
+    with BagWriter(path) as bag:
+        for k, message in enumerate(messages):
+            if k == 1:
+                message.data = message.data[:1000]
+            ns = 10**9 * (k + 5)
+            bag.write("/cam/camera_info", make_camera_info(CAMERA, ns, "eye"), ns)
+            bag.write("/cam/image_raw", message, ns)
+    return messages
+
+
+def topic(path: Path, name: str) -> list[Any]:
+    with open_bag(path) as bag:
+        return [message for _, _, message in bag.messages([name])]
 
 
 def clouds(path: Path) -> list[Any]:
-    with open_bag(path) as bag:
-        return [read_correspondences(m) for _, _, m in bag.messages(["/correspondences"])]
+    return [read_correspondences(message) for message in topic(path, "/correspondences")]
 
 
-def test_video_of_a_board(files, capsys):
-    words = [*files.calibration, *files.board, "--rate", "20", "--images"]
-    assert detect(files, files.video, *words, "--readout-time", "0.011") == 0
-    # The third image cuts the board off, in the fifth there is none.
+def settings(here: Any) -> dict[str, Any]:
+    return load_params_file(here.out / "parameters.yaml")
+
+
+def test_video_of_a_board(here, capsys):
+    words = [*here.calibration, *here.board, "--rate", "20", "--images"]
+    assert detect(here, here.video, *words, "--readout-time", "0.011") == 0
     said = capsys.readouterr().out
     assert "4 of 6 images, 24 corners each" in said
-    assert f"rs_localizer replay {files.out} --params {files.out}/parameters.yaml" in said
-    found = clouds(files.out)
+    assert f"rs_localizer replay {here.out} --params {here.out}/parameters.yaml" in said
+    found = clouds(here.out)
     assert [cloud.stamp_ns for cloud in found] == [
         1_000_000_000 + 50_000_000 * index for index in (0, 1, 3, 5)
     ]
@@ -113,124 +150,177 @@ def test_video_of_a_board(files, capsys):
         expected = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
         np.testing.assert_allclose(cloud.points, expected, atol=1e-7)
         np.testing.assert_array_equal(cloud.table["id"], np.arange(24))
-    with open_bag(files.out) as bag:
-        infos = [m for _, _, m in bag.messages(["/camera_info"])]
-        images = [m for _, _, m in bag.messages(["/image/compressed"])]
+    infos, images = topic(here.out, "/camera_info"), topic(here.out, "/image/compressed")
     assert len(infos) == len(images) == 4
     assert tuple(K.ravel()) == read_camera_info(infos[0]).K
-    assert images[0].format == "jpeg"
     # Not compressed twice.
-    assert Path(files.video).read_bytes().startswith(images[0].data.tobytes())
-    assert build(load_params_file(files.out / "parameters.yaml")).readout_time == 0.011
-    # Once more: nothing is overwritten, and it says so in one line.
-    assert detect(files, files.video, *words) == 1
+    assert Path(here.video).read_bytes().startswith(images[0].data.tobytes())
+    # A board is known as paper is: 0.2 mm in 10 cm.
+    paper = 0.002 * np.sqrt(np.mean((x - x.mean()) ** 2 + (y - y.mean()) ** 2))
+    assert settings(here) == pytest.approx({"map_deviation": paper, "readout_time": 0.011})
+    # Nothing is overwritten without being asked; the next command asks for the shutter.
+    assert detect(here, here.video, *words) == 1
     assert capsys.readouterr().err.endswith("exists already; it is not overwritten\n")
+    assert detect(here, here.video, *words, "--overwrite", "-p", "map_deviation:=0.0") == 0
+    assert "-p readout_time:=SECONDS" in capsys.readouterr().out
+    assert settings(here) == {"map_deviation": 0.0}
 
 
-def image_bag(path: Path, images: list[Any], info: bool = True) -> None:
-    """Raw images, the second one damaged, with the camera's info after the first."""
-    with BagWriter(path) as bag:
-        for index, image in enumerate(images):
-            ns = 10**9 * (index + 5)
-            cut = image.tobytes()[: 1000 if index == 1 else None]
-            message = make_message(
-                "sensor_msgs/msg/Image",
-                header=make_camera_info(CAMERA, ns).header,
-                height=240,
-                width=320,
-                encoding="mono8",
-                is_bigendian=0,
-                step=320,
-                data=np.frombuffer(cut, np.uint8),
-            )
-            bag.write("/cam/image_raw", message, ns)
-            if info:
-                bag.write("/cam/camera_info", make_camera_info(CAMERA, ns), ns)
-
-
-def test_bag_of_markers(files, tmp_path, capsys):
-    images = [markers(x) for x in (0.0, 0.0, 0.01, 5.0)]
-    image_bag(tmp_path / "bag", images)
-    (tmp_path / "bag" / "parameters.yaml").write_text(
-        "rs_localizer: {ros__parameters: {readout_time: 0.02}}"
-    )
-    assert detect(files, str(tmp_path / "bag"), *files.map, "--timing") == 0
+def test_bag_of_markers(here, capsys):
+    bag = here.path / "bag"
+    messages = image_bag(bag, [markers(x) for x in (0.0, 0.0, 0.01, 5.0)])
+    (bag / "parameters.yaml").write_text("rs_localizer: {ros__parameters: {readout_time: 0.02}}")
+    assert detect(here, bag, *here.map, "--timing") == 0
     said = capsys.readouterr().out
     assert re.search(r"time per image: [\d.]+ ms, of which OpenCV's search took [\d.]+ ms", said)
     assert "2 of 4 images, 8 corners each (median), within 0." in said
     assert "the first one because the data are truncated" in said
-    first, second = clouds(files.out)
+    first, second = clouds(here.out)
     assert (first.stamp_ns, second.stamp_ns) == (5 * 10**9, 7 * 10**9)
     assert first.frame == "hall"
     np.testing.assert_array_equal(first.table["id"], np.arange(8))
     np.testing.assert_allclose(first.points, MARKERS.points, atol=1e-7)
-    assert build(load_params_file(files.out / "parameters.yaml")).readout_time == 0.02
+    assert settings(here)["readout_time"] == 0.02
     # The same bits as the node's own code makes of the message.
-    detector = FrameDetector(DetectorConfig(marker_map=files.map[1]))
-    with open_bag(tmp_path / "bag") as bag:
-        raw = [message for _, _, message in bag.messages(["/cam/image_raw"])]
-    node = correspondences(detector.take(raw[0]), make_message)
-    with open_bag(files.out) as bag:
-        _, _, offline = next(bag.messages(["/correspondences"]))
-    assert node.data.tobytes() == offline.data.tobytes()
-    assert not detector.take(raw[1])
-    assert detector.take(raw[2])
+    detector = FrameDetector(DetectorConfig(marker_map=here.map[1]))
+    node = correspondences(detector.take(messages[0]), make_message)
+    assert bytes(node.data) == bytes(topic(here.out, "/correspondences")[0].data)
 
 
-def test_georeferenced_maps_keep_their_millimetres(files, tmp_path):
+@pytest.mark.parametrize(("kind", "width"), [("orb", 32), ("sift", 128)])
+def test_keypoints_of_anything(here, kind, width, capsys):
+    noise = np.random.default_rng(0).integers(0, 256, (4, 240, 320), np.uint8)
+    images = [cv2.GaussianBlur(each, (0, 0), 2.0) for each in noise]
+    messages = image_bag(here.path / "bag", [*images, np.zeros((240, 320), np.uint8)])
+    words = ["--features", kind, "--max-keypoints", "40", "--timing", "--readout-time", "0.02"]
+    assert detect(here, here.path / "bag", *words) == 0
+    said = capsys.readouterr().out
+    assert re.search(rf"out: 3 of 5 images, \d\d keypoints \({kind}\) each \(median\)", said)
+    assert "1 images have no keypoint\n" in said
+    assert f"parameters.yaml --out {here.out}_poses --map MAP" in said
+    assert re.search(r"time per image: [\d.]+ ms, \d+ images/s", said)
+    # As the node does it, to the last bit.
+    extractor = FrameExtractor(FeatureConfig(features=kind, max_keypoints=40))
+    found = topic(here.out, "/keypoints")
+    for message, cloud in zip([messages[k] for k in (0, 2, 3)], found, strict=True):
+        live = keypoints(extractor.take(message), make_message)
+        assert bytes(cloud.data) == bytes(live.data)
+        assert repr((cloud.header, cloud.fields)) == repr((live.header, live.fields))
+        descriptors = read_keypoints(cloud).descriptors
+        assert descriptors is not None
+        assert descriptors.shape == (cloud.width, width)
+    assert len(topic(here.out, "/camera_info")) == 3
+
+
+def test_georeferenced_maps_keep_their_millimetres(here):
     # UTM coordinates do not fit into single precision.
-    text = Path(files.map[1]).read_text()
-    far = text.replace("[-0.05, 0.0, 0.0]", "[691608.001, 5334764.002, 0.0]")
-    far = far.replace("[0.05, 0.0, 0.0]", "[691608.101, 5334764.002, 0.0]")
-    assert "691608.101" in far
-    Path(files.map[1]).write_text(far)
-    image_bag(tmp_path / "bag", [markers()])
-    assert detect(files, str(tmp_path / "bag"), *files.map) == 0
-    (found,) = clouds(files.out)
+    path = here.path / "map.yaml"
+    far = path.read_text().replace("[-0.05, 0.0, 0.0]", "[691608.001, 5334764.002, 0.0]")
+    path.write_text(far.replace("[0.05, 0.0, 0.0]", "[691608.101, 5334764.002, 0.0]"))
+    image_bag(here.path / "bag", [markers()])
+    assert detect(here, here.path / "bag", *here.map) == 0
+    (found,) = clouds(here.out)
     assert found.points[0] == pytest.approx([691607.966, 5334764.037, 0.0], abs=1e-6)
 
 
-def test_nothing_is_left_where_nothing_was_seen(files, tmp_path, capsys):
-    other = MarkerMap(wall("5x5_50", (1, 1), 0.1, 0.1, first_id=7))
-    write_marker_map(tmp_path / "map.yaml", other)
-    image_bag(tmp_path / "bag", [markers()])
-    assert detect(files, str(tmp_path / "bag"), *files.map) == 1
-    error = capsys.readouterr().err
-    assert "none of the 1 images shows anything of the map (5x5_50); they show 5x5_50 0, " in error
-    assert not files.out.exists()
+def test_what_is_seen_instead_is_named(here, monkeypatch, capsys):
+    """Other markers; another board, after the first images; nothing is left of the result."""
+    write_marker_map(here.path / "map.yaml", MarkerMap(wall("5x5_50", (1, 1), 0.1, 0, first_id=7)))
+    image_bag(here.path / "bag", [markers()])
+    assert detect(here, here.path / "bag", *here.map) == 1
+    shows = "none of the 1 images shows anything of the map (5x5_50); they show 5x5_50 0, "
+    assert shows in capsys.readouterr().err
+    monkeypatch.setattr(detecting, "_PATIENCE", 4)
+    images = folder(here.path / "images", [board(7, 5)] * 6)
+    assert detect(here, images, *here.calibration, *here.board, "--rate", "30") == 1
+    said = capsys.readouterr().err
+    shows = r"shows anything of the map \(chessboard 6x4\); they show a chessboard of 7x5 inner"
+    assert re.search(f"note: none of the first 4 images {shows}", said)
+    assert re.search(f"detect: none of the 6 images {shows}", said)
+    assert not here.out.exists()
 
 
-def test_settings_are_passed_on(files, tmp_path):
+def test_settings_are_passed_on(here):
     """The scan direction, and what else calibrate found, not the readout time alone."""
-    file = tmp_path / "shutter.yaml"
+    file = here.path / "shutter.yaml"
     file.write_text(
         "/**:\n  ros__parameters:\n    readout_time: 0.011\n    readout_time_deviation: 0.0002\n"
         "    scan_direction: bottom_to_top\n    imu.time_offset: 0.004\n"
     )
-    words = [*files.calibration, *files.board, "--rate", "20", "--params", str(file)]
-    assert detect(files, files.video, *words, "-p", "stamp_offset:=0.002") == 0
-    config = build(load_params_file(files.out / "parameters.yaml"))
+    words = [*here.calibration, *here.board, "--rate", "20", "--params", str(file)]
+    assert detect(here, here.video, *words, "-p", "stamp_offset:=0.002") == 0
+    config = build(settings(here))
     assert (config.readout_time, config.readout_time_deviation) == (0.011, 0.0002)
     assert (config.scan_direction, config.stamp_offset) == ("bottom_to_top", 0.002)
     assert config.imu.time_offset == 0.004
-    # An option of its own counts more; an earlier result is replaced if that is wanted.
-    again = [*words, "--scan-direction", "top_to_bottom"]
-    assert detect(files, files.video, *again) == 1
-    assert detect(files, files.video, *again, "--overwrite") == 0
-    config = build(load_params_file(files.out / "parameters.yaml"))
-    assert (config.readout_time, config.scan_direction) == (0.011, "top_to_bottom")
+    # An option of its own counts more.
+    again = [*words, "--scan-direction", "top_to_bottom", "--overwrite"]
+    assert detect(here, here.video, *again) == 0
+    assert settings(here)["scan_direction"] == "top_to_bottom"
 
 
-def test_a_board_is_known_as_paper_is(files, capsys):
-    """0.2 mm in 10 cm, unless a setting says it; the next command still asks for the shutter."""
-    words = [*files.calibration, *files.board, "--rate", "20"]
-    assert detect(files, files.video, *words) == 0
-    y, x = np.mgrid[-1.5:2, -2.5:3] * SQUARE
-    paper = 0.002 * np.sqrt(np.mean(x**2 + y**2))
-    found = load_params_file(files.out / "parameters.yaml")
-    assert found == pytest.approx({"map_deviation": paper})
+def test_a_video_has_its_own_times(here, capsys):
+    path = write_mp4(here.path / "a.mp4", [board(x=0.001 * k) for k in range(4)], 20.0)
+    words = [*here.calibration, *here.board, "--readout-time", "0.06", "--start", "7.5"]
+    assert detect(here, path, *words) == 0
+    stamps = [cloud.stamp_ns for cloud in clouds(here.out)]
+    assert stamps == [7_500_000_000 + 50_000_000 * k for k in range(4)]
     said = capsys.readouterr().out
-    assert f"--params {files.out}/parameters.yaml --out" in said
-    assert "-p readout_time:=SECONDS" in said
-    assert detect(files, files.video, *words, "--overwrite", "-p", "map_deviation:=0.0") == 0
-    assert load_params_file(files.out / "parameters.yaml") == {"map_deviation": 0.0}
+    assert "presentation times of the video, 20 images/s on average; the first image at 7.5" in said
+    assert "warning: the readout time of 60 ms is longer than the 50 ms from image to im" in said
+
+
+def test_a_wrong_calibration_is_named(here, capsys):
+    (here.path / "camera.json").write_text(LENS.replace('"fy": 300', '"fy": 900'))
+    images = folder(here.path / "images", [board()] * 3)
+    assert detect(here, images, *here.calibration, *here.board, "--rate", "30") == 0
+    said = capsys.readouterr().out
+    assert re.search(r"warning: even the stillest images leave \d+\.\d px rms: the calib", said)
+
+
+def test_a_board_of_exactly_min_inliers_corners(here):
+    images = folder(here.path / "images", [board(4, 3, 0.001 * x) for x in range(12)])
+    words = [*here.calibration, "--board", "4x3", "--square", "0.03", "--rate", "30"]
+    assert detect(here, images, *words) == 0
+    poses = here.path / "poses"
+    assert main(["replay", str(here.out), "-p", "readout_time:=0.02", "--out", str(poses)]) == 0
+    found = read_motions(poses).poses.positions
+    assert len(found) == 12
+    expected = -TURN.T @ first_corner(4, 3)
+    np.testing.assert_allclose(np.median(found, axis=0), expected, atol=0.01)
+
+
+@pytest.mark.parametrize("own_calibration", [True, False])
+def test_transforms_and_imu_of_a_bag_are_kept(here, own_calibration, capsys):
+    start, still = 100 * 10**9, Rotation.identity()  # the recorder's clock is another one
+    with BagWriter(here.path / "bag") as bag:
+        bag.write("/tf_static", tf("base_link", "eye", (0.0, 0.0, 2.0), still, 5), start)
+        for k in range(6):
+            stamp = 10**9 + 33_000_000 * k
+            info = make_camera_info(CAMERA, stamp, "eye")
+            png = cv2.imencode(".png", board(x=0.001 * k))[1].ravel()
+            image = make_message(
+                "sensor_msgs/msg/CompressedImage", header=info.header, format="png", data=png
+            )
+            wheel = tf("base_link", "wheel", (0.0, 0.0, 2.0), still, 5)
+            bag.write("/camera_info", info, start + stamp)
+            bag.write("/image", image, start + stamp)
+            bag.write("/imu/data", imu(stamp), start + stamp + 7)
+            bag.write("/tf", wheel, start + stamp)
+    calibration = here.calibration if own_calibration else ()
+    assert detect(here, here.path / "bag", *calibration, *here.board) == 0
+    assert "kept for replay: /tf_static (1), " in capsys.readouterr().out
+    counts = [len(topic(here.out, name)) for name in ("/tf_static", "/tf", "/imu/data")]
+    assert counts == [1, 6, 6]
+    with open_bag(here.out) as bag:
+        times = [ns for _, ns, _ in bag.messages(["/imu/data", "/correspondences"])]
+    assert times == sorted(times)
+    assert times[1] - times[0] == 7
+    assert (here.out / "metadata.yaml").read_text().count("durability: transient_local") == 1
+    # The camera hangs where the recording has it: 2 m before the body, along its own axis.
+    poses = here.path / "poses"
+    words = ["-p", "base_frame:=base_link", "-p", "readout_time:=0.02", "--out", str(poses)]
+    assert main(["replay", str(here.out), *words]) == 0
+    found = read_motions(poses).poses.positions
+    expected = -TURN.T @ (first_corner(6, 4) + 2.0 * np.eye(3)[2])
+    np.testing.assert_allclose(np.median(found, axis=0), expected, atol=0.05)

@@ -8,9 +8,9 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
+from recorded import write_mp4, write_phone_log
 
 from rs_localizer import data
 from rs_localizer.cli.main import main
@@ -36,23 +36,11 @@ DEMOS = Piece(37.56, 0.5, RATE), Piece(38.3, 0.5, RATE)
 def film(room: Room, piece: Piece, path: Path) -> np.ndarray:
     """A video, and the log of the phone that took it; the stamps of its images, ns."""
     path.parent.mkdir()
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), RATE, (320, 240))
-    for image in room.images(piece):
-        writer.write(cv2.cvtColor(image.pixels, cv2.COLOR_GRAY2BGR))
-    writer.release()
+    write_mp4(path, (image.pixels for image in room.images(piece)), RATE)
     stamps = np.array(room.stamps(piece))
     seconds = np.arange(-0.1, piece.duration + 0.2, 0.005)
-    times = stamps[0] + 1e9 * seconds
     device = room.motion.state(int(stamps[0]), seconds).angular @ CAMERA_FROM_SENSOR
-    heading = "Timestamp[nanosec],gx[rad/s],gy[rad/s],gz[rad/s],ax[m/s^2],ay[m/s^2],az[m/s^2]\n"
-    rows = [
-        f"{t:.0f},{','.join(map(repr, turn))},0,0,9.8\n"
-        for t, turn in zip(times, device.tolist(), strict=True)
-    ]
-    (path.parent / "gyro_accel.csv").write_text(heading + "".join(rows))
-    heading = "Timestamp[nanosec],Exposure time[nanosec],Frame readout time[nanosec]\n"
-    rows = [f"{stamp},0,{1e9 * READOUT:.0f}\n" for stamp in stamps]
-    (path.parent / "movie_metadata.csv").write_text(heading + "".join(rows))
+    write_phone_log(path.parent, stamps[0] + 1e9 * seconds, device, stamps, READOUT)
     return stamps
 
 
@@ -67,16 +55,6 @@ def filmed(tmp_path_factory) -> SimpleNamespace:
     (folder / "camera.json").write_text(json.dumps(lens))
     write_marker_map(folder / "wall.yaml", room.marker_map)
     return SimpleNamespace(folder=folder, room=room, demos=demos, stamps=stamps)
-
-
-def places(filmed: SimpleNamespace, rows: list[dict], which: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (n,3) of a demonstration as they were found, and in truth."""
-    first, found, true = filmed.stamps[which][0], [], []
-    for row in rows:
-        after = row["pose_stamp_ns"] - 10**9  # since its first image, whose stamp is 1 s
-        found.append([row[name] for name in "xyz"])
-        true.append(filmed.room.motion.state(int(first + after), np.zeros(1)).positions[0])
-    return np.array(found), np.array(true)
 
 
 def test_demonstrations_become_trajectories(filmed, tmp_path, capsys):
@@ -101,8 +79,11 @@ def test_demonstrations_become_trajectories(filmed, tmp_path, capsys):
         good = [row for row in mine if row["state"] == "localized"]
         assert len(mine) == len(filmed.stamps[k])
         assert len(good) >= 0.9 * len(mine)
-        found, true = places(filmed, good, k)
-        both.append((found, true))
+        # Since the first image, whose stamp is 1 s.
+        times = [int(filmed.stamps[k][0] + row["pose_stamp_ns"] - 10**9) for row in good]
+        true = [filmed.room.motion.state(time, np.zeros(1)).positions[0] for time in times]
+        found = np.array([[row[name] for name in "xyz"] for row in good])
+        both.append((found, np.array(true)))
         # The same in the replay buffer.
         part = slice(ends[k], ends[k + 1])
         np.testing.assert_array_equal(root["data/position"][part], found)

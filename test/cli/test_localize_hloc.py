@@ -113,9 +113,8 @@ def make(folder: Path, motions: dict[str, Pose], old: bool = False) -> SimpleNam
             correspondences[name] = keypoints[chosen[:, 0]], points[chosen[:, 1]]
     (folder / "queries.txt").write_text("\n".join(queries) + "\n")
     (folder / "pairs.txt").write_text("\n".join(pairs) + "\n")
-    return SimpleNamespace(
-        folder=folder, sfm=sfm, correspondences=correspondences, results=folder / "poses.txt"
-    )
+    results = folder / "poses.txt"
+    return SimpleNamespace(folder=folder, sfm=sfm, seen=correspondences, results=results)
 
 
 def localize(files: Any, *words: str, **paths: Path) -> int:
@@ -148,25 +147,23 @@ def errors(found: tuple[Any, Any], truth: tuple[Any, Any]) -> Any:
     )
 
 
-def motions(count: int, still: bool = False) -> dict[str, Pose]:
+def motions(count: int) -> dict[str, Pose]:
     rng = np.random.default_rng(8)
     found = {}
     for k in range(count):
         angular, linear = rng.normal(0, 0.8, 3), rng.normal(0, 0.6, 3)
         turn, centre = rng.normal(0, 0.1, 3), rng.normal(0, 0.2, 3)
-        speed = 0.0 if still else 1.0
-        found[f"query/cam{k % 2}/{k}.jpg"] = Pose(turn, centre, speed * angular, speed * linear)
+        found[f"query/cam{k % 2}/{k}.jpg"] = Pose(turn, centre, angular, linear)
     return found
 
 
 def global_shutter(files: Any, name: str) -> tuple[Any, Any]:
     """The pose that hloc itself would give."""
     pycolmap = pytest.importorskip("pycolmap")
-    model, width, height, *parameters = LENS.split()
     camera = pycolmap.Camera(
-        model=model, width=int(width), height=int(height), params=[float(p) for p in parameters]
+        model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, 320.0, 240.0]
     )
-    pixels, points = files.correspondences[name]
+    pixels, points = files.seen[name]
     found = pycolmap.estimate_and_refine_absolute_pose(
         pixels + 0.5, points, camera, {"ransac": {"max_error": 12.0}}
     )
@@ -184,7 +181,7 @@ def test_moving_queries_lose_half_of_the_error(tmp_path, capsys):
     assert set(found) == {f"{k}.jpg" for k in range(6)}
     ours, theirs = [], []
     for name, pose in truth.items():
-        ours.append(errors(found[name.split("/")[-1]], pose.at(0.0)))
+        ours.append(errors(found[Path(name).name], pose.at(0.0)))
         theirs.append(errors(global_shutter(files, name), pose.at(0.0)))
         motion = told["queries"][name]
         deviations = np.sqrt(np.diag(motion["twist_covariance"]))
@@ -217,52 +214,47 @@ def test_rows_names_and_older_files(tmp_path, capsys):
 
 def test_bad_files_are_told_of_in_one_line(tmp_path, capsys):
     files = make(tmp_path, motions(1))
-    name = "query/cam0/0.jpg"
-    bad = tmp_path / "bad"
+    name, h5 = "query/cam0/0.jpg", tmp_path / "bad.h5"
+    bad, broken = tmp_path / "bad", tmp_path / "broken"
+    broken.mkdir()
 
-    def refused(text: str, **paths: Path) -> None:
+    def refused(said: str, **paths: Path) -> None:
         assert localize(files, **paths) == 1
-        said = capsys.readouterr().err
-        assert text in said
-        assert said.count("\n") == 1 or "localize:" in said
+        error = capsys.readouterr().err
+        assert said in error
+        assert error.count("\n") == 1 or "localize:" in error
         assert not files.results.exists()
         assert not (tmp_path / "poses_motion.json").exists()
 
     bad.write_bytes((tmp_path / "features.h5").read_bytes()[:500])
     refused("bad cannot be read as HDF5", features=bad)
-    with h5py.File(tmp_path / "empty.h5", "w") as file:
+    with h5py.File(h5, "w") as file:
         file.create_group(f"{name}/keypoints")
-    refused(f"empty.h5 has no keypoints of {name}", features=tmp_path / "empty.h5")
-    refused("has no matches of query/cam0/0.jpg and db/0.jpg", matches=tmp_path / "empty.h5")
-    with h5py.File(tmp_path / "few.h5", "w") as file:
+    refused(f"bad.h5 has no keypoints of {name}", features=h5)
+    refused("has no matches of query/cam0/0.jpg and db/0.jpg", matches=h5)
+    with h5py.File(h5, "w") as file:
         file[f"{name}/keypoints"] = np.zeros((5, 2))
-    refused("but query/cam0/0.jpg has 5: are features and matches", features=tmp_path / "few.h5")
-    for index, told in (
+    refused("but query/cam0/0.jpg has 5: are features and matches", features=h5)
+    for index, said in (
         (9999, "keypoint 9999 of db/0.jpg, which has"), (-7, "db/0.jpg are of keypoint -7"),
     ):  # fmt: skip
-        shutil.copy(tmp_path / "m.h5", tmp_path / "far.h5")
-        with h5py.File(tmp_path / "far.h5", "a") as file:
+        shutil.copy(tmp_path / "m.h5", h5)
+        with h5py.File(h5, "a") as file:
             file["query-cam0-0.jpg/db-0.jpg/matches0"][3] = index
-        refused(told, matches=tmp_path / "far.h5")
-    bad.write_text(f"{name}\n")
-    refused("bad, line 1: expected QUERY IMAGE", retrieval=bad)
-    bad.write_text(f"{name} db/7.jpg\n")
-    refused("is in the model: db/7.jpg is not one of db/0.jpg", retrieval=bad)
-    bad.write_text("other.jpg db/0.jpg\n")
-    refused("most often: no image of the model is paired with it", retrieval=bad)
-    bad.write_text(f"{name} FOV 640 480 500 320 240 1\n")
-    refused("model must be one of SIMPLE_PINHOLE", queries=bad)
-    bad.write_text("# nothing\n")
-    refused("bad has no query", queries=bad)
-    refused("has neither images.bin nor images.txt", reference_sfm=tmp_path)
-    broken = tmp_path / "broken"
-    broken.mkdir()
-    for data in (b"\x01", struct.pack("<Q", 1000), struct.pack("<Q", 1) + bytes(70)):
-        (broken / "images.bin").write_bytes(data)
-        refused("images.bin is truncated or damaged", reference_sfm=broken)
-    (broken / "images.bin").unlink()
-    for text, told in (("1 0 0 0 1 0 0\n\n", "expected ID QW QX"), ("#\n", "has no images")):
-        (broken / "images.txt").write_text(text)
-        refused(told, reference_sfm=broken)
+        refused(said, matches=h5)
+    for option, text, said in (
+        ("retrieval", f"{name}\n", "bad, line 1: expected QUERY IMAGE"),
+        ("retrieval", f"{name} db/7.jpg\n", "is in the model: db/7.jpg is not one of db/0.jpg"),
+        ("retrieval", "other.jpg db/0.jpg\n", "most often: no image of the model is paired with"),
+        ("queries", f"{name} FOV 640 480 500 320 240 1\n", "model must be one of SIMPLE_PINHOLE"),
+        ("queries", "# nothing\n", "bad has no query"),
+    ):
+        bad.write_text(text)
+        refused(said, **{option: bad})
+    refused("has neither images.bin nor images.txt", reference_sfm=broken)
+    (broken / "images.txt").write_text("1 0 0 0 1 0 0\n\n")
+    refused("expected ID QW QX", reference_sfm=broken)
+    (broken / "images.bin").write_bytes(struct.pack("<Q", 1) + bytes(70))
+    refused("images.bin is truncated or damaged", reference_sfm=broken)
     assert localize(files, "-p", "readout:=1") == 2
     assert localize(files, "--row", "third") == 2

@@ -14,6 +14,7 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -25,16 +26,24 @@ from rs_localizer.core.simd.jit import cache_directory
 from rs_localizer.io.atomic_files import atomic_files
 
 
-def run(*words: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rs_localizer", *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+def run(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "rs_localizer", *words],
+        capture_output=True, text=True, timeout=120, env={**os.environ, **variables},
+    )  # fmt: skip
+
+
+def start(*words: str, **more: Any) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "rs_localizer", *words],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **more,
+    )  # fmt: skip
 
 
 def test_as_a_module():
     done = run("--version")
-    assert done.returncode == 0
-    assert done.stdout == f"rs_localizer {rs_localizer.__version__}\n"
-    assert done.stderr == ""
+    version = f"rs_localizer {rs_localizer.__version__}\n"
+    assert (done.returncode, done.stdout, done.stderr) == (0, version, "")
 
 
 def test_help_names_every_command_with_an_example(capsys):
@@ -71,8 +80,7 @@ for words in {[*([name] for name in COMMANDS), *actions]}:
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    command = [sys.executable, "-X", "importtime", "-m", "rs_localizer", "map", "build", "--help"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    done = run("map", "build", "--help", PYTHONPROFILEIMPORTTIME="1")
     assert "usage: rs_localizer map build " in done.stdout
     assert "numba" not in done.stderr
 
@@ -96,26 +104,54 @@ def test_wrong_usage(words, text, capsys):
     assert captured.out == ""
 
 
+@pytest.fixture
+def command(monkeypatch) -> SimpleNamespace:
+    """What is run in the place of replay."""
+    fake = SimpleNamespace(add_arguments=lambda parser: None)
+    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, fake)
+    return fake
+
+
+def raising(error: BaseException) -> Any:
+    def run(arguments: argparse.Namespace) -> None:
+        # Names in recordings cannot steer the terminal.
+        sys.stdout.write("frame \x1b]0;title\x07 \x9b2J\n\tä\n")
+        raise error
+
+    return run
+
+
 @pytest.mark.parametrize(
     ("error", "code", "text"),
     [
-        (ValueError("it is\n  bent"), 1, "rs_localizer replay: it is bent\n"),
+        (ValueError("it is\n  bent \x1b[2J"), 1, "rs_localizer replay: it is bent \\x1b[2J\n"),
         (OSError(28, "No space left on device"), 1, "No space left on device\n"),
         (UsageError("not so"), 2, "rs_localizer replay: not so\n"),
         (KeyboardInterrupt(), 130, "rs_localizer replay: interrupted\n"),
     ],
 )
-def test_faults_are_one_line_and_an_exit_code(error, code, text, monkeypatch, capsys):
-    def fail(arguments: argparse.Namespace) -> None:
-        raise error
-
-    command = SimpleNamespace(add_arguments=lambda parser: None, run=fail)
-    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
+def test_faults_are_one_line_and_an_exit_code(error, code, text, command, capsys):
+    command.run = raising(error)
     assert main(["replay"]) == code
-    assert capsys.readouterr().err.endswith(text)
+    said = capsys.readouterr()
+    assert said.out == "frame \\x1b]0;title\\x07 \\x9b2J\n\tä\n"
+    assert said.err.endswith(text)
+    assert main(["replay", "-q"]) == code
+    assert capsys.readouterr() == ("", said.err)
 
 
-def test_a_signal_while_the_workplace_is_removed(tmp_path, monkeypatch):
+def test_tracebacks_are_those_of_faults_in_the_program_and_of_verbose(command, capsys):
+    command.run = raising(ValueError("a fault"))
+    assert main(["replay", "-v"]) == 1
+    said = capsys.readouterr().err
+    assert "Traceback" in said
+    assert said.endswith("rs_localizer replay: a fault\n")
+    command.run = raising(TypeError("a bug"))
+    with pytest.raises(TypeError, match="a bug"):
+        main(["replay"])
+
+
+def test_a_signal_while_the_workplace_is_removed(tmp_path, monkeypatch, command):
     remove = shutil.rmtree
 
     def interrupted(path: Path, ignore_errors: bool = False) -> None:
@@ -127,48 +163,29 @@ def test_a_signal_while_the_workplace_is_removed(tmp_path, monkeypatch):
             part.write_text("whole")
             monkeypatch.setattr(shutil, "rmtree", interrupted)
 
-    command = SimpleNamespace(add_arguments=lambda parser: None, run=make)
-    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
+    command.run = make
     assert main(["replay"]) == 130
     assert [path.name for path in tmp_path.iterdir()] == ["map.yaml"]
 
 
-def test_what_a_command_prints_as_json(monkeypatch, capsys):
-    results: list[object] = [{"residual (px)": math.nan, "poses": 3}, None]
-
+@pytest.mark.parametrize(
+    ("result", "told"),
+    [
+        (
+            {"residual (px)": math.nan, "poses": 3},
+            {"result": {"residual (px)": None, "poses": 3}, "next": "rs_localizer evaluate"},
+        ),
+        (None, {"text": ["a line", "next: rs_localizer evaluate"]}),
+    ],
+)
+def test_what_a_command_prints_as_json(result, told, command, capsys):
     def run(arguments: argparse.Namespace) -> object:
-        sys.stdout.write(
-            "a line\nnext: rs_localizer evaluate\n" if len(results) > 1 else "a line\n"
-        )
-        return results.pop(0)
+        sys.stdout.write("a line\nnext: rs_localizer evaluate\n")
+        return result
 
-    command = SimpleNamespace(add_arguments=lambda parser: None, run=run)
-    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
-    expected = {
-        "command": "replay",
-        "result": {"residual (px)": None, "poses": 3},
-        "next": "rs_localizer evaluate",
-    }
+    command.run = run
     assert main(["replay", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == expected
-    assert main(["replay", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"command": "replay", "text": ["a line"]}
-
-
-def test_quiet_and_verbose(monkeypatch, capsys):
-    def run(arguments: argparse.Namespace) -> None:
-        sys.stdout.write("a line\n")
-        raise ValueError("a fault")
-
-    command = SimpleNamespace(add_arguments=lambda parser: None, run=run)
-    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
-    assert main(["replay", "-q"]) == 1
-    assert capsys.readouterr() == ("", "rs_localizer replay: a fault\n")
-    assert main(["replay", "-v"]) == 1
-    said = capsys.readouterr()
-    assert said.out == "a line\n"
-    assert "Traceback" in said.err
-    assert said.err.endswith("rs_localizer replay: a fault\n")
+    assert json.loads(capsys.readouterr().out) == {"command": "replay", **told}
 
 
 @pytest.mark.parametrize(
@@ -187,33 +204,8 @@ def test_shells_complete(tmp_path, line, expected):
         "COMP_POINT": str(len(line)), "_ARGCOMPLETE_SUPPRESS_SPACE": "1", "COMP_TYPE": "9",
         "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "answer"),
     }  # fmt: skip
-    subprocess.run(
-        [sys.executable, "-m", "rs_localizer"], env={**os.environ, **asked}, timeout=120, check=True
-    )
+    assert run(**asked).returncode == 0
     assert {word.strip() for word in (tmp_path / "answer").read_text().split()} == expected
-
-
-def test_names_cannot_steer_the_terminal(monkeypatch, capsys):
-    def run(arguments: argparse.Namespace) -> None:
-        sys.stdout.write("frame \x1b]0;title\x07 \x9b2J\n\tä\n")
-        raise ValueError("no topic \x1b[2J")
-
-    command = SimpleNamespace(add_arguments=lambda parser: None, run=run)
-    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
-    assert main(["replay"]) == 1
-    captured = capsys.readouterr()
-    assert captured.out == "frame \\x1b]0;title\\x07 \\x9b2J\n\tä\n"
-    assert captured.err == "rs_localizer replay: no topic \\x1b[2J\n"
-
-
-def test_a_fault_in_the_program_keeps_its_traceback(monkeypatch):
-    def fail(arguments: argparse.Namespace) -> None:
-        raise TypeError("a bug")
-
-    command = SimpleNamespace(add_arguments=lambda parser: None, run=fail)
-    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
-    with pytest.raises(TypeError, match="a bug"):
-        main(["replay"])
 
 
 # A module that tells that it is being imported, and takes its time.
@@ -225,13 +217,8 @@ SLOW = "import pathlib, time; pathlib.Path(__file__).with_suffix('.seen').touch(
 )
 def test_signals_while_a_command_is_imported(tmp_path, number, slow):
     (tmp_path / f"{slow}.py").write_text(SLOW)
-    process = subprocess.Popen(
-        [sys.executable, "-m", "rs_localizer", "replay", "bag"],
-        env={**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    path = f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"
+    process = start("replay", "bag", env={**os.environ, "PYTHONPATH": path})
     while not (tmp_path / f"{slow}.seen").exists():
         assert process.poll() is None
         time.sleep(0.02)
@@ -242,14 +229,9 @@ def test_signals_while_a_command_is_imported(tmp_path, number, slow):
 
 
 def test_ctrl_c_while_a_command_runs_leaves_nothing_in_the_way(tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(Path(rs_localizer.__file__).parents[1])}
     words = ["simulate", "bag", "--duration", "3000"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "rs_localizer", *words],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(rs_localizer.__file__).parents[1])},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = start(*words, cwd=tmp_path, env=environment)
     while not list(tmp_path.glob(".unfinished-*/bag")):
         assert process.poll() is None
         time.sleep(0.02)
@@ -268,40 +250,28 @@ def test_who_stops_reading_is_not_told_of_it():
         "sys.modules['rs_localizer.cli.map'] = N(add_arguments=lambda p: None, run=run)\n"
         "sys.exit(c.main(['map']))"
     )
-    process = subprocess.Popen(
+    with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    assert process.stderr is not None
-    assert process.stdout.readline() == "a line of a long table\n"
-    process.stdout.close()
-    assert process.stderr.read() == ""
-    process.stderr.close()
-    assert process.wait(timeout=60) == 141
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == "a line of a long table\n"
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
 
 
 def test_it_says_where_the_kernels_are(capsys):
-    assert main(["warm", "--solver", "p3p"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line[:10].strip() for line in lines[:2]] == ["markers", "solver p3p"]
-    assert lines[2:] == [f"kernels are in {cache_directory()}"]
-    assert list(cache_directory().rglob("*.nbc"))
     assert main(["warm", "--solver", "p3p", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)["result"]
     assert list(result["seconds"]) == ["markers", "solver p3p"]
     assert result["kernels"] == str(cache_directory())
+    assert list(cache_directory().rglob("*.nbc"))
 
 
 def test_kernels_that_cannot_be_kept_are_a_failure(tmp_path):
     (tmp_path / "cache").write_text("a file in its place")
-    done = subprocess.run(
-        [sys.executable, "-m", "rs_localizer", "warm", "--solver", "p3p"],
-        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")},
-        text=True,
-        capture_output=True,
-        timeout=120,
-        check=False,
-    )
+    done = run("warm", "--solver", "p3p", XDG_CACHE_HOME=str(tmp_path / "cache"))
     assert done.returncode == 1
     assert done.stderr.startswith(f"rs_localizer warm: cache of kernels in {tmp_path}/cache/")
     assert done.stderr.endswith(("Not a directory\n", "File exists\n"))

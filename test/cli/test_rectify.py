@@ -7,13 +7,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 
 from rs_localizer.cli.main import main
-from rs_localizer.io.bags import open_bag
-from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.trajectories import Trajectory, write_tum
 
 READOUT = 0.02
 
@@ -29,31 +25,13 @@ def walls(tmp_path_factory):
 
 @pytest.fixture
 def poses(walls: Path, tmp_path: Path) -> Path:
-    """True poses of the first row, and as far beyond the middle those of the last; of all images
-    but one.
-    """
-    with open_bag(walls) as bag:
-        truth = [message for _, _, message in bag.messages(["/truth/pose"])]
-    first, middle = truth[2::2], truth[3::2]
-    stamps = np.array([stamp_ns(message) for message in first])
-
-    def positions(messages):
-        return np.array([[getattr(m.pose.position, k) for k in "xyz"] for m in messages])
-
-    def quaternions(messages):
-        return np.array([[getattr(m.pose.orientation, k) for k in "xyzw"] for m in messages])
-
-    folder = tmp_path / "poses"
-    folder.mkdir()
-    write_tum(
-        folder / "poses_first.txt", Trajectory(stamps, positions(first), quaternions(first)), []
-    )
-    ahead = 2 * positions(middle) - positions(first)
-    turned = 2 * quaternions(middle) - quaternions(first)
-    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-    later = stamps + round(1e9 * READOUT)
-    write_tum(folder / "poses_last.txt", Trajectory(later, ahead, turned), [])
-    return folder
+    """Of all images but one."""
+    out = tmp_path / "poses"
+    words = ["--map", str(walls / "marker_map.yaml"), "--row", "first", "--row", "last"]
+    assert main(["replay", str(walls), *words, "--out", str(out)]) == 0
+    for file in (out / "poses_first.txt", out / "poses_last.txt"):
+        file.write_text("".join(file.read_text().splitlines(keepends=True)[:-1]))
+    return out
 
 
 def test_images_with_a_pose(walls, poses, tmp_path, capsys):

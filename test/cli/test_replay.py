@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """``rs_localizer replay``: three kinds of recordings in, poses and twists out, faults in a line."""
 
+import dataclasses
+import re
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +12,16 @@ import numpy as np
 import pytest
 from recorded import CAMERA, READOUT_TIME, SHUTTER, flight, write_ros1
 
+from rs_localizer.cli import replay as replay_command
 from rs_localizer.cli.main import main
+from rs_localizer.cli.replay_result import Tally, figures, print_summary
 from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
-from rs_localizer.io.outputs import TYPES
-from rs_localizer.io.trajectories import read_tum, read_twists
+from rs_localizer.io.outputs import TYPES, Localized
+from rs_localizer.io.trajectories import read_motions, read_tum, read_twists
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.settings import FrameSettings
+from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 FRAMES = 6
 # Nanoseconds since 1970 that a float of seconds cannot hold.
@@ -39,41 +45,27 @@ def messages(path: Path) -> list[tuple[str, int, Any]]:
         return list(bag.messages(tuple(bag.topics)))
 
 
-def rewrite(source: Path, target: Path, change: Any, storage: str = "mcap") -> Path:
-    """A copy of a recording; ``change(topic, message)`` gives the topic, or None to leave out."""
-    with BagWriter(target, storage) as bag:
-        for topic, stamp_ns, message in messages(source):
-            new_topic = change(topic, message)
-            if new_topic is not None:
-                bag.write(new_topic, message, stamp_ns)
-    return target
-
-
 def test_what_comes_out(recording, tmp_path, capsys):
     out = tmp_path / "deep" / "out"
     assert main(["replay", str(recording), "--out", str(out), *SHUTTER]) == 0
     captured = capsys.readouterr()
-    words = {line.rsplit(None, 1)[0]: line.split()[-1] for line in captured.out.splitlines()}
-    assert words["frames"] == words["localized"] == str(FRAMES)
     assert captured.err == ""  # no progress bar where nobody watches
+    rows = dict(line.rsplit(None, 1) for line in captured.out.splitlines())
+    assert rows["frames"] == rows["localized"] == str(FRAMES)
+    assert 0.2 < float(rows["residual of the inliers (px rms, median)"]) < 1.0
+    rolling, still = (int(rows[f"  inliers with a {of} shutter"]) for of in ("rolling", "global"))
+    assert 12 <= still < rolling <= int(rows["points of a frame (median)"])
+    # All but the first.
+    assert rows["tracked from the frame before"] == f"{(FRAMES - 1) / FRAMES:.1%}"
 
-    truth = {
-        topic: [message for name, _, message in messages(recording) if name == topic]
-        for topic in ("/truth/pose", "/truth/twist")
-    }
+    truth = read_motions(recording, "/truth/pose", "/truth/twist")
     poses, twists = read_tum(out / "poses.txt"), read_twists(out / "twists.txt")
-    assert len(poses) == len(twists) == FRAMES
+    assert len(poses) == FRAMES
+    np.testing.assert_array_equal(poses.stamps_ns, twists.stamps_ns)
     # The truth comes in pairs: at the stamp and at the middle row.
-    for i, pose in enumerate(truth["/truth/pose"][::2]):
-        stamp = pose.header.stamp.sec * 10**9 + pose.header.stamp.nanosec
-        assert poses.stamps_ns[i] == twists.stamps_ns[i] == stamp
-        position = pose.pose.position
-        error = poses.positions[i] - (position.x, position.y, position.z)
-        assert np.linalg.norm(error) < 0.05
-    for i, twist in enumerate(truth["/truth/twist"][::2]):
-        angular = twist.twist.angular
-        error = twists.angular[i] - (angular.x, angular.y, angular.z)
-        assert np.linalg.norm(error) < 0.3
+    np.testing.assert_array_equal(poses.stamps_ns, truth.poses.stamps_ns[::2])
+    np.testing.assert_allclose(poses.positions, truth.poses.positions[::2], atol=0.05)
+    np.testing.assert_allclose(twists.angular, truth.twists.angular[::2], atol=0.3)
     with open_bag(out / "result") as bag:
         assert bag.topics == {f"/rs_localizer/{name}": kind for name, kind in TYPES.items()}
         for topic in bag.topics:
@@ -91,12 +83,11 @@ def test_what_comes_out(recording, tmp_path, capsys):
 
 def test_every_kind_of_recording_gives_the_same(recording, tmp_path):
     inputs = [message for message in messages(recording) if not message[0].startswith("/truth")]
-    bags = [
-        recording,
-        next(recording.glob("*.mcap")),
-        rewrite(recording, tmp_path / "sqlite", lambda topic, message: topic, "sqlite3"),
-        write_ros1(tmp_path / "old.bag", inputs),
-    ]
+    with BagWriter(tmp_path / "sqlite", "sqlite3") as bag:
+        for topic, stamp_ns, message in inputs:
+            bag.write(topic, message, stamp_ns)
+    one_file = next(recording.glob("*.mcap"))
+    bags = [recording, one_file, tmp_path / "sqlite", write_ros1(tmp_path / "old.bag", inputs)]
     texts = []
     for i, bag in enumerate(bags):
         out = tmp_path / f"out{i}"
@@ -122,13 +113,63 @@ def test_settings_of_a_file_and_of_the_command_line(recording, tmp_path):
 
 
 def test_no_frame_localized_is_a_failure(recording, tmp_path, capsys):
-    def empty(topic: str, message: Any) -> str:
-        if topic == "/correspondences":
-            message.width, message.row_step, message.data = 0, 0, np.zeros(0, np.uint8)
-        return topic
-
-    bag = rewrite(recording, tmp_path / "empty", empty)
-    assert main(["replay", str(bag), "--out", str(tmp_path / "out")]) == 1
+    with BagWriter(tmp_path / "empty") as bag:
+        for topic, stamp_ns, message in messages(recording):
+            if topic == "/correspondences":
+                message.width, message.row_step, message.data = 0, 0, np.zeros(0, np.uint8)
+            bag.write(topic, message, stamp_ns)
+    assert main(["replay", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 1
     captured = capsys.readouterr()
-    assert f"no frame of {bag} was localized" in captured.err
+    assert f"no frame of {tmp_path / 'empty'} was localized" in captured.err
     assert "refused: empty_cloud" in captured.out
+
+
+def test_frames_are_written_as_they_come_and_let_go(recording, tmp_path, monkeypatch):
+    """An hour of them would take gigabytes."""
+    real = replay_command.replay
+    alive, most = weakref.WeakSet[Localized](), 0
+
+    class Watched(Localized):
+        """That a weak reference can be to."""
+
+    def many(*arguments: Any) -> Any:
+        nonlocal most
+        answer = next(iter(real(*arguments)))
+        first = answer.result
+        values = {item.name: getattr(first, item.name) for item in dataclasses.fields(first)}
+        for k in range(300):
+            frame = Watched(**values | {"stamp_ns": first.stamp_ns + k})
+            alive.add(frame)
+            most = max(most, len(alive))
+            yield answer._replace(result=frame)
+
+    monkeypatch.setattr(replay_command, "replay", many)
+    assert main(["replay", str(recording), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
+    assert len(read_tum(tmp_path / "out" / "poses.txt")) == 300
+    assert most < 10
+
+
+def test_notices_stand_in_the_summary(recording, tmp_path, monkeypatch, capsys):
+    real = replay_command.replay
+    tallies: list[Tally] = []
+
+    def odd(bag: Any, topics: Any, localizer: Any) -> Any:
+        for k, item in enumerate(real(bag, topics, localizer)):
+            localizer._notice("readout_time", f"estimated readout time {k} ms differs")
+            yield item
+        localizer.readout_watch.measured = MeasuredReadout(0.0211, 0.0002, 50, 50.0)
+
+    monkeypatch.setattr(replay_command, "replay", odd)
+    monkeypatch.setattr(replay_command, "print_summary", both(tallies, print_summary))
+    assert main(["replay", str(recording), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
+    said = capsys.readouterr().out
+    assert re.search(rf"noticed: readout_time +{FRAMES}\n", said)
+    assert f"readout_time: estimated readout time {FRAMES - 1} ms differs" in said
+    columns = figures(tallies[0])
+    assert columns["noticed"] == f"readout_time {FRAMES}"
+    assert columns["readout time seen (ms)"] == pytest.approx(21.1)
+    assert columns["its deviation (ms)"] == pytest.approx(0.2)
+
+
+def both(kept: list[Tally], function: Any) -> Any:
+    return lambda tally, *rest: (kept.append(tally), function(tally, *rest))

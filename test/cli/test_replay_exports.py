@@ -82,9 +82,7 @@ def test_places_are_checked_before_the_work(flight, tmp_path, capsys):
     before = (splat / "viewmats.npy").read_bytes(), table.read_bytes()
     for words, text in (
         (["--gsplat", str(splat)], "splat exists; choose another --gsplat"),
-        (["--parquet", str(table)], "frames.parquet exists; choose another --parquet"),
         (["--parquet", str(notes), "--overwrite"], "notes.txt is no earlier result of --parquet"),
-        (["--ncore", str(splat), "--overwrite"], "splat is no earlier result of --ncore"),
         (["--ncore", str(tmp_path / "other" / "ncore")], "has to be a directory beside"),
         (["--parquet", str(notes / "a.parquet")], "a.parquet cannot be written: Not a directory"),
         (["--rerun", str(notes / "a.rrd")], "a.rrd cannot be written: Not a directory"),

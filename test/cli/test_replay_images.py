@@ -9,12 +9,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
+from recorded import write_mp4, write_phone_log
 
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import open_bag
+from rs_localizer.io.calibration import write_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.images import decode
 
@@ -34,14 +35,8 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> Path:
         camera = read_camera_info(next(m for _, _, m in bag.messages([info]))).camera(
             0.0, "top_to_bottom"
         )
-    size = images[0].shape[::-1]
-    codec = cv2.VideoWriter_fourcc(*"mp4v")
-    writer = cv2.VideoWriter(str(path.parent / "walls.mp4"), codec, 30.0, size)
-    for image in images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
-    lens = {"K": camera.K.tolist(), "D": camera.D.tolist(), "width": size[0], "height": size[1]}
-    (path.parent / "camera.json").write_text(json.dumps(lens))
+    write_mp4(path.parent / "walls.mp4", images, 30.0)
+    write_calibration(path.parent / "camera.yaml", camera)
     return path
 
 
@@ -50,7 +45,7 @@ def test_poses_are_those_of_detect_and_replay(kind: str, walls: Path, tmp_path: 
     folder = walls.parent
     source = [str(walls)]
     if kind == "video":
-        source = [str(folder / "walls.mp4"), "--calibration", str(folder / "camera.json")]
+        source = [str(folder / "walls.mp4"), "--calibration", str(folder / "camera.yaml")]
     given = [*source, "--map", str(walls / "marker_map.yaml"), "-p", f"readout_time:={READOUT}"]
     more = ["-p", "inlier_threshold:=2.5", "--smooth"]
     seen, steps, once = tmp_path / "seen", tmp_path / "steps", tmp_path / "once"
@@ -70,10 +65,8 @@ def test_poses_are_those_of_detect_and_replay(kind: str, walls: Path, tmp_path: 
 
 def test_what_a_phones_log_says_is_exported(walls: Path, tmp_path: Path) -> None:
     video = shutil.copy(walls.parent / "walls.mp4", tmp_path)
-    (tmp_path / "gyro_accel.csv").write_text("".join(f"{k}000000,0,0,0,0,0,9.8\n" for k in (0, 9)))
-    heading = "Timestamp[nanosec],Exposure time[nanosec],Frame readout time[nanosec]\n"
-    (tmp_path / "movie_metadata.csv").write_text(heading + 2 * f"0,4000000,{1e9 * READOUT:.0f}\n")
-    words = ["--calibration", str(walls.parent / "camera.json"), "--nerfstudio", "--no-imu"]
+    write_phone_log(tmp_path, [0, 9e6], np.zeros((2, 3)), [0, 0], READOUT, 0.004)
+    words = ["--calibration", str(walls.parent / "camera.yaml"), "--nerfstudio", "--no-imu"]
     words += ["--map", str(walls / "marker_map.yaml"), "--out", str(tmp_path / "scene")]
     assert main(["replay", str(video), *words]) == 0
     told = json.loads((tmp_path / "scene" / "transforms.json").read_text())
@@ -82,15 +75,25 @@ def test_what_a_phones_log_says_is_exported(walls: Path, tmp_path: Path) -> None
     assert told["rolling_shutter_time"] == pytest.approx(READOUT * height / (height - 1))
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("film.mp4", "is a video"), ("one.PNG", "is an image"), ("folder", "is a folder of 2 images")],
+)
+def test_images_are_sent_to_detect(tmp_path, capsys, name, text):
+    path = tmp_path / name
+    if not path.suffix:
+        path.mkdir()
+    for file in [path] if path.suffix else [path / "1.jpg", path / "2.jpg"]:
+        file.touch()
+    assert main(["replay", str(path)]) == 1
+    said = f"{path} {text}, not matches: first run: rs_localizer detect {path} --map MAP.yaml"
+    assert f"{said} --calibration camera.yaml" in capsys.readouterr().err
+
+
 def test_what_is_missing_is_said(walls: Path, tmp_path: Path, capsys: Any) -> None:
-    video, markers = str(walls.parent / "walls.mp4"), str(walls / "marker_map.yaml")
-    out = ["--out", str(tmp_path / "out")]
-    assert main(["replay", video, *out]) == 1
-    assert "walls.mp4 is a video, not matches: first run: rs_localizer detect" in (
-        capsys.readouterr().err
-    )
-    assert main(["replay", video, "--map", markers, *out]) == 2
+    words = ["replay", str(walls.parent / "walls.mp4"), "--out", str(tmp_path / "out"), "--map"]
+    assert main([*words, str(walls / "marker_map.yaml")]) == 2
     assert "a video or folder has no camera_info: give --calibration" in capsys.readouterr().err
-    assert main(["replay", video, "--map", "s3://bucket/map.npz", *out]) == 1
+    assert main([*words, "s3://bucket/map.npz"]) == 1
     assert "the map of images has to be a file of this machine" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -61,8 +61,11 @@ def values(found: dict[str, Any], path: str, column: str) -> list[Any]:
     return [value for _, value in sorted(rows, key=lambda row: row[0])]
 
 
-def test_poses_and_velocities_are_those_of_the_result(shown):
+def test_what_is_shown_is_the_result(flight, shown, tmp_path):
     out, found = shown
+    assert main(["replay", str(flight), *SHUTTER, "--out", str(tmp_path / "plain")]) == 0
+    for name in ("poses.txt", "twists.txt"):
+        assert (tmp_path / "plain" / name).read_bytes() == (out / name).read_bytes()
     motions = read_motions(out)
     assert motions.twists is not None
     places = values(found, paths.BODY, "Transform3D:translation")
@@ -75,21 +78,10 @@ def test_poses_and_velocities_are_those_of_the_result(shown):
         if "LineStrips3D:strips" in batch.schema.names
     ]
     np.testing.assert_allclose(path, motions.poses.positions, atol=1e-5)
-
-
-def test_the_result_is_that_without_a_file(flight, shown, tmp_path):
-    assert main(["replay", str(flight), *SHUTTER, "--out", str(tmp_path / "plain")]) == 0
-    for name in ("poses.txt", "twists.txt"):
-        assert (tmp_path / "plain" / name).read_bytes() == (shown[0] / name).read_bytes()
-
-
-def test_matches_are_inliers_or_others(shown):
-    _, found = shown
-    inliers = values(found, paths.MATCHES, "Points2D:positions")
-    rest = values(found, paths.OTHERS, "Points2D:positions")
-    assert len(inliers) == len(rest) == FRAMES
     # Of 150 points each a fifth is wrong.
-    assert all(len(a) + len(b) == 150 for a, b in zip(inliers, rest, strict=True))
+    matches = (paths.MATCHES, paths.OTHERS)
+    inliers, rest = (values(found, name, "Points2D:positions") for name in matches)
+    assert [len(a) + len(b) for a, b in zip(inliers, rest, strict=True)] == [150] * FRAMES
     assert all(100 < len(a) <= 121 for a in inliers)
     assert len(values(found, paths.COVARIANCE, "Ellipsoids3D:half_sizes")) == FRAMES
     assert len(values(found, paths.IMAGE, "EncodedImage:blob")) == FRAMES

@@ -1,57 +1,76 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bag of `simulate`: what it holds, and that its truth is the truth of its frames."""
+"""Bags of `simulate`: what they hold, and that their truth is the truth of their frames; and what
+replay makes of an IMU in them.
+"""
 
+import re
 import shlex
 from collections import Counter
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import open_bag
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.trajectories import read_motions
+from rs_localizer.io.transforms import TransformTree
+from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.settings import load_params_file
+
+TURN = ("--angular-velocity", "0.5", "-1", "2", "--linear-velocity", "0.2", "0", "0")
+SHORT = ("--duration", "1", "--points", "60")
+CLEAN = (
+    "--gyroscope-noise", "0", "--gyroscope-bias", "0", "--gyroscope-bias-walk", "0",
+    "--accelerometer-noise", "0", "--accelerometer-bias", "0",
+)  # fmt: skip
 
 
 def simulate(out: Path, *words: str) -> int:
     return main(["simulate", str(out), *words])
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_bag_holds_frames_and_their_truth(tmp_path, storage):
-    words = ("--duration", "0.5", "--storage", storage, "--readout-time", "0.02")
-    assert simulate(tmp_path / "bag", *words) == 0
+@pytest.mark.parametrize(
+    ("topic", "words"),
+    [
+        ("/correspondences", ["--storage", "sqlite3"]),
+        ("/image_raw/compressed", ["--images", "--width", "320", "--height", "240"]),
+    ],
+)
+def test_bag_holds_frames_and_their_truth(tmp_path, topic, words):
+    more = ("--duration", "0.3", "--readout-time", "0.02")
+    assert simulate(tmp_path / "bag", *words, *more) == 0
     with open_bag(tmp_path / "bag") as bag:
-        assert bag.topics == {
-            "/camera_info": "sensor_msgs/msg/CameraInfo",
-            "/correspondences": "sensor_msgs/msg/PointCloud2",
-            "/truth/pose": "geometry_msgs/msg/PoseStamped",
-            "/truth/twist": "geometry_msgs/msg/TwistStamped",
-        }
         messages = list(bag.messages(bag.topics))
-    counts = Counter(topic for topic, _, _ in messages)
     assert messages[0][0] == "/camera_info"  # or the first frame would be lost
-    frames = counts["/correspondences"]
-    assert frames == 15
-    assert counts == {
-        "/camera_info": frames, "/correspondences": frames,
-        "/truth/pose": 2 * frames, "/truth/twist": 2 * frames,
+    assert Counter(name for name, _, _ in messages) == {
+        "/camera_info": 9, topic: 9, "/truth/pose": 18, "/truth/twist": 18,
     }  # fmt: skip
-    clouds = [m for topic, _, m in messages if topic == "/correspondences"]
-    stamps = [stamp_ns(m) for m in clouds]
+    frames = [message for name, _, message in messages if name == topic]
+    stamps = [stamp_ns(message) for message in frames]
     assert stamps[0] == 1_000_000_000
     np.testing.assert_allclose(np.diff(stamps), 1e9 / 30, atol=2)
     # At the first row and at the middle one, so that either pose_time has its exact truth.
-    truth = {stamp_ns(m) for topic, _, m in messages if topic == "/truth/pose"}
+    truth = {stamp_ns(m) for name, _, m in messages if name == "/truth/pose"}
     assert truth == set(stamps) | {stamp + 10_000_000 for stamp in stamps}
-    assert {m.header.frame_id for t, _, m in messages if t == "/truth/pose"} == {"map"}
-    cameras = {m.header.frame_id for t, _, m in messages if t in ("/truth/twist", "/camera_info")}
-    assert cameras == {"camera_optical_frame"}
-    assert clouds[0].header.frame_id == "map"
-    assert len(set(read_correspondences(clouds[0]).table["id"])) == 150
+    ids = {name: message.header.frame_id for name, _, message in messages}
+    camera = "camera_optical_frame"
+    assert ids == {
+        "/camera_info": camera, "/truth/twist": camera, "/truth/pose": "map",
+        topic: "map" if topic == "/correspondences" else camera,
+    }  # fmt: skip
+    if topic == "/correspondences":
+        assert len(set(read_correspondences(frames[0]).table["id"])) == 150
+    else:
+        assert frames[0].format == "jpeg"
+        assert cv2.imdecode(frames[0].data, cv2.IMREAD_UNCHANGED).shape == (240, 320)
 
 
 def test_the_next_command_has_the_shutter(tmp_path, monkeypatch, capsys):
@@ -67,3 +86,97 @@ def test_the_next_command_has_the_shutter(tmp_path, monkeypatch, capsys):
     }
     assert main(command) == 0
     assert main(["evaluate", "my bag_poses", "my bag"]) == 0
+
+
+def test_markers_are_where_map_and_truth_put_them(tmp_path):
+    """Each corner projected at the time of its own line, by the pose and twist in the bag."""
+    lens = ("--distortion", "-0.2", "0.05", "0.001", "-0.001")
+    words = ("--images", *TURN, *lens, "--duration", "0.1", "--scan-direction", "right_to_left")
+    noise = ("--format", "png", "--exposure", "0.002", "--grey-noise", "1")
+    assert simulate(tmp_path / "bag", *words, *noise) == 0
+    corners = {m.id: m.corners for m in read_marker_map(tmp_path / "bag/marker_map.yaml").markers}
+    truth = read_motions(tmp_path / "bag", "/truth/pose", "/truth/twist")
+    assert truth.twists is not None
+    with open_bag(tmp_path / "bag") as bag:
+        info = next(m for _, _, m in bag.messages(["/camera_info"]))
+        images = [m for _, _, m in bag.messages(["/image_raw/compressed"])]
+    camera = read_camera_info(info).camera(0.03, "right_to_left")
+    errors = []
+    for message in images:
+        row = truth.poses.stamps_ns.tolist().index(stamp_ns(message))
+        for number, seen in detect(cv2.imdecode(message.data, cv2.IMREAD_GRAYSCALE)).items():
+            late = 0.03 * (1 - seen[:, :1] / 639)
+            start = Rotation.from_quat(truth.poses.quaternions[row])
+            turned = start * Rotation.from_rotvec(late * truth.twists.angular[row])
+            travel = late * start.apply(truth.twists.linear[row])
+            local = corners[number] - truth.poses.positions[row] - travel
+            errors.append(seen - camera.project(turned.inv().apply(local)))
+    offsets = np.concatenate(errors)
+    assert len(offsets) > 60
+    assert np.median(np.linalg.norm(offsets, axis=1)) < 0.4
+    assert np.abs(np.median(offsets, axis=0)).max() < 0.05
+
+
+def detect(image: np.ndarray) -> dict[int, np.ndarray]:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+    if hasattr(cv2.aruco, "ArucoDetector"):
+        corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
+    else:  # OpenCV 4.6
+        corners, ids, _ = cv2.aruco.detectMarkers(image, dictionary)
+    found = {}
+    for number, quad in zip(ids.ravel(), corners, strict=True):
+        # A window on the scale of the marker, so that it holds no other corner.
+        window = int(np.clip(np.linalg.norm(quad[0] - quad[0, 1], axis=1).max() / 12, 2, 5))
+        refined = cv2.cornerSubPix(
+            image, np.array(quad[0][:, None]), (window, window), (-1, -1), (3, 30, 1e-3)
+        )
+        found[int(number)] = refined[:, 0].astype(np.float64)
+    return found
+
+
+def test_a_recording_holds_readings_and_where_they_were_taken(tmp_path):
+    assert simulate(tmp_path / "bag", *SHORT, *TURN, "--imu", *CLEAN, "--imu-offset", "0.004") == 0
+    with open_bag(tmp_path / "bag") as bag:
+        assert bag.topics["/imu"] == "sensor_msgs/msg/Imu"
+        messages = list(bag.messages(["/imu", "/correspondences", "/camera_info"]))
+        tree = TransformTree()
+        for _, _, message in bag.messages(["/tf_static"]):
+            tree.add(message, static=True)
+    counts = Counter(topic for topic, _, _ in messages)
+    assert counts["/correspondences"] == counts["/camera_info"] == 30
+    assert counts["/imu"] >= 400
+    mounting = tree.lookup("camera_optical_frame", "imu_link", None)
+    np.testing.assert_allclose(mounting.translation, [0.03, -0.02, -0.01])
+    for topic, recorded_ns, message in messages:
+        delay = 1e-9 * (recorded_ns - stamp_ns(message))
+        if topic != "/imu":  # comes when its last row has been read
+            assert delay == pytest.approx(0.03)
+            continue
+        assert delay == pytest.approx(0.004)  # and the clock of the IMU is slow
+        reading = read_imu(message)
+        turn = mounting.rotation @ np.array(reading.angular_velocity)
+        np.testing.assert_allclose(turn, [0.5, -1.0, 2.0], atol=1e-9)
+        assert 9.0 < np.linalg.norm(reading.linear_acceleration or 0.0) < 10.6
+    stamps = [recorded_ns for _, recorded_ns, _ in messages]
+    assert stamps == sorted(stamps)
+
+
+def test_replay_uses_it_and_says_so(tmp_path, capsys):
+    assert simulate(tmp_path / "bag", *SHORT, *TURN, "--imu") == 0
+    replay = ["replay", str(tmp_path / "bag"), "-p", "readout_time:=0.03"]
+    capsys.readouterr()
+    poses = []
+    for name, words in (("both", []), ("alone", ["--no-imu"]), ("off", ["-p", "imu.use:=none"])):
+        assert main([*replay, "--out", str(tmp_path / name), *words]) == 0
+        said = capsys.readouterr().out
+        assert ("localized with the IMU" in said) == (name == "both")
+        if name == "both":
+            assert re.search(r"localized with the IMU +(9\d\.\d|100\.0)%", said)
+            assert re.search(r"time offset of the IMU \(ms\) +-?\d+\.\d\d", said)
+        poses.append((tmp_path / name / "poses.txt").read_bytes())
+    assert poses[0] != poses[1]
+    assert poses[1] == poses[2]
+    more = [*replay, "--out", str(tmp_path / "n"), "--imu"]
+    assert main([*more, "/nowhere"]) == 1
+    assert "topic /nowhere does not exist" in capsys.readouterr().err
+    assert main([*more, "/imu", "--no-imu"]) == 2

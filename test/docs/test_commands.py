@@ -71,18 +71,12 @@ def test_launch_files_exist(page, line):
         return
     code = (pages.ROOT / "launch" / file).read_text()
     code += (pages.ROOT / "rs_localizer" / "ros" / "launching.py").read_text()
-    known = {
-        *settings(),
-        *settings(DetectorConfig),
-        *settings(FeatureConfig),
-        *INPUTS,
-        *re.findall(r"\"(\w+)\"", code),
-    }
+    known = {*settings(), *settings(DetectorConfig), *settings(FeatureConfig), *INPUTS}
+    known |= set(re.findall(r"\"(\w+)\"", code))
     if file == "two_cameras.launch.py":  # which puts these names together
         known |= {"left", "right", "left_params_file", "right_params_file"}
-    assert {word.partition(":=")[0] for word in arguments if not word.startswith("--")} <= known, (
-        page
-    )
+    given = {word.partition(":=")[0] for word in arguments if not word.startswith("--")}
+    assert given <= known, page
 
 
 @pytest.mark.parametrize("page", pages.NAMES)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of README and docs that repeat the code say what the code says."""
 
-import ast
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -21,7 +20,6 @@ from rs_localizer.ros.node.health import State
 from rs_localizer.settings import Kind, settings
 from rs_localizer.solvers.table import SOLVERS, find_solver
 
-PACKAGE = pages.ROOT / "rs_localizer"
 OF_NODES: list[tuple[Kind, set[str]]] = [
     (NodeConfig, {*pages.NAMES} - {"docs/detector.md", "docs/features.md"}),
     (DetectorConfig, {"docs/detector.md"}),
@@ -71,12 +69,9 @@ def test_the_table_of_solvers():
 
 def test_the_columns_of_the_table_of_frames() -> None:
     (table,) = pages.all_tables("column", "type")
-    said = {
-        name: kind
-        for names, kind in zip(table.column("column"), table.column("type"), strict=True)
-        for name in pages.names_in(names)
-    }
-    assert list(said.items()) == list(COLUMNS.items())
+    pairs = zip(table.column("column"), table.column("type"), strict=True)
+    said = [(name, kind) for names, kind in pairs for name in pages.names_in(names)]
+    assert said == list(COLUMNS.items())
 
 
 def test_figures_are_of_solvers_that_exist():
@@ -84,12 +79,15 @@ def test_figures_are_of_solvers_that_exist():
     assert {name for row in table.rows for name in pages.names_in(row[0])} <= set(SOLVERS)
 
 
+def taken_topics() -> Any:
+    unused: Any = None
+    return Feed(unused, unused, unused, unused).topics(NodeConfig())
+
+
 def test_the_topics_of_the_localizer():
     (table,) = [t for t in pages.all_tables("topic or service") if t.page == "docs/node.md"]
     said = {pages.names_in(row[1])[0]: (row[0], row[2]) for row in table.rows}
-    unused: Any = None
-    inputs = Feed(unused, unused, unused, unused).topics(NodeConfig())
-    taken = {name: topic.type for name, topic in inputs.items()}
+    taken = {name: topic.type for name, topic in taken_topics().items()}
     # Their packages are not installed everywhere; the node then does without.
     optional = {name: item for name, item in INPUTS.items() if item.also}
     assert {name for name, (way, _) in said.items() if way == "in"} == {*taken, *optional}
@@ -104,28 +102,15 @@ def test_the_topics_of_the_localizer():
 
 def test_the_diagram_of_the_node_has_every_topic():
     (diagram,) = pages.fenced("docs/node.md", "mermaid")
-    unused: Any = None
-    for name in Feed(unused, unused, unused, unused).topics(NodeConfig()):
+    for name in (*taken_topics(), *(f"~/{name}" for name in TYPES)):
         assert name in diagram
-    for name in TYPES:
-        assert f"~/{name}" in diagram
-
-
-def literals() -> Iterator[tuple[str, ast.AST]]:
-    for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            yield str(path), node
 
 
 def test_every_notice_is_explained_and_given_somewhere():
     (table,) = pages.all_tables("notice")
     assert {name for cell in table.column("notice") for name in pages.names_in(cell)} == set(Notice)
-    given = {
-        node.attr
-        for _, node in literals()
-        if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "Notice"
-    }
-    assert given == {notice.name for notice in Notice}
+    code = "".join(path.read_text() for path in (pages.ROOT / "rs_localizer").rglob("*.py"))
+    assert set(re.findall(r"\bNotice\.([A-Z_]+)", code)) == {notice.name for notice in Notice}
 
 
 def test_every_state_is_explained():

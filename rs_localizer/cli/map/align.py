@@ -15,6 +15,8 @@ from rs_localizer.cli.map import either
 from rs_localizer.core.arrays import Array
 
 if WORKING:
+    from scipy.spatial.transform import Rotation
+
     from rs_localizer.io.maps.landmarks import Map
     from rs_localizer.mapping.gauge import Similarity, upright
     from rs_localizer.markers.maps import MarkerMap
@@ -192,7 +194,7 @@ def run(args: argparse.Namespace) -> None:
     any_map, _ = either.read(args)
     by = alignment(any_map, wishes)
     result = moved_markers(any_map, by) if isinstance(any_map, MarkerMap) else moved(any_map, by)
-    turn = np.degrees(np.arccos(np.clip(0.5 * (np.trace(by.rotation) - 1.0), -1.0, 1.0)))
+    turn = np.degrees(Rotation.from_matrix(by.rotation).magnitude())
     shift = ", ".join(f"{value:.4f}" for value in by.translation)
     print(f"scaled by {by.scale:.6g}, turned by {turn:.3f} deg, shifted by ({shift}) m")
     if isinstance(any_map, MarkerMap) and by.scale != 1.0:

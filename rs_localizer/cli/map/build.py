@@ -35,7 +35,6 @@ if WORKING:
     from rs_localizer.io.bags import is_bag, open_bag
     from rs_localizer.io.calibration import write_calibration
     from rs_localizer.io.image_clock import DEFAULT_START_NS
-    from rs_localizer.io.images import Image
     from rs_localizer.io.imu import read_imu_csv
     from rs_localizer.io.maps.files import write_npz
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
@@ -114,9 +113,11 @@ def look_at_images(args: argparse.Namespace, looker: Looker) -> Looked:
                 raise ValueError("the camera changes within the recording; cut it there")
             camera, size = seen_by, image.pixels.shape
             stamps.append(image.stamp_ns)
-            asked = [s for s in wanted if s not in named and _time(image, stamps) >= s - 1e-3]
+            since = (image.stamp_ns - stamps[0]) * 1e-9
+            asked = [s for s in wanted if s not in named and since >= s - 1e-3]
             named |= dict.fromkeys(asked, len(views))
-            if asked or _due(image, views, args.images_per_second):
+            due_ns = 1e9 * _EARLY / args.images_per_second
+            if asked or not views or image.stamp_ns - views[-1].stamp_ns >= due_ns:
                 views.append(looker.look(image))
                 if len(views) == _EARLY_VIEWS:
                     check_features(views)
@@ -127,28 +128,12 @@ def look_at_images(args: argparse.Namespace, looker: Looker) -> Looked:
     period = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else np.nan
     for fault in time_faults(args, source.clock, period):
         print(f"warning: {fault}")
-    return Looked(views, camera, images, _points(args, named))
-
-
-def _time(image: Image, stamps: list[int]) -> float:
-    """s since the first image."""
-    return (image.stamp_ns - stamps[0]) * 1e-9
-
-
-def _due(image: Image, views: list[View], rate: float) -> bool:
-    if not views:
-        return True
-    since = (image.stamp_ns - views[-1].stamp_ns) * 1e-9
-    return since >= _EARLY / rate
-
-
-def _points(args: argparse.Namespace, named: dict[float, int]) -> tuple[PointSight, ...]:
     sights = []
     for name, seconds, u, v in args.point:
         if seconds not in named:
             raise UsageError(f"--point {name}: the images end before {seconds:g} s")
         sights.append(PointSight(name, named[seconds], (u, v)))
-    return tuple(sights)
+    return Looked(views, camera, images, tuple(sights))
 
 
 def add_imu_arguments(group: argparse._ArgumentGroup) -> None:

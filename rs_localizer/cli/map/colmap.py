@@ -33,7 +33,6 @@ _OF_RECORDINGS = ("recordings", "out", "map", "hold")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of models."""
     group = parser.add_argument_group(
         "a model of COLMAP, for programs that know a global shutter only",
         "Keypoints are moved to where a global shutter would have seen their points; poses are of "
@@ -68,7 +67,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Undo the shutter of a model."""
     for name in _OF_RECORDINGS:
         if getattr(args, name) not in (None, []):
             raise UsageError(f"--colmap goes without {'--' * (name != 'recordings')}{name}")

@@ -24,7 +24,6 @@ from rs_localizer.markers.formats import (
 if WORKING:
     import numpy as np
 
-    from rs_localizer.core.arrays import Array
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.maps.landmarks import Map, make_map
     from rs_localizer.io.maps.ply import write_ply
@@ -105,7 +104,10 @@ def write(args: argparse.Namespace, any_map: Map | MarkerMap) -> None:
         if isinstance(any_map, MarkerMap) and path.suffix in SUFFIXES:
             write_any(part, any_map, args.to or ("wpilib" if path.suffix == ".json" else OWN))
         else:
-            landmarks = corners(any_map) if isinstance(any_map, MarkerMap) else any_map
+            landmarks = any_map
+            if isinstance(landmarks, MarkerMap):  # corners, whose ids are rows of its points
+                ids = np.arange(len(landmarks.points))
+                landmarks = make_map(landmarks.points, ids, None, landmarks.map_frame)
             if args.text:
                 write_ply(part, landmarks, binary=False)
             else:
@@ -113,16 +115,12 @@ def write(args: argparse.Namespace, any_map: Map | MarkerMap) -> None:
     print(f"written to {path}")
 
 
-def corners(marker_map: MarkerMap) -> Map:
-    """The corners of a marker map as landmarks: their ids are rows of ``MarkerMap.points``."""
-    points = marker_map.points
-    return make_map(points, np.arange(len(points)), None, marker_map.map_frame)
-
-
 def describe(file: Path, any_map: Map | MarkerMap, kind: str) -> dict[str, str]:
     """Print the table of a map, and return it."""
     rows = _of_markers(any_map, kind) if isinstance(any_map, MarkerMap) else _of_landmarks(any_map)
-    rows += _extents(any_map.points)
+    for name, values in zip("xyz", any_map.points.T, strict=True):
+        extent = f"{values.min():.3f} to {values.max():.3f}, median {np.median(values):.3f}"
+        rows.append((f"{name} (m)", extent))
     print(file)
     for name, text in rows:
         print(f"  {name:40} {text}")
@@ -133,8 +131,14 @@ def _of_landmarks(landmarks: Map) -> list[tuple[str, str]]:
     rows = [("landmarks", str(len(landmarks)))]
     if landmarks.dropped:
         rows.append(("left out (not finite, or not described)", str(landmarks.dropped)))
-    rows.append(("ids", _ids(landmarks)))
-    rows.append(("descriptors", _descriptors(landmarks)))
+    ids, described = "none", "none"
+    if landmarks.ids is not None:
+        ids = f"{landmarks.ids.min()} to {landmarks.ids.max()}"
+    if landmarks.descriptors is not None:
+        width, of = landmarks.descriptors.shape[1], landmarks.descriptors.dtype
+        measure = "Hamming" if of == np.uint8 else "L2"
+        described = f"{width} x {of}, compared by {measure} distance"
+    rows += [("ids", ids), ("descriptors", described)]
     if landmarks.covariances is not None:
         spread = np.sqrt(np.trace(landmarks.covariances, axis1=1, axis2=2))
         finite = spread[np.isfinite(spread)]
@@ -161,26 +165,3 @@ def _of_markers(marker_map: MarkerMap, kind: str) -> list[tuple[str, str]]:
     if marker_map.boards:
         rows.append(("boards", ", ".join(board.name for board in marker_map.boards)))
     return rows
-
-
-def _extents(points: Array) -> list[tuple[str, str]]:
-    rows = []
-    low, high, median = points.min(axis=0), points.max(axis=0), np.median(points, axis=0)
-    for name, *values in zip("xyz", low, median, high, strict=True):
-        least, middle, most = (f"{value:.3f}" for value in values)
-        rows.append((f"{name} (m)", f"{least} to {most}, median {middle}"))
-    return rows
-
-
-def _ids(landmarks: Map) -> str:
-    if landmarks.ids is None:
-        return "none"
-    return f"{landmarks.ids.min()} to {landmarks.ids.max()}"
-
-
-def _descriptors(landmarks: Map) -> str:
-    if landmarks.descriptors is None:
-        return "none"
-    width, kind = landmarks.descriptors.shape[1], landmarks.descriptors.dtype
-    measure = "Hamming" if kind == np.uint8 else "L2"
-    return f"{width} x {kind}, compared by {measure} distance"

@@ -5,11 +5,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, number, refuse_existing
+from rs_localizer.cli import WORKING, UsageError, number, refuse_existing, write_all
 from rs_localizer.cli.map import add_readout_argument, check_readout, colmap, print_step
 from rs_localizer.cli.rig_input import (
     MapCamera,
@@ -26,8 +27,6 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer.core.arrays import Array
-    from rs_localizer.core.camera import Camera
-    from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import open_bag
     from rs_localizer.io.calibration import read_calibration, write_calibration
     from rs_localizer.io.clouds import Correspondences
@@ -112,7 +111,8 @@ def run(args: argparse.Namespace) -> None:
     if shutter == _GIVEN and not known:
         raise UsageError("--shutter given needs -p readout_time:=S or --params")
     rig, clouds = zip(*(_recorded(of, landmarks, shutter) for of in cameras), strict=True)
-    localized = _localized([one.camera for one in rig], clouds, landmarks)
+    with tqdm(total=sum(map(len, clouds)), unit="image", desc="localize", disable=None) as bar:
+        localized = from_recordings([one.camera for one in rig], clouds, landmarks, bar.update)
     deviations = _deviations(args, localized.landmarks, config.map_deviation)
     freedom = MapFreedom(shutter == _ESTIMATED, args.intrinsics, deviations)
     refined = refine_rig(rig, localized.seen, localized.start, freedom, done=print_step)
@@ -138,15 +138,6 @@ def _recorded(
     return RigCamera(camera, config.stamp_offset, of.mounting), recorded.clouds
 
 
-def _localized(
-    cameras: Sequence[Camera],
-    clouds: Sequence[Sequence[Correspondences]],
-    landmarks: Map | None,
-) -> RecordedMap:
-    with tqdm(total=sum(map(len, clouds)), unit="image", desc="localize", disable=None) as bar:
-        return from_recordings(cameras, clouds, landmarks, bar.update)
-
-
 def _deviations(args: argparse.Namespace, landmarks: Map, map_deviation: float) -> Array | None:
     """How well each landmark is known, m; None: not at all."""
     every = map_deviation if map_deviation > 0.0 else np.inf
@@ -161,7 +152,6 @@ def _deviations(args: argparse.Namespace, landmarks: Map, map_deviation: float) 
 
 
 def _tell(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> None:
-    """The table of what changed."""
     moved = np.linalg.norm(refined.points - localized.start.points, axis=1)[refined.refined]
     spread = np.sqrt(np.trace(refined.covariances[refined.refined], axis1=1, axis2=2))
     rows = [
@@ -172,13 +162,9 @@ def _tell(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> 
         ("keypoints that fit", f"{np.mean(refined.inliers):.1%}"),
     ]
     if len(moved):
-        rows += [
-            (
-                "landmarks moved by",
-                f"{1e3 * np.median(moved):.1f} mm (median), {1e3 * moved.max():.1f} at most",
-            ),
-            ("deviation of a landmark", f"{1e3 * np.median(spread):.1f} mm (median)"),
-        ]
+        far = f"{1e3 * np.median(moved):.1f} mm (median), {1e3 * moved.max():.1f} at most"
+        rows.append(("landmarks moved by", far))
+        rows.append(("deviation of a landmark", f"{1e3 * np.median(spread):.1f} mm (median)"))
     for of, camera in zip(names, refined.cameras, strict=True):
         deviation = camera.readout_time_deviation
         spread_text = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
@@ -195,23 +181,18 @@ def _tell(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> 
             print(f"{whose} is negative: the scan direction is the reverse of what was set")
 
 
-def _millimetres(lengths: Array) -> str:
-    return f"{1e3 * np.median(lengths):.1f} mm (median)"
-
-
 def _write(
     args: argparse.Namespace, landmarks: Map, result: RefinedMap, names: Sequence[str]
 ) -> None:
     refined = replace(landmarks, points=result.points, covariances=result.covariances)
-    files = [args.out]
-    for name in names if args.intrinsics else ():
+    writers: dict[Path, Callable[[Path], object]] = {
+        args.out: lambda part: WRITERS[args.out.suffix](part, refined)
+    }
+    for name, camera in zip(names, result.cameras, strict=True) if args.intrinsics else ():
         of = f"{args.out.stem}_{name}" if name else args.out.stem
-        files.append(args.out.with_name(f"{of}_camera_info.yaml"))
-    with atomic_files(*files) as (part, *lenses):
-        WRITERS[args.out.suffix](part, refined)
-        for lens, camera in zip(lenses, result.cameras, strict=False):
-            write_calibration(lens, camera.camera)
-    print(f"written: {', '.join(map(str, files))}")
+        lens = args.out.with_name(f"{of}_camera_info.yaml")
+        writers[lens] = partial(write_calibration, camera=camera.camera)
+    write_all(writers)
     unchanged = np.count_nonzero(~result.refined)
     if unchanged:
         print(

@@ -7,9 +7,10 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, number, refuse_existing
+from rs_localizer.cli import WORKING, UsageError, number, refuse_existing, write_all
 from rs_localizer.cli.map import add_readout_argument, check_readout
 from rs_localizer.cli.rig_input import (
     MapCamera,
@@ -26,7 +27,6 @@ if WORKING:
 
     from rs_localizer.cli.image_input import opened, tell_times
     from rs_localizer.core.arrays import Array
-    from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.camera_info import Calibration, read_camera_info
     from rs_localizer.io.images import Image
     from rs_localizer.mapping.survey import MISFIT, Survey, survey_rig
@@ -105,32 +105,29 @@ def run(args: argparse.Namespace) -> None:
     if args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
     config, markers = given_settings(args), _markers(args)
-    origin = _origin(args, markers)
+    origin = None
+    if args.origin is not None:
+        origin = next((k for k, marker in enumerate(markers) if marker.id == args.origin), None)
+        if origin is None:
+            raise UsageError(f"--origin: {' and '.join(args.family)} have no id {args.origin}")
     refuse_existing(args)
     spotter, cameras = Spotter(markers, args.min_side), map_cameras(args, config)
     filmed = [_filmed(camera, spotter) for camera in cameras]
-    surveyed_map = survey_rig(filmed, markers, origin=origin)
-    every = (
-        surveyed_map.deviations_of_shape if args.deviations == _SHAPE else surveyed_map.deviations
-    )
-    _tell(surveyed_map, every, cameras, filmed)
-    for camera, result in zip(cameras, surveyed_map.cameras, strict=True):
+    found = survey_rig(filmed, markers, origin=origin)
+    every = found.deviations_of_shape if args.deviations == _SHAPE else found.deviations
+    _tell(found, every, cameras, filmed)
+    for camera, result in zip(cameras, found.cameras, strict=True):
         instead = "calibrate --rig finds it" if camera.name else "without one it is found"
         check_readout(args, result.readout_check, instead, camera.name)
-    surveyed = tuple(
-        replace(marker, deviations=deviations)
-        for marker, deviations in zip(surveyed_map.markers, every, strict=True)
-    )
+    pairs = zip(found.markers, every, strict=True)
+    surveyed = tuple(replace(marker, deviations=deviations) for marker, deviations in pairs)
     marker_map = MarkerMap(surveyed, map_frame=args.map_frame)
-    with atomic_files(args.out) as (part,):
-        write_marker_map(part, marker_map)
-    print(f"written: {args.out}")
+    write_all({args.out: partial(write_marker_map, marker_map=marker_map)})
     for text in problems(marker_map):
         print(f"warning: {text}")
 
 
 def _markers(args: argparse.Namespace) -> tuple[Marker, ...]:
-    """All that may be there, by families and sizes."""
     try:
         families: list[Family] = [family(name) for name in args.family]
     except ValueError as error:
@@ -155,15 +152,6 @@ def _markers(args: argparse.Namespace) -> tuple[Marker, ...]:
     if not size:
         raise UsageError("--size needs the size of all other markers, too")
     return every_marker(families, size, sizes)
-
-
-def _origin(args: argparse.Namespace, markers: tuple[Marker, ...]) -> int | None:
-    if args.origin is None:
-        return None
-    places = [k for k, marker in enumerate(markers) if marker.id == args.origin]
-    if not places:
-        raise UsageError(f"--origin: {' and '.join(args.family)} have no id {args.origin}")
-    return places[0]
 
 
 def _filmed(given: MapCamera, spotter: Spotter) -> Filmed:
@@ -195,13 +183,13 @@ def _filmed(given: MapCamera, spotter: Spotter) -> Filmed:
 
 
 def _tell(
-    surveyed_map: Survey, every: Array, cameras: Sequence[MapCamera], filmed: Sequence[Filmed]
+    found: Survey, every: Array, cameras: Sequence[MapCamera], filmed: Sequence[Filmed]
 ) -> None:
     """The table of the markers, with their deviations (m,6)."""
-    fit = surveyed_map.fit
+    fit = found.fit
     print(f"noise of the corners     {fit.deviation:.3f} px, {np.mean(fit.inliers):.1%} fit")
     for given, images, result, count in zip(
-        cameras, filmed, surveyed_map.cameras, surveyed_map.images, strict=True
+        cameras, filmed, found.cameras, found.images, strict=True
     ):
         of = f"{given.name}: " if given.name else ""
         print(f"{f'{of}images with a marker':24} {count} of {len(images.spotted)}")
@@ -209,17 +197,15 @@ def _tell(
         spread = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
         print(f"{f'{of}readout time':24} {1e3 * result.readout_time:.3f}{spread} ms")
         if images.mounting is not None:
-            mounted = replace(
-                result.extrinsics, offset=images.stamp_offset + result.extrinsics.offset
-            )
-            print(
-                "\n".join(mounting_lines(given.name, cameras[0].name, mounted, result.deviations))
-            )
+            offset = images.stamp_offset + result.extrinsics.offset
+            mounted = replace(result.extrinsics, offset=offset)
+            lines = mounting_lines(given.name, cameras[0].name, mounted, result.deviations)
+            print("\n".join(lines))
     print(
         f"{'marker':26} {'images':>6} {'x':>9} {'y':>9} {'z (m)':>9} {'+- (mm)':>8} {'+- (deg)':>8}"
     )
     for marker, sights, deviations, poor in zip(
-        surveyed_map.markers, surveyed_map.sights, every, surveyed_map.poor, strict=True
+        found.markers, found.sights, every, found.poor, strict=True
     ):
         x, y, z = marker.pose.position
         place = 1e3 * np.linalg.norm(deviations[:3])
@@ -227,35 +213,32 @@ def _tell(
         name = marker.name.removeprefix("marker ")
         mark = " poor" if poor else ""
         print(f"{name:26} {sights:6} {x:9.4f} {y:9.4f} {z:9.4f} {place:8.2f} {turn:8.3f}{mark}")
-    _tell_frame(surveyed_map)
-    if surveyed_map.poor.any():
-        poor = tuple(surveyed_map.markers[k] for k in np.flatnonzero(surveyed_map.poor))
+    _tell_frame(found)
+    if found.poor.any():
+        poor = tuple(found.markers[k] for k in np.flatnonzero(found.poor))
         print(f"warning: known to worse than a tenth of their size: {_listed(poor)}")
-    for part in surveyed_map.apart:
+    for part in found.apart:
         print(
             f"not connected: {_listed(part)}: no image shows one of them together with those above"
         )
-    if surveyed_map.misfits:
-        print(f"left out: {_listed(surveyed_map.misfits)}: corners do not fit the others: {MISFIT}")
-    if surveyed_map.rare:
+    if found.misfits:
+        print(f"left out: {_listed(found.misfits)}: corners do not fit the others: {MISFIT}")
+    if found.rare:
         print(
-            f"left out: {_listed(surveyed_map.rare)}: too few images show them, or not enough to "
+            f"left out: {_listed(found.rare)}: too few images show them, or not enough to "
             "determine their orientation"
         )
 
 
-def _tell_frame(surveyed_map: Survey) -> None:
+def _tell_frame(found: Survey) -> None:
     """What the errors of the origin's own pose make of all others in its frame."""
-    origin, places = (
-        surveyed_map.markers[0],
-        [marker.pose.position for marker in surveyed_map.markers],
-    )
-    turn = np.degrees(np.linalg.norm(surveyed_map.deviations_of_shape[0, 3:]))
-    far = int(np.argmax(np.linalg.norm(places, axis=1)))
-    there = 1e3 * np.linalg.norm(surveyed_map.deviations[far, :3])
+    origin = found.markers[0]
+    turn = np.degrees(np.linalg.norm(found.deviations_of_shape[0, 3:]))
+    far = int(np.argmax([np.linalg.norm(marker.pose.position) for marker in found.markers]))
+    there = 1e3 * np.linalg.norm(found.deviations[far, :3])
     print(
         f"frame: that of {origin.name}, whose own orientation is known to {turn:.3f} deg: in it, "
-        f"{surveyed_map.markers[far].name} is known to {there:.1f} mm"
+        f"{found.markers[far].name} is known to {there:.1f} mm"
     )
 
 
