@@ -130,7 +130,7 @@ def _remarks(found: MountFound, imu: ImuRecording) -> list[str]:
     if imu.camera_from_imu is None:
         said.append("imu: TF does not say how it hangs on the camera; the rotation is not checked")
     elif found.rotation_determined:
-        off = np.degrees(found.turned_from(imu.camera_from_imu))
+        off = np.degrees(found.mount.turned_from(imu.camera_from_imu))
         error = float(np.degrees(np.linalg.norm(found.rotation_deviations)))
         if off > max(_MOST_TURN, _SIGMAS * error):
             said.append(f"imu: {_GIVEN} has another rotation, {off:.1f} deg off: is it right?")

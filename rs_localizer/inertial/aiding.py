@@ -381,11 +381,6 @@ class GyroscopeAid:
         self._last_ns, self._stepped = None, False
         self._search = OffsetSearch() if self._settings.estimate_time_offset else None
 
-    @property
-    def searches(self) -> bool:
-        """Whether the time offset is still looked for among all that are possible."""
-        return self._search is not None
-
     def wants_sight(self) -> bool:
         """Whether this frame is to help in that: only where the camera vibrates one may err."""
         return self._shaken and self._search is not None and self._search.wants()

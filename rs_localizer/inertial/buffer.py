@@ -81,8 +81,6 @@ class ReadingBuffer:
         self._values = np.zeros((2 * MOST, 9))
         self._first = self._last = 0
         self.frame = ""  # of the readings' axes
-        self.repeated = 0  # readings with a stamp that was there already
-        self.jumps = 0  # times that the clock was set back
 
     def __len__(self) -> int:
         return self._last - self._first
@@ -106,17 +104,14 @@ class ReadingBuffer:
             if set_back or frame != self.frame:
                 self._first = self._last = 0
                 self.frame = frame
-                self.jumps += set_back
             place = self._insert(stamp_ns)
-            if place is None:
-                self.repeated += 1
-                return not set_back
-            row = self._values[place]
-            row[:3] = angular_velocity
-            row[3:6] = np.nan if specific_force is None else specific_force
-            row[6:] = np.abs(row[:3])
-            if place > self._first:
-                np.maximum(row[6:], self._values[place - 1, 6:], out=row[6:])
+            if place is not None:
+                row = self._values[place]
+                row[:3] = angular_velocity
+                row[3:6] = np.nan if specific_force is None else specific_force
+                row[6:] = np.abs(row[:3])
+                if place > self._first:
+                    np.maximum(row[6:], self._values[place - 1, 6:], out=row[6:])
             return not set_back
 
     def _insert(self, stamp_ns: int) -> int | None:
@@ -155,8 +150,8 @@ class ReadingBuffer:
     def rate(self) -> float:
         """Readings per second, by the median of the last steps; NaN for less than two."""
         with self._lock:
-            stamps = self._stamps[self._first : self._last].copy()
-        return 1e9 / _period(stamps) if len(stamps) > 1 else float("nan")
+            steps = np.diff(self._stamps[self._first : self._last][-_RATE_COUNT:])
+        return 1e9 / float(np.median(steps)) if len(steps) else math.nan
 
     def between(
         self, start_ns: int, end_ns: int, since_ns: int | None = None, until_ns: int | None = None
@@ -243,11 +238,6 @@ def _apart(stamps: IntArray) -> IntArray:
         if stamps[i] - stamps[kept[-1]] >= _CLOSEST_NS:
             kept.append(i)
     return np.array(kept)
-
-
-def _period(stamps: IntArray) -> float:
-    """Median step in ns of the last readings (2 or more)."""
-    return float(np.median(np.diff(stamps[-_RATE_COUNT:]))) if len(stamps) > 1 else 0.0
 
 
 def _at_the_end_of_the_range(rates: Array, greatest: Array) -> BoolArray:

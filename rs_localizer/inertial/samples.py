@@ -32,17 +32,14 @@ class ImuSamples:
 
     def __post_init__(self) -> None:
         count = len(self.times_ns)
-        if np.shape(self.times_ns) != (count,) or not _increases(
-            np.ascontiguousarray(self.times_ns, np.int64)
-        ):
+        times_ns = np.asarray(self.times_ns, np.int64)
+        if times_ns.shape != (count,) or not np.all(np.diff(times_ns) > 0):
             raise ValueError("times_ns must be (n,) and increase")
         for name in ("angular_velocity", "specific_force"):
             values = getattr(self, name)
             if values is None:
                 continue
-            if np.shape(values) != (count, 3) or not _is_finite(
-                np.ascontiguousarray(values, np.float64)
-            ):
+            if np.shape(values) != (count, 3) or not np.isfinite(values).all():
                 raise ValueError(
                     f"{name} must be ({count},3) and finite, got shape {np.shape(values)}"
                 )
@@ -69,23 +66,6 @@ def needed(readout_time: float, middle_ns: int, period_ns: int) -> tuple[int, in
     """
     reach = round(0.5e9 * readout_time) + MARGIN * period_ns
     return middle_ns - reach, middle_ns + reach
-
-
-@kernel
-def _increases(times_ns: IntArray) -> bool:
-    increases = True
-    for i in range(len(times_ns) - 1):
-        increases &= times_ns[i] < times_ns[i + 1]
-    return increases
-
-
-@kernel
-def _is_finite(values: Array) -> bool:
-    finite = True
-    for i in range(len(values)):
-        for axis in range(3):
-            finite &= np.isfinite(values[i, axis])
-    return finite
 
 
 # Readings farther apart than so many periods are a gap: one that is missing can be told from its

@@ -72,7 +72,7 @@ def make_scratch(rows: Rows) -> Scratch:
 
 
 @kernel
-def record(curve: Curve, sights: Sights, terms: Terms, values: Array) -> None:
+def record(curve: Curve, terms: Terms, sights: Sights, values: Array) -> None:
     """Fill the whitened rows of keypoints; zeros for those that do not count."""
     row = make_row(sights, terms)
     shared = row.by_shared.shape[1]
@@ -330,11 +330,12 @@ class Reduced:
         self._slope += normal.held @ normal.held_error
         system, sequence = _dense(motion, damping), _sequence(self._rows)
         with ThreadPoolExecutor(_WORKERS) as workers:
-            for _ in workers.map(
-                lambda part: eliminate(self._rows, sequence, part, _WORKERS, system),
-                range(_WORKERS),
-            ):
-                pass
+            list(
+                workers.map(
+                    lambda part: eliminate(self._rows, sequence, part, _WORKERS, system),
+                    range(_WORKERS),
+                )
+            )
         system += normal.held @ normal.held.T
         # LAPACK counts along columns: the lower triangle is its upper one.
         self._factor, failed = dpotrf(system.T, lower=0, overwrite_a=1, clean=0)
@@ -369,8 +370,7 @@ class Reduced:
         inverse, parts = inverse.T, np.array_split(_sequence(self._rows), _WORKERS)
         out = np.empty((len(self._rows.precisions), 3, 3))
         with ThreadPoolExecutor(_WORKERS) as workers:
-            for _ in workers.map(lambda part: covariances(self._rows, part, inverse, out), parts):
-                pass
+            list(workers.map(lambda part: covariances(self._rows, part, inverse, out), parts))
         shared = np.tril(inverse[self._controls :, self._controls :])
         return out, shared + np.tril(shared, -1).T
 
@@ -421,10 +421,6 @@ class MapProblem:
         self._whole = Floating(start.spline, motion.border) if floating else None
         self._precisions = deviations**-2.0
 
-    def errors(self, state: State) -> Array:
-        """Squared whitened errors (n,), px^2."""
-        return self.motion.errors(state)
-
     def noise(self, state: State, deviation: float) -> float:
         """Standard deviation of the noise, px."""
         return self.motion.noise(state, deviation)
@@ -450,7 +446,7 @@ class MapProblem:
             terms = camera.terms(one, deviation * float(ratio))
             own = np.empty((len(camera.observations.points), 2, LOCAL + len(at) + 4))
             ends = np.cumsum([len(sights.first) for sights in parts])
-            camera.each(partial(_record, curve, terms), parts, np.split(own, ends[:-1]))
+            camera.each(partial(record, curve, terms), parts, np.split(own, ends[:-1]))
             firsts += [sights.first for sights in parts]
             every.append(own if len(at) == border else _spread(own, at, border))
         values, first = np.concatenate(every), np.concatenate(firsts)
@@ -474,10 +470,6 @@ class MapProblem:
         """The state after a step."""
         moved = self.motion.moved(state, normal.motion, (step.controls, step.shared))
         return moved.with_landmarks(state.landmarks + step.landmarks)
-
-
-def _record(curve: Curve, terms: Terms, sights: Sights, part: Array) -> None:
-    record(curve, sights, terms, part)
 
 
 def _spread(own: Array, columns: IntArray, border: int) -> Array:

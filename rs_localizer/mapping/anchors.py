@@ -17,7 +17,7 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.mapping import MappingError
 from rs_localizer.mapping.gauge import Similarity, through, upright
-from rs_localizer.mapping.observations import MapFreedom, MapObservations, Start
+from rs_localizer.mapping.observations import MapObservations, Start
 from rs_localizer.mapping.triangulation import Sights, Triangulated, triangulate
 from rs_localizer.mapping.views import View
 from rs_localizer.markers.maps import MarkerMap
@@ -76,18 +76,15 @@ class Anchors:
 
     def seen(self, views: Sequence[View]) -> tuple[IntArray, IntArray, Array]:
         """Views (n,), anchors (n,) and pixels (n,2) of all sights."""
-        rows, anchors, pixels = [], [], []
-        for row, view in enumerate(views if self.corners else ()):
-            for corner, pixel in zip(view.corner_ids.tolist(), view.corners, strict=True):
-                rows.append(row)
-                anchors.append(corner)
-                pixels.append(pixel)
         names = self.names
-        for sight in self.sights:
-            rows.append(sight.view)
-            anchors.append(self.corners + names.index(sight.name))
-            pixels.append(np.array(sight.pixel))
-        return np.array(rows, np.int64), np.array(anchors, np.int64), np.reshape(pixels, (-1, 2))
+        every = [
+            (row, corner, pixel)
+            for row, view in enumerate(views if self.corners else ())
+            for corner, pixel in zip(view.corner_ids.tolist(), view.corners.tolist(), strict=True)
+        ]
+        every += [(of.view, self.corners + names.index(of.name), of.pixel) for of in self.sights]
+        rows, anchors = (np.array([of[k] for of in every], np.int64) for k in (0, 1))
+        return rows, anchors, np.reshape([of[2] for of in every], (-1, 2)).astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,8 +206,10 @@ def marker_constraints(
     start: Start,
     corners: MapObservations,
     places: Array,
-) -> tuple[MapObservations, Start, MapFreedom]:
+) -> tuple[MapObservations, Start, Array | None]:
     """What is adjusted with the corners of markers, in their frame; without, if too few are seen.
+
+    With the deviations (p,) of all landmarks, m; None: without corners.
 
     Args:
         seen, start: of the landmarks.
@@ -224,7 +223,7 @@ def marker_constraints(
         triangulated.counts >= _LEAST_OBSERVATIONS
     )
     if np.count_nonzero(known) < _LEAST_CORNERS:
-        return seen, start, MapFreedom()
+        return seen, start, None
     to_markers = through(triangulated.points[known], places[known])
     kept = known[corners.landmarks]
     count = len(start.points)
@@ -242,5 +241,5 @@ def marker_constraints(
             to_markers.rotation @ start.rotations,
             to_markers(start.positions),
         ),
-        MapFreedom(deviations=np.repeat([np.inf, _DEVIATION], [count, len(places)])),
+        np.repeat([np.inf, _DEVIATION], [count, len(places)]),
     )

@@ -24,7 +24,6 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.mapping import MappingError
 from rs_localizer.mapping.anchors import Anchors, Placement, marker_constraints, placement
@@ -36,10 +35,15 @@ from rs_localizer.mapping.inertial_metres import (
     place_by_imu,
     refuse_early,
 )
-from rs_localizer.mapping.initial_trajectory import usual_accelerations
 from rs_localizer.mapping.observations import MapObservations, Start, most_observed
-from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
-from rs_localizer.mapping.shutter_fit import LEAST_FIT, ShutterFit, fit_shutter, likely_axes
+from rs_localizer.mapping.refine import RefinedMap, refine
+from rs_localizer.mapping.shutter_fit import (
+    LEAST_FIT,
+    ShutterFit,
+    colmap_freedom,
+    fit_shutter,
+    likely_axes,
+)
 from rs_localizer.mapping.track_on_map import Tracked, track_on_map
 from rs_localizer.mapping.triangulation import Sights, Triangulated, triangulate
 from rs_localizer.mapping.views import View, blurred
@@ -59,10 +63,6 @@ _KEYFRAMES, _KEYFRAMES_PER_SECOND = 60, 4.0
 _LEAST_PART = 0.5
 # A landmark counts when so many views agree, and it is known to this part of its usual distance.
 _LEAST_SIGHTS, _MOST_DEVIATION = 3, 0.03
-# How well COLMAP's lens is known: focal length and centre by focal length (of one phone's video 21
-# images give 384.2 px, 42 give 383.2), distortion. Under a steady motion a focal length along the
-# scan stands for a shutter: looser ones leave the two to chance.
-LENS_DEVIATIONS = 0.005, 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,10 +99,6 @@ class Motion:
     times: Array  # (g,) s since the refinement's start, of the middle rows
     refined: RefinedMap
 
-    def poses(self) -> tuple[Array, Array]:
-        """map_from_camera (g,3,3), (g,3) at the middle rows, in the refinement's frame."""
-        return self.refined.poses()
-
     def sights(self, views: IntArray, landmarks: IntArray, pixels: Array) -> Sights:
         """Keypoints (n,) of those views that have a pose, with that at the time of their rows."""
         place = np.minimum(np.searchsorted(self.rows, views), len(self.rows) - 1)
@@ -130,7 +126,6 @@ class Built:
     posed: IntArray  # (g,) rows of the views with a pose
     rotations: Array  # (g,3,3) map_from_camera at their middle rows
     positions: Array  # (g,3)
-    deviation: float  # px, of the keypoints' noise
 
     @property
     def placement(self) -> Placement:
@@ -162,7 +157,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
     camera = replace(
         structure.camera,
         readout_time=inputs.readout_time or 0.0,
-        scan_direction=inputs.scan_direction or likely_axes(structure.camera.size)[0],
+        scan_direction=likely_axes(structure.camera.size, inputs.scan_direction)[0],
     )
     with work.stage("track", len(inputs.views)) as step:
         tracked = track_on_map(inputs.views, structure, camera, lambda: step(1))
@@ -175,7 +170,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
     place = place_by_imu(_placement(inputs, motion), refined, inputs.imu)
     similarity = place.placement.similarity
     kept = _kept(triangulated, motion)
-    rotations, positions = motion.poses()
+    rotations, positions = motion.refined.poses()
     return Built(
         landmarks=_landmarks(
             triangulated, kept, structure.descriptors, similarity, inputs.frame
@@ -191,7 +186,6 @@ def build_map(inputs: Given, work: Workshop) -> Built:
         posed=motion.rows,
         rotations=similarity.rotation @ rotations,
         positions=similarity(positions),
-        deviation=refined.deviation,
     )  # fmt: skip
 
 
@@ -272,38 +266,22 @@ def _refined(
     inputs: Given, tracked: Tracked, structure: Structure, camera: Camera, work: Workshop
 ) -> tuple[RefinedMap, ShutterFit | None, IntArray]:
     """The refined map, what is found of an unknown shutter, and the rows of its views."""
-    chosen = np.zeros(len(structure.points), np.bool_)
-    wanted = most_observed(tracked.points, tracked.images, work.effort.adjusted)
-    chosen[: len(wanted)] = wanted
-    of = chosen[tracked.points]
+    of = most_observed(tracked.points, tracked.images, work.effort.adjusted)[tracked.points]
     used, images = np.unique(tracked.images[of], return_inverse=True)
     rows = tracked.views[used]
     observations = MapObservations(
         inputs.stamps_ns[rows], images, tracked.points[of], tracked.pixels[of]
     )
     start = Start(structure.points, tracked.rotations[used], tracked.positions[used])
-    freedom = MapFreedom()
-    # A time lapse, whose stamps are closer than its images were, moves faster than any hand.
-    angular, linear = usual_accelerations(
-        1e-9 * (observations.stamps_ns - observations.stamps_ns[0]), start.rotations,
-        start.positions,
-    )  # fmt: skip
+    freedom = colmap_freedom(observations, start, inputs.camera is None)
     if inputs.anchors.marker_map is not None:
         corners = _corners(inputs, observations.stamps_ns)
         places = inputs.anchors.marker_map.points
-        observations, start, freedom = marker_constraints(
+        observations, start, deviations = marker_constraints(
             camera, observations, start, corners, places
         )
-    freedom = replace(
-        freedom,
-        lens=inputs.camera is None,
-        lens_deviations=LENS_DEVIATIONS,
-        angular_acceleration=max(freedom.angular_acceleration, angular),
-        linear_acceleration=max(freedom.linear_acceleration, linear),
-    )
-    directions = [ScanDirection(camera.scan_direction)]
-    if inputs.scan_direction is None:
-        directions = likely_axes(camera.size)
+        freedom = replace(freedom, deviations=deviations)
+    directions = likely_axes(camera.size, inputs.scan_direction)
     unknown = inputs.readout_time is None
     with work.stage("refine", 3 * (1 + len(directions)) if unknown else 3) as step:
 
@@ -350,12 +328,12 @@ def check_fit(share: float, focal_length: float | None) -> None:
 def _placement(inputs: Given, motion: Motion) -> Placement:
     shown = motion.sights(*inputs.anchors.seen(inputs.views))
     triangulated = triangulate(motion.refined.camera, shown, inputs.anchors.count)
-    return placement(inputs.anchors, triangulated, *motion.poses())
+    return placement(inputs.anchors, triangulated, *motion.refined.poses())
 
 
 def _kept(triangulated: Triangulated, motion: Motion) -> IntArray:
     """Rows of the points that are good enough to be landmarks."""
-    _, positions = motion.poses()
+    _, positions = motion.refined.poses()
     away = np.linalg.norm(triangulated.points - np.median(positions, axis=0), axis=1)
     spread = np.sqrt(np.trace(triangulated.covariances, axis1=1, axis2=2))
     good = triangulated.counts >= _LEAST_SIGHTS

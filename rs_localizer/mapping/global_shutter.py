@@ -17,21 +17,18 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rectification import transferred
-from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.maps.colmap import Model, ModelImage, Points
 from rs_localizer.mapping import MappingError
-from rs_localizer.mapping.build import LENS_DEVIATIONS, USUAL_DISTANCE, Motion
+from rs_localizer.mapping.build import USUAL_DISTANCE, Motion
 from rs_localizer.mapping.colmap import HALF, Effort
-from rs_localizer.mapping.initial_trajectory import usual_accelerations
 from rs_localizer.mapping.observations import (
     LEAST_KEYPOINTS,
-    MapFreedom,
     MapObservations,
     Start,
     most_observed,
 )
 from rs_localizer.mapping.refine import RefinedMap, refine
-from rs_localizer.mapping.shutter_fit import ShutterFit, fit_shutter, likely_axes
+from rs_localizer.mapping.shutter_fit import ShutterFit, colmap_freedom, fit_shutter, likely_axes
 from rs_localizer.mapping.triangulation import triangulate
 from rs_localizer.trajectory.problem import LIMIT
 
@@ -101,11 +98,10 @@ def undo_shutter(
     fits: BoolArray = (errors < (LIMIT * refined.deviation) ** 2) & (in_camera[:, 2] > 0.0)
     fits &= (np.bincount(rows[fits], minlength=len(points)) > 1)[rows]
     at, rows, pixels = at[fits], rows[fits], pixels[fits]
-    ends = _poses(refined, -0.5), _poses(refined, 0.5)
-    wanted = _poses(refined, known.tau)
+    turns, places = _poses(refined, known.tau)
+    turns = np.swapaxes(turns, 1, 2)
+    views = turns, -np.einsum("nij,nj->ni", turns, places)
     place = np.searchsorted(used, at)
-    wanted = np.swapaxes(wanted[0], 1, 2), wanted[1]
-    views = wanted[0], -np.einsum("nij,nj->ni", wanted[0], wanted[1])
     of_each = views[0][place], views[1][place]
     own = own[0][fits], own[1][fits]
     moved = transferred(refined.camera, pixels, own, of_each, in_camera[fits, 2])
@@ -121,6 +117,10 @@ def undo_shutter(
             pixels=moved[mine] + HALF,
             points=model.ids[rows[mine]],
         )
+    ends = [
+        list(zip(turns, places / given.scale, strict=True))
+        for turns, places in (_poses(refined, -0.5), _poses(refined, 0.5))
+    ]
     shown = np.unique(rows)
     counts = np.bincount(rows, minlength=len(points))
     means = np.bincount(rows, apart, len(points)) / np.maximum(counts, 1)
@@ -130,13 +130,7 @@ def undo_shutter(
         points=Points(
             model.ids[shown], points[shown] / given.scale, model.colors[shown], means[shown]
         ),
-        ends={
-            names[row]: (
-                (ends[0][0][k], ends[0][1][k] / given.scale),
-                (ends[1][0][k], ends[1][1][k] / given.scale),
-            )
-            for k, row in enumerate(used.tolist())
-        },
+        ends=dict(zip((names[row] for row in used.tolist()), zip(*ends, strict=True), strict=True)),
         refined=refined,
         shutter=shutter,
         keypoints=len(given.rows),
@@ -196,10 +190,7 @@ def _refined(
     done: Callable[[str], object],
 ) -> tuple[RefinedMap, ShutterFit | None, IntArray]:  # fmt: skip
     """Motion and shutter, and which images (g,) have a pose."""
-    wanted = most_observed(given.rows, given.images, Effort().adjusted)
-    chosen = np.zeros(len(given.points), np.bool_)
-    chosen[: len(wanted)] = wanted
-    of = chosen[given.rows]
+    of = most_observed(given.rows, given.images, Effort().adjusted)[given.rows]
     counts = np.bincount(given.images[of], minlength=len(stamps))
     of &= (counts >= LEAST_KEYPOINTS)[given.images]
     if not of.any():
@@ -209,20 +200,8 @@ def _refined(
     used, images = np.unique(given.images[of], return_inverse=True)
     seen = MapObservations(stamps[used], images, given.rows[of], given.pixels[of])
     start = Start(given.points, given.rotations[used], given.positions[used])
-    angular, linear = usual_accelerations(
-        1e-9 * (seen.stamps_ns - seen.stamps_ns[0]), start.rotations, start.positions
-    )
-    usual = MapFreedom()
-    freedom = replace(
-        usual,
-        lens=known.lens,
-        lens_deviations=LENS_DEVIATIONS,
-        angular_acceleration=max(usual.angular_acceleration, angular),
-        linear_acceleration=max(usual.linear_acceleration, linear),
-    )
-    directions = likely_axes(camera.size)
-    if known.scan_direction is not None:
-        directions = [ScanDirection(known.scan_direction)]
+    freedom = colmap_freedom(seen, start, known.lens)
+    directions = likely_axes(camera.size, known.scan_direction)
     if known.readout_time is None:
         return *fit_shutter(camera, seen, start, freedom, directions, done), used
     camera = replace(camera, readout_time=known.readout_time, scan_direction=directions[0])

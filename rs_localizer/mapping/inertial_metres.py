@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.inertial.gravity import STANDARD_GRAVITY
 from rs_localizer.mapping import MappingError
@@ -132,10 +131,7 @@ def _mount(refined: RefinedMap, imu: ImuRecording) -> tuple[ImuExtrinsics, float
                 "or give the rotation by TF"
             )
         return replace(mount, mount=replace(mount.mount, camera_from_imu=given)), None
-    if given is None:
-        return mount, None
-    between = np.ascontiguousarray(given.T @ mount.mount.camera_from_imu)
-    return mount, float(np.linalg.norm(so3.log(between)))
+    return mount, None if given is None else mount.mount.turned_from(given)
 
 
 def elsewhen(imu: ImuRecording, first: float, last: float) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.mapping.adjustment import MapProblem, apply_similarity, sights_of
+from rs_localizer.mapping.adjustment import MapProblem, Reduced, apply_similarity, sights_of
 from rs_localizer.mapping.initial_trajectory import (
     ANGULAR_VELOCITY,
     LINEAR_VELOCITY,
@@ -30,19 +30,19 @@ from rs_localizer.mapping.observations import (
     Adjusted,
     MapFreedom,
     MapObservations,
+    ReadoutCheck,
     RigCamera,
     Start,
     check,
     frame_numbers,
     shared_landmarks,
 )
-from rs_localizer.mapping.readout_check import ReadoutCheck, readout_checks
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.cluster_robust import Pull, pull_at_landmarks
 from rs_localizer.trajectory.descent import settle
 from rs_localizer.trajectory.fit import inflation_of, left_over, steepness
 from rs_localizer.trajectory.lens import with_lens
-from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
+from rs_localizer.trajectory.model import Freedom, Observations, State, rig_state
 from rs_localizer.trajectory.online_readout import REVERSED
 from rs_localizer.trajectory.problem import LIMIT, Problem, RigProblem
 from rs_localizer.trajectory.sight_kernels import EXTRINSICS
@@ -76,8 +76,12 @@ class Preparation:
         self.deviations, self.floating = self._known()
         self.used = self._usable()
         self.spline = self._spline()
-        if freedom.readout_time:
-            self._check_stretches()
+        if freedom.readout_time and not self.tells_readout:
+            raise ValueError(
+                f"estimating the readout time needs {_LEAST_STRETCH} images in a row, at most "
+                f"{LONGEST_GAP} s apart; there are {self._longest()}: give it, or more of the "
+                "recording"
+            )
         held = CONTROL * len(self.spline.positions)
         if held > _MOST_UNKNOWNS:
             raise ValueError(
@@ -129,15 +133,6 @@ class Preparation:
         follow = following(self.times[best], rotations)
         return initial_trajectory(self.times[best], rotations, positions, longest, follow)
 
-    def _check_stretches(self) -> None:
-        """Raise ValueError when the readout time cannot be found."""
-        if not self.tells_readout:
-            raise ValueError(
-                f"estimating the readout time needs {_LEAST_STRETCH} images in a row, at most "
-                f"{LONGEST_GAP} s apart; there are {self._longest()}: give it, or more of the "
-                "recording"
-            )
-
     @property
     def tells_readout(self) -> bool:
         """Images on their own tell turn and way per readout only, and not how long it takes."""
@@ -173,14 +168,8 @@ class Preparation:
 
     def state(self, seen: Sequence[Observations]) -> State:
         """The first guess."""
-        first, *others = (
-            replace(
-                start_state(one.camera, own, self.spline, one.camera.readout_time),
-                extrinsics=one.extrinsics,
-            )
-            for one, own in zip(self.rig, seen, strict=True)
-        )
-        return replace(first, others=tuple(others))
+        pairs = zip(self.rig, seen, strict=True)
+        return rig_state(self.spline, ((one.camera, own, one.extrinsics) for one, own in pairs))
 
     def problem(
         self, seen: Sequence[Observations], start: State, freedom: Freedom, held: bool = False
@@ -192,7 +181,7 @@ class Preparation:
             )
             for one, own, state in zip(self.rig, seen, (start, *start.others), strict=True)
         ]
-        return RigProblem(cameras, np.ones(len(cameras)))
+        return RigProblem(cameras)
 
 
 __all__ = ["MapFreedom", "MapObservations", "RefinedMap", "Start", "refine", "refine_rig"]
@@ -350,7 +339,7 @@ class _Refinement:
 
     def _result(self, problem: MapProblem, before: float, deviation: float) -> RefinedMap:
         state, prepared, seen = self.state, self.prepared, problem.observations
-        squared = problem.errors(state)
+        squared = problem.motion.errors(state)
         inliers = squared < (LIMIT * deviation) ** 2
         sights, images = sights_of(seen, inliers)
         used = self._freedoms(state.spline) + 3 * int(np.count_nonzero(images))
@@ -388,7 +377,7 @@ class _Refinement:
     def _cluster_robust(self, problem: MapProblem, deviation: float, independent: float) -> float:
         """The covariances' inflation, with what errors of a second pull together."""
         rows, seen = problem.normal(self.state, deviation)[1].rows, problem.observations
-        squared = problem.errors(self.state)
+        squared = problem.motion.errors(self.state)
         inside = squared[squared < (LIMIT * deviation) ** 2]
         pull = pull_at_landmarks(rows.values[..., -4:], seen.points, seen.times, rows.precisions)
         own = steepness(inside, deviation) ** 2
@@ -438,10 +427,24 @@ class _Refinement:
         none: list[ReadoutCheck | None] = [None] * len(known)
         if self.freedom.readout_time or not any(known) or not self.prepared.tells_readout:
             return none
-        free = self._problem(replace(self.freedom, readout_time=True))
         try:
-            asked = readout_checks(free, self.state, deviation)
+            asked = self._readout_times(deviation)
         except Undetermined:
             return none
         grown = [replace(one, deviation=math.sqrt(inflation) * one.deviation) for one in asked]
         return [one if given else None for one, given in zip(grown, known, strict=True)]
+
+    def _readout_times(self, deviation: float) -> list[ReadoutCheck]:
+        """One step of each camera's from the minimum with those that were given."""
+        problem = self._problem(replace(self.freedom, readout_time=True))
+        reduced = Reduced(problem.normal(self.state, deviation)[1])
+        changes, checks, motion = reduced.step()[1], [], problem.motion
+        for columns, one in zip(motion.columns, motion.states(self.state), strict=True):
+            place = reduced.size - motion.border + columns[0]
+            unit = np.zeros((reduced.size, 1))
+            unit[place] = 1.0
+            nothing = np.zeros((*self.state.landmarks.shape, 1))
+            variance = reduced.solve(unit, nothing)[0][place, 0]
+            given, change = float(one.readout_time), float(changes[columns[0]])
+            checks.append(ReadoutCheck(given, given + change, float(np.sqrt(variance))))
+        return checks

@@ -13,6 +13,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.mapping.initial_trajectory import usual_accelerations
 from rs_localizer.mapping.observations import MapFreedom, MapObservations, Start
 from rs_localizer.mapping.refine import RefinedMap, refine
 from rs_localizer.trajectory.problem import LIMIT, noise_of
@@ -59,14 +60,39 @@ class ShutterFit:
         return self.axis_chance < _CHANCE
 
 
-def likely_axes(size: tuple[int, int]) -> list[ScanDirection]:
-    """Scan directions to try, their reverses included, the likelier first.
+def likely_axes(size: tuple[int, int], given: str | None) -> list[ScanDirection]:
+    """Scan directions to try, their reverses included, the likelier first; only a given one.
 
     The rows of sensors lie along their longer side, also where a driver or a phone has turned the
     images.
     """
+    if given is not None:
+        return [ScanDirection(given)]
     axes = [ScanDirection.TOP_TO_BOTTOM, ScanDirection.LEFT_TO_RIGHT]
     return axes if size[0] >= size[1] else axes[::-1]
+
+
+# How well COLMAP's lens is known: focal length and centre by focal length (of one phone's video 21
+# images give 384.2 px, 42 give 383.2), distortion. Under a steady motion a focal length along the
+# scan stands for a shutter: looser ones leave the two to chance.
+_LENS_DEVIATIONS = 0.005, 0.02
+
+
+def colmap_freedom(seen: MapObservations, start: Start, lens: bool) -> MapFreedom:
+    """What is free of a map that COLMAP has begun; ``lens``: that of its lens, too.
+
+    A time lapse, whose stamps are closer than its images were, moves faster than any hand.
+    """
+    times = 1e-9 * (seen.stamps_ns - seen.stamps_ns[0])
+    angular, linear = usual_accelerations(times, start.rotations, start.positions)
+    usual = MapFreedom()
+    return replace(
+        usual,
+        lens=lens,
+        lens_deviations=_LENS_DEVIATIONS,
+        angular_acceleration=max(usual.angular_acceleration, angular),
+        linear_acceleration=max(usual.linear_acceleration, linear),
+    )
 
 
 def fit_shutter(

@@ -30,8 +30,7 @@ from rs_localizer.mapping.initial_trajectory import (
     acceleration_prior,
     initial_trajectory,
 )
-from rs_localizer.mapping.observations import Adjusted, Frame, frames_of
-from rs_localizer.mapping.readout_check import ReadoutCheck
+from rs_localizer.mapping.observations import Adjusted, Frame, ReadoutCheck, frames_of
 from rs_localizer.mapping.unknown_markers import (
     Chained,
     Filmed,
@@ -44,7 +43,7 @@ from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.bodies import BODY, PLACE
 from rs_localizer.trajectory.cluster_robust import cluster_robust
 from rs_localizer.trajectory.fit import Fit, solve
-from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
+from rs_localizer.trajectory.model import Freedom, Observations, State, rig_state
 from rs_localizer.trajectory.normal_kernels import Normal
 from rs_localizer.trajectory.problem import LIMIT, Problem, RigProblem
 from rs_localizer.trajectory.sight_kernels import EXTRINSICS
@@ -74,14 +73,8 @@ class Adjustable:
 
     def start(self, spline: Spline) -> State:
         """A first guess."""
-        first, *others = (
-            replace(
-                start_state(one.camera, seen, spline, one.camera.readout_time),
-                extrinsics=one.extrinsics,
-            )
-            for one, seen in zip(self.filmed, self.seen, strict=True)
-        )
-        return replace(first, others=tuple(others))
+        pairs = zip(self.filmed, self.seen, strict=True)
+        return rig_state(spline, ((one.camera, own, one.extrinsics) for one, own in pairs))
 
     def problem(
         self,
@@ -110,7 +103,7 @@ class Adjustable:
             )
             seen = seen if bodies is None else replace(seen, bodies=bodies)
             cameras.append(Problem(one.camera, seen, state, own))
-        return RigProblem(cameras, np.ones(len(cameras)), one_map=True)
+        return RigProblem(cameras, one_map=True)
 
     def fit(self, start: State, freedom: Freedom, deviation: float, *free: bool) -> Fit:
         """The minimum of a problem."""

@@ -21,8 +21,7 @@ from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.bodies import is_flat
 from rs_localizer.trajectory.first_lens import as_fisheye
 from rs_localizer.trajectory.fit import Fit, cheaper, cost_at, fit, image_speeds
-from rs_localizer.trajectory.gyro import NoMount
-from rs_localizer.trajectory.gyro_terms import DELAY, MOUNT
+from rs_localizer.trajectory.gyro import DELAY, MOUNT, NoMount
 from rs_localizer.trajectory.imu import ImuRecording, MountFound, mount_of, with_gyro
 from rs_localizer.trajectory.lens import LensErrors, lens_difference, lens_errors
 from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
@@ -380,8 +379,8 @@ def calibrate(
     images = _thinned(in_order(images))
     if len(images) < _LEAST_IMAGES:
         raise ValueError(f"{len(images)} images show the map, at least {_LEAST_IMAGES} are needed")
-    taken = (taken - taken[0]) * 1e-9
-    posed, fitted = _fitted(camera, images, examine(taken).interval, intrinsics, done)
+    stamps = examine((taken - taken[0]) * 1e-9)
+    posed, fitted = _fitted(camera, images, stamps.interval, intrinsics, done)
     every, fits = sum(len(image.points) for image in images), np.count_nonzero(fitted.inliers)
     plain = fitted.camera.distortion_model == DistortionModel.PLUMB_BOB
     if intrinsics and plain and fits < (1.0 - _LEFT_OUT) * every:
@@ -389,10 +388,9 @@ def calibrate(
         with suppress(ValueError):
             alike = as_fisheye(fitted.camera, seen.pixels)
             fisheye = replace(camera, K=alike.K, D=alike.D, distortion_model=alike.distortion_model)
-            other = _fitted(fisheye, images, examine(taken).interval, intrinsics, lambda: None)
+            other = _fitted(fisheye, images, stamps.interval, intrinsics, lambda: None)
             if np.count_nonzero(other[1].inliers) > fits + _MOST_OF_THEM * (every - fits):
                 camera, (posed, fitted) = fisheye, other
-    stamps = examine(taken)
     observations, no_mount = within(posed.observations, fitted.state.spline), ""
     if imu is not None:
         try:

@@ -9,7 +9,6 @@ limit closes from the first guess to the noise.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -21,9 +20,6 @@ from rs_localizer.trajectory.lens import with_lens
 from rs_localizer.trajectory.model import Freedom, Observations, State
 from rs_localizer.trajectory.problem import LIMIT, Problem, RigProblem
 from rs_localizer.trajectory.spline_kernels import CONTROL
-
-AnyProblem = TypeVar("AnyProblem", Problem, RigProblem)
-"""Of one camera, or of several."""
 
 _FEW_STEPS = 6
 # Richer models must lower the cost by this much per new parameter (Akaike).
@@ -79,10 +75,10 @@ def fit(
     Raises:
         Undetermined: when the keypoints do not determine what is free.
     """
-    return solve(Problem(camera, observations, start, freedom), start, deviation)
+    return solve(RigProblem([Problem(camera, observations, start, freedom)]), start, deviation)
 
 
-def solve(problem: AnyProblem, start: State, deviation: float | None = None) -> Fit:
+def solve(problem: RigProblem, start: State, deviation: float | None = None) -> Fit:
     """:func:`fit` of one camera or of a rig, whose noise is that of its first camera's keypoints.
 
     Raises:
@@ -103,7 +99,7 @@ def cost_at(camera: Camera, observations: Observations, fitted: Fit, readout_tim
     """
     held = replace(fitted.freedom, readout_time=False)
     start = replace(fitted.state, readout_time=readout_time)
-    problem = Problem(camera, observations, start, held)
+    problem = RigProblem([Problem(camera, observations, start, held)])
     least = minimise(problem, start, fitted.deviation, _FEW_STEPS)
     return problem.normal(least, fitted.deviation)[0]
 
@@ -126,11 +122,11 @@ def image_speeds(camera: Camera, observations: Observations, state: State) -> Ar
     return np.concatenate(speeds)
 
 
-def _finish(problem: AnyProblem, state: State, deviation: float) -> Fit:
+def _finish(problem: RigProblem, state: State, deviation: float) -> Fit:
     """The estimate with its covariances."""
     squared = problem.errors(state)
     cost, normal = problem.normal(state, deviation)
-    factored = problem.factored(normal)
+    factored = Factored(normal.whole)
     inliers = squared < (LIMIT * deviation) ** 2
     used = problem.border + CONTROL * min(problem.images(inliers), len(state.spline.positions))
     inflation = inflation_of(squared[inliers], deviation, used)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.trajectory.spline import Layout, Spline
 
@@ -21,6 +22,12 @@ _LEAST_SAMPLES = 100
 _LEAST_EXPLAINED = 0.5
 # A unit is wrong, not a scale, where rates differ by more than this.
 _MOST_SCALE = 1.5
+MOUNT, DELAY = 13, 6
+"""Numbers of a mount: turn of the IMU in its own axes, bias, delay, shape; place of the delay."""
+# What a first guess of turn (rad), bias (rad/s) and delay (s) may be off: as good as nothing, but
+# what the motion does not tell stays where it is. Scales and angles of consumer gyroscopes are good
+# to some percent.
+MOUNT_DEVIATIONS = np.repeat([1.0, 1.0, 0.5, 0.03], (3, 3, 1, 6))
 # Weight of a rotation that is given, by what the motion says: it helps where that is nothing.
 _GIVEN_WEIGHT = 1e-3
 
@@ -64,6 +71,24 @@ class GyroMount:
         symmetric = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         matrix: Array = (np.eye(3) + symmetric) @ self.camera_from_imu.T
         return matrix
+
+    def moved(self, step: Array) -> GyroMount:
+        """After a step (13,)."""
+        return GyroMount(
+            self.camera_from_imu @ so3.exp(step[:3]), self.bias + step[3:6],
+            self.delay + float(step[DELAY]), self.shape + step[DELAY + 1 :],
+        )  # fmt: skip
+
+    def beside(self, first: GyroMount) -> Array:
+        """The step (13,) that leads here from a first guess, which has no shape."""
+        turn = so3.log(np.ascontiguousarray(first.camera_from_imu.T @ self.camera_from_imu))
+        step: Array = np.r_[turn, self.bias - first.bias, self.delay - first.delay, self.shape]
+        return step
+
+    def turned_from(self, given: Array) -> float:
+        """Angle (rad) between its rotation and a given one (3,3)."""
+        between = np.ascontiguousarray(given.T @ self.camera_from_imu)
+        return float(np.linalg.norm(so3.log(between)))
 
 
 class NoMount(ValueError):

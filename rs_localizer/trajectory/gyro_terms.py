@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A gyroscope's samples as a part of the trajectory's cost.
 
-The gyroscope's part of the normal equations, compiled.
-
 In the gyroscope's axes ``e = M rate(t + delay) + bias - measured``: the noise of the samples must
 not stand beside what is estimated of ``M``, which it would make smaller.
 """
@@ -17,15 +15,16 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.trajectory.gyro import GyroMount, GyroSamples
+from rs_localizer.trajectory.gyro import (
+    DELAY,
+    MOUNT,
+    MOUNT_DEVIATIONS,
+    GyroMount,
+    GyroSamples,
+)
 from rs_localizer.trajectory.model import State
 from rs_localizer.trajectory.normal_kernels import Normal
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
-
-MOUNT = 13
-"""Numbers of a mount: turn of the IMU in its own axes, bias, delay, shape."""
-DELAY = 6
-"""Place of the delay among them."""
 
 
 class Turns(NamedTuple):
@@ -81,9 +80,6 @@ def accumulate_turns(turns: Turns, column: int, variance: float, limit: float,
 
 
 _LIMIT = 6.0  # of Tukey's weight, in standard deviations
-# What a first guess of turn (rad), bias (rad/s) and delay (s) may be off: as good as nothing, but
-# what the motion does not tell stays where it is. Scales and angles are good to some percent.
-_DEVIATIONS = np.repeat([1.0, 1.0, 0.5, 0.03], (3, 3, 1, 6))
 # Samples nearer (s) to the edge of the motion are left out: the delay may yet change.
 _MARGIN = 0.02
 # Median of the squared length of three standard Gaussian numbers.
@@ -116,8 +112,8 @@ class GyroTerms:
         by_mount = np.empty((len(first), 3, MOUNT))
         by_mount[:, :, :3] = mount.matrix @ mount.camera_from_imu @ so3.hat(turned)
         by_mount[:, :, 3:6] = np.eye(3)
-        by_mount[:, :, 6] = states.angular_acceleration @ mount.matrix.T
-        by_mount[:, :, 7:] = by_shape(turned)
+        by_mount[:, :, DELAY] = states.angular_acceleration @ mount.matrix.T
+        by_mount[:, :, DELAY + 1 :] = by_shape(turned)
         errors = states.angular @ mount.matrix.T + mount.bias - self.samples.rates
         return Turns(first, errors, mount.matrix @ jacobians[:, 6:9], by_mount)
 
@@ -136,26 +132,16 @@ class GyroTerms:
         cost = accumulate_turns(
             self.look(state), self.column, variance, _LIMIT**2 * variance, normal
         )
-        offset = self._offset(state) / _DEVIATIONS
+        assert state.mount is not None
+        offset = state.mount.beside(self.start) / MOUNT_DEVIATIONS
         at = np.arange(self.column, self.column + MOUNT)
-        normal.border_slope[at] += offset / _DEVIATIONS
-        normal.corner[at, at] += _DEVIATIONS**-2
+        normal.border_slope[at] += offset / MOUNT_DEVIATIONS
+        normal.corner[at, at] += MOUNT_DEVIATIONS**-2
         return float(cost) + float(offset @ offset)
-
-    def _offset(self, state: State) -> Array:
-        mount = state.mount
-        assert mount is not None
-        turn = so3.log(np.ascontiguousarray(self.start.camera_from_imu.T @ mount.camera_from_imu))
-        bias, delay = mount.bias - self.start.bias, mount.delay - self.start.delay
-        return np.concatenate([turn, bias, [delay], mount.shape])
 
     def moved(self, mount: GyroMount, border: Array) -> GyroMount:
         """The mount after a step of the border."""
-        step = border[self.column : self.column + MOUNT]
-        return GyroMount(
-            mount.camera_from_imu @ so3.exp(step[:3]), mount.bias + step[3:6],
-            mount.delay + float(step[6]), mount.shape + step[7:],
-        )  # fmt: skip
+        return mount.moved(border[self.column : self.column + MOUNT])
 
 
 def by_shape(rates: Array) -> Array:

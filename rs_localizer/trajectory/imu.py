@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.fit import Fit, fit
-from rs_localizer.trajectory.gyro import GyroMount, GyroSamples, first_mount
-from rs_localizer.trajectory.gyro_terms import DELAY, MOUNT, GyroTerms
+from rs_localizer.trajectory.gyro import DELAY, MOUNT, GyroMount, GyroSamples, first_mount
+from rs_localizer.trajectory.gyro_terms import GyroTerms
 from rs_localizer.trajectory.metric import ForceSamples
 from rs_localizer.trajectory.model import Observations
 from rs_localizer.trajectory.online_readout import REVERSED
@@ -45,18 +44,18 @@ class ImuRecording:
 
     def samples(self, start_ns: int) -> GyroSamples:
         """Its finite samples in the order of time, one for each stamp, from a time 0 on."""
-        finite = np.isfinite(self.angular_velocities).all(axis=1)
-        stamps, order = np.unique(self.stamps_ns[finite], return_index=True)
-        times = (stamps - start_ns).astype(float) * 1e-9
-        return GyroSamples(times, self.angular_velocities[finite][order])
+        return GyroSamples(*self._finite(self.angular_velocities, start_ns))
 
     def forces(self, start_ns: int, delay: float) -> ForceSamples:
         """The accelerometer's finite samples likewise, their times later by ``delay`` (s)."""
         assert self.specific_forces is not None
-        finite = np.isfinite(self.specific_forces).all(axis=1)
+        times, forces = self._finite(self.specific_forces, start_ns)
+        return ForceSamples(times + delay, forces)
+
+    def _finite(self, values: Array, start_ns: int) -> tuple[Array, Array]:
+        finite = np.isfinite(values).all(axis=1)
         stamps, order = np.unique(self.stamps_ns[finite], return_index=True)
-        times = (stamps - start_ns).astype(float) * 1e-9 + delay
-        return ForceSamples(times, self.specific_forces[finite][order])
+        return (stamps - start_ns).astype(float) * 1e-9, values[finite][order]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,11 +85,6 @@ class MountFound:
     @property
     def bias_determined(self) -> bool:
         return bool(np.all(self.bias_deviations < _MOST_BIAS))
-
-    def turned_from(self, given: Array) -> float:
-        """Angle (rad) between the rotation that was found and a given one (3,3)."""
-        between = np.ascontiguousarray(given.T @ self.mount.camera_from_imu)
-        return float(np.linalg.norm(so3.log(between)))
 
 
 def with_gyro(

@@ -24,8 +24,16 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.rate_spline import rotations_at_knots
 from rs_localizer.core.rate_spline import spline as cubics_of
-from rs_localizer.trajectory.gyro import GyroMount, GyroSamples, NoMount, first_mount
-from rs_localizer.trajectory.gyro_terms import DELAY, MOUNT, by_shape
+from rs_localizer.trajectory.gyro import (
+    DELAY,
+    MOUNT,
+    MOUNT_DEVIATIONS,
+    GyroMount,
+    GyroSamples,
+    NoMount,
+    first_mount,
+)
+from rs_localizer.trajectory.gyro_terms import by_shape
 from rs_localizer.trajectory.spline import Layout, Spline
 
 # Turns are taken over about so long (s): short beside the motion, long beside the images' noise.
@@ -39,10 +47,6 @@ _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 _STEP = 1e-3  # s, of the derivative by the delay
 # Squared errors of three axes count up to so many times their median.
 _LIMIT = 16.0
-# What a first guess of turn (rad), bias (rad/s) and delay (s) may be off: as good as nothing, but
-# what the motion does not tell stays where it is. Scales and angles of consumer gyroscopes are good
-# to some percent.
-_DEVIATIONS = np.repeat([1.0, 1.0, 0.5, 0.03], (3, 3, 1, MOUNT - DELAY - 1))
 # Turns further apart than so many have nothing to do with each other.
 _PART = 6
 _LEAST_PARTS = 3
@@ -81,7 +85,7 @@ def imu_extrinsics(
     """
     calmed = _calmed(samples)
     start = mount = first_mount(calmed, spline, given)
-    shown = _Shown(samples, calmed)
+    shown = _Turned(samples), _Turned(calmed)
     times, whiles = _times(spline.layout, samples.times + mount.delay)
     if len(times) < _LEAST_PARTS * _PART:
         raise NoMount(f"{_WHILE * len(times):.1f} s of the motion have samples without a gap")
@@ -94,10 +98,10 @@ def imu_extrinsics(
         weights = np.square(np.maximum(1.0 - squared / (_LIMIT * np.median(squared)), 0.0))
         scores = weights[:, None] * np.einsum("nij,ni->nj", by_mount, errors)
         variance = float(weights @ squared / (3.0 * np.sum(weights)))
-        held = np.diag(variance / _DEVIATIONS**2)
+        held = np.diag(variance / MOUNT_DEVIATIONS**2)
         normal = np.einsum("n,nij,nik->jk", weights, by_mount, by_mount)
         inverse = np.linalg.inv(normal + held)
-        mount = _moved(mount, -inverse @ (scores.sum(axis=0) + held @ _offset(start, mount)))
+        mount = mount.moved(-inverse @ (scores.sum(axis=0) + held @ mount.beside(start)))
     sums = np.zeros((parts[-1] + 1, MOUNT))
     np.add.at(sums, parts, scores)
     return ImuExtrinsics(mount, inverse @ (sums.T @ sums + variance * held) @ inverse)
@@ -113,26 +117,6 @@ def _calmed(samples: GyroSamples) -> GyroSamples:
     )
     at = np.array([np.interp(ends, samples.times, axis) for axis in turned.T])
     return GyroSamples(samples.times, ((at[:, 1] - at[:, 0]) / (ends[1] - ends[0])).T)
-
-
-class _Shown:
-    """Turns by a gyroscope."""
-
-    def __init__(self, samples: GyroSamples, calmed: GyroSamples) -> None:
-        self._all, self._calm = _Turned(samples), _Turned(calmed)
-
-    def turns(self, times: Array, whiles: Array) -> Array:
-        """Rotation vectors (m,3) from times (m,) on, for whiles (m,)."""
-        return self._all.turns(times, whiles)
-
-    def changes(self, times: Array, whiles: Array) -> Array:
-        """How they change with the times (m,), rad/s, without vibration.
-
-        With it, an offset would be found at which the tone of a motor happens to be zero at these
-        times.
-        """
-        ahead, behind = (self._calm.turns(times + shift, whiles) for shift in (_STEP, -_STEP))
-        return np.asarray((ahead - behind) / (2.0 * _STEP))
 
 
 class _Turned:
@@ -182,28 +166,21 @@ def _unevenly(times: Array) -> Array:
 
 
 def _errors(
-    shown: _Shown, when: tuple[Array, Array], turns: Array, mount: GyroMount
+    shown: tuple[_Turned, _Turned], when: tuple[Array, Array], turns: Array, mount: GyroMount
 ) -> tuple[Array, Array]:
-    """What turns (m,3) of the gyroscope should be more, and its derivatives (m,3,13)."""
+    """What turns (m,3) of the gyroscope should be more, and its derivatives (m,3,13).
+
+    Args:
+        shown: turns by the samples, and without vibration: with it, an offset would be found at
+            which the tone of a motor happens to be zero at these times.
+    """
     turned = turns @ mount.camera_from_imu
     here, whiles = when[0] - mount.delay, when[1]
-    errors = turns @ mount.matrix.T + whiles[:, None] * mount.bias - shown.turns(here, whiles)
+    errors = turns @ mount.matrix.T + whiles[:, None] * mount.bias - shown[0].turns(here, whiles)
+    ahead, behind = (shown[1].turns(here + shift, whiles) for shift in (_STEP, -_STEP))
     by_mount = np.empty((len(turns), 3, MOUNT))
     by_mount[:, :, :3] = mount.matrix @ mount.camera_from_imu @ so3.hat(turned)
     by_mount[:, :, 3:6] = whiles[:, None, None] * np.eye(3)
-    by_mount[:, :, DELAY] = shown.changes(here, whiles)
+    by_mount[:, :, DELAY] = (ahead - behind) / (2.0 * _STEP)
     by_mount[:, :, DELAY + 1 :] = by_shape(turned)
     return errors, by_mount
-
-
-def _moved(mount: GyroMount, step: Array) -> GyroMount:
-    return GyroMount(
-        mount.camera_from_imu @ so3.exp(step[:3]), mount.bias + step[3:6],
-        mount.delay + float(step[DELAY]), mount.shape + step[DELAY + 1 :],
-    )  # fmt: skip
-
-
-def _offset(start: GyroMount, mount: GyroMount) -> Array:
-    turn = so3.log(np.ascontiguousarray(start.camera_from_imu.T @ mount.camera_from_imu))
-    bias, delay = mount.bias - start.bias, mount.delay - start.delay
-    return np.concatenate([turn, bias, [delay], mount.shape])

@@ -264,9 +264,6 @@ class Metric:
     gravity: Array  # (3,) m/s^2, downwards, in the map's axes
     gravity_deviation: float  # rad, of its direction
     bias: Array  # (3,) m/s^2, in the accelerometer's axes
-    lever: Array  # (3,) m, of the IMU in the camera's axes
-    force: float  # scale of the forces' own by that of gravity
-    explained: float  # share of the accelerations that camera and IMU have in common
     inflation: float  # of the scale's deviation, because parts disagree; 1: they do not
     means: int  # number of mean accelerations
 
@@ -315,9 +312,6 @@ def metric(means: Sequence[Means], lever: Lever) -> Metric:
         gravity=gravity,
         gravity_deviation=float(np.hypot(np.sqrt(np.linalg.eigvalsh(tilt)[-1]), _BEND)),
         bias=fit.found[BIAS] / inverse,
-        lever=fit.found[LEVER] / inverse,
-        force=float(fit.found[FORCE]) / inverse,
-        explained=fit.explained,
         inflation=_inflation(means, kept, fit),
         means=int(sum(map(np.count_nonzero, kept))),
     )

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -133,3 +134,12 @@ def start_state(
     """A first guess with the camera's own lens and the map as it is given."""
     delays = np.zeros(int(observations.frames.max(initial=-1)) + 1)
     return State(spline, readout_time, lens_values(camera), observations.landmarks.copy(), delays)
+
+
+def rig_state(spline: Spline, cameras: Iterable[tuple[Camera, Observations, Extrinsics]]) -> State:
+    """A first guess of cameras on what moves, with their own readout times and clocks."""
+    first, *others = (
+        replace(start_state(camera, seen, spline, camera.readout_time), extrinsics=mounted)
+        for camera, seen, mounted in cameras
+    )
+    return replace(first, others=tuple(others))

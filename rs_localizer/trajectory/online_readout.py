@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -346,60 +346,21 @@ _WINDOW = 10.0
 _LONGEST_INTERVAL, _MOST_UNLIKE = 0.15, 2.5
 # Fewer triples than this have no scatter worth the name.
 _LEAST_TRIPLES = 20
-_LEAST_ROOM = 64  # triples
 _MOST_POINTS = 200  # of a frame: more take longer than they are worth
 
 
-class _Window:
-    """The equations of the last seconds, in their order, one behind the other in memory."""
-
-    def __init__(self) -> None:
-        self._times_ns = np.empty(_LEAST_ROOM, np.int64)
-        self._all = _room(_LEAST_ROOM)
-        self._first, self._end = 0, 0
-
-    def __len__(self) -> int:
-        return self._end - self._first
-
-    def clear(self) -> None:
-        """Forget all; equations that were given away stay what they are."""
-        self._all = _room(len(self._times_ns))
-        self._first = self._end = 0
-
-    def add(self, time_ns: int, views: Sequence[View], first: float, second: float) -> None:
-        """Add the equation of three views, so many seconds apart."""
-        if self._end == len(self._times_ns):
-            self._make_room()
-        before, now, after = views
-        equation(before, now, after, first, second, self._all, self._end)
-        self._times_ns[self._end] = time_ns
-        self._end += 1
-
-    def forget(self, before_ns: int) -> None:
-        """Forget what is older."""
-        while self._first < self._end and self._times_ns[self._first] < before_ns:
-            self._first += 1
-
-    def equations(self) -> Equations:
-        return Equations(*(part[self._first : self._end] for part in self._all))
-
-    def newest(self, count: int) -> Equations:
-        """The last ones."""
-        return Equations(*(part[self._end - count : self._end] for part in self._all))
-
-    def _make_room(self) -> None:
-        held, times_ns = self.equations(), self._times_ns[self._first : self._end]
-        size = max(2 * len(self), _LEAST_ROOM)
-        self._all, self._times_ns = _room(size), np.empty(size, np.int64)
-        self._first, self._end = 0, len(times_ns)
-        self._times_ns[: self._end] = times_ns
-        for part, filled in zip(self._all, held, strict=True):
-            part[: self._end] = filled
+def _stacked(rows: Iterable[Equations]) -> Equations:
+    """One behind the other in memory."""
+    return Equations(*map(np.concatenate, zip(*rows, strict=True)))
 
 
-def _room(size: int) -> Equations:
-    sides, covariances = (size, SIDE), (size, SIDE, SIDE)
-    return Equations(np.empty(sides), np.empty(sides), *(np.empty(covariances) for _ in range(3)))
+def _of_three(views: Sequence[View], first: float, second: float) -> Equations:
+    """The equation of three views, so many seconds apart."""
+    side, covariance = (1, SIDE), (1, SIDE, SIDE)
+    row = Equations(np.empty(side), np.empty(side), *(np.empty(covariance) for _ in range(3)))
+    before, now, after = views
+    equation(before, now, after, first, second, row, 0)
+    return row
 
 
 class ReadoutMonitor:
@@ -412,14 +373,14 @@ class ReadoutMonitor:
     def __init__(self, window: float = _WINDOW) -> None:
         self._window_ns = round(window * 1e9)
         self._views: deque[tuple[int, View]] = deque(maxlen=3)
-        self._window = _Window()
+        self._equations: deque[tuple[int, Equations]] = deque()
         self._in_a_row = 0  # triples, each one frame after the other
         self.odds = ShutterHypotheses()
 
     def reset(self) -> None:
         """Forget all frames: the camera, the map or the assumed direction has changed."""
         self._views.clear()
-        self._window.clear()
+        self._equations.clear()
         self._in_a_row = 0
         self.odds.reset()
 
@@ -463,7 +424,8 @@ class ReadoutMonitor:
         self._views.append((time_ns, view))
         if len(self._views) == 3:
             self._add_equation(camera.readout_time)
-        self._window.forget(time_ns - self._window_ns)
+        while self._equations and self._equations[0][0] < time_ns - self._window_ns:
+            self._equations.popleft()
 
     def _add_equation(self, readout_time: float) -> None:
         (before_ns, _), (now_ns, _), (after_ns, _) = self._views
@@ -474,10 +436,11 @@ class ReadoutMonitor:
         if not (alike and near) or jumps(before, now, after, first, second):
             self._in_a_row = 0
             return
-        self._window.add(now_ns, (before, now, after), first, second)
-        self._in_a_row += 1
+        self._equations.append((now_ns, _of_three((before, now, after), first, second)))
+        self._in_a_row = min(self._in_a_row + 1, len(self._equations))
         if self._in_a_row > 1 and readout_time > 0.0:
-            self.odds.add(self._window.newest(2), readout_time)
+            newest = (self._equations[k][1] for k in (-2, -1))
+            self.odds.add(_stacked(newest), readout_time)
 
     def measure(self) -> MeasuredReadout | None:
         """What the window shows; None as long as the motion determines nothing.
@@ -490,9 +453,9 @@ class ReadoutMonitor:
 
     def measurement(self) -> Measurement | None:
         """The same, to be computed bit by bit; None as long as there are too few frames."""
-        if len(self._window) < _LEAST_TRIPLES:
+        if len(self._equations) < _LEAST_TRIPLES:
             return None
-        return Measurement(self._window.equations())
+        return Measurement(_stacked(row for _, row in self._equations))
 
 
 def warm_up(camera: Camera) -> None:
@@ -500,9 +463,8 @@ def warm_up(camera: Camera) -> None:
     pixels = np.random.default_rng(0).uniform(0.3, 0.7, (20, 2)) * camera.size
     points = np.column_stack([np.nan_to_num(camera.rays(pixels)), np.ones(len(pixels))])
     single_image_likelihood(camera, Motion(np.eye(3), *np.zeros((3, 3))), points, pixels)
-    window, view = _Window(), View(np.eye(3), np.zeros(3), np.zeros(SIDE), np.eye(2 * SIDE))
-    window.add(0, [view, view, view], 1.0, 1.0)
+    view = View(np.eye(3), np.zeros(3), np.zeros(SIDE), np.eye(2 * SIDE))
+    row = _of_three([view, view, view], 1.0, 1.0)
     jumps(view, view, view, 1.0, 1.0)
-    Measurement(window.equations()).finish()
-    window.add(1, [view, view, view], 1.0, 1.0)
-    ShutterHypotheses().add(window.newest(2), 1.0)
+    Measurement(row).finish()
+    ShutterHypotheses().add(_stacked([row, row]), 1.0)

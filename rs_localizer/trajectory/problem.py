@@ -17,7 +17,8 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Factored, Undetermined
 from rs_localizer.trajectory.bodies import Pieces, paper_covariance
-from rs_localizer.trajectory.gyro_terms import MOUNT, GyroTerms
+from rs_localizer.trajectory.gyro import MOUNT
+from rs_localizer.trajectory.gyro_terms import GyroTerms
 from rs_localizer.trajectory.lens import lens_prior, project
 from rs_localizer.trajectory.model import Freedom, Observations, State
 from rs_localizer.trajectory.normal_kernels import (
@@ -55,7 +56,7 @@ Step = tuple[Array, Array]
 
 
 class Problem:
-    """The cost of a state and its normal equations."""
+    """The cost of what one camera sees and its normal equations."""
 
     def __init__(
         self, camera: Camera, observations: Observations, start: State, freedom: Freedom
@@ -153,10 +154,6 @@ class Problem:
             squared.append(np.empty(len(sights.first)))
             squared_errors(sights, terms, squared[-1])
         return np.concatenate(squared)
-
-    def noise(self, state: State, deviation: float) -> float:
-        """Standard deviation of the noise, from the errors that are not far off the last one."""
-        return max(noise_of(self.errors(state), deviation), self.freedom.least_noise)
 
     def normal(self, state: State, deviation: float, motion: bool = True) -> tuple[float, Normal]:
         """Cost and normal equations; without ``motion`` others add what is expected of it."""
@@ -275,18 +272,6 @@ class Problem:
             state.spline.moved(controls), readout_time, lens, landmarks, delays, mount, extrinsics
         )
 
-    def factored(self, normal: Normal, damping: float = 0.0) -> Factored:
-        """The normal equations, with Levenberg's damping.
-
-        Raises:
-            Undetermined: when they are not positive definite.
-        """
-        return Factored(normal, damping)
-
-    def step(self, normal: Normal, damping: float) -> Step:
-        """Of controls and border, Levenberg's."""
-        return self.factored(normal, damping).step()
-
     def trusted(self, start: State) -> Problem:
         """The same with the trusted keypoints only."""
         observations = self.observations
@@ -308,12 +293,15 @@ class RigProblem:
     """The cost of one motion that several cameras see; borders and keypoints stand in their order.
 
     Args:
-        cameras: of which the first has what is expected of the motion.
-        noises: (k,) px, of each camera's keypoints; they keep their ratios.
+        cameras: one or more, of which the first has what is expected of the motion.
+        noises: (k,) px, of each camera's keypoints; they keep their ratios (None: all alike).
         one_map: the free landmarks are the same of all; they come last, once.
     """
 
-    def __init__(self, cameras: list[Problem], noises: Array, one_map: bool = False) -> None:
+    def __init__(
+        self, cameras: list[Problem], noises: Array | None = None, one_map: bool = False
+    ) -> None:
+        noises = np.ones(len(cameras)) if noises is None else noises
         self.cameras, self.ratios, self._one_map = cameras, noises / noises[0], one_map
         self.camera, self.freedom = cameras[0].camera, cameras[0].freedom
         points = cameras[0].pieces.columns if one_map else 0
@@ -338,6 +326,8 @@ class RigProblem:
             added, normal = camera.normal(one, deviation * float(ratio), motion=not own)
             own.append(normal)
             cost += added
+        if len(own) == 1:
+            return cost, RigNormal(own[0], own)
         count = len(own[0].slope)
         whole = own[0]._replace(
             band=np.zeros((max(len(normal.band) for normal in own), count)),
@@ -354,11 +344,9 @@ class RigProblem:
             whole.border_slope[at] += normal.border_slope
         return cost, RigNormal(whole, own)
 
-    def factored(self, normal: RigNormal, damping: float = 0.0) -> Factored:
-        return Factored(normal.whole, damping)
-
     def step(self, normal: RigNormal, damping: float) -> Step:
-        return self.factored(normal, damping).step()
+        """Levenberg's; raises Undetermined when the equations are not positive definite."""
+        return Factored(normal.whole, damping).step()
 
     def moved(self, state: State, normal: RigNormal, step: Step) -> State:
         """The state after a step that these normal equations led to."""

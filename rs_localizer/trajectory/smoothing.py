@@ -27,8 +27,15 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.motion_model import FADING
 from rs_localizer.inertial.settings import SCALE_DEVIATION
 from rs_localizer.inertial.turning import MOST_ROUGH
-from rs_localizer.trajectory.fit import AnyProblem, Fit, cheaper, solve
-from rs_localizer.trajectory.model import Extrinsics, Freedom, Observations, State, start_state
+from rs_localizer.trajectory.fit import Fit, cheaper, solve
+from rs_localizer.trajectory.model import (
+    Extrinsics,
+    Freedom,
+    Observations,
+    State,
+    rig_state,
+    start_state,
+)
 from rs_localizer.trajectory.normal_kernels import changes
 from rs_localizer.trajectory.observe import Observed, collect
 from rs_localizer.trajectory.problem import LIMIT, Problem, RigProblem
@@ -87,6 +94,8 @@ _SHAKEN, _SHAKEN_SIGMAS, _MOST_SHAKEN = 1.5, 5.0, 0.2
 # deg at 60 Hz all do, by 1.3 to 5.4 times.
 _IN_FRAME, _NEXT = 1.0, 9
 _ROWS = np.linspace(-0.5, 0.5, 17)
+Parts = list[tuple[Camera, Observations]]
+"""What each camera saw."""
 # The expected accelerations are settled when they change by less than this part.
 _ALIKE, _ROUNDS = 0.05, 6
 
@@ -338,14 +347,9 @@ def smooth(
     observations = observations.subset(
         spline.layout.inside(observations.times) & np.isfinite(observations.pixels[:, 0])
     )
-    best = _best(
-        lambda state, freedom: Problem(camera, observations, state, freedom),
-        start_state(camera, observations, spline, readout_time),
-        fading,
-    )
-    shaken = _shaken(best, observations.frames, estimates) | _turns_in_frame(
-        camera.focal_length, estimates
-    )
+    parts = [(camera, observations)]
+    best = _best(parts, start_state(camera, observations, spline, readout_time), fading)
+    shaken = _shaken(best, parts, camera.focal_length, estimates)
     counted = shaken if fast is None else shaken[fast.covered]
     if counted.mean() > _MOST_SHAKEN:
         shaken[:] = True
@@ -377,8 +381,8 @@ def smooth_rig(rig: Rig, frames: list[RigFrame]) -> Smoothed:
     positions = np.array([one.position for one in estimates])
     longest = max(one.span for one in estimates)
     spline = first_spline(times, rotations, positions, spacing, longest)
-    parts: list[tuple[Camera, Observations]] = []
-    states: list[State] = []
+    parts: Parts = []
+    mounted: list[Extrinsics] = []
     for name, camera in rig.cameras.items():
         own = [k for k, frame in enumerate(frames) if name in frame.images]
         if not own:
@@ -390,20 +394,12 @@ def smooth_rig(rig: Rig, frames: list[RigFrame]) -> Smoothed:
         seen = posed.observations
         shift = (posed.start_ns - start_ns) * 1e-9
         seen = replace(seen, times=seen.times + shift, frames=np.array(own)[seen.frames])
-        seen = seen.subset(spline.layout.inside(seen.times))
+        parts.append((camera, seen.subset(spline.layout.inside(seen.times))))
         axes, moved = rig.camera_from_rig[name]
-        state = start_state(camera, seen, spline, camera.readout_time)
-        states.append(replace(state, extrinsics=Extrinsics(axes, -axes.T @ moved, 0.0)))
-        parts.append((camera, seen))
-
-    def problem(state: State, freedom: Freedom) -> RigProblem:
-        pairs = zip(parts, (state, *state.others), strict=True)
-        cameras = [Problem(*part, one, freedom) for part, one in pairs]
-        return RigProblem(cameras, np.ones(len(cameras)))
-
-    best = _best(problem, replace(states[0], others=tuple(states[1:])), fading)
-    numbers = np.concatenate([seen.frames for _, seen in parts])
-    shaken = _shaken(best, numbers, estimates) | _turns_in_frame(rig.focal_length, estimates)
+        mounted.append(Extrinsics(axes, -axes.T @ moved, 0.0))
+    start = rig_state(spline, ((*part, one) for part, one in zip(parts, mounted, strict=True)))
+    best = _best(parts, start, fading)
+    shaken = _shaken(best, parts, rig.focal_length, estimates)
     if shaken.mean() > _MOST_SHAKEN:
         shaken[:] = True
     readout_time = next(iter(rig.cameras.values())).readout_time
@@ -421,13 +417,19 @@ def _all_inliers(estimate: Estimate, image: Observed) -> Estimate:
     return replace(estimate, inliers=np.ones(len(image.points), dtype=np.bool_))
 
 
-def _best(problem: Callable[[State, Freedom], AnyProblem], start: State, fading: float) -> Fit:
+def _problem(parts: Parts, state: State, freedom: Freedom) -> RigProblem:
+    pairs = zip(parts, (state, *state.others), strict=True)
+    return RigProblem([Problem(*part, one, freedom) for part, one in pairs])
+
+
+def _best(parts: Parts, start: State, fading: float) -> Fit:
     """With the accelerations that the motion shows, and finer knots if they are worth it."""
-    plain = solve(problem(start, Freedom(readout_time=False, fading=fading)), start)
-    fitted = _lively(problem, plain)
+    freedom = Freedom(readout_time=False, fading=fading)
+    fitted = _lively(parts, solve(_problem(parts, start, freedom), start))
     spline = fitted.state.spline
     halved = replace(fitted.state, spline=refined(spline, 0.5 * spline.layout.spacing))
-    finer = _lively(problem, solve(problem(halved, fitted.freedom), halved, fitted.deviation))
+    finer = solve(_problem(parts, halved, fitted.freedom), halved, fitted.deviation)
+    finer = _lively(parts, finer)
     more = np.sum(told(finer).numbers) - np.sum(told(fitted).numbers)
     return finer if cheaper(finer, fitted, float(more)) else fitted
 
@@ -441,8 +443,9 @@ def _turned_pixels(
     return camera.project(np.einsum("nij,nj->ni", turns, rays))
 
 
-def _shaken(fitted: Fit, frames: IntArray, estimates: list[Estimate]) -> BoolArray:
-    """Which images (f,) shake in a way that the motion does not follow, by their keypoints (n,)."""
+def _shaken(fitted: Fit, parts: Parts, focal_length: float, estimates: list[Estimate]) -> BoolArray:
+    """Which images (f,) shake in a way that the motion does not follow, by their keypoints."""
+    frames = np.concatenate([seen.frames for _, seen in parts])
     own = np.array([max(one.residual_rms, fitted.freedom.least_noise) ** 2 for one in estimates])
     count = np.bincount(frames, minlength=len(estimates))
     # Robust, as the estimates are: outliers of the motion count as its limit.
@@ -451,7 +454,8 @@ def _shaken(fitted: Fit, frames: IntArray, estimates: list[Estimate]) -> BoolArr
     # An estimate's errors are those of two coordinates, less what it took to fit them.
     freedom = np.maximum(1.0 - PARAMETERS / np.maximum(2 * count, 1), 0.1)
     limit = np.maximum(_SHAKEN**2, 1.0 + _SHAKEN_SIGMAS / np.sqrt(np.maximum(count, 1)))
-    return np.asarray((count > 0) & (off > limit * own / freedom), np.bool_)
+    shaken = (count > 0) & (off > limit * own / freedom)
+    return np.asarray(shaken | _turns_in_frame(focal_length, estimates), np.bool_)
 
 
 def _turns_in_frame(focal_length: float, estimates: list[Estimate]) -> BoolArray:
@@ -466,11 +470,12 @@ def _turns_in_frame(focal_length: float, estimates: list[Estimate]) -> BoolArray
     return np.asarray(turning & (near > 0.5 * count))
 
 
-def _lively(problem: Callable[[State, Freedom], AnyProblem], fitted: Fit) -> Fit:
+def _lively(parts: Parts, fitted: Fit) -> Fit:
     """With a prior of the accelerations that the motion itself shows."""
     for _ in range(_ROUNDS):
         before, freedom = fitted.freedom, told(fitted).most_likely(fitted.freedom)
-        fitted = solve(problem(fitted.state, freedom), fitted.state, fitted.deviation)
+        problem = _problem(parts, fitted.state, freedom)
+        fitted = solve(problem, fitted.state, fitted.deviation)
         changed = (
             freedom.angular_acceleration / before.angular_acceleration,
             freedom.linear_acceleration / before.linear_acceleration,

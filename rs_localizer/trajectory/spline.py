@@ -125,11 +125,6 @@ class Layout:
         return Layout(float(spacing), middles - 0.5 * spacing * spans, firsts)
 
     @property
-    def count(self) -> int:
-        """Number of controls."""
-        return int(self.firsts[-1])
-
-    @property
     def ends(self) -> Array:
         """Ends (s,) of the stretches, s."""
         ends: Array = self.starts + self.spacing * (np.diff(self.firsts) - (ORDER - 1))

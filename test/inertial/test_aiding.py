@@ -58,15 +58,14 @@ def test_the_bias_is_found(held):
     assert np.degrees(status.bias_deviation) < 0.2
 
 
-@pytest.mark.parametrize(("axes", "angle"), [((1.0, -1.0, -1.0), 180.0)])
-def test_upside_down_is_dropped_with_its_angle(held, axes, angle):
+def test_upside_down_is_dropped_with_its_angle(held):
     def turned(samples, frame):
-        return ImuSamples(samples.times_ns, samples.angular_velocity * axes)
+        return ImuSamples(samples.times_ns, samples.angular_velocity * (1.0, -1.0, -1.0))
 
     found = statuses(held, turned)
     status, _ = found[-1]
     assert status.alone is Alone.TURNED
-    assert abs(np.degrees(status.extrinsic_angle) - angle) < 3.0
+    assert abs(np.degrees(status.extrinsic_angle) - 180.0) < 3.0
     assert all(result for _, result in found)
 
 

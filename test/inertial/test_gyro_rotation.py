@@ -44,13 +44,10 @@ def test_rotations_are_the_integral_of_the_rates():
 
 
 def test_a_parabola_leaves_nothing():
-    rates = np.column_stack([1.0 + TAU, TAU**2, 0.0 * TAU])
     # A natural spline is none at its ends; a cubic through many samples is one in the middle.
-    turn = GyroRotation.of(np.linspace(-3.0, 3.0, 121), np.zeros((121, 3)))
-    assert turn.roughness == 0.0
     dense = np.linspace(-3.0, 3.0, 121)
-    rates = np.column_stack([1.0 + dense, dense**2, 0.0 * dense])
-    turn = GyroRotation.of(dense, rates)
+    assert GyroRotation.of(dense, np.zeros((121, 3))).roughness == 0.0
+    turn = GyroRotation.of(dense, np.column_stack([1.0 + dense, dense**2, 0.0 * dense]))
     np.testing.assert_allclose(turn.parabola, [[1, 0, 0], [1, 0, 0], [0, 1, 0]], atol=1e-6)
     assert turn.roughness < 1e-6
     late = late_at(0.3, turn.tau, turn.rates, turn.parabola)
@@ -85,12 +82,9 @@ def test_derivatives_of_compensated_bearings_by_differences():
             pixel[None] / focal, np.array([later]), np.zeros((1, 2, 2)), gradient, turn
         )[0][0]
 
-    by_pixel = np.array(
-        [
-            (steady(focal * ray + step * axis) - steady(focal * ray - step * axis)) / (2.0 * step)
-            for axis in np.eye(2)
-        ]
-    ).T
+    steps = step * np.eye(2)
+    changes = [steady(focal * ray + one) - steady(focal * ray - one) for one in steps]
+    by_pixel = np.array(changes).T / (2.0 * step)
     _, found = gyro_compensated(ray[None], np.array([tau]), focal * np.eye(2)[None], gradient, turn)
     np.testing.assert_allclose(found[0] @ by_pixel, np.eye(2), atol=1e-6)
 

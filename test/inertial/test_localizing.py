@@ -33,7 +33,7 @@ def test_the_truth_comes_back_under_vibration(camera, solver):
     points, pixels = shaken.frame(camera)
     turn = turn_within(shaken.samples(), MIDDLE_NS, READOUT_TIME, errors()).known
     found = Localizer(camera, solver=solver).localize(points, pixels, turn=turn)
-    assert isinstance(found, Estimate)
+    assert found
     assert found.inliers.all()
     for tau in (-0.5, 0.0, 0.31):
         rotation, position = shaken.pose(tau * READOUT_TIME)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of a room and of markers by the tests' own rolling-shutter camera."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import projector
@@ -15,7 +15,7 @@ from rs_localizer.mapping.observations import Adjusted, MapObservations, Start
 from rs_localizer.mapping.refine import RefinedMap
 from rs_localizer.mapping.unknown_markers import Spotted
 from rs_localizer.trajectory.imu import ImuRecording
-from rs_localizer.trajectory.model import Extrinsics
+from rs_localizer.trajectory.model import Extrinsics, Mounting
 
 READOUT = 0.03
 # A motion with an IMU.
@@ -26,6 +26,24 @@ SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -
 def camera(readout: float = READOUT) -> Camera:
     return Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D,
                   readout_time=readout)  # fmt: skip
+
+
+# A second camera looks back, 10 cm beside the first; its shutter runs up.
+UP = replace(camera(), scan_direction="bottom_to_top")
+BACK = Rotation.from_euler("yx", [175.0, 10.0], degrees=True).as_matrix()
+CENTRE = np.array([0.1, -0.02, -0.05])
+# What its extrinsics and its clock are known to, and how far off they are given.
+DEVIATIONS = np.repeat([1.7e-3, 5e-3, 1.5e-3], [3, 3, 1])
+OFF = DEVIATIONS * [1.0, -1.0, 0.5, 1.0, 1.0, -1.0, 1.0]
+MOUNTED = Mounting(Extrinsics(BACK, CENTRE, 0.0).moved(OFF), DEVIATIONS)
+
+
+def is_mounted_back(found: Adjusted) -> None:
+    """And the recording knows turns and the clock better than they were given."""
+    errors = found.extrinsics.beside(Extrinsics(BACK, CENTRE, 0.0))
+    assert np.all(np.abs(errors) < 4.0 * found.deviations)
+    assert np.all(found.deviations[[0, 1, 2, 6]] < 0.7 * DEVIATIONS[[0, 1, 2, 6]])
+    assert not found.readout_check.differs
 
 
 def hand(rng: np.random.Generator, slow: float = 0.5, stamps: int = 2) -> projector.Motion:

@@ -62,21 +62,12 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def stages() -> dict[str, int]:
-    return {}
-
-
-@pytest.fixture(scope="module")
-def built(room, views, folder, stages) -> Built:
+def built(room, views, folder) -> Built:
     @contextmanager
-    def stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
-        stages[name] = 0
-
-        def step(count: int) -> None:
-            stages[name] += count
-
-        yield step
-        assert stages[name] <= total
+    def stage(_: str, total: int) -> Iterator[Callable[[int], object]]:
+        done: list[int] = []
+        yield done.append
+        assert sum(done) <= total
 
     return room.build(views, folder, stage)
 
@@ -88,9 +79,8 @@ def test_the_map_is_where_the_room_is(room, built):
     )
     assert len(built.landmarks) > 100
     assert np.median(distances) < 0.02
-    covariances = built.landmarks.covariances
-    assert covariances is not None
-    assert np.all(np.linalg.eigvalsh(covariances) > 0.0)
+    assert np.all(np.linalg.eigvalsh(built.landmarks.covariances) > 0.0)
+    assert built.refined.after < 0.6 * built.refined.before
 
 
 def truth(room: Room, views: list[View], built: Built) -> tuple[Array, Array, Rotation]:
@@ -134,10 +124,6 @@ def test_other_images_are_localized(room, views, built):
     assert np.median(theirs.positions) > 2.0 * np.median(ours.positions)
 
 
-def test_the_refinement_lowers_the_noise(built):
-    assert built.refined.after < 0.6 * built.refined.before
-
-
 def test_the_report_says_what_an_imu_says(built, views):
     felt = Felt.random(0)
     metres = inertial_metres(refined_of(felt), imu_of(felt))
@@ -157,7 +143,6 @@ def test_without_calibration_lens_and_shutter_are_found(views, folder):
     work = Workshop(alone, Effort(), lambda *_: nullcontext(lambda count: None))
     built = build_map(Given(views, None, Anchors()), work)
     assert len(built.posed) == len(views)
-    assert built.shutter is not None
     assert built.shutter.visible
     assert built.camera.scan_direction == "top_to_bottom"
     apart = abs(built.camera.readout_time - 0.03)
@@ -187,7 +172,7 @@ def test_the_model_of_colmap_becomes_that_of_a_global_shutter(
     assert after < 0.5 * before
     still = Renderer(replace(CAMERA, readout_time=0.0), room.planes, ImageSettings())
     errors = []
-    for name in list(read_images(out))[::5]:
+    for name in list(read_images(out))[::9]:
         stamp = views[int(Path(name).stem)].stamp_ns
         true = still.image(room.motion, middle_stamp(CAMERA, stamp)).astype(float)
         made, rolling = (

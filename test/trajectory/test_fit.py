@@ -152,13 +152,11 @@ def test_truth_without_noise():
     np.testing.assert_allclose(states.rotations, rotations, atol=2e-4)
 
 
-@pytest.mark.parametrize(("readout", "outliers", "axis"), [(0.03, 0.0, 1), (-0.02, 0.3, 0)])
-def test_noise_outliers_directions(readout, outliers, axis):
-    rng = np.random.default_rng(4)
-    motion = projector.Motion.random(rng)
-    camera = make_camera(scan_direction="top_to_bottom" if axis else "left_to_right")
+def test_noise_outliers_and_columns_that_are_read_backwards():
+    rng, readout = np.random.default_rng(4), -0.02
+    motion, camera = projector.Motion.random(rng), make_camera(scan_direction="left_to_right")
     frames = projector.record(rng, motion, projector.room(rng), readout=readout, seconds=2.0,
-                              outliers=outliers, axis=axis)  # fmt: skip
+                              outliers=0.3, axis=0)  # fmt: skip
     seen = observe(camera, frames)
     # Half of the outliers pass for inliers of their frame.
     half = seen.trusted | (rng.random(len(seen.trusted)) < 0.1)
@@ -195,20 +193,3 @@ def test_a_wrong_lens_and_a_bent_board_are_found():
     assert abs(found.state.readout_time - READOUT) < 4.0 * found.readout_time_deviation < 4e-4
     assert found.camera.K[0, 0] == pytest.approx(projector.FOCAL, rel=3e-3)
     assert found.deviation == pytest.approx(0.1, rel=0.1)
-
-
-def test_images_with_times_of_their_own():
-    """Stamps that are 3 ms off: without the images' own times the readout time pays for it."""
-    rng = np.random.default_rng(6)
-    motion, camera = projector.Motion.random(rng), make_camera()
-    frames = projector.record(rng, motion, projector.room(rng), readout=READOUT, seconds=2.0)
-    late = rng.normal(0.0, 3e-3, len(frames))
-    stamped = [replace(f, stamp=f.stamp - d) for f, d in zip(frames, late, strict=True)]
-    seen = observe(camera, stamped)
-    start = start_state(camera, seen, guess(rng, motion, frames))
-    found = fit(camera, seen, start, Freedom(stamps=3e-3))
-    assert abs(found.state.readout_time - READOUT) < 4.0 * found.readout_time_deviation < 4e-4
-    delays = found.state.delays
-    assert np.corrcoef(delays[5:-5], late[5:-5])[0, 1] > 0.95
-    plain = fit(camera, seen, start, Freedom())
-    assert plain.deviation > 1.2 * found.deviation

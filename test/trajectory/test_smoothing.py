@@ -118,20 +118,18 @@ def test_frames_that_shake_faster_than_the_motion_are_said_to():
     scene = projector.room(rng, 1500)
     for motion, share in ((calm, 0.0), (shaking, 1.0)):
         recorded = projector.record(rng, motion, scene, readout=READOUT, seconds=1.2)
-        images, estimates = [], []
-        for frame in recorded:
-            middle = frame.stamp + 0.5 * READOUT
-            (rotation,), (position,) = motion.pose(np.array([middle]))
-            one = Localizer(CAMERA).localize(frame.points, frame.pixels)
-            assert one
-            # As with the gyroscope's turn: the pose is right, and the noise is all that is left.
-            known = replace(
+        images = [Observed(round(1e9 * f.stamp), f.points, f.pixels) for f in recorded]
+        poses = zip(*motion.pose([f.stamp + 0.5 * READOUT for f in recorded]), strict=True)
+        one = Localizer(CAMERA).localize(recorded[0].points, recorded[0].pixels)
+        # As with the gyroscope's turn: the poses are right, and the noise is all that is left.
+        estimates = [
+            replace(
                 one, rotation=rotation.T, translation=-rotation.T @ position,
-                inliers=np.ones(len(frame.points), np.bool_),
-                residuals=np.full(len(frame.points), 0.3 * np.sqrt(2.0)),
-            )  # fmt: skip
-            images.append(Observed(round(1e9 * frame.stamp), frame.points, frame.pixels))
-            estimates.append(known)
+                inliers=np.ones(len(image.points), np.bool_),
+                residuals=np.full(len(image.points), 0.3 * np.sqrt(2.0)),
+            )
+            for image, (rotation, position) in zip(images, poses, strict=True)
+        ]  # fmt: skip
         found = smooth(CAMERA, images, estimates)
         assert np.mean(found.shaken) == share
         if share:

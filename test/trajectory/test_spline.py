@@ -17,7 +17,6 @@ def random_spline(rng: np.random.Generator, turn: float, count: int = 9) -> Spli
     for k in range(1, count):
         rotations[k] = rotations[k - 1] @ so3.exp(turn * rng.normal(size=3))
     layout = Layout.over(np.array([[1.0, 1.0 + 0.05 * (count - 3)]]), 0.05)
-    assert layout.count == count
     return Spline(layout, rotations, rng.normal(size=(count, 3)))
 
 

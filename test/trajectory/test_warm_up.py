@@ -15,8 +15,7 @@ import projector
 from numba.core.dispatcher import Dispatcher
 from rs_localizer.core.camera import Camera
 from rs_localizer.localizer import Localizer
-from rs_localizer.trajectory.calibration import calibrate
-from rs_localizer.trajectory.calibration import likelihood
+from rs_localizer.trajectory.calibration import calibrate, likelihood
 from rs_localizer.trajectory.observe import Observed, localize_each
 from rs_localizer.trajectory.smoothing import smooth
 from rs_localizer.trajectory.warm_up import warm_up
@@ -29,35 +28,27 @@ def compiled():
 Localizer(Camera(width=640, height=480, K=projector.K, readout_time=0.03)).warm_up()
 warm_up()
 before = compiled()
-fisheye = {"D": np.array([0.01, -0.02, 0.003, 0.001]), "distortion_model": "equidistant"}
-for lens in ({"D": projector.D}, fisheye):
-    rng = np.random.default_rng(0)
-    motion = projector.Motion.random(rng)
-    frames = projector.record(rng, motion, projector.room(rng, 300), readout=0.03, seconds=0.75)
-    images = [Observed(round(1e9 * f.stamp) + 10**9, f.points, f.pixels) for f in frames]
-    camera = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K,
-                    readout_time=0.03, **lens)
-    found = calibrate(camera, images)
-    likelihood(camera, found, 1)
-    posed = [pair for pair in zip(images, localize_each(camera, images)) if pair[1]]
-    smoothed = smooth(camera, *map(list, zip(*posed)))
-    smoothed.sample(np.array([image.stamp_ns for image in images]))
+camera = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, readout_time=0.03,
+                D=np.array([0.01, -0.02, 0.003, -0.001]), distortion_model="equidistant")
+rng = np.random.default_rng(0)
+motion = projector.Motion.random(rng)
+frames = projector.record(rng, motion, projector.room(rng, 300), readout=0.03, seconds=0.75)
+images = [Observed(round(1e9 * f.stamp) + 10**9, f.points, f.pixels) for f in frames]
+likelihood(camera, calibrate(camera, images), 1)
+posed = [pair for pair in zip(images, localize_each(camera, images)) if pair[1]]
+smoothed = smooth(camera, *map(list, zip(*posed)))
+smoothed.sample(np.array([image.stamp_ns for image in images]))
 assert any(module.endswith("gyro_terms") for module, _, _ in before)
 print(sorted(compiled() - before))
 """
 
 
 def test_calibrating_and_smoothing_compile_nothing_any_more():
+    paths = [*filter(None, sys.path), str(Path(__file__).parent)]
     found = subprocess.run(
         [sys.executable, "-c", _SCRIPT],
-        env={
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join([*filter(None, sys.path), str(Path(__file__).parent)]),
-        },
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+        capture_output=True, text=True, check=False, timeout=300,
+    )  # fmt: skip
     assert found.returncode == 0, found.stderr
     assert found.stdout.strip() == "[]"
