@@ -32,10 +32,9 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera as Believed
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rig import Rig
-from rs_localizer.estimation.assumptions import assumptions, known_terms, turn_seen, with_experience
 from rs_localizer.estimation.observations import Observed, Sighted, find_usable, packed
 from rs_localizer.estimation.posterior import maximum_a_posteriori
-from rs_localizer.estimation.prior import Prior
+from rs_localizer.estimation.prior import Prior, assumptions, of_frame
 from rs_localizer.estimation.ransac import generator
 from rs_localizer.estimation.searching import MotionSearch
 from rs_localizer.solvers.table import Solver, find_solver, start_solver
@@ -160,16 +159,14 @@ def _found(
     config = LocalizerConfig()
     exposure = Rig.of(camera).exposure()
     terms, assumed = assumptions(camera.readout_time, Rig.of(camera), config, solver)
+    terms, assumed, _ = of_frame(terms, assumed, prior, turn)
     usable = find_usable(exposure, *given, [len(given[0])], turn)
     observed = Observed(
         packed(exposure, given[0], usable),
-        usable.indices,
-        len(given[0]),
-        usable.centre,
-        None,
-        known_terms(terms, prior, turn),
+        np.zeros(0, np.int64),
+        terms,
         generator(config.seed),
-        with_experience(assumed, prior, turn_seen(terms, turn)),
+        assumed,
         Sighted(exposure, *given, usable, turn),
     )
     start, best = MotionSearch(camera.focal_length, config, solver, start_solver(solver)).find(
