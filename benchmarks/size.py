@@ -50,7 +50,8 @@ def main() -> int:
         ),
         "localizer.py": _lines({"": sources["localizer"]}),
         "Estimate / Prior / Posterior: fields": " / ".join(
-            str(len(dataclasses.fields(kind))) for kind in (rsl.Estimate, rsl.Prior, Posterior)
+            str(len(fields))
+            for fields in (*map(dataclasses.fields, (rsl.Estimate, rsl.Prior)), Posterior._fields)
         ),
         "one cloud: Python calls / kernels / files": f"{calls} / {kernels} / {files}",
         "lines of test": _lines(_texts("test")),

@@ -303,10 +303,9 @@ class Matching:
     """How keypoints are matched with the landmarks of a map."""
 
     by: str = setting(
-        MatchBy.AUTO.value,
+        MatchBy.AUTO,
         "What keypoints and landmarks are compared by; auto: descriptors if both have them, "
         "otherwise ids",
-        choices=tuple(choice.value for choice in MatchBy),
     )
     ratio: float = setting(
         0.8,
@@ -346,10 +345,9 @@ class Imu:
     """The IMU beside the camera, and how far it is believed."""
 
     use: str = setting(
-        ImuUse.AUTO.value,
+        ImuUse.AUTO,
         "auto: use the IMU if messages come on imu and TF knows how it is turned against the "
         "camera; none: never",
-        choices=tuple(use.value for use in ImuUse),
     )
     time_offset: float = setting(
         0.0, "Time to add to the stamps of the IMU to get the camera's time, in s", (-10.0, 10.0)
@@ -434,9 +432,8 @@ class NodeConfig(LocalizerConfig):
         "some seconds of it frames have twists and are tracked",
     )
     scan_direction: str = setting(
-        ScanDirection.TOP_TO_BOTTOM.value,
+        ScanDirection.TOP_TO_BOTTOM,
         "Direction in which the shutter moves over the raw image",
-        choices=tuple(direction.value for direction in ScanDirection),
     )
     stamp_offset: float = setting(
         0.0,
@@ -444,10 +441,9 @@ class NodeConfig(LocalizerConfig):
         (-10.0, 10.0),
     )
     pose_time: str = setting(
-        PoseTime.STAMP.value,
+        PoseTime.STAMP,
         "stamp: the pose is valid at the input's stamp; mid_frame: the output's stamp is moved to "
         "the exposure of the middle row",
-        choices=tuple(time.value for time in PoseTime),
     )
     tracking: bool = setting(
         True,
@@ -470,30 +466,26 @@ class NodeConfig(LocalizerConfig):
         "odom", "Frame of the odometry, for publish_tf map_to_odom", fixed=True
     )
     publish_tf: str = setting(
-        PublishTf.NONE.value,
+        PublishTf.NONE,
         "Transform to publish: map_to_camera: the body (base_frame if set) in the map; "
         "map_to_odom: REP-105, needs odometry on TF",
-        choices=tuple(choice.value for choice in PublishTf),
     )
     orientation_covariance: str = setting(
-        OrientationCovariance.FIXED_AXES.value,
+        OrientationCovariance.FIXED_AXES,
         "What covariances of poses are about; fixed_axes: rotations about those of the map, as "
         "REP-103 has it; roll_pitch_yaw: these angles, as robot_localization reads them",
-        choices=tuple(choice.value for choice in OrientationCovariance),
     )
     px4_odometry: str = setting(
-        Px4Odometry.NONE.value,
+        Px4Odometry.NONE,
         "External vision of PX4 on ~/vehicle_odometry; frd: the map has z up; ned: it has x east, "
         "y north, z up; needs px4_msgs and base_frame",
-        choices=tuple(choice.value for choice in Px4Odometry),
         fixed=True,
     )
     image_rect_shutter: str = setting(
-        ShutterDepth.NONE.value,
+        ShutterDepth.NONE,
         "Images as a global shutter would have taken them on ~/image_rect_shutter, from image or "
         "image/compressed; far: the turn is undone; plane: by the plane of the frame's inliers; "
         "map: by what lies between them",
-        choices=tuple(choice.value for choice in ShutterDepth),
         fixed=True,
     )
     transform_tolerance: float = setting(
@@ -607,9 +599,8 @@ class DetectorConfig:
         10.0, "Markers with a shorter side than this, in px, are left out", (0.0, 10000.0)
     )
     transport: str = setting(
-        ImageTransport.AUTO.value,
+        ImageTransport.AUTO,
         "Topic of the images; auto: image if it has a publisher, otherwise image/compressed",
-        choices=tuple(transport.value for transport in ImageTransport),
         read_only=True,
     )
     readout_time: float = setting(
@@ -618,9 +609,8 @@ class DetectorConfig:
         (0.0, 0.2),
     )
     scan_direction: str = setting(
-        ScanDirection.TOP_TO_BOTTOM.value,
+        ScanDirection.TOP_TO_BOTTOM,
         "Only for the debug image: direction in which the shutter moves, as the localizer's",
-        choices=tuple(direction.value for direction in ScanDirection),
     )
     stamp_offset: float = setting(
         0.0,
@@ -648,17 +638,15 @@ class FeatureConfig:
     """Settings of the feature detector."""
 
     features: str = setting(
-        FeatureKind.SIFT.value,
+        FeatureKind.SIFT,
         "How keypoints are found and described; sift: as COLMAP does; it has to be the map's",
-        choices=tuple(kind.value for kind in FeatureKind),
     )
     max_keypoints: int = setting(
         1000, "Most keypoints of an image: the best ones of all its parts", (7, 1_000_000)
     )
     transport: str = setting(
-        ImageTransport.AUTO.value,
+        ImageTransport.AUTO,
         "Topic of the images; auto: image if it has a publisher, otherwise image/compressed",
-        choices=tuple(transport.value for transport in ImageTransport),
         read_only=True,
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)

@@ -23,19 +23,13 @@ from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation import frame_fit, mirror, motion_model, observations, ransac
-from rs_localizer.estimation.acceptance import refusal, uncertain
-from rs_localizer.estimation.assumptions import (
-    assumptions,
-    known_terms,
-    told_speed,
-    turn_seen,
-    with_experience,
-)
+from rs_localizer.estimation import motion_model, observations, ransac
+from rs_localizer.estimation.acceptance import estimate_of, refusal, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
 from rs_localizer.estimation.lens import decided, find_lens, may_be_lens, refuted, told_of_lens
 from rs_localizer.estimation.observations import (
+    NEAREST,
     Observed,
     Sighted,
     checked,
@@ -49,13 +43,14 @@ from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior import (
     Prior,
     PriorTerms,
+    assumptions,
+    of_frame,
     offset_between,
     pivot_of,
     state_in,
     with_motion,
 )
 from rs_localizer.estimation.ransac import Candidate, generator
-from rs_localizer.estimation.result import estimate_of
 from rs_localizer.estimation.searching import MotionSearch
 from rs_localizer.solvers.table import find_solver, start_solver
 
@@ -67,7 +62,7 @@ _MOST_INNOVATION = 62.0
 # Points whose places are off by a standard deviation in either direction lie within so many of them
 # (95 % of Rayleigh's distribution).
 _MAP_GATE = 2.45
-_NEAREST = 1e-6  # m
+_UNRANKED = np.zeros(0, np.int64)
 # Points that agree with a prediction's optimum, as a share of those that agreed before.
 _STILL_TRACKED = 0.7
 
@@ -131,7 +126,7 @@ class Localizer:
         if not self._alone:
             Localizer(next(iter(self.rig.cameras.values())), self.config).warm_up()
             return
-        for part in (frame_fit, mirror, motion_model, observations, ransac):
+        for part in (motion_model, observations, ransac):
             part.warm_up()
         # A still camera before a scene that is no plane; with half a prediction, which is dropped.
         count = max(160, self.config.min_inliers)
@@ -222,7 +217,7 @@ class Localizer:
         sights = self._sights(points, pixels, scores, stamps)
         given = _Given(*sights, prior, expected_share, turn)
         lens = None if prior is None else prior.lens
-        if not given.exposure.alone and (turn is not None or lens is not None):
+        if (turn is not None or lens is not None) and not given.exposure.alone:
             raise ValueError("a known turn, or a lens, is that of a camera alone, not of a rig")
         if turn is not None:
             given = given._replace(exposure=given.exposure.ahead())
@@ -256,12 +251,9 @@ class Localizer:
     def _found(self, given: _Given, lens: LensError | None) -> Estimate | Failure:
         """What there is to find by a lens that other frames tell of, or by the calibration's."""
         exposure, counts, points, pixels, scores, prior, expected_share, turn = given
-        terms, assumed = configured = self._assume(exposure.span)
+        terms, assumed = self._assume(exposure.span)
         if prior is not None or turn is not None:
-            if assumed.may_rest:
-                terms, prior = told_speed(terms, prior)
-            assumed = with_experience(assumed, prior, turn_seen(configured[0], turn))
-            terms = known_terms(terms, prior, turn)
+            terms, assumed, prior = of_frame(terms, assumed, prior, turn)
         if lens is not None:
             exposure = exposure.by(lens.mended(*exposure.cameras))
         # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
@@ -271,10 +263,7 @@ class Localizer:
             return failure
         observed = Observed(
             packed(exposure, points, usable),
-            usable.indices,
-            len(points),
-            usable.centre,
-            None if scores is None else np.argsort(-scores[usable.indices], kind="stable"),
+            _UNRANKED if scores is None else np.argsort(-scores[usable.indices], kind="stable"),
             terms,
             generator(self.config.seed),
             assumed,
@@ -305,8 +294,8 @@ class Localizer:
         threshold = self.config.inlier_threshold
         if (
             observed.lens is not None
-            or not observed.sighted.exposure.alone
             or not self._solver.rolling_shutter
+            or not observed.sighted.exposure.alone
             or not may_be_lens(found, posterior, threshold)
         ):
             return found
@@ -344,12 +333,12 @@ class Localizer:
             posterior = self._settle(observed, best, observed.terms)
         result = self._accept(observed, start, best, posterior, self._own_terms(observed, prior))
         if result and np.count_nonzero(result.inliers) < (
-            _STILL_TRACKED * expected_share * len(observed.usable)
+            _STILL_TRACKED * expected_share * observed.observations.count
         ):
             return Failure(
                 Reason.TOO_FEW_INLIERS,
                 f"{np.count_nonzero(result.inliers)} inliers near the prior motion, "
-                f"{expected_share:.0%} of {len(observed.usable)} were expected",
+                f"{expected_share:.0%} of {observed.observations.count} were expected",
             )
         return result
 
@@ -374,7 +363,7 @@ class Localizer:
         observations = observed.observations
         depth = observations.median_depth(state, np.ones(len(observations), dtype=np.bool_))
         focal = observed.assumed.focal_length
-        return math.hypot(threshold, _MAP_GATE * deviation * focal / max(depth, _NEAREST))
+        return math.hypot(threshold, _MAP_GATE * deviation * focal / max(depth, NEAREST))
 
     def _own_terms(self, observed: Observed, prior: Prior) -> PriorTerms:
         """What is known of a frame by its own and by the velocities of those before.
@@ -402,7 +391,7 @@ class Localizer:
         known = math.hypot(posterior.declared, effect.residual)  # px, of map and calibration
         failure = refusal(
             observed.observations,
-            replace(posterior, declared=known),
+            posterior._replace(declared=known),
             best.samples,
             min_inliers=self.config.min_inliers,
             threshold=self._gate(observed, posterior.state),

@@ -13,10 +13,9 @@ from benchmarks.frames.conditions import named
 from benchmarks.frames.judged import far_off, judge
 from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.estimation.assumptions import assumptions
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import maximum_a_posteriori
-from rs_localizer.estimation.prior import state_in
+from rs_localizer.estimation.prior import assumptions, state_in
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.solvers.table import find_solver
 

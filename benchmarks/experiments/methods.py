@@ -21,7 +21,7 @@ from benchmarks.experiments.trials import POINTS, Motions, Trials, camera
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.rig import Mounts, Rig
-from rs_localizer.estimation.assumptions import assumptions
+from rs_localizer.estimation.prior import assumptions
 from rs_localizer.solvers.minimal import solve_minimal
 from rs_localizer.solvers.table import SOLVERS, find_solver
 

@@ -14,15 +14,17 @@ image, at the row that sees it there.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
 from rs_localizer.core.so3 import hat
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.solvers.batch import MODEL_SIZE
-from rs_localizer.solvers.r9p import solve_free
+from rs_localizer.solvers.batch import MODEL_SIZE, Sample, gather, inputs, scatter
+from rs_localizer.solvers.r9p import SAMPLE_SIZE, unknowns
 
 # As of motions: nearer to the pace of the rows any row sees the point, and the second look is taken
 # no farther away.
@@ -59,7 +61,7 @@ def solve_all(
 ) -> Array:
     """Models (h,3,8) of samples (h,9) from an initial rotation (3,3); NaN where there is none."""
     found = np.empty((MODEL_SIZE, len(samples)))
-    solve_free(
+    _solve_free(
         observations.points, observations.rays, observations.tau, samples, rotation[None],
         as_published, found,
     )  # fmt: skip
@@ -79,6 +81,38 @@ def best_free_motion(
     )  # fmt: skip
     best = int(np.argmin(costs))
     return FreeMotion(models[best]) if np.isfinite(costs[best]) else None
+
+
+_INPUTS = inputs(SAMPLE_SIZE)
+
+
+def _unknowns_of(values: list[Lanes], *, fix_trace: bool) -> Vector:
+    v, c, t, matrix = unknowns(Sample(values, SAMPLE_SIZE), fix_trace=fix_trace)
+    return [*v, *c, *t, *(x for row in matrix for x in row)]
+
+
+_lanes = traced(lambda values: _unknowns_of(values, fix_trace=True), _INPUTS)
+_lanes_as_published = traced(lambda values: _unknowns_of(values, fix_trace=False), _INPUTS)
+
+
+@kernel
+def _solve_free(
+    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, as_published: bool,
+    models: Array,
+) -> None:  # fmt: skip
+    """The unknowns themselves: models (18,h) are v, C, t and R_RS, in the initial rotation's frame.
+
+    Row-major. Arguments otherwise as in :mod:`rs_localizer.solvers.batch`.
+    """
+    work = np.empty(_INPUTS * LANES)
+    model = np.empty(MODEL_SIZE * LANES)
+    for start in range(0, len(samples), LANES):
+        gather(points, rays, tau, samples, rotations, start, work)
+        if as_published:
+            _lanes_as_published(work, model)
+        else:
+            _lanes(work, model)
+        scatter(model, 0, start, models)
 
 
 @kernel

@@ -31,25 +31,27 @@ _RESULTS = 7
 
 def bearings(camera: Camera, pixels: Array) -> tuple[Array, Array]:
     """As :meth:`Camera.rays_and_jacobian` of raw pixels (n,2), to rounding errors."""
-    D = camera.D
-    other = len(D) > 0 and not camera.law.is_polynomial
-    if len(pixels) == 0 or other or np.any(D[_COEFFICIENTS:]):
+    lens = pinhole(camera)
+    if lens is None or len(pixels) == 0:
         return camera.rays_and_jacobian(pixels)
-    lens = np.zeros(_COEFFICIENTS)
-    lens[: len(D)] = D[:_COEFFICIENTS]
-    rays, by_ray, lost = _bearings(pixels, *_pinhole(camera), lens)
+    rays, by_ray, lost = _bearings(pixels, *lens)
     if lost.any():
         rays[lost], by_ray[lost] = camera.rays_and_jacobian(pixels[lost])
     return rays, by_ray
 
 
 @lru_cache(64)  # of the cameras of a rig, and lenses that are tried
-def _pinhole(camera: Camera) -> tuple[Array, Array]:
-    """Focal lengths (2,) and centre (2,) of the image, in delivered pixels."""
+def pinhole(camera: Camera) -> tuple[Array, Array, Array] | None:
+    """Focal lengths (2,), centre (2,) in delivered pixels, and coefficients (12,) of a pinhole."""
+    D = camera.D
+    if len(D) > 0 and (not camera.law.is_polynomial or np.any(D[_COEFFICIENTS:])):
+        return None
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     x, y = camera.binning
     left, top = (0, 0) if camera.roi is None else (camera.roi.x_offset, camera.roi.y_offset)
-    return np.array([fx / x, fy / y]), np.array([(cx - left) / x, (cy - top) / y])
+    lens = np.zeros(_COEFFICIENTS)
+    lens[: len(D)] = D[:_COEFFICIENTS]
+    return np.array([fx / x, fy / y]), np.array([(cx - left) / x, (cy - top) / y]), lens
 
 
 def _step(values: list[Lanes]) -> Vector:
@@ -128,3 +130,26 @@ def _bearings(
             xx, xy, yx, yy = by_ray[i, 0, 0], by_ray[i, 0, 1], by_ray[i, 1, 0], by_ray[i, 1, 1]
             lost[i] = not (steps[6 * LANES + lane] < _SAME and xx > 0.0 and xx * yy > xy * yx)
     return rays, by_ray, lost
+
+
+@kernel
+def radial_slopes(rays: Array, focal: Array, lens: Array) -> tuple[Array, Array]:
+    """Pixels (n,2) of rays (n,2) from the image's centre, and derivatives (n,2) by k1.
+
+    Through a lens of :func:`pinhole`.
+    """
+    k1, k2, p1, p2, k3, k4 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
+    k5, k6, s1, s2, s3, s4 = lens[6], lens[7], lens[8], lens[9], lens[10], lens[11]
+    pixels, slopes = np.empty(rays.shape), np.empty(rays.shape)
+    for i in range(len(rays)):
+        x, y = rays[i, 0], rays[i, 1]
+        square = x * x + y * y
+        above = 1.0 + square * (k1 + square * (k2 + square * k3))
+        below = 1.0 / (1.0 + square * (k4 + square * (k5 + square * k6)))
+        across = x * above * below + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
+        down = y * above * below + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
+        pixels[i, 0] = focal[0] * (across + square * (s1 + square * s2))
+        pixels[i, 1] = focal[1] * (down + square * (s3 + square * s4))
+        slopes[i, 0] = focal[0] * x * square * below
+        slopes[i, 1] = focal[1] * y * square * below
+    return pixels, slopes

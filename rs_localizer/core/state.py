@@ -35,7 +35,7 @@ POSE, VELOCITIES, ACCELERATIONS = slice(0, 6), slice(6, 12), slice(12, 18)
     STATE_ANGULAR_ACCELERATION,
     STATE_LINEAR_ACCELERATION,
 ) = (slice(k, k + 3) for k in range(9, STATE_SIZE, 3))
-_POSE_SIZE = STATE_TRANSLATION.stop
+POSE_SIZE = STATE_TRANSLATION.stop
 
 
 def rotation_of(state: Array) -> Array:
@@ -43,23 +43,18 @@ def rotation_of(state: Array) -> Array:
     return state[:9].reshape(3, 3)
 
 
-def at_rest(state: Array) -> Array:
-    """The same pose of a camera that does not move."""
-    return np.concatenate([state[:_POSE_SIZE], np.zeros(STATE_SIZE - _POSE_SIZE)])
-
-
 @kernel
 def step_between(state: Array, other: Array) -> Array:
     """The step (18,) that leads from one state to another."""
     turn, step = np.empty((3, 3)), np.empty(PARAMETERS)
     for i in range(3):
-        moved = state[_POSE_SIZE - 3 + i]
+        moved = state[POSE_SIZE - 3 + i]
         for j in range(3):
             total = 0.0
             for k in range(3):
                 total += state[3 * i + k] * other[3 * j + k]
             turn[i, j] = total
-            moved -= total * other[_POSE_SIZE - 3 + j]
+            moved -= total * other[POSE_SIZE - 3 + j]
         step[3 + i] = moved
     turned = so3.log(turn)
     for i in range(3):

@@ -18,6 +18,7 @@ import numpy as np
 
 from rs_localizer.config import CalibrationErrors
 from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.bearings import pinhole, radial_slopes
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.scales import SPEEDS
@@ -25,13 +26,12 @@ from rs_localizer.core.shake import shake_at
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE
 from rs_localizer.estimation.frame_fit import SMOOTH_TERMS, smooth_terms
-from rs_localizer.estimation.lens import rays_of_lens
 from rs_localizer.estimation.mirror import longest_axis
-from rs_localizer.estimation.observations import Observed
+from rs_localizer.estimation.observations import Observed, rays_of_lens
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import PriorTerms, add_prior, terms_at
 from rs_localizer.estimation.refine import inverted
-from rs_localizer.estimation.residuals import Lines, linearized
+from rs_localizer.estimation.residuals import linearized
 
 # Of each camera: centre (2), focal length, distortion.
 _ERRORS = 4
@@ -61,54 +61,72 @@ def calibration_effect(
         terms: what is known of the motion but for poses of other frames, which are off by as much.
     """
     observations, chosen = observed.observations, posterior.inliers
-    lines = linearized(
-        observations.packed, observations.count, posterior.state,
-        shake_at(observations.tau, posterior.shake),
-    )  # fmt: skip
-    rays = rays_of_lens(observed.sighted, observations.tau[chosen], lines.image[chosen])
-    of_camera, exposure = observations.camera[chosen], observed.sighted.exposure
-    columns = np.zeros((len(rays), 2, _ERRORS * len(exposure.cameras)))
-    for place, side in enumerate(exposure.sides):
-        here, first = of_camera == place, _ERRORS * side.place
-        if np.any(here):
-            towards = side.towards(rays[here])
-            columns[here, :, first : first + _ERRORS] = _columns(side.camera, towards, deviation)
-    smooth, variance = _smooth_columns(posterior, lines, chosen), posterior.noise**2
-    rows = np.concatenate([lines.by_motion[chosen], smooth, columns], axis=2)
-    size, rows = PARAMETERS + smooth.shape[2], rows.reshape(-1, rows.shape[2])
-    every = rows.T @ rows
-    of_pose = posterior.inflation * variance * inverted(np.ascontiguousarray(every[POSE, POSE]))
-    still = longest_axis(of_pose) if np.all(np.isfinite(of_pose)) else np.inf
-    products = np.ascontiguousarray(every[:size, :size])
-    crossed = np.hstack([every[:size, size:], variance * np.eye(size)[:, PARAMETERS:]])
+    exposure = observed.sighted.exposure
+    by_motion, image, tau = _lines(
+        observations.packed, observations.tau, posterior.state, posterior.shake, chosen
+    )
+    turn = observed.sighted.turn
+    rays = image if turn is None else rays_of_lens(turn, tau, image)
+    if len(exposure.sides) == 1:
+        (side,) = exposure.sides
+        columns = _columns(side.camera, side.towards(rays), deviation)
+    else:
+        of_side = observations.camera[chosen]
+        columns = np.zeros((len(rays), 2, _ERRORS * len(exposure.cameras)))
+        for place, side in enumerate(exposure.sides):
+            here, first = of_side == place, _ERRORS * side.place
+            if np.any(here):
+                columns[here, :, first : first + _ERRORS] = _columns(
+                    side.camera, side.towards(rays[here]), deviation
+                )
+    bend = posterior.bend[chosen] if posterior.bend.shape[1] else np.zeros((len(rays), 0))
     parts = posterior.speeds if len(posterior.speeds) else _CONFIGURED
-    pull, taken, finite = _effect(
-        products, crossed, posterior.state, terms, parts, observed.sighted.turn is not None,
-        variance,
+    effect: CalibrationEffect = _effect(
+        by_motion, _smooth_columns(by_motion, image, bend, posterior.shared), columns,
+        posterior.state, terms, parts, turn is not None, posterior.noise**2,
+        posterior.inflation,
     )  # fmt: skip
-    if not finite:
-        return NO_EFFECT._replace(still_deviation=still)
-    taken = taken[:, : columns.shape[2]]
-    beside = every[:PARAMETERS, :PARAMETERS] @ taken - 2.0 * every[:PARAMETERS, size:]
-    left = np.trace(every[size:, size:]) + np.sum(taken * beside)
-    residual = np.sqrt(max(left, 0.0) / max(len(rows), 1))
-    return CalibrationEffect(pull @ pull.T, float(residual), still)
+    return effect
+
+
+@kernel
+def _lines(
+    data: Array, tau: Array, state: Array, shake: Array, chosen: BoolArray
+) -> tuple[Array, Array, Array]:
+    """Derivatives (m,2,18) of the chosen points by the motion, rays (m,2), and row times (m,)."""
+    lines = linearized(data, len(tau), state, shake_at(tau, shake))
+    return lines.by_motion[chosen], lines.image[chosen], tau[chosen]
 
 
 @kernel
 def _effect(
-    products: Array, crossed: Array, state: Array, terms: PriorTerms, parts: Array,
-    turn_known: bool, variance: float,
-) -> tuple[Array, Array, bool]:  # fmt: skip
-    """How errors (k) move pose and velocities (12,k), and the motion alone (18,k); whether they do.
+    by_motion: Array, smooth: Array, columns: Array, state: Array, terms: PriorTerms,
+    parts: Array, turn_known: bool, variance: float, inflation: float,
+) -> CalibrationEffect:  # fmt: skip
+    """How errors move motion and smooth error.
 
     Args:
-        products: (m,m) of the columns of motion and smooth error.
-        crossed: (m,k) and of these with what the errors move.
+        by_motion, smooth, columns: derivatives (n,2,18), (n,2,q) by the motion and the smooth
+            error, and by how much the errors move the points (n,2,k).
         parts: (5,) of the typical speeds.
-        variance: of the noise, px^2.
+        variance, inflation: of the noise, px^2, and because it is an estimate.
     """
-    pull, alone = np.zeros((MOTION_PARAMETERS, crossed.shape[1])), crossed[:PARAMETERS] * 0.0
+    count, q, errors = 2 * len(by_motion), smooth.shape[2], columns.shape[2]
+    size, rows = PARAMETERS + q, np.empty((count, PARAMETERS + q + errors))
+    rows[:, :PARAMETERS] = by_motion.reshape(count, PARAMETERS)
+    rows[:, PARAMETERS:size] = smooth.reshape(count, q)
+    rows[:, size:] = columns.reshape(count, errors)
+    every = rows.T @ rows
+    still, of_pose = np.inf, inflation * variance * inverted(every[POSE, POSE].copy())
+    if np.all(np.isfinite(of_pose)):
+        still = longest_axis(of_pose)
+    products = every[:size, :size].copy()
+    crossed = np.zeros((size, errors + q))
+    crossed[:, :errors] = every[:size, size:]
+    for k in range(q):
+        crossed[PARAMETERS + k, errors + k] = variance
+    pull, taken = np.zeros((MOTION_PARAMETERS, errors + q)), np.zeros((PARAMETERS, errors))
+    of_errors = crossed[:PARAMETERS, :errors].copy()
     for k in range(len(parts)):
         if parts[k] < _NO_PART:
             continue
@@ -122,36 +140,59 @@ def _effect(
             information[i, i] += variance
         inverse = inverted(information)
         if not np.all(np.isfinite(inverse)):
-            return pull, alone, False
+            return CalibrationEffect(np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)), 0.0, still)
         pull -= parts[k] * (inverse[:MOTION_PARAMETERS] @ crossed)
-        alone += parts[k] * (inverted(of_motion) @ crossed[:PARAMETERS])
-    return pull, alone, True
+        taken += parts[k] * (inverted(of_motion) @ of_errors)
+    # What no motion takes up.
+    left = np.trace(every[size:, size:].copy())
+    beside = products[:PARAMETERS, :PARAMETERS].copy() @ taken - 2.0 * of_errors
+    left += np.sum(taken * beside)
+    residual = np.sqrt(max(left, 0.0) / max(count, 1))
+    return CalibrationEffect(pull @ pull.T, residual, still)
 
 
-def _smooth_columns(posterior: Posterior, lines: Lines, chosen: BoolArray) -> Array:
+@kernel
+def _smooth_columns(by_motion: Array, rays: Array, bend: Array, scale: float) -> Array:
     """By how many pixels a deviation of each coefficient of the smooth error moves (n,2,q)."""
-    scale, rays = posterior.shared, lines.image[chosen]
+    count = len(rays)
     if not scale > 0.0:
-        return np.zeros((len(rays), 2, 0))
-    if posterior.bend.shape[1]:
-        moved = -scale * lines.by_motion[chosen][:, :, MOVE]
-        bent: Array = np.einsum("nka,nb->nkba", moved, posterior.bend[chosen])
-        return bent.reshape(len(rays), 2, -1)
-    low, high = rays.min(axis=0), rays.max(axis=0)
-    columns, each = np.zeros((len(rays), 2, 2 * SMOOTH_TERMS)), np.zeros(SMOOTH_TERMS)
-    for k, ray in enumerate(rays):
-        smooth_terms(ray, low, high, each)
-        columns[k, 0, :SMOOTH_TERMS] = columns[k, 1, SMOOTH_TERMS:] = scale * each
+        return np.zeros((count, 2, 0))
+    if bend.shape[1] > 0:
+        bent = np.empty((count, 2, 3 * bend.shape[1]))
+        for i in range(count):
+            for side in range(2):
+                for k in range(bend.shape[1]):
+                    for axis in range(3):
+                        moved = -scale * by_motion[i, side, MOVE.start + axis]
+                        bent[i, side, 3 * k + axis] = moved * bend[i, k]
+        return bent
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for i in range(count):
+        for axis in range(2):
+            low[axis] = min(low[axis], rays[i, axis])
+            high[axis] = max(high[axis], rays[i, axis])
+    columns, each = np.zeros((count, 2, 2 * SMOOTH_TERMS)), np.zeros(SMOOTH_TERMS)
+    for i in range(count):
+        smooth_terms(rays[i], low, high, each)
+        for k in range(SMOOTH_TERMS):
+            columns[i, 0, k] = columns[i, 1, SMOOTH_TERMS + k] = scale * each[k]
     return columns
 
 
 def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Array:
     """By how many pixels a standard deviation of each error moves rays or bearings: (n,2,4)."""
-    by_all = by_lens(camera, towards)
-    focal = coefficients_of(camera) - 4
-    corner = corner_of(camera) * camera.focal_length / camera.binning[0]
+    corner = corner_of(camera)
+    corner_pixels = corner * camera.focal_length / camera.binning[0]
     columns = np.zeros((len(towards), 2, _ERRORS))
     columns[:, 0, 0] = columns[:, 1, 1] = deviation.principal_point
+    lens = pinhole(camera)
+    if lens is not None:  # the same, for less
+        pixels, slopes = radial_slopes(towards, lens[0], lens[2])
+        columns[:, :, 2] = deviation.focal_length * pixels
+        columns[:, :, 3] = deviation.distortion / (corner_pixels * corner**2) * slopes
+        return columns
+    by_all = by_lens(camera, towards)
+    focal = coefficients_of(camera) - 4
     columns[:, :, 2] = deviation.focal_length * by_all[:, :, focal : focal + 2].sum(axis=2)
-    columns[:, :, 3] = deviation.distortion / corner * by_all[:, :, 0]
+    columns[:, :, 3] = deviation.distortion / corner_pixels * by_all[:, :, 0]
     return columns

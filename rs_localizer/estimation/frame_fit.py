@@ -23,12 +23,9 @@ from numpy.polynomial.legendre import legvander
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.scales import SCALES
 from rs_localizer.core.shake import (
-    COMBINATIONS,
     FUNCTIONS,
-    IN_COMBINATIONS,
     MIDDLE_RATES,
     MIDDLE_VALUES,
-    RESOLVED,
     shake_at,
     shake_basis,
 )
@@ -36,8 +33,7 @@ from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, noise_deviation
 from rs_localizer.estimation.prior import PriorTerms, add_prior
-from rs_localizer.estimation.refine import apply_step, half_inverse, inverted, squared
-from rs_localizer.estimation.residual_tests import neighbours_agree
+from rs_localizer.estimation.refine import LEAST_NOISE, TINY, apply_step, half_inverse, squared
 from rs_localizer.estimation.residuals import POINT_SIZE, Lines, linearized, squared_errors
 
 SMOOTH_DEGREE = 3
@@ -86,9 +82,8 @@ _SHORT = 1e-3
 _HALVINGS = 6
 # Fewer inliers determine nothing.
 _FEWEST = 6
-_TINY = 1e-300
-# Products of a turn of three axes with the motion and the errors.
-_OUTER = 3 * PARAMETERS + 3
+# Points nearer than this part of the image that the points fill are neighbours in it.
+_FAR_APART = 0.15
 
 
 class Products(NamedTuple):
@@ -113,7 +108,7 @@ class FrameFit(NamedTuple):
     log_scales: Array  # (15,)
     decided: Array  # (15,) how many coefficients of each scale the points decide
     smooth: float  # scale of the smooth error: its expected root mean square
-    agreement: float  # of neighbouring rows (see residual_tests)
+    agreement: float  # of neighbouring rows (see neighbours_agree)
     evidence: float  # logarithm, but for a constant of the inliers
     left: float  # squared errors beside all, in variances of the noise
     prior_cost: float  # of motion, coefficients and scales
@@ -535,7 +530,7 @@ def _climb(
             if g < SCALES - 1 and 0 <= other < SCALES - 1:
                 climb -= _SMOOTH_SPECTRUM * (scales[g] - scales[other])
                 bend += _SMOOTH_SPECTRUM
-        step = min(max(climb / (bend + _TINY), -_LONGEST_SCALE_STEP), _LONGEST_SCALE_STEP)
+        step = min(max(climb / (bend + TINY), -_LONGEST_SCALE_STEP), _LONGEST_SCALE_STEP)
         steps[g] = min(max(scales[g] + step, _LEAST_LOG_SCALE), _MOST_LOG_SCALE) - scales[g]
     return steps
 
@@ -546,7 +541,7 @@ def _extrapolate(steps: Array, before: Array) -> None:
     for g in range(SCALES):
         ratio = steps[g] / before[g] if before[g] != 0.0 else 0.0
         if ratio > 0.0:
-            steps[g] *= min(1.0 / max(1.0 - ratio, _TINY), _FARTHEST)
+            steps[g] *= min(1.0 / max(1.0 - ratio, TINY), _FARTHEST)
 
 
 @inlined
@@ -697,7 +692,7 @@ def fit_frame(
     smooth = math.exp(scales[SCALES - 1]) if with_smooth else 0.0
     agreement = neighbours_agree(errors, tau, lines.image, inliers)
     finite = finite and bool(np.all(np.isfinite(solved.covariance)))
-    by_smooth = solved.covariance[:chosen, chosen:] / max(smooth, _TINY)
+    by_smooth = solved.covariance[:chosen, chosen:] / max(smooth, TINY)
     own = solved.covariance[:chosen, :chosen] - by_smooth @ by_smooth.T
     if with_turns:
         own += _by_scales(solved.covariance[:chosen], coefficients, scales, groups, spread)
@@ -777,167 +772,43 @@ def _largest_move(step: Array, covariance: Array) -> float:
     """Square of the longest part of a step, in deviations; NaN where one is not finite."""
     longest = 0.0
     for i in range(len(step)):
-        part = step[i] * step[i] / max(covariance[i, i], _TINY)
+        part = step[i] * step[i] / max(covariance[i, i], TINY)
         if not part <= longest:
             longest = part
     return longest
 
 
-class ScoreProducts(NamedTuple):
-    """Products of columns at a motion without in-frame turn and smooth error, over the inliers."""
-
-    own: Array  # (14,6,6) of each frequency's columns with themselves
-    by_motion: Array  # (14,6,18) and with the motion's
-    along: Array  # (14,6) and with the negative errors
-    smooth: Array  # (20,20) of the smooth error's
-    smooth_by_motion: Array  # (20,18)
-    smooth_along: Array  # (20,)
-    # (48,48), (48,18), (48,): the same of what the rows resolve of all frequencies (core/shake.py)
-    together: Array
-    together_by_motion: Array
-    together_along: Array
-    inverse: Array  # (18,18) of the motion's, with the prior's information
-
-
 @kernel
-def score_products(
-    data: Array, count: int, state: Array, inliers: BoolArray, prior: PriorTerms,
-    variance: float, turns: bool,
-) -> tuple[ScoreProducts, float]:  # fmt: skip
-    """What tells how much an in-frame turn and a smooth error would explain (Rao 1948).
+def neighbours_agree(errors: Array, tau: Array, rays: Array, inliers: BoolArray) -> float:
+    """How much the errors of points in neighbouring rows agree: standard normal if they do not.
 
-    A column of the turn is a function of the row time times a derivative: their products are sums
-    of products of the one times products of the other.
-
-    Args:
-        variance: of the noise, px^2.
-        turns: whether products of in-frame turns are wanted; without, they are zero.
-
-    Returns:
-        the products, and how much the errors of neighbouring rows agree.
+    Neighbours in the image do not count: corners of one marker share errors whatever the camera
+    does.
     """
-    lines = linearized(data, count, state, np.zeros((count, 6)))
-    front = squared_errors(data, count, state)
-    frequencies = SCALES - 1
-    information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    add_prior(prior, state, variance, information, slope)
-    # By the functions of the row time: the derivatives' products with motion and errors, and with
-    # themselves (the functions squared and multiplied).
-    crossed, own = np.zeros((RESOLVED, _OUTER)), np.zeros((6, RESOLVED * (RESOLVED + 1) // 2))
-    # By the terms of the smooth error: the motion's derivatives and the errors; themselves.
-    beside, within = (
-        np.zeros((SMOOTH_TERMS, 2 * PARAMETERS + 2)),
-        np.zeros((SMOOTH_TERMS, SMOOTH_TERMS)),
-    )
-    values, rates, terms = np.empty(FUNCTIONS), np.empty(FUNCTIONS), np.empty(SMOOTH_TERMS)
-    outer, both = np.empty(_OUTER), np.empty(2 * PARAMETERS + 2)
-    resolved, squares = np.empty(RESOLVED), np.empty(own.shape[1])
-    low, high = extent(lines, inliers)
-    for i in range(count):
-        if not inliers[i] or not np.isfinite(front[i]):
+    order = np.argsort(tau)
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    squared, count = 0.0, 0
+    for i in order:
+        if inliers[i]:
+            squared += errors[i, 0] ** 2 + errors[i, 1] ** 2
+            count += 1
+            for k in range(2):
+                low[k], high[k] = min(low[k], rays[i, k]), max(high[k], rays[i, k])
+    if count < 2 or not squared > 0.0:
+        return 0.0
+    far = _FAR_APART * max(high[0] - low[0], high[1] - low[1])
+    agreement, pairs = 0.0, 0
+    previous = -1
+    for i in order:
+        if not inliers[i]:
             continue
-        rows, by_turn, errors = lines.by_motion[i], lines.by_turn[i], lines.errors[i]
-        for a in range(PARAMETERS):
-            for b in range(PARAMETERS):
-                information[a, b] += rows[0, a] * rows[0, b] + rows[1, a] * rows[1, b]
-            both[a], both[PARAMETERS + a] = rows[0, a], rows[1, a]
-        both[2 * PARAMETERS], both[2 * PARAMETERS + 1] = errors[0], errors[1]
-        smooth_terms(lines.image[i], low, high, terms)
-        _add_outer(beside, terms, both)
-        _add_outer(within, terms, terms)
-        if turns:
-            shake_basis(lines.tau[i], values, rates)
-            resolved[:] = 0.0
-            for k in range(FUNCTIONS):
-                for j in range(RESOLVED):
-                    resolved[j] += values[k] * COMBINATIONS[k, j]
-            _turn_products(rows, by_turn, errors, resolved, outer, squares, own)
-            _add_outer(crossed, resolved, outer)
-    products = ScoreProducts(
-        np.empty((frequencies, 6, 6)), np.empty((frequencies, 6, PARAMETERS)),
-        np.empty((frequencies, 6)), np.zeros((2 * SMOOTH_TERMS, 2 * SMOOTH_TERMS)),
-        np.empty((2 * SMOOTH_TERMS, PARAMETERS)), np.empty(2 * SMOOTH_TERMS),
-        np.empty((3 * RESOLVED, 3 * RESOLVED)), np.empty((3 * RESOLVED, PARAMETERS)),
-        np.empty(3 * RESOLVED), inverted(information),
-    )  # fmt: skip
-    if turns:
-        _spread_turns(products, own, crossed)
-    for i in range(2 * SMOOTH_TERMS):
-        side, k = i // SMOOTH_TERMS, i % SMOOTH_TERMS
-        for j in range(SMOOTH_TERMS):
-            products.smooth[i, SMOOTH_TERMS * side + j] = within[k, j]
-        for a in range(PARAMETERS):
-            products.smooth_by_motion[i, a] = beside[k, PARAMETERS * side + a]
-        products.smooth_along[i] = -beside[k, 2 * PARAMETERS + side]
-    return products, neighbours_agree(lines.errors, lines.tau, lines.image, inliers)
-
-
-@kernel
-def _add_outer(total: Array, left: Array, right: Array) -> None:
-    """Add the products of each number of one vector with each of another."""
-    for i in range(len(left)):
-        row, factor = total[i], left[i]
-        for j in range(len(right)):
-            row[j] += factor * right[j]
-
-
-@inlined
-def _turn_products(
-    rows: Array, by_turn: Array, errors: Array, values: Array, outer: Array, squares: Array,
-    own: Array,
-) -> None:  # fmt: skip
-    """Fill in a point's products of turn and motion, turn and errors; add those of the turn."""
-    for axis in range(3):
-        one, other = by_turn[0, axis], by_turn[1, axis]
-        for a in range(PARAMETERS):
-            outer[PARAMETERS * axis + a] = one * rows[0, a] + other * rows[1, a]
-        outer[3 * PARAMETERS + axis] = one * errors[0] + other * errors[1]
-    place = 0
-    for k in range(len(values)):
-        for j in range(k + 1):
-            squares[place] = values[k] * values[j]
-            place += 1
-    for axis in range(3):
-        for other_axis in range(axis + 1):
-            product = by_turn[0, axis] * by_turn[0, other_axis]
-            product += by_turn[1, axis] * by_turn[1, other_axis]
-            place = axis * (axis + 1) // 2 + other_axis
-            for j in range(len(squares)):
-                own[place, j] += product * squares[j]
-
-
-@kernel
-def _spread_turns(products: ScoreProducts, own: Array, crossed: Array) -> None:
-    """Write the products of the resolved combinations (axes within them), and of each frequency's
-    columns (axes of the cosine, then of the sine), which are sums of these.
-    """
-    of_functions = IN_COMBINATIONS.T @ crossed
-    for axis in range(3):
-        first, last = PARAMETERS * axis, PARAMETERS * (axis + 1)
-        products.together_by_motion[axis::3] = crossed[:, first:last]
-        products.together_along[axis::3] = -crossed[:, 3 * PARAMETERS + axis]
-        for side in range(2):
-            column = 3 * side + axis
-            products.by_motion[:, column] = of_functions[side::2, first:last]
-            products.along[:, column] = -of_functions[side::2, 3 * PARAMETERS + axis]
-        for other in range(axis + 1):
-            place, both = 0, np.empty((RESOLVED, RESOLVED))
-            for k in range(RESOLVED):
-                for j in range(k + 1):
-                    both[k, j] = both[j, k] = own[axis * (axis + 1) // 2 + other, place]
-                    place += 1
-            products.together[axis::3, other::3] = both
-            products.together[other::3, axis::3] = both
-            half = both @ IN_COMBINATIONS
-            for f in range(len(products.own)):
-                for k in range(4):
-                    total, one, two = 0.0, 2 * f + k // 2, 2 * f + k % 2
-                    for i in range(RESOLVED):
-                        total += IN_COMBINATIONS[i, one] * half[i, two]
-                    row, column = 3 * (k // 2) + axis, 3 * (k % 2) + other
-                    products.own[f, row, column] = products.own[f, column, row] = total
-
-
-def warm_up() -> None:
-    """Compile what frames with smooth errors come to."""
-    smooth_terms(np.zeros(2), np.zeros(2), np.ones(2), np.zeros(SMOOTH_TERMS))
+        if previous >= 0:
+            x, y = rays[i, 0] - rays[previous, 0], rays[i, 1] - rays[previous, 1]
+            if x * x + y * y > far * far:
+                pairs += 1
+                agreement += errors[previous, 0] * errors[i, 0] + errors[previous, 1] * errors[i, 1]
+        previous = i
+    # Each of the two products of a pair has the square of the mean square as its variance.
+    variance = max(0.5 * squared / count, LEAST_NOISE * LEAST_NOISE)
+    normalized: float = agreement / (variance * np.sqrt(2.0 * max(pairs, 1)))
+    return normalized

@@ -10,19 +10,18 @@ Gaussian (Laplace approximation) with its evidence; the mixture's mean and covar
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.scales import SCALES, SPEEDS, Scales
-from rs_localizer.core.shake import CYCLES, TYPICAL_SIZES
-from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES
-from rs_localizer.estimation.assumptions import Assumed
+from rs_localizer.core.scales import SPEEDS
+from rs_localizer.core.shake import CYCLES
+from rs_localizer.core.state import PARAMETERS
+from rs_localizer.estimation.first_look import Hyperprior, first_look, near_outliers
 from rs_localizer.estimation.frame_fit import FrameFit, bend_of, fit_frame
-from rs_localizer.estimation.mirror import farthest, is_plane, mirrored
+from rs_localizer.estimation.mirror import farthest
 from rs_localizer.estimation.modes import (
     FAR_LESS_PROBABLE,
     LEAST_LIKELY,
@@ -35,12 +34,9 @@ from rs_localizer.estimation.modes import (
     mixed,
     mixture_of,
 )
-from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, maximum_a_posteriori
-from rs_localizer.estimation.prior import PriorTerms, terms_at
-from rs_localizer.estimation.refine import inverted
-from rs_localizer.estimation.residual_tests import standard_scores
-from rs_localizer.estimation.undetected_vibration import score_statistics
+from rs_localizer.estimation.observations import MOST_POINTS, NEAREST, Observations
+from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior
+from rs_localizer.estimation.prior import Assumed, PriorTerms, terms_at
 
 # An in-frame turn is fitted where chance explains as much in three frames of ten, because one that
 # hides in the noise spoils regions and a fit from near by is cheap; a smooth error in one of
@@ -54,20 +50,6 @@ _ASKS_REMEMBERED = 3.3
 _RESTS, _NOTHING = np.array([speed == 0.0 for speed in SPEEDS], float), np.zeros(len(SPEEDS))
 # Shaking of up to this (rad, 2 deg) moves points out of the gate of a motion without it.
 _LARGEST_SHAKE = 0.035
-# Points just outside of the gate that are no chance: shaking may have moved them there.
-_NEAR_OUTLIERS, _NEAR_PART, _NEAR_GATE = 5, 0.2, 8.0
-# Hyperprior of the scales where no frame says more: an ordinary vibration, a decade up or down
-# within one deviation; a map and a lens of 0.03 px, to a factor of e: surveyed tags before a
-# calibrated lens have 0.2 (two deviations).
-_TURN_SCALES = np.log(TYPICAL_SIZES)
-_SMOOTH_SCALE, _PRECISION, _SMOOTH_PRECISION = math.log(0.03), 1.0 / 2.3**2, 1.0
-# What is declared of a map is known to a factor of e within one deviation: thirteen printed boards
-# (benchmarks.real) are bent 0.3 to 9 times as much as 0.2 mm per 10 cm, 1.0 of the logarithm. A
-# motion that makes a bent board look flat is less probable than one before a bent board.
-_DECLARED_PRECISION = 1.0
-# Scales from which a fit starts: those that it does not need shrink fast, those that it needs grow
-# slowly.
-_FIRST_TURN, _FIRST_SMOOTH = math.log(5e-3), math.log(0.3)
 # Steps from the next faster speed. More change nothing but times (benchmarks.frames); with five,
 # curled sheets jitter (benchmarks.real, single `sj`: 7.7 times as much as P3P; 12 and 25: 2.5).
 _WARM_STEPS = 12
@@ -75,27 +57,13 @@ _WARM_STEPS = 12
 _KEPT = 0.9
 # Probability that does not count.
 _NO_PART = 1e-4
-# More points than this only take time.
-_MOST_POINTS = 2500
-# Logarithm of the odds of none against an in-frame turn, before any frame.
-_STEADY_ODDS = math.log(100.0)
+# Logarithm of the odds of none against an in-frame turn, before any frame: as for rest.
+_STEADY_ODDS = REST_ODDS
 # Of the cameras that do not show it, one in ten shakes: with one in three, in ten, and in twenty
 # the turn rates of hands are claimed to be 1.9, 1.5 and 1.35 times their actual deviation, 93.4,
 # 92.3 and 90.8 % of the twists under one sine are inside, and 0.9, 1.4 and 1.7 % of the poses under
 # bands are beyond five deviations (benchmarks.frames, hand, sine, bands, 24 frames each, seed 1).
 _HIDDEN_ODDS = math.log(10.0)
-# Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
-# which the prior knows less than this part: typical speeds are not weighed.
-_CLEARLY_MOVING, _LITTLE_OF_THE_PRIOR = 67.0, 0.05
-_NEAREST = 1e-6  # m; points nearer than this would make any map useless
-
-
-class Hyperprior(NamedTuple):
-    """Of the logarithms (15,) of the scales."""
-
-    first: Array  # where a fit starts
-    mean: Array
-    precision: Array
 
 
 class _Frame(NamedTuple):
@@ -136,18 +104,18 @@ def frame_posterior(
         assumed: of the camera.
         one_lens: one camera sees them all; of two lenses a smooth error is not one polynomial.
     """
-    if observations.count > _MOST_POINTS:
-        thinned = observations.thinned(_MOST_POINTS)
+    if observations.count > MOST_POINTS:
+        thinned = observations.thinned(MOST_POINTS)
         part = _of_points(thinned, start, terms, threshold, assumed, one_lens)
         gate = np.sqrt(part.squared_errors[part.inliers].max(initial=0.0))
         errors = observations.squared_errors(part.state)
         inliers = errors <= gate**2
         bend = part.bend
         if bend.shape[1]:
-            depth = max(observations.median_depth(part.state, inliers), _NEAREST)
+            depth = max(observations.median_depth(part.state, inliers), NEAREST)
             size = depth / assumed.focal_length
             bend = bend_of(observations.points, inliers, part.declared, size)
-        return replace(part, squared_errors=errors, inliers=inliers, bend=bend)
+        return part._replace(squared_errors=errors, inliers=inliers, bend=bend)
     return _of_points(observations, start, terms, threshold, assumed, one_lens)
 
 
@@ -155,28 +123,16 @@ def _of_points(
     observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed,
     one_lens: bool,
 ) -> Posterior:  # fmt: skip
-    best = maximum_a_posteriori(observations, start, terms, threshold)
+    look = first_look(
+        observations.packed, observations.points, start, terms, threshold, assumed.map_deviation,
+        assumed.focal_length, assumed.rolling, assumed.turn is not None, assumed.scales,
+    )  # fmt: skip
+    best = Posterior(*look.best)
     if not best.determined:
         return best
-    other = mirrored(observations.points, best.inliers, best.state)
-    if other is not None:
-        again = maximum_a_posteriori(observations, other, terms, threshold)
-        if (
-            again.determined
-            and again.cost < best.cost - best.noise**2
-            and (np.count_nonzero(again.inliers) >= np.count_nonzero(best.inliers))
-        ):
-            best, other = again, mirrored(observations.points, again.inliers, again.state)
-    depth = max(observations.median_depth(best.state, best.inliers), _NEAREST)
-    declared = assumed.map_deviation * assumed.focal_length / depth  # px
-    hyper = _hyperprior(assumed, declared)
-    explained, coefficients, agreement, vibration = score_statistics(
-        observations.packed, observations.count, best.state,
-        best.inliers, terms, best.noise, best.freedom, *_size_of_vibration(hyper),
-        assumed.rolling,
-    )  # fmt: skip
-    excess, remembered = standard_scores(explained, coefficients, best.freedom), assumed.scales
-    near = _near_outliers(best, threshold) if assumed.rolling else 0
+    declared, excess, remembered = look.declared, look.excess, assumed.scales
+    near, vibration = look.near_outliers, look.vibration
+    best = best._replace(agreement=look.agreement, near_outliers=near, declared=declared)
     most = excess[:-1].max()
     known = remembered.excess[:-1].max() > _ASKS_REMEMBERED
     wide = assumed.rolling and bool(most > _WIDENS or near > 0)
@@ -186,14 +142,15 @@ def _of_points(
     # What a gyroscope that comes too late leaves is smooth, too.
     shows = one_lens and (excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED)
     smooth = bool(best.inliers.any() and (declared > 0.0 or (assumed.turn is None and shows)))
-    best = replace(best, agreement=agreement, near_outliers=near, declared=declared)
     # What turns within the frame would explain, errors of map and lens may explain as well.
     frame = _Frame(
-        observations, best, terms, threshold, assumed, hyper, smooth,
-        is_plane(observations.points, best.inliers), np.zeros((len(observations), 0)),
+        observations, best, terms, threshold, assumed, look.hyper, smooth, look.planar,
+        np.zeros((observations.count, 0)),
     )  # fmt: skip
     if smooth:
-        bend = bend_of(observations.points, best.inliers, declared, depth / assumed.focal_length)
+        bend = bend_of(
+            observations.points, best.inliers, declared, look.depth / assumed.focal_length
+        )
         of_map = frame._replace(bend=bend)
         # Before a plane both explain alike. In depth a bent map leaves more open: it is left out
         # only where it is far less probable.
@@ -202,8 +159,9 @@ def _of_points(
         ):
             frame = of_map
     # A map that is known to be bent may look like motion.
-    moving = declared == 0.0 and not frame.planar and _clearly_moving(best, terms, assumed)
+    moving = declared == 0.0 and not frame.planar and look.moving
     slowest = 0 if assumed.may_rest and not moving else len(SPEEDS) - 1
+    other = look.mirrored if look.is_mirrored else None
     shaken = _shaken(frame, wide, other, slowest) if turns else None
     if frame.smooth or frame.planar or slowest == 0:
         posterior, evidence = _merged(frame, slowest)
@@ -221,16 +179,8 @@ def _of_points(
     elif assumed.rolling and assumed.turn is None:
         odds = TEMPER * of_vibration - _HIDDEN_ODDS
         may_shake = 1.0 / (1.0 + math.exp(-min(odds, 700.0)))
-        posterior = replace(posterior, undetected=may_shake * vibration.covariance)
-    return replace(posterior, scales=posterior.scales._replace(excess=excess))
-
-
-def _near_outliers(best: Posterior, threshold: float) -> int:
-    """Points just beyond the gate, where they are too many to be chance; else 0."""
-    inliers = int(np.count_nonzero(best.inliers))
-    within = best.squared_errors < (_NEAR_GATE * threshold) ** 2
-    count = int(np.count_nonzero(within & ~best.inliers))
-    return count if count >= max(_NEAR_OUTLIERS, _NEAR_PART * inliers) else 0
+        posterior = posterior._replace(undetected=may_shake * vibration.covariance)
+    return posterior._replace(scales=posterior.scales._replace(excess=excess))
 
 
 def _evidence_of(frame: _Frame) -> float:
@@ -239,30 +189,6 @@ def _evidence_of(frame: _Frame) -> float:
         _inliers(frame), frame.best.state, frame.terms, _NOTHING, _NOTHING, len(SPEEDS) - 1, False,
         False, _smooth(frame),
     ).evidence  # fmt: skip
-
-
-def _hyperprior(assumed: Assumed, declared: float) -> Hyperprior:
-    """What is known of the scales of a frame; ``declared``: px, of the map."""
-    mean = np.append(_TURN_SCALES, _SMOOTH_SCALE)
-    precision = np.append(np.full(SCALES - 1, _PRECISION), _SMOOTH_PRECISION)
-    if declared > 0.0:
-        mean[-1], precision[-1] = math.log(declared), _DECLARED_PRECISION
-    first = np.full(SCALES, _FIRST_TURN)
-    first[-1] = max(_FIRST_SMOOTH, mean[-1])
-    known = assumed.scales
-    both = precision + known.precisions
-    mean = (precision * mean + known.precisions * known.means) / both
-    first = np.where(known.precisions > 1.0, mean, first)
-    return Hyperprior(first, mean, both)
-
-
-def _size_of_vibration(hyper: Hyperprior) -> tuple[float, float]:
-    """Logarithm of a factor of all scales of the in-frame turn, and its precision: one decade, and
-    what the frames before say of each scale.
-    """
-    away = hyper.precision[:-1] * (hyper.mean[:-1] - _TURN_SCALES)
-    precision = _PRECISION + float(np.sum(hyper.precision[:-1] - _PRECISION))
-    return float(np.sum(away)) / precision, precision
 
 
 def _shaken(
@@ -348,8 +274,7 @@ def _at_any_speed(frame: _Frame, fastest: FrameFit, slowest: int) -> tuple[Poste
     )
     weights, own, posterior = np.zeros(len(SPEEDS)), evidences - odds, _of_fit(frame, best)
     weights[::-1][: len(fits)] = possible
-    posterior = replace(
-        posterior,
+    posterior = posterior._replace(
         state=state,
         covariance=covariance,
         shake=turns,
@@ -367,14 +292,14 @@ def _of_fit(frame: _Frame, fit: FrameFit) -> Posterior:
     own = 2.0 * fit.decided  # precision of the frame alone
     total = fit.log_scales * (own + precision)
     said = np.where(own > 0.1, (total - precision * mean) / np.maximum(own, 0.1), 0.0)
-    fitted = replace(
-        frame.best, state=fit.state, covariance=fit.covariance, noise=fit.noise,
+    near = near_outliers(fit.squared_errors, fit.inliers, frame.threshold)
+    return frame.best._replace(
+        state=fit.state, covariance=fit.covariance, noise=fit.noise,
         freedom=fit.freedom, inliers=fit.inliers, squared_errors=fit.squared_errors,
         shake=fit.turns, model_error=fit.smooth, shared=fit.smooth, bend=frame.bend,
-        agreement=fit.agreement, near_outliers=0,
-        scales=Scales.nothing()._replace(means=said, precisions=np.where(own > 0.1, own, 0.0)),
+        agreement=fit.agreement, near_outliers=near,
+        scales=frame.best.scales._replace(means=said, precisions=np.where(own > 0.1, own, 0.0)),
     )  # fmt: skip
-    return replace(fitted, near_outliers=_near_outliers(fitted, frame.threshold))
 
 
 def _odds_of_speeds(frame: _Frame) -> tuple[Array, Array]:
@@ -383,18 +308,6 @@ def _odds_of_speeds(frame: _Frame) -> tuple[Array, Array]:
     if assumed.turn is not None:
         by_turn = np.array([assumed.turn.evidence(speed) for speed in SPEEDS])
     return assumed.scales.speeds + assumed.of_rest * _RESTS, by_turn
-
-
-def _clearly_moving(best: Posterior, terms: PriorTerms, assumed: Assumed) -> bool:
-    """Whether neither rest nor another typical speed would change anything."""
-    chosen = LINEAR if assumed.turn is not None else VELOCITIES  # of the others a gyroscope knows
-    spread = best.covariance[chosen, chosen]
-    information = inverted(np.ascontiguousarray(spread))
-    velocities = best.state[6:][chosen]  # behind the pose a state is longer by six
-    part = float(np.diag(terms.informations[0])[chosen] @ np.diag(spread))
-    return bool(
-        part < _LITTLE_OF_THE_PRIOR and velocities @ information @ velocities > _CLEARLY_MOVING
-    )
 
 
 def _merged(frame: _Frame, slowest: int) -> tuple[Posterior, float]:
@@ -409,9 +322,8 @@ def _merged(frame: _Frame, slowest: int) -> tuple[Posterior, float]:
         assumed.turn is not None, frame.planar, _smooth(frame),
     )  # fmt: skip
     if found.evidence == -math.inf:
-        return replace(best, smallest_eigenvalue=0.0), -math.inf
-    posterior = replace(
-        best,
+        return best._replace(smallest_eigenvalue=0.0), -math.inf
+    posterior = best._replace(
         state=found.state,
         covariance=found.covariance,
         arched=found.arched,
@@ -420,7 +332,7 @@ def _merged(frame: _Frame, slowest: int) -> tuple[Posterior, float]:
         shared=found.shared,
         bend=frame.bend,
         speeds=found.speeds,
-        scales=Scales.nothing()._replace(speeds=found.log_likelihoods),
+        scales=best.scales._replace(speeds=found.log_likelihoods),
         mirror=(
             farthest(found.costs, found.evidences, found.steps, found.covariance)
             if frame.planar
@@ -428,9 +340,8 @@ def _merged(frame: _Frame, slowest: int) -> tuple[Posterior, float]:
         ),
     )
     if best.declared > 0.0:  # points that a known bend moves out of the gate are no outliers
-        beside = replace(best, inliers=found.chosen, squared_errors=found.squared_errors)
-        near = _near_outliers(beside, frame.threshold)
-        posterior = replace(posterior, inliers=found.chosen, near_outliers=near)
+        near = near_outliers(found.squared_errors, found.chosen, frame.threshold)
+        posterior = posterior._replace(inliers=found.chosen, near_outliers=near)
     return posterior, found.evidence - math.log(len(SPEEDS))
 
 
@@ -470,8 +381,7 @@ def _either(
     )
     likely = steady if probable > 0.5 else shaken
     shared = math.sqrt(weight * steady.shared**2 + (1.0 - weight) * shaken.shared**2)
-    return replace(
-        likely,
+    return likely._replace(
         state=state,
         covariance=covariance,
         arched=None,

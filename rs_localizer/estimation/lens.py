@@ -29,7 +29,14 @@ from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.mirror import is_plane
-from rs_localizer.estimation.observations import Observations, Observed, Sighted, relinearized
+from rs_localizer.estimation.observations import (
+    MOST_POINTS,
+    Observations,
+    Observed,
+    Sighted,
+    rays_of_lens,
+    relinearized,
+)
 from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.refine import apply_step, inverted
@@ -49,8 +56,6 @@ _MOST_DEVIATIONS = 3.0
 _PARTS = (0.06, 0.2, 0.6)
 # Gates of the rounds, in inlier thresholds: at first the rim of the image is far off.
 _GATES = (4.0, 2.0, 1.0, 1.0, 1.0)
-# More points than this only take time.
-_MOST_POINTS = 2500
 _SMALL = 0.2  # of a step, in standard deviations
 # What a lens that is off makes of a frame that is refused, and of one that nearly is: errors around
 # the motion, in inlier thresholds, or a smooth field, whatever else explains it (logarithm of the
@@ -98,8 +103,8 @@ def find_lens(observed: Observed, refused: Posterior, threshold: float) -> Mende
         observations = sighted.by(mended)
         if observations is None:
             return None
-        if observations.count > _MOST_POINTS:
-            observations = observations.thinned(_MOST_POINTS)
+        if observations.count > MOST_POINTS:
+            observations = observations.thinned(MOST_POINTS)
         best = maximum_a_posteriori(observations, state, terms, gate * threshold)
         if not (best.determined and np.all(np.isfinite(best.state))):
             return None
@@ -143,7 +148,7 @@ def told_of_lens(observed: Observed, posterior: Posterior) -> tuple[Posterior, L
     covariance = posterior.covariance.copy()
     spread = posterior.inflation * believed.covariance
     covariance[:PARAMETERS, :PARAMETERS] += pull @ spread @ pull.T
-    return replace(posterior, covariance=covariance), says
+    return posterior._replace(covariance=covariance), says
 
 
 def _too_few(sighted: Sighted, posterior: Posterior) -> bool:
@@ -253,16 +258,6 @@ def _known(lens: LensError, part: float) -> float:
     return float(np.linalg.slogdet(within)[1] - np.linalg.slogdet(part**-2 * beforehand)[1])
 
 
-def rays_of_lens(sighted: Sighted, tau: Array, rays: Array) -> Array:
-    """Rays (n,2) as they come in at row times (n,), out of which a known turn was taken."""
-    if sighted.turn is None:
-        return rays
-    turned = sighted.turn.at_rows(tau)[0]
-    local = np.einsum("nij,nj->ni", turned, np.column_stack([rays, np.ones(len(rays))]))
-    seen: Array = local[:, :2] / local[:, 2:]
-    return seen
-
-
 def _told(
     sighted: Sighted, observations: Observations, best: Posterior, terms: PriorTerms,
     coefficients: Array,
@@ -282,7 +277,7 @@ def _told(
         shake_at(observations.tau, best.shake),
     )
     camera, side_of = sighted.camera, observations.camera[chosen]
-    seen = rays_of_lens(sighted, observations.tau[chosen], lines.image[chosen])
+    seen = rays_of_lens(sighted.turn, observations.tau[chosen], lines.image[chosen])
     by_coefficients = np.empty((len(seen), 2, len(coefficients)))
     for place, side in enumerate(sighted.exposure.sides):
         here = side_of == place

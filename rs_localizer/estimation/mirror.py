@@ -28,21 +28,6 @@ CLEARLY_WORSE = 9.2
 _COVERED = 4.0
 
 
-def mirrored(points: Array, inliers: BoolArray, state: Array) -> Array | None:
-    """The state (24,) whose view of the plane of the points leans the other way.
-
-    None if the points (n,3) that count are no plane, or face the camera.
-    """
-    found, other = leaning_less(points, inliers, state, 2.0)
-    return other if found else None
-
-
-def facing(points: Array, inliers: BoolArray, state: Array) -> Array | None:
-    """The state (24,) half-way to the mirrored one, whose plane faces the camera; None as there."""
-    found, other = leaning_less(points, inliers, state, 1.0)
-    return other if found else None
-
-
 def is_plane(points: Array, inliers: BoolArray) -> bool:
     """Whether the points (n,3) that count lie on a plane."""
     return bool(plane_of(points, inliers)[0])
@@ -52,7 +37,11 @@ def is_plane(points: Array, inliers: BoolArray) -> bool:
 def leaning_less(
     points: Array, inliers: BoolArray, state: Array, leans: float
 ) -> tuple[bool, Array]:
-    """Whether there is a state whose view of the plane leans by so many times its lean less."""
+    """Whether there is a state (24,) whose view of the plane leans by so many times its lean less.
+
+    Twice its lean less it is mirrored, once it faces the camera. None if the points (n,3) that
+    count are no plane, or face the camera.
+    """
     plane, centre, axis_of_plane = plane_of(points, inliers)
     if not plane:
         return False, state
@@ -129,8 +118,3 @@ def farthest(costs: Array, evidence: Array, steps: Array, covariance: Array) -> 
     # Curved valleys leave the ellipsoid early; the longest axis tells how far they go.
     deviation = longest_axis(covariance)
     return Mirror(steps[far], float(worse[far]), bool(turns[far] < _COVERED * deviation))
-
-
-def warm_up() -> None:
-    """Compile what planes come to that show two poses."""
-    longest_axis(np.eye(3))

@@ -40,9 +40,10 @@ from rs_localizer.estimation.frame_fit import (
 )
 from rs_localizer.estimation.mirror import leaning_less, plane_of
 from rs_localizer.estimation.observations import weighted
-from rs_localizer.estimation.posterior import WIDEST_GATE
+from rs_localizer.estimation.posterior import ITERATIONS, NO_SCALE, WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, add_prior, offset_between, terms_at
 from rs_localizer.estimation.refine import (
+    TINY,
     apply_step,
     half_inverse,
     inverted,
@@ -75,7 +76,6 @@ LEAST_LIKELY = -10.0
 # the widest one, and would stay there.
 _FIRST_GATE = 2.0 * WIDEST_GATE
 _FITS, _FINE = 4, 1e-6
-_NO_SCALE, _ITERATIONS = 1e6, 50
 # Deviation of a lean (rad, 2 deg) up to which one Gaussian will do.
 _KNOWN_LEAN = 0.035
 # Steps of the grid of leans in deviations: the trapezoid rule is right to 3e-4 of a Gaussian, and
@@ -87,7 +87,7 @@ _PINNED_STEPS, _PINNED_GAIN = 6, 1e-2
 # they reach beyond three deviations.
 _LEAST_PART, _MOST_PARTS = 4.0, 100
 # Where the evidence falls faster than that of the mode's Gaussian, steps shrink to this at least.
-_LEAST_SHARE, _TINY = 0.25, 1e-300
+_LEAST_SHARE = 0.25
 # Probabilities that have no part in the covariance.
 _NO_PART = 1e-5
 
@@ -427,7 +427,7 @@ def _mode(
     state, information, cost = start, np.empty((PARAMETERS, PARAMETERS)), 0.0
     for _ in range(_FITS):
         state, information, cost, converged = refine(
-            data, state, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, _FINE
+            data, state, NO_SCALE, 0.0, terms, noise, 2, ITERATIONS, _FINE
         )
         if converged:
             break
@@ -502,7 +502,7 @@ def _equations(
 ) -> float:
     """Fill in the normal equations, the smooth error marginalized; the cost, noise variances."""
     variance, size = held.noise * held.noise, held.field.shape[2]
-    cost = normal_equations(data, state, _NO_SCALE, 0.0, 2, information, slope)
+    cost = normal_equations(data, state, NO_SCALE, 0.0, 2, information, slope)
     if size > 0:
         count = len(held.field)
         lines = linearized(data, count, state, np.zeros((count, 6)))
@@ -568,7 +568,7 @@ def _over_leans(
     away = axes.T @ step_between(mode.state, twin)[TURN]
     used = 2 if max(sizes[1], away[1] ** 2) > _KNOWN_LEAN**2 else 1
     axes, away = axes.T[::-1][:used].copy(), away[::-1][:used].copy()
-    steps = _SPACING * np.sqrt(np.maximum(sizes[::-1][:used], _TINY))
+    steps = _SPACING * np.sqrt(np.maximum(sizes[::-1][:used], TINY))
     held, data = mode.held, weighted(inliers.data, mode.held.chosen)
     if mode.smooth > 0.0:
         held = _marginal(inliers, mode, smooth)

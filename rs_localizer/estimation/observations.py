@@ -19,11 +19,10 @@ from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Mounts, Rig
-from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Failure
-from rs_localizer.estimation.assumptions import Assumed
-from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.prior import Assumed, PriorTerms
 from rs_localizer.estimation.residuals import (
     AXES,
     CENTRE,
@@ -31,23 +30,12 @@ from rs_localizer.estimation.residuals import (
     POINT_SIZE,
     WEIGHT,
     linearized,
-    row_paces,
     squared_errors,
 )
 
 
-@inlined
-def median_point(points: Array, chosen: BoolArray) -> Array:
-    """Median (3,) of each coordinate over some of the points (n,3); zero if there are none."""
-    found = np.zeros(3)
-    if np.any(chosen):
-        for axis in range(3):
-            found[axis] = median(points[:, axis][chosen])
-    return found
-
-
 @kernel
-def _median_depth(data: Array, state: Array, chosen: BoolArray) -> float:
+def median_depth(data: Array, state: Array, chosen: BoolArray) -> float:
     depths = np.empty(len(chosen))
     for i in range(len(chosen)):
         block, lane = data[i // LANES], i % LANES
@@ -143,31 +131,6 @@ def distinct(points: Array, pixels: Array, camera: IntArray, chosen: IntArray) -
     return chosen[np.sort(first)]
 
 
-@kernel
-def near_image(pixels: Array, width: float, height: float) -> BoolArray:
-    """Which pixels (n,2) lie in the image, or as far outside as noise may have put them."""
-    near = np.empty(len(pixels), dtype=np.bool_)
-    across, down = _MARGIN * width, _MARGIN * height
-    for i in range(len(pixels)):
-        x, y = pixels[i, 0], pixels[i, 1]
-        near[i] = -across < x < width + across and -down < y < height + down
-    return near
-
-
-@kernel
-def _extent(pixels: Array, chosen: IntArray, camera: IntArray, cameras: int) -> float:
-    """Width or height of what the chosen pixels of a camera fill, whichever is the largest."""
-    largest = 0.0
-    for place in range(cameras):
-        for axis in range(2):
-            low, high = np.inf, -np.inf
-            for i in chosen:
-                if camera[i] == place:
-                    low, high = min(low, pixels[i, axis]), max(high, pixels[i, axis])
-            largest = max(largest, high - low)
-    return largest
-
-
 def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Failure | None:
     """Why points cannot carry a pose whatever the motion, or None.
 
@@ -185,12 +148,11 @@ def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Fai
             Reason.TOO_FEW_POINTS,
             f"{len(indices)} usable points of {len(pixels)}, {needed} are needed{hint}",
         )
-    extent = _extent(pixels, indices, usable.camera, len(exposure.sides))
-    if extent < _LEAST_EXTENT:
+    if usable.extent < _LEAST_EXTENT:
         return Failure(
             Reason.DEGENERATE,
-            f"all {len(indices)} points lie within {extent:.2g} pixels; are these normalized "
-            "coordinates? Pixels of the raw image are needed",
+            f"all {len(indices)} points lie within {usable.extent:.2g} pixels; are these "
+            "normalized coordinates? Pixels of the raw image are needed",
         )
     return None
 
@@ -306,17 +268,15 @@ class Observations:
         near: BoolArray = squared_errors(self.packed, self.count, state) < distance**2
         return near
 
-    def row_paces(self, state: Array) -> Array:
-        """How much faster than the image points the rows move (n,): 1 at rest, 0 in step."""
-        paces: Array = row_paces(self.packed, self.count, state)
-        return paces
-
     def median_depth(self, state: Array, chosen: BoolArray) -> float:
         """How far before their cameras the median of some points is (chosen: (n,)); NaN: none."""
-        depth: float = _median_depth(self.packed, state, chosen)
+        depth: float = median_depth(self.packed, state, chosen)
         return depth
 
 
+# More points than this only take time.
+MOST_POINTS = 2500
+NEAREST = 1e-6  # m; points nearer than this would make any map useless
 # What fewer points see of it is lost in their noise.
 _MANY = 300
 # Errors beyond which (px) the motion says nothing of where a point ought to be.
@@ -355,10 +315,7 @@ def relinearized(
             by_ray[here] = side.pixel_jacobian(rays[here])
     else:
         (camera,), gradient = exposure.cameras, observations.mounts.gradients[0]
-        local = np.einsum(
-            "nij,nj->ni", turn.at_rows(observations.tau)[0], np.column_stack([rays, np.ones(count)])
-        )
-        raw = local[:, :2] / local[:, 2:]
+        raw = rays_of_lens(turn, observations.tau, rays)
         by_ray = gyro_compensated(
             raw, observations.tau, camera.pixel_jacobian(raw), gradient, turn
         )[1]
@@ -366,6 +323,16 @@ def relinearized(
         observations.points, observations.rays, observations.tau, by_ray, observations.mounts,
         observations.camera,
     )  # fmt: skip
+
+
+def rays_of_lens(turn: GyroRotation | None, tau: Array, rays: Array) -> Array:
+    """Rays (n,2) as they come in at row times (n,), out of which a known turn was taken."""
+    if turn is None:
+        return rays
+    turned = turn.at_rows(tau)[0]
+    local = np.einsum("nij,nj->ni", turned, np.column_stack([rays, np.ones(len(rays))]))
+    seen: Array = local[:, :2] / local[:, 2:]
+    return seen
 
 
 # Points farther away than this (m) are faults, and their squares would be infinite.
@@ -382,6 +349,7 @@ class Usable(NamedTuple):
     by_ray: Array  # (n,2,2) derivatives of the pixels by them
     tau: Array  # (n,) row times
     camera: IntArray  # (n,) which side of the frame's cameras sees each
+    extent: float  # px, of what those of one side fill
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -417,16 +385,18 @@ class Observed:
     """The points of one image on their way through the steps, and what is known beside them."""
 
     observations: Observations
-    usable: IntArray  # which of the given points are observed
-    count: int  # of the given points
-    centre: Array  # (3,) map frame: origin of the observed points
-    ranking: IntArray | None  # observed points from the best to the worst
+    ranking: IntArray  # observed points from the best to the worst; empty: they are alike
     terms: PriorTerms  # velocity prior and whatever else is known but the pose
     random: Random
     assumed: Assumed
     sighted: Sighted
     lens: LensError | None = None  # what its camera lacked
     asks_lens: bool = False  # what the frame says of that
+
+    @property
+    def centre(self) -> Array:
+        """(3,) map frame: origin of the observed points."""
+        return self.sighted.usable.centre
 
 
 def find_usable(
@@ -440,21 +410,23 @@ def find_usable(
 
     A known turn is taken out of them.
     """
-    rays, by_ray = np.empty((len(pixels), 2)), np.empty((len(pixels), 2, 2))
-    tau, shown = np.empty(len(pixels)), np.empty(len(pixels), dtype=np.bool_)
-    of_camera, first = np.empty(len(pixels), np.int64), 0
-    for place, (camera, count) in enumerate(zip(exposure.cameras, counts, strict=True)):
-        here = slice(first, first + count)
-        tau[here] = exposure.row_time(place, pixels[here])
-        rays[here], by_ray[here], of_camera[here] = _rays(
-            exposure, place, pixels[here], tau[here], turn
-        )
-        width, height = camera.size
-        shown[here] = near_image(pixels[here], float(width), float(height))
+    parts, first = [], 0
+    for place, count in enumerate(counts):
+        own = pixels[first : first + count]
+        tau = exposure.row_time(place, own)
+        parts.append((*_rays(exposure, place, own, tau, turn), tau))
         first += count
-    centre, candidates = _candidates(points, rays, shown)
-    chosen = distinct(points, pixels, of_camera, candidates)
-    return Usable(chosen, shown, centre, rays, by_ray, tau, of_camera)
+    rays, by_ray, side, tau = (
+        parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))
+    )
+    sizes = np.array([each.camera.size for each in exposure.sides], float)
+    # Equal pixels have equal keys.
+    keys = pixels[:, 0] + math.pi * pixels[:, 1]
+    indices, shown, centre, extent, repeated = _select(points, pixels, rays, side, sizes, keys)
+    if repeated:  # a copy says nothing new
+        pairs = np.hstack([points[indices], pixels[indices], side[indices, None]])
+        indices = indices[np.sort(np.unique(pairs, axis=0, return_index=True)[1])]
+    return Usable(indices, shown, centre, rays, by_ray, tau, side, extent)
 
 
 def _rays(
@@ -469,19 +441,49 @@ def _rays(
 
 
 @kernel
-def _candidates(points: Array, rays: Array, shown: BoolArray) -> tuple[Array, IntArray]:
-    """The median (3,) of the points with a bearing, and which of these that are shown are near."""
+def _select(
+    points: Array, pixels: Array, rays: Array, side: IntArray, sizes: Array, keys: Array
+) -> tuple[IntArray, BoolArray, Array, float, bool]:
+    """Which points can be used, but for copies.
+
+    Args:
+        side: (n,) by which each is seen, of a camera with an image of a size (k,2).
+        keys: (n,) of the pixels.
+
+    Returns:
+        the usable ones (m,); which (n,) lie in the image, or as far outside as noise may have put
+        them; the median (3,) of the points with a bearing; width or height of what the pixels of a
+        side fill, whichever is the largest; and whether two keys are the same.
+    """
     count = len(points)
-    seen = np.empty(count, dtype=np.bool_)
+    seen, shown = np.empty(count, dtype=np.bool_), np.empty(count, dtype=np.bool_)
     for i in range(count):
-        seen[i] = np.isfinite(rays[i, 0])
-    centre = median_point(points, seen)
+        seen[i], shown[i] = np.isfinite(rays[i, 0]), True
+        for axis in range(2):
+            size = sizes[side[i], axis]
+            beyond = _MARGIN * size
+            shown[i] = shown[i] and -beyond < pixels[i, axis] < size + beyond
+    centre = np.zeros(3)
+    if np.any(seen):
+        for axis in range(3):
+            centre[axis] = median(points[:, axis][seen])
+    low, high = np.full(sizes.shape, np.inf), np.full(sizes.shape, -np.inf)
     for i in range(count):
         farthest = 0.0
         for axis in range(3):
             farthest = max(farthest, abs(points[i, axis] - centre[axis]))
         seen[i] = seen[i] and shown[i] and farthest < _FARTHEST_POINT
-    return centre, np.flatnonzero(seen)
+        if seen[i]:
+            for axis in range(2):
+                least, most = low[side[i], axis], high[side[i], axis]
+                low[side[i], axis] = min(least, pixels[i, axis])
+                high[side[i], axis] = max(most, pixels[i, axis])
+    extent = max(np.max(high - low), 0.0)
+    usable = np.flatnonzero(seen)
+    sorted_keys, repeated = np.sort(keys[usable]), False
+    for k in range(1, len(usable)):
+        repeated = repeated or sorted_keys[k] == sorted_keys[k - 1]
+    return usable, shown, centre, extent, repeated
 
 
 def packed(exposure: Exposure, points: Array, usable: Usable) -> Observations:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -30,19 +29,31 @@ from rs_localizer.estimation.residuals import squared_errors
 GATE = 3.5
 WIDEST_GATE = 2.0
 _ROUNDS = 3
-_ITERATIONS = 50
+ITERATIONS = 50
 # Gain of a last step, noise variances: of the first round, whose inliers are not the last ones, and
 # of the others.
 _FIRST, _LATER = 1e-2, 1e-4
 # A truncation that truncates nothing, px.
-_NO_SCALE = 1e6
+NO_SCALE = 1e6
 # Of the information matrix scaled to a unit diagonal.
-_LEAST_EIGENVALUE = 1e-11
+LEAST_EIGENVALUE = 1e-11
 _NOISE_ROUNDS = 20
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Mirror:
+class Best(NamedTuple):
+    """The best motion of a frame, and what the points say of it."""
+
+    state: Array  # (24,)
+    cost: float  # of the inliers, with the prior, px^2
+    covariance: Array  # (18,18)
+    noise: float  # px, measured standard deviation
+    freedom: float  # of the errors
+    smallest_eigenvalue: float  # of the information scaled to a unit diagonal, or less
+    inliers: BoolArray  # (n,)
+    squared_errors: Array  # (n,) px^2
+
+
+class Mirror(NamedTuple):
     """The mirrored pose before a plane, if it cannot be ruled out."""
 
     step: Array  # (18,) from the estimate to it
@@ -55,8 +66,7 @@ class Mirror:
         return float(np.linalg.norm(self.step[:3]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Posterior:
+class Posterior(NamedTuple):
     """The refined motion of one frame and what the points say of it."""
 
     state: Array  # (24,)
@@ -68,27 +78,27 @@ class Posterior:
     inliers: BoolArray  # (n,)
     squared_errors: Array  # (n,) px^2
     mirror: Mirror | None = None
-    shake: Array = field(default_factory=np.zeros((0, 3)).copy)  # (k,3) rad, coefficients
+    shake: Array = np.zeros((0, 3))  # (k,3) rad, coefficients
     model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
     shared: float = 0.0  # px, likewise, of all modes together
     agreement: float = 0.0  # of neighbouring rows, standard deviations
     declared: float = 0.0  # px, the part of it that the map is known to be off
     # Probabilities of the typical speeds; empty: the configured one
-    speeds: Array = field(default_factory=np.zeros(0).copy)
+    speeds: Array = np.zeros(0)
     near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance
-    scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
+    scales: Scales = Scales.nothing()  # what the frame says of them
     # (18,18) with the second order of arcs, of a mixture; None: of the covariance as a Gaussian's
     arched: Array | None = None
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
-    undetected: Array = field(default_factory=np.zeros((12, 12)).copy)
+    undetected: Array = np.zeros((12, 12))
     # (n,b): of what the smooth error is a combination (see frame_fit), which other frames share, so
     # that the covariance does not have it, either
-    bend: Array = field(default_factory=np.zeros((0, 0)).copy)
+    bend: Array = np.zeros((0, 0))
 
     @property
     def determined(self) -> bool:
         """Whether points and prior together determine all parameters."""
-        return self.smallest_eigenvalue > _LEAST_EIGENVALUE
+        return self.smallest_eigenvalue > LEAST_EIGENVALUE
 
     @property
     def inflation(self) -> float:
@@ -152,33 +162,20 @@ def _least_eigenvalue(information: Array, inverse: Array) -> float:
     total = 0.0  # of the eigenvalues of the scaled inverse
     for i in range(len(information)):
         total += inverse[i, i] * information[i, i]
-    if total > 0.0 and total < 1.0 / _LEAST_EIGENVALUE:
+    if total > 0.0 and total < 1.0 / LEAST_EIGENVALUE:
         return 1.0 / total
     return smallest_eigenvalue(information)
 
 
-class _Best(NamedTuple):
-    """What :class:`Posterior` needs of the best motion."""
-
-    state: Array
-    cost: float
-    covariance: Array
-    noise: float
-    freedom: float
-    smallest_eigenvalue: float
-    inliers: BoolArray
-    squared_errors: Array
-
-
 @kernel
-def _rounds(
-    data: Array,
-    count: int,
-    start: Array,
-    prior: PriorTerms,
-    threshold: float,
-) -> _Best:
-    """Refine, measure the noise, choose the inliers, and again."""
+def best_motion(data: Array, count: int, start: Array, prior: PriorTerms, threshold: float) -> Best:
+    """Refine a motion, measure the noise, choose the inliers, and again.
+
+    Args:
+        data: packed points, ``count`` of them.
+        start: state (24,).
+        threshold: px, least gate for inliers.
+    """
     # From the wide side: a start that fits few points well would see little noise and keep few.
     state, gate, noise, freedom = start, WIDEST_GATE * threshold, EXPECTED_NOISE * threshold, 0.0
     errors = squared_errors(data, count, state)
@@ -189,16 +186,9 @@ def _rounds(
         for i in range(count):
             weights[i] = 1.0 if errors[i] < gate * gate else 0.0
         state, information, _, _ = refine(
-            weighted(data, weights),
-            state,
-            _NO_SCALE,
-            0.0,
-            prior,
-            noise,
-            2,
-            _ITERATIONS,
+            weighted(data, weights), state, NO_SCALE, 0.0, prior, noise, 2, ITERATIONS,
             _FIRST if turn == 0 else _LATER,
-        )
+        )  # fmt: skip
         errors = squared_errors(data, count, state)
         inverse = inverted(information)
         # The prior takes its part of the parameters that the points decide.
@@ -209,7 +199,7 @@ def _rounds(
     # Of all of these: a start that is far off may have been fitted to few of them.
     cost = add_prior(prior, state, noise * noise, information.copy(), np.zeros(PARAMETERS))
     cost += np.sum(errors[inliers])
-    return _Best(
+    return Best(
         state, cost, noise * noise * inverse, noise, 2.0 * np.sum(inliers) - freedom,
         _least_eigenvalue(information, inverse), inliers, errors,
     )  # fmt: skip
@@ -218,37 +208,5 @@ def _rounds(
 def maximum_a_posteriori(
     observations: Observations, start: Array, prior: PriorTerms, threshold: float
 ) -> Posterior:
-    """Refine a motion on its inliers, which the noise decides that it leaves.
-
-    Args:
-        start: state (24,).
-        threshold: px, least gate for inliers.
-    """
-    return Posterior(
-        *_rounds(
-            observations.packed,
-            observations.count,
-            start,
-            prior,
-            threshold,
-        )
-    )
-
-
-@kernel
-def fit(
-    data: Array, start: Array, terms: PriorTerms, noise: float, tolerance: float
-) -> tuple[Array, float, bool]:
-    """State (24,), cost and convergence of a fit to some of the points (see :func:`.refine`).
-
-    Args:
-        data: the points, packed, with weight 1 where they count.
-        start: state (24,).
-        terms: of the prior.
-        noise: px.
-        tolerance: gain of the last step, noise variances.
-    """
-    state, _, cost, converged = refine(
-        data, start, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, tolerance
-    )
-    return state, cost, converged
+    """As :func:`best_motion`, near a state (24,)."""
+    return Posterior(*best_motion(observations.packed, observations.count, start, prior, threshold))

@@ -8,23 +8,22 @@ It knows a solver only as a function that turns samples into models.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from itertools import accumulate
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray, Random
 from rs_localizer.core.blocks import write
+from rs_localizer.core.rig import Mounts
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.state import STATE_SIZE
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.refine import anneal, refine
-from rs_localizer.estimation.residuals import POINT_SIZE, truncated_cost
+from rs_localizer.estimation.residuals import POINT_SIZE, squared_errors, truncated_cost
 from rs_localizer.solvers.batch import MODEL_SIZE, into_rig
+from rs_localizer.solvers.table import Solver
 
 
 def generator(seed: int) -> Random:
@@ -39,30 +38,81 @@ _MOST_REDRAWS = 8
 _RANKED_HORIZON = 200_000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pool:
-    """Points of one camera to draw from.
+class Pools(NamedTuple):
+    """Points to draw from: those of each camera, as a pool that gives its share of the samples.
 
-    ``ranked``: they are sorted from the best to the worst and the first samples come from the
+    In a ranked pool they are sorted from the best to the worst, and the first samples come from the
     first of them (PROSAC: Chum, Matas, "Matching with PROSAC", CVPR 2005).
     """
 
-    points: IntArray
-    row_range: float  # of the row times of its camera's points
-    ranked: bool = False
-    share: float = 1.0  # of the samples, beside those of the other pools
+    points: IntArray  # of all pools, one after the other
+    ends: IntArray  # (p,) where each of them ends
+    row_ranges: Array  # (p,) of the row times of its camera's points
+    ranked: BoolArray  # (p,)
+    shares: Array  # (p,) of the points that it was made of
 
-    def prefix_sizes(self, first: int, count: int, size: int) -> IntArray:
-        """From how many points of the pool samples ``first ... first + count - 1`` are drawn."""
-        total = len(self.points)
-        if not self.ranked or total <= size:
-            return np.full(count, total, dtype=np.int64)
-        n = np.arange(size, total + 1)
-        # Expected number of the horizon's samples that lie in the first n points (T_n there).
-        factors = (n[:, None] - np.arange(size)) / (total - np.arange(size))
-        expected = _RANKED_HORIZON * np.prod(factors, axis=1)
-        drawn = np.arange(first + 1, first + count + 1)
-        return np.minimum(size + np.searchsorted(expected, drawn), total).astype(np.int64)
+
+@kernel
+def pools_of(
+    camera: IntArray, tau: Array, cameras: int, size: int, among: BoolArray, ranking: IntArray,
+    also_all: bool,
+) -> Pools:  # fmt: skip
+    """A pool for each camera that has enough points for a sample.
+
+    Half of the samples ignore the scores, so that wrong ones cost a factor of two at most.
+
+    Args:
+        camera, tau: (n,) of each point.
+        size: of a sample.
+        among: (n,) which points to take.
+        ranking: points from the best to the worst; empty: they are alike.
+        also_all: take all points, too, beside these; then only all are ranked.
+    """
+    count, first = len(tau), 0 if also_all else 1
+    most = (3 - first) * cameras
+    points, ends = np.empty((3 - first) * count, np.int64), np.empty(most, np.int64)
+    row_ranges, ranked, shares = np.empty(most), np.empty(most, np.bool_), np.empty(most)
+    found, end = 0, 0
+    for group in range(first, 3):  # those near, by rank, and all
+        if group == 1 and len(ranking) == 0:
+            continue
+        everyone = also_all and group > 0
+        total = count if everyone else np.count_nonzero(among)
+        for place in range(cameras):
+            begin, low, high = end, np.inf, -np.inf
+            for k in range(count):
+                i = ranking[k] if group == 1 else k
+                if camera[i] == place:
+                    low, high = min(low, tau[i]), max(high, tau[i])
+                    if everyone or among[i]:
+                        points[end] = i
+                        end += 1
+            if end - begin < size:
+                end = begin
+                continue
+            ends[found], row_ranges[found] = end, high - low
+            ranked[found], shares[found] = group == 1, (end - begin) / total
+            found += 1
+    return Pools(
+        points[:end].copy(), ends[:found].copy(), row_ranges[:found].copy(),
+        ranked[:found].copy(), shares[:found].copy(),
+    )  # fmt: skip
+
+
+@kernel
+def prefix_sizes(total: int, first: int, size: int, prefixes: IntArray) -> None:
+    """Fill in from how many of a ranked pool's points samples ``first ...`` are drawn."""
+    n = size if total > size else total
+    for h in range(len(prefixes)):
+        while n < total:
+            # Expected number of the horizon's samples that lie in the first n points (T_n there).
+            expected = 1.0 * _RANKED_HORIZON
+            for k in range(size):
+                expected *= (n - k) / (total - k)
+            if expected >= first + h + 1:
+                break
+            n += 1
+        prefixes[h] = n
 
 
 @inlined
@@ -101,6 +151,26 @@ def draw(pool: Any, prefixes: Any, tau: Array, row_range: float, random: Any, sa
                 last = max(last, tau[point])
             if last - first >= _LEAST_ROW_SPREAD * row_range:
                 break
+
+
+@kernel
+def _draw_block(
+    pools: Pools, drawn: IntArray, tau: Array, random: Random, samples: IntArray
+) -> None:
+    """Fill the samples from all pools by their shares, and count what each has given."""
+    count, size = samples.shape
+    prefixes, ends = np.empty(count, np.int64), np.cumsum(pools.shares)
+    first, begin = 0, 0
+    for k in range(len(pools.ends)):
+        last = count if k == len(pools.ends) - 1 else int(ends[k] * count / ends[-1])
+        points, here = pools.points[begin : pools.ends[k]], prefixes[first:last]
+        if pools.ranked[k]:
+            prefix_sizes(len(points), drawn[k], size, here)
+        else:
+            here[:] = len(points)
+        draw(points, here, tau, pools.row_ranges[k], random, samples[first:last])
+        drawn[k] += last - first
+        first, begin = last, pools.ends[k]
 
 
 # Of local optimisation, at the last scale.
@@ -218,26 +288,7 @@ def warm_up() -> None:
 _KEEP = 2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Hypotheses:
-    """How samples become models, and how models are judged.
-
-    ``solve(points, rays, tau, samples, rotations, iterations, models)`` fills models (k,18,h), see
-    :mod:`rs_localizer.solvers.batch`.
-    """
-
-    solve: Callable[[Array, Array, Array, IntArray, Array, int, Array], None]
-    sample_size: int
-    solutions: int
-    block: int  # samples per block
-    score_scale: float  # px, truncation of the error of minimal models
-    final_scale: float  # px, truncation after local optimisation: the inlier threshold
-    noise: float  # px, expected standard deviation
-    iterations: int = 0  # of an iterative solver
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
+class Candidate(NamedTuple):
     """The best motion so far."""
 
     state: Array  # (24,) of model B
@@ -246,18 +297,28 @@ class Candidate:
 
     @property
     def found(self) -> bool:
-        return bool(np.isfinite(self.cost))
+        return self.cost < math.inf
 
 
 NOTHING = Candidate(np.zeros(STATE_SIZE), math.inf)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Draws:
+class Hypotheses(NamedTuple):
+    """How samples become models, and how models are judged."""
+
+    solver: Solver
+    block: int  # samples per block
+    score_scale: float  # px, truncation of the error of minimal models
+    final_scale: float  # px, truncation after local optimisation: the inlier threshold
+    noise: float  # px, expected standard deviation
+    iterations: int  # of an iterative solver
+
+
+class Draws(NamedTuple):
     """Where samples come from, and how many there may be."""
 
-    rotations: Sequence[Array]  # (3,3) to start from, in turn
-    pools: Sequence[Pool]
+    rotation: Array  # (3,3) to start from
+    pools: Pools
     confidence: float
     most: int
     random: Random
@@ -269,75 +330,78 @@ def search(
 ) -> Candidate:  # fmt: skip
     """The best optimised hypothesis of up to ``draws.most`` minimal samples.
 
-    Blocks take the initial rotations in turn and draw equally from all pools. The search stops
+    Blocks draw equally from all pools. The search stops
     when the chance that no sample so far held inliers alone, at the inlier ratios of the best
     *optimised* motion, is below ``1 - draws.confidence``: minimal models see too few of the inliers
     to count them (a six-point model sees a tenth). Only models that beat all minimal ones before
     are optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). The samples of ``start`` count: a
     search goes on from where another stopped.
     """
-    size, count = hypotheses.sample_size, observations.count
-    usable = [pool for pool in draws.pools if len(pool.points) >= size]
-    best, inliers = start, np.zeros(count, dtype=np.bool_)
-    if start.found:
-        inliers = observations.within(start.state, hypotheses.final_scale)
-    drawn, blocks = [start.samples // max(len(usable), 1)] * len(usable), 0
-    ends, mounts = list(accumulate(pool.share for pool in usable)), observations.mounts
-    rotations = [mounts.axes @ rotation for rotation in draws.rotations]
-    no_fit, best_gain = count * hypotheses.score_scale**2, 0.0
-    while usable and (left := draws.most - sum(drawn)) > 0:
-        samples = np.empty((min(hypotheses.block, left), size), dtype=np.int64)
-        _draw(observations, usable, ends, drawn, draws.random, samples)
-        models = np.empty((hypotheses.solutions, MODEL_SIZE, len(samples)))
-        blocks += 1
+    solver, pools, mounts = hypotheses.solver, draws.pools, observations.mounts
+    scales = hypotheses.score_scale, hypotheses.final_scale, hypotheses.noise
+    state, cost, used = start.state, start.cost, len(pools.ends)
+    drawn, shares = np.full(used, start.samples // max(used, 1)), np.full(used, np.nan)
+    rotations = mounts.axes @ draws.rotation
+    no_fit, best_gain = observations.count * hypotheses.score_scale**2, 0.0
+    left = draws.most - int(drawn.sum()) if used else 0
+    while left > 0:
+        samples = np.empty((min(hypotheses.block, left), solver.sample_size), np.int64)
+        _draw_block(pools, drawn, observations.tau, draws.random, samples)
+        models = np.empty((solver.solutions, MODEL_SIZE, len(samples)))
         camera = observations.camera[samples[:, 0]]
-        hypotheses.solve(
-            observations.points, observations.rays, observations.tau, samples,
-            rotations[blocks % len(rotations)][camera], hypotheses.iterations, models,
+        solver.solve(
+            observations.points, observations.rays, observations.tau, samples, rotations[camera],
+            hypotheses.iterations, models,
         )  # fmt: skip
-        into_rig(models, camera, mounts)
-        states, costs = best_models(
-            models, observations.packed,
-            hypotheses.score_scale, _KEEP, no_fit - best_gain,
+        state, cost, least, missed = _judge(
+            models, camera, mounts, observations.packed, observations.count, state, cost, scales,
+            no_fit - best_gain, prior, pools, drawn, shares, solver.sample_size,
         )  # fmt: skip
-        best_gain = max(best_gain, no_fit - float(costs[0]))
-        state, cost = optimize(
-            states, costs, observations.packed,
-            2.0 * hypotheses.score_scale, hypotheses.final_scale, prior, hypotheses.noise,
-        )  # fmt: skip
-        if cost < best.cost:
-            best = Candidate(state, cost)
-            inliers = observations.within(state, hypotheses.final_scale)
-        if _missed(inliers, usable, drawn, size) < 1.0 - draws.confidence:
+        best_gain = max(best_gain, no_fit - least)
+        left = draws.most - int(drawn.sum())
+        if missed < 1.0 - draws.confidence:
             break
-    return Candidate(best.state, best.cost, sum(drawn))
+    return Candidate(state, cost, int(drawn.sum()))
 
 
-def _draw(
-    observations: Observations, pools: Sequence[Pool], ends: Sequence[float], drawn: list[int],
-    random: Random, samples: IntArray,
-) -> None:  # fmt: skip
-    """Fill the samples from all pools by their shares, and count what each has given.
+@kernel
+def _judge(
+    models: Array, camera: IntArray, mounts: Mounts, data: Array, count: int, best: Array,
+    least: float, scales: tuple[float, float, float], bar: float, prior: PriorTerms, pools: Pools,
+    drawn: IntArray, shares: Array, size: int,
+) -> tuple[Array, float, float, float]:  # fmt: skip
+    """Optimise the best of a block's models.
 
-    ``ends``: the sums of the shares so far.
+    Args:
+        models: (k,18,h), of the cameras (h,).
+        best, least: the best optimised state so far, and its cost.
+        scales: px, truncation of minimal models and of optimised ones, expected noise.
+        bar: cost that a minimal model must stay below to be optimised.
+        drawn: (p,) samples from each pool until now, of ``size`` points.
+        shares: (p,) of its points that are inliers of the best state, kept up to date; NaN: not
+            counted yet.
+
+    Returns:
+        the best state and its cost; the least cost of a minimal model; and the chance that none of
+        the samples held inliers alone.
     """
-    count, size = samples.shape
-    first = 0
-    for index, pool in enumerate(pools):
-        part = samples[first : count if pool is pools[-1] else int(ends[index] * count / ends[-1])]
-        if pool.ranked:
-            prefixes = pool.prefix_sizes(drawn[index], len(part), size)
-        else:
-            prefixes = np.full(len(part), len(pool.points), dtype=np.int64)
-        draw(pool.points, prefixes, observations.tau, pool.row_range, random, part)
-        drawn[index] += len(part)
-        first += len(part)
-
-
-def _missed(inliers: BoolArray, pools: Sequence[Pool], drawn: Sequence[int], size: int) -> float:
-    """Chance that none of the samples drawn from the pools held inliers alone."""
+    into_rig(models, camera, mounts)
+    score_scale, final_scale, noise = scales
+    states, costs = best_models(models, data, score_scale, _KEEP, bar)
+    state, cost = optimize(states, costs, data, 2.0 * score_scale, final_scale, prior, noise)
+    better = cost < least
+    if better:
+        best, least = state, cost
+    if better or (least < np.inf and np.isnan(shares[0])):
+        errors, begin = squared_errors(data, count, best), 0
+        for k in range(len(drawn)):
+            inliers = 0
+            for i in pools.points[begin : pools.ends[k]]:
+                inliers += errors[i] < final_scale * final_scale
+            shares[k] = inliers / (pools.ends[k] - begin)
+            begin = pools.ends[k]
     missed = 1.0
-    for pool, count in zip(pools, drawn, strict=True):
-        share = np.count_nonzero(inliers[pool.points]) / len(pool.points)
-        missed *= (1.0 - share**size) ** count
-    return missed
+    for k in range(len(drawn)):
+        if shares[k] > 0.0:
+            missed *= (1.0 - shares[k] ** size) ** drawn[k]
+    return best, least, costs[0], missed

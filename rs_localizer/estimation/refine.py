@@ -27,7 +27,8 @@ LEAST_NOISE = 0.01
 # method, 1999).
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-8, 1e8
 _GROWTH, _LEAST_KEPT = 2.0, 1.0 / 3.0
-_TINY = 1e-300
+TINY = 1e-300
+"""What is divided by where nothing is."""
 # Pivots of a matrix of unit diagonal below this are rounding errors.
 _SINGULAR = 1e-15
 # More damping halts in the flat valleys of fast planes, less loses planes that face the camera.
@@ -170,7 +171,7 @@ def refine(
             accepted = trial_cost <= cost
             if accepted:
                 # As far as the gain is the predicted one, the next step may be longer.
-                held = 2.0 * (cost - trial_cost) / max(gain + predicted, _TINY) - 1.0
+                held = 2.0 * (cost - trial_cost) / max(gain + predicted, TINY) - 1.0
                 damping *= max(1.0 - held**3, _LEAST_KEPT)
                 damping = 0.0 if damping < _LEAST_DAMPING else damping
                 growth = _GROWTH

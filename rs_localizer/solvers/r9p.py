@@ -51,7 +51,7 @@ def _angular_velocity(matrix: list[Vector], v: Vector) -> Vector:
     ]
 
 
-def _unknowns(sample: Sample, *, fix_trace: bool) -> tuple[Vector, Vector, Vector, list[Vector]]:
+def unknowns(sample: Sample, *, fix_trace: bool) -> tuple[Vector, Vector, Vector, list[Vector]]:
     """v, C, t and the rows of R_RS in the frame of the initial rotation."""
     points, rays, tau = sample.rotated_points(), sample.rays, sample.tau
     depth = linear.depth_column(rays)
@@ -101,21 +101,14 @@ def _unknowns(sample: Sample, *, fix_trace: bool) -> tuple[Vector, Vector, Vecto
 
 def _solve(values: list[Lanes], *, fix_trace: bool) -> Vector:
     sample = Sample(values, SAMPLE_SIZE)
-    v, c, t, matrix = _unknowns(sample, fix_trace=fix_trace)
+    v, c, t, matrix = unknowns(sample, fix_trace=fix_trace)
     w = _angular_velocity(matrix, v)
     rotation = linear.fold(sample.rotation, v)
     return [*(x for row in rotation for x in row), *c, *w, *t]
 
 
-def _solve_free(values: list[Lanes], *, fix_trace: bool) -> Vector:
-    v, c, t, matrix = _unknowns(Sample(values, SAMPLE_SIZE), fix_trace=fix_trace)
-    return [*v, *c, *t, *(x for row in matrix for x in row)]
-
-
 _lanes = traced(lambda values: _solve(values, fix_trace=True), _INPUTS)
 _lanes_as_published = traced(lambda values: _solve(values, fix_trace=False), _INPUTS)
-_free_lanes = traced(lambda values: _solve_free(values, fix_trace=True), _INPUTS)
-_free_lanes_as_published = traced(lambda values: _solve_free(values, fix_trace=False), _INPUTS)
 
 
 @kernel
@@ -154,23 +147,3 @@ def solve_batch_as_published(
         gather(points, rays, tau, samples, rotations, start, work)
         _lanes_as_published(work, model)
         scatter(model, 0, start, models[0])
-
-
-@kernel
-def solve_free(
-    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, as_published: bool,
-    models: Array,
-) -> None:  # fmt: skip
-    """The unknowns themselves: models (18,h) are v, C, t and R_RS, in the initial rotation's frame.
-
-    Row-major. Arguments otherwise as :func:`solve_batch`.
-    """
-    work = np.empty(_INPUTS * LANES)
-    model = np.empty(MODEL_SIZE * LANES)
-    for start in range(0, len(samples), LANES):
-        gather(points, rays, tau, samples, rotations, start, work)
-        if as_published:
-            _free_lanes_as_published(work, model)
-        else:
-            _free_lanes(work, model)
-        scatter(model, 0, start, models)

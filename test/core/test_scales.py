@@ -46,13 +46,6 @@ def test_a_camera_that_begins_to_shake_is_soon_known_to_and_forgotten():
     assert known.precisions.max() < 1e-6
 
 
-def test_the_logarithm_of_a_scale_is_never_known_to_more_than_a_tenth():
-    known = Scales.nothing()
-    for _ in range(300):
-        known = joined(known, says(-5.0, 50.0))
-    assert known.precisions.max() == pytest.approx(100.0)
-
-
 def test_excess_of_chance_stays_chance_and_what_is_shared_adds_up():
     rng, known, spread = np.random.default_rng(0), Scales.nothing(), []
     for _ in range(4000):
@@ -63,11 +56,3 @@ def test_excess_of_chance_stays_chance_and_what_is_shared_adds_up():
     for _ in range(30):
         known = joined(known, says(0.0, 0.0, excess=1.0))
     assert known.excess.min() > 3.3  # half of a deviation in each frame would never be looked at
-
-
-def test_odds_of_speeds_settle():
-    """A frame counts for a third of an independent one, and for ten frames."""
-    known = Scales.nothing()
-    for _ in range(300):
-        known = joined(known, says(0.0, 0.0, speeds=-2.0))
-    np.testing.assert_allclose(known.speeds, -2.0 * 0.3 / (1.0 - 0.9))

@@ -61,17 +61,6 @@ def test_accelerations_are_the_second_derivatives_at_the_middle_row():
     np.testing.assert_allclose(sum(turns) / h**2, motion.angular_acceleration, atol=1e-6)
 
 
-def test_the_solvers_model_and_ours_agree_to_first_order():
-    rng = np.random.default_rng(1)
-    rotation = Rotation.random(random_state=2).as_matrix()
-    c, w, t, point = np.array([0.2, 0.1, 3.0]), *rng.normal(size=(3, 3))
-    motion = Motion(rotation, c, -w, np.cross(w, c) - t)
-    for tau in (1e-3, 1e-4):
-        ours = motion.at(tau)[0] @ point + motion.at(tau)[1]
-        theirs = Rotation.from_rotvec(tau * w).as_matrix() @ rotation @ point + c + tau * t
-        assert np.linalg.norm(ours - theirs) < 10 * tau**2
-
-
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_a_point_is_seen_by_its_own_row(direction):
     camera = Camera(640, 480, K, [-0.2, 0.05, 0.001, 0.0, 0.0], scan_direction=direction)
@@ -117,18 +106,6 @@ def plain(tau):
     """Values (28,) of one cosine and one sine per half-cycle, without value and slope at 0."""
     angle = 2.0 * np.pi * np.arange(0.5, 7.5, 0.5) * tau
     return np.column_stack([np.cos(angle) - 1.0, np.sin(angle) - angle]).ravel()
-
-
-@pytest.mark.parametrize("tau", TAUS)
-def test_values_are_those_of_cosines_and_sines(tau):
-    np.testing.assert_allclose(basis(tau)[0], plain(tau), atol=1e-12)
-
-
-@pytest.mark.parametrize("tau", TAUS)
-def test_rates_are_derivatives_by_the_row_time(tau):
-    h = 1e-5
-    expected = (basis(tau + h)[0] - basis(tau - h)[0]) / (2.0 * h)
-    np.testing.assert_allclose(basis(tau)[1], expected, atol=1e-5)
 
 
 def test_what_is_taken_away_there_makes_it_whole_waves_again():

@@ -11,7 +11,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Mounts
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.estimation import observations
+from rs_localizer.estimation.observations import Observations
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]])
 
@@ -57,14 +57,20 @@ def frame(direction="top_to_bottom", speed=0.15, noise=0.0, count=21, seed=0, ac
     return camera, motion, points, true, true + noise * rng.normal(size=true.shape)
 
 
-def pack(camera, points, pixels, gradient=None):
+def observe(camera, points, pixels, gradient=None):
     rays = camera.rays(pixels)
     mounts = Mounts.one(camera.row_time_gradient if gradient is None else gradient)
-    return observations.Observations.of(
+    return Observations.of(
         points, rays, camera.row_time(pixels), camera.pixel_jacobian(rays), mounts
-    ).packed
+    )
+
+
+def pack(camera, points, pixels, gradient=None):
+    return observe(camera, points, pixels, gradient).packed
 
 
 @pytest.fixture
 def scene():
-    return SimpleNamespace(frame=frame, pack=pack, state_of=state_of, motion_of=motion_of)
+    return SimpleNamespace(
+        frame=frame, observe=observe, pack=pack, state_of=state_of, motion_of=motion_of
+    )

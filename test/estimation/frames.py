@@ -9,8 +9,8 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.state import step_between
-from rs_localizer.estimation.assumptions import assumptions
 from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.prior import assumptions
 from rs_localizer.solvers.table import find_solver
 
 from .projection import gradient, in_camera, jacobian_of, pixels_of, row_time

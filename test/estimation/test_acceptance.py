@@ -8,25 +8,20 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.rig import Mounts
 from rs_localizer.estimation.acceptance import refusal, uncertain
-from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Mirror, maximum_a_posteriori
 from rs_localizer.estimation.prior import motion_terms
 from rs_localizer.localizer import Localizer
 
 PRIOR = motion_terms((0.18, 0.09), (0.009, 0.0036))
 THRESHOLD = 2.0
+ELEVEN = np.arange(40) < 11
 
 
 @pytest.fixture
 def good(scene):
     camera, motion, points, _, measured = scene.frame(noise=0.3, count=40)
-    rays = camera.rays(measured)
-    observations = Observations.of(
-        points, rays, camera.row_time(measured), camera.pixel_jacobian(rays),
-        Mounts.one(camera.row_time_gradient),
-    )  # fmt: skip
+    observations = scene.observe(camera, points, measured)
     return observations, maximum_a_posteriori(
         observations, scene.state_of(motion), PRIOR, THRESHOLD
     )
@@ -39,29 +34,48 @@ def reason(observations, posterior, rolling=True):
     return None if failure is None else failure.reason
 
 
-def with_state(posterior, place, values):
-    state = posterior.state.copy()
-    state[place] = values
-    return replace(posterior, state=state)
+def mirrored(turn, covered):
+    step = np.zeros(18)
+    step[1] = turn
+    return {"mirror": Mirror(step, 1.0, covered)}
 
 
-def test_a_good_posterior_is_accepted(good):
-    assert reason(*good) is None
-
-
-def test_too_few_inliers(good):
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, None),
+        ({"inliers": ELEVEN}, Reason.TOO_FEW_INLIERS),
+        (
+            {"inliers": ELEVEN, "squared_errors": np.where(ELEVEN, 0.1, np.inf)},
+            Reason.BEHIND_CAMERA,
+        ),
+        ({"smallest_eigenvalue": 1e-13}, Reason.DEGENERATE),
+        # Errors as large as the gate.
+        ({"noise": 1.45}, None),
+        ({"noise": 1.55}, Reason.RESIDUAL),
+        # Errors that neighbouring rows share: below a twentieth of the threshold no pose suffers.
+        ({"agreement": 4.1}, None),
+        ({"agreement": 4.3}, Reason.MODEL_ERROR),
+        ({"agreement": 4.3, "noise": 0.09}, None),
+        ({"near_outliers": 5}, Reason.MODEL_ERROR),
+        ({"model_error": 0.89}, None),
+        ({"model_error": 0.91}, Reason.MODEL_ERROR),
+        (mirrored(0.19, False), None),
+        (mirrored(0.21, False), Reason.MIRRORED),
+        (mirrored(0.34, True), None),
+        (mirrored(0.36, True), Reason.MIRRORED),
+    ],
+)
+def test_what_is_wrong_with_a_posterior_is_its_reason(good, changes, expected):
     observations, posterior = good
-    eleven = np.arange(len(observations)) < 11
-    assert reason(observations, replace(posterior, inliers=eleven)) is Reason.TOO_FEW_INLIERS
-    behind = np.where(eleven, 0.1, np.inf)
-    lost = replace(posterior, inliers=eleven, squared_errors=behind)
-    assert reason(observations, lost) is Reason.BEHIND_CAMERA
+    assert reason(observations, posterior._replace(**changes)) is expected
 
 
-def test_points_that_do_not_determine_the_motion(good):
+def test_a_global_shutter_leaves_larger_errors_and_shares_them(good):
     observations, posterior = good
-    flat = replace(posterior, smallest_eigenvalue=1e-13)
-    assert reason(observations, flat) is Reason.DEGENERATE
+    for noise, expected in ((1.95, None), (2.05, Reason.RESIDUAL)):
+        assert reason(observations, posterior._replace(noise=noise), rolling=False) is expected
+    assert reason(observations, posterior._replace(agreement=4.3), rolling=False) is None
 
 
 @pytest.mark.parametrize("part", ["state", "covariance"])
@@ -69,73 +83,28 @@ def test_what_cannot_be_computed_is_no_motion(good, part):
     observations, posterior = good
     lost = getattr(posterior, part).copy()
     lost.flat[-1] = np.nan
-    assert reason(observations, replace(posterior, **{part: lost})) is Reason.DEGENERATE
+    assert reason(observations, posterior._replace(**{part: lost})) is Reason.DEGENERATE
 
 
-@pytest.mark.parametrize(
-    ("rolling", "noise", "expected"),
-    [
-        (True, 1.45, None), (True, 1.55, Reason.RESIDUAL),
-        (False, 1.95, None), (False, 2.05, Reason.RESIDUAL),
-    ],
-)  # fmt: skip
-def test_errors_as_large_as_the_gate(good, rolling, noise, expected):
+def moving(posterior, place, values):
+    state = posterior.state.copy()
+    state[place] = values
+    return posterior._replace(state=state)
+
+
+def test_motions_that_no_camera_makes(good, scene):
     observations, posterior = good
-    assert reason(observations, replace(posterior, noise=noise), rolling) is expected
-
-
-def test_errors_that_neighbouring_rows_share(good):
-    observations, posterior = good
-    shaking = replace(posterior, agreement=4.3)
-    assert reason(observations, shaking) is Reason.MODEL_ERROR
-    assert reason(observations, replace(posterior, agreement=4.1)) is None
-    assert reason(observations, shaking, rolling=False) is None
-    # Below a twentieth of the threshold no pose suffers.
-    assert reason(observations, replace(shaking, noise=0.09)) is None
-
-
-def test_points_just_beyond_the_gate(good):
-    observations, posterior = good
-    assert reason(observations, replace(posterior, near_outliers=5)) is Reason.MODEL_ERROR
-
-
-def test_errors_that_are_smooth_over_the_image(good):
-    observations, posterior = good
-    assert reason(observations, replace(posterior, model_error=0.89)) is None
-    assert reason(observations, replace(posterior, model_error=0.91)) is Reason.MODEL_ERROR
-
-
-def test_motions_that_no_camera_makes(good):
-    observations, posterior = good
-    rolled = with_state(posterior, slice(12, 15), [0.0, 0.0, 1.6])  # about the line of sight
+    turn, way = slice(12, 15), slice(15, 18)
+    rolled = moving(posterior, turn, [0.0, 0.0, 1.6])  # about the line of sight
     assert reason(observations, rolled) is Reason.IMPLAUSIBLE
-    assert reason(observations, with_state(posterior, slice(12, 15), [0.0, 0.0, 1.4])) is None
-    advances = with_state(posterior, slice(15, 18), [0.0, 0.0, 5.0])  # the points are 4 m away
+    assert reason(observations, moving(posterior, turn, [0.0, 0.0, 1.4])) is None
+    advances = moving(posterior, way, [0.0, 0.0, 5.0])  # the points are 4 m away
     assert reason(observations, advances) is Reason.IMPLAUSIBLE
-
-
-def test_an_image_that_moves_along_with_its_rows(good, scene):
-    observations, posterior = good
-    camera = scene.frame()[0]
     # In a readout the rows pass over the image's height: so does a point of a camera that turns so.
+    camera = scene.frame()[0]
     height = camera.height / camera.focal_length
-    along = [with_state(posterior, slice(12, 15), [turn, 0.0, 0.0]) for turn in (height, -height)]
+    along = [moving(posterior, turn, [rate, 0.0, 0.0]) for rate in (height, -height)]
     assert sorted(str(reason(observations, one)) for one in along) == ["None", "implausible"]
-
-
-@pytest.mark.parametrize(
-    ("turn", "covered", "expected"),
-    [
-        (0.19, False, None), (0.21, False, Reason.MIRRORED),
-        (0.34, True, None), (0.36, True, Reason.MIRRORED),
-    ],
-)  # fmt: skip
-def test_a_mirrored_pose_that_fits_as_well(good, turn, covered, expected):
-    observations, posterior = good
-    step = np.zeros(18)
-    step[1] = turn
-    doubtful = replace(posterior, mirror=Mirror(step, 1.0, covered))
-    assert reason(observations, doubtful) is expected
 
 
 def test_an_orientation_that_is_hardly_known(scene):

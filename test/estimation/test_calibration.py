@@ -128,17 +128,10 @@ def test_tracking_does_not_average_it_away():
     assert last > 0.9 * first
 
 
-@pytest.mark.parametrize("deviation", [0.0, 0.01])
-def test_a_declared_error_of_the_map_refuses_nothing(deviation):
+def test_a_perfect_map_of_which_an_error_is_declared_is_not_refused():
+    """Nor is a bent one, below."""
     localizer = rsl.Localizer(CAMERA, map_deviation=0.01)
-    published = 0
-    for seed in range(20):
-        points, pixels, _ = frame(seed, 0.0)
-        # As a printer stretches paper and a wall is bent: neighbours are off together.
-        x, y = points[:, 0], points[:, 1]
-        bent = deviation * np.column_stack([np.sin(2.0 * y), np.cos(3.0 * x), np.sin(x + y)])
-        published += bool(localizer.localize(points + bent, pixels))
-    assert published >= 19
+    assert sum(bool(localizer.localize(*frame(seed, 0.0)[:2])) for seed in range(20)) >= 19
 
 
 @pytest.mark.parametrize(("depth", "least"), [(2.0, 0.9), (0.0, 0.75)], ids=["room", "wall"])
@@ -180,11 +173,8 @@ def test_points_of_a_curled_sheet_are_inliers_beside_its_bend():
     curled = flat - 0.015 * np.clip(x / 0.15 + y / 0.2, 0.0, None)[:, None] ** 2 / 2.25 * [0, 0, 1]
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        seen = curled @ so3.exp(np.array([0.3, 0.2, 0.1]) * rng.uniform(-1.0, 1.0, 3)).T + [
-            0,
-            0,
-            0.5,
-        ]
+        turn = so3.exp(np.array([0.3, 0.2, 0.1]) * rng.uniform(-1.0, 1.0, 3))
+        seen = curled @ turn.T + np.array([0.0, 0.0, 0.5])
         pixels = 2000.0 * seen[:, :2] / seen[:, 2:] + [960.0, 540.0]
         found = localizer.localize(flat, pixels + rng.normal(0.0, 0.3, pixels.shape))
         assert found, found

@@ -125,22 +125,3 @@ def test_errors_beside_the_shaking_are_distances_of_pixels():
         np.column_stack([shake(measured, SHAKE), rates]),
     )  # fmt: skip
     np.testing.assert_allclose(errors, -off, atol=5e-3)
-
-
-def test_a_still_camera_has_the_lines_of_its_normal_equations():
-    direction = "left_to_right"
-    state, points = scene(direction, seed=3, count=37)  # no multiple of the lanes
-    rays, _ = project(state, points, direction)
-    off = 0.5 * np.random.default_rng(1).normal(size=rays.shape)
-    data, _ = packed(points, rays, direction, off)
-    errors, by_motion, *_ = residuals.linearized(
-        data, len(points), state, np.zeros((len(points), 6))
-    )
-    information, slope = np.empty((18, 18)), np.empty(18)
-    cost = residuals.normal_equations(data, state, 1e3, 0.0, 2, information, slope)
-    assert cost == pytest.approx(np.sum(errors**2), rel=1e-10)
-    products = np.einsum("nci,ncj->ij", by_motion, by_motion)
-    np.testing.assert_allclose(information, products, rtol=1e-9, atol=1e-9 * products.max())
-    np.testing.assert_allclose(slope, np.einsum("nci,nc->i", by_motion, errors), rtol=1e-8)
-    squared = residuals.squared_errors(data, len(points), state)
-    np.testing.assert_allclose(squared, np.sum(errors**2, axis=1), rtol=1e-10)

@@ -10,11 +10,10 @@ from rs_localizer.config import LocalizerConfig, VelocityPrior
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Rig
-from rs_localizer.core.scales import SCALES, SPEEDS, Scales, joined
+from rs_localizer.core.scales import SCALES, SPEEDS, Scales
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.assumptions import assumptions, told_speed
 from rs_localizer.estimation.experience import Experience
-from rs_localizer.estimation.prior import Prior
+from rs_localizer.estimation.prior import Prior, assumptions, told_speed
 from rs_localizer.solvers.table import find_solver
 
 
@@ -30,21 +29,6 @@ def seen(scales):
         linear_velocity=np.zeros(3), inliers=np.ones(12, bool), residuals=np.zeros(12),
         joint_covariance=np.eye(18), global_shutter_inliers=12, iterations=0, scales=scales,
     )  # fmt: skip
-
-
-def test_what_frames_say_of_scales_is_joined():
-    first, second = says(-6.0), says(-4.0, 1.0)
-    experience = Experience.of(seen(first))
-    assert experience.scales is first
-    found = experience.and_of(seen(second)).scales
-    for part, expected in zip(found, joined(first, second), strict=True):
-        np.testing.assert_array_equal(part, expected)
-
-
-def test_a_prior_says_it_and_nothing_of_the_motion():
-    prior = Experience.of(seen(says(-6.0))).prior
-    assert prior.motion is None
-    np.testing.assert_array_equal(prior.scales.means, -6.0)
 
 
 def test_smooth_errors_in_excess_ask_for_the_lens():

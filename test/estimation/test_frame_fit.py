@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.rig import Mounts
 from rs_localizer.core.scales import SCALES
-from rs_localizer.core.shake import COMBINATIONS, CYCLES, FUNCTIONS, shake_at
+from rs_localizer.core.shake import FUNCTIONS, shake_at
 from rs_localizer.estimation.frame_fit import (
     SMOOTH_TERMS,
     TURNS,
@@ -19,9 +19,8 @@ from rs_localizer.estimation.frame_fit import (
     _of_scales,
     fit_frame,
     full_prior,
-    log_determinant_of_inverse,
+    neighbours_agree,
     products_of,
-    score_products,
     smooth_at,
     smooth_terms,
     with_scales,
@@ -56,33 +55,6 @@ def lines_of(seed=0, count=COUNT):
         rng.uniform(-0.5, 0.6, (count, 2)),
     )
     return lines, rng.uniform(size=count) < 0.9
-
-
-def test_scores_are_of_the_columns_of_a_fit():
-    """Of the combinations that the rows resolve exactly; of a frequency but for what they leave."""
-    observations, state = frame(0, 0.02, 0.5, 60)
-    best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
-    packed, count = observations.packed, observations.count
-    lines = linearized(packed, count, best.state, np.zeros((count, 6)))
-    whole = products_of(lines, best.inliers, lines.errors, True, False, IMAGE)
-    found, _ = score_products(packed, count, best.state, best.inliers, PRIOR, 0.25, True)
-    turns, motion = whole.products[18:, 18:], whole.products[18:, :18]
-    combined = np.kron(COMBINATIONS, np.eye(3))
-    size = np.sqrt(np.outer(*2 * [np.diag(combined.T @ turns @ combined)]))
-    np.testing.assert_allclose(
-        found.together / size, combined.T @ turns @ combined / size, atol=1e-9
-    )
-    np.testing.assert_allclose(found.together_by_motion, combined.T @ motion, rtol=1e-7, atol=1e-6)
-    np.testing.assert_allclose(
-        found.together_along, combined.T @ whole.with_errors[18:], rtol=1e-7, atol=1e-6
-    )
-    for f in range(len(CYCLES)):
-        one = slice(6 * f, 6 * f + 6)
-        size = np.sqrt(np.diag(turns[one, one]))
-        difference = (found.own[f] - turns[one, one]) / np.outer(size, size)
-        assert np.abs(difference).max() < 3e-2, f
-        away = (found.along[f] - whole.with_errors[18:][one]) / (size * best.noise)
-        assert np.abs(away).max() < 0.1, f
 
 
 def polynomials(rays, inliers):
@@ -143,12 +115,6 @@ def test_the_smooth_error_of_all_points_is_that_of_its_polynomials():
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-def test_a_log_determinant():
-    root = np.random.default_rng(0).normal(size=(7, 9))
-    matrix = root @ root.T
-    assert log_determinant_of_inverse(matrix) == pytest.approx(np.linalg.slogdet(matrix)[1])
-
-
 def test_the_prior_is_of_the_motion_without_its_turn():
     """Slope and information against finite differences of the cost, by motion and coefficients."""
     rng = np.random.default_rng(3)
@@ -179,26 +145,16 @@ def test_the_prior_is_of_the_motion_without_its_turn():
         assert whole[i, j] == pytest.approx(second / 8e-6, abs=1e-4 * np.abs(whole).max())
 
 
-def test_without_turns_the_prior_is_that_of_the_motion():
-    whole, along, _ = full_prior(TERMS, STATE, np.zeros((0, 3)), 18 + 20)
-    precisions = np.diag(TERMS.informations[0])
-    np.testing.assert_allclose(whole[:18, :18], np.diag(precisions))
-    np.testing.assert_allclose(along[6:18], precisions[6:] * STATE[12:])
-    assert not whole[18:].any()
-    assert not along[18:].any()
-
-
 HYPER_MEAN, HYPER_PRECISION = np.full(SCALES, np.log(3e-4)), np.full(SCALES, 0.2)
 HYPER_MEAN[-1] = np.log(0.03)
 
 
-def solved(lines, inliers, log_scales, rounds, coefficients=None, hyper=HYPER_PRECISION):
+def solved(lines, inliers, log_scales, rounds):
     normal = products_of(lines, inliers, lines.errors, True, True, IMAGE)
     information, slope, _ = full_prior(TERMS, STATE, np.zeros((FUNCTIONS, 3)), 18 + TURNS + 20)
-    coefficients = np.zeros(TURNS + 20) if coefficients is None else coefficients
     result = with_scales(
-        normal, information, slope, coefficients, log_scales, HYPER_MEAN, hyper, NOISE,
-        2 * int(inliers.sum()), rounds,
+        normal, information, slope, np.zeros(TURNS + 20), log_scales, HYPER_MEAN,
+        HYPER_PRECISION, NOISE, 2 * int(inliers.sum()), rounds,
     )  # fmt: skip
     return result, information, slope
 
@@ -232,21 +188,6 @@ def test_at_held_scales_it_is_the_gaussian_posterior():
     assert found.prior_cost == pytest.approx(np.sum(ridge * mean[18:] ** 2), rel=1e-5)
     used = np.trace(covariance @ matrix.T @ matrix) / NOISE**2
     assert found.freedom == pytest.approx(max(len(errors) - used, 1.0), rel=1e-5)
-
-
-def test_it_does_not_matter_about_which_coefficients_errors_are_linearized():
-    """But for the prior of the motion, whose slope is taken where the coefficients are."""
-    lines, inliers = lines_of(4)
-    scales = np.full(SCALES, np.log(1e-3))
-    about = 1e-3 * np.random.default_rng(1).normal(size=TURNS + 20)
-    about[:TURNS] = 0.0
-    first, *_ = solved(lines, inliers, scales, 1)
-    smooth = polynomials(lines.image, inliers) @ about[TURNS:].reshape(2, -1).T
-    moved = lines._replace(errors=lines.errors + smooth)
-    second, *_ = solved(moved, inliers, scales, 1, about)
-    deviations = np.sqrt(np.diag(first.covariance))
-    np.testing.assert_allclose(second.values / deviations, first.values / deviations, atol=1e-6)
-    assert second.left == pytest.approx(first.left)
 
 
 def shaken_lines(seed):
@@ -287,34 +228,6 @@ def test_scales_are_where_their_probability_is_largest():
         uphill = (log_probability(best + e) - log_probability(best - e)) / (2.0 * h)
         assert uphill == pytest.approx(0.0, abs=0.05)
     assert np.argmax(found.log_scales[:-1]) in (2, 8)
-
-
-def test_scales_are_found_about_as_large_as_they_are():
-    sizes = []
-    for seed in range(6):
-        lines, inliers, coefficients = shaken_lines(seed)
-        found, *_ = solved(lines, inliers, np.full(SCALES, np.log(5e-3)), 60)
-        scales = np.exp(found.log_scales)
-        true = [np.sqrt(np.mean(coefficients[part] ** 2))
-                for part in (slice(12, 18), slice(48, 54), slice(TURNS, None))]  # fmt: skip
-        sizes.append(np.log(scales[[2, 8, 14]] / true))
-        quiet = np.delete(scales[:14], [2, 8])
-        assert np.median(quiet) < 5e-4
-    # Six coefficients tell a scale to 30 %, and the hyperprior pulls.
-    np.testing.assert_allclose(np.mean(sizes, axis=0), 0.0, atol=0.5)
-
-
-def test_scales_that_vanish_leave_the_covariance_of_the_motion_alone():
-    lines, inliers = lines_of(6)
-    found, information, _ = solved(lines, inliers, np.full(SCALES, np.log(1e-9)), 1)
-    matrix, _ = design(lines, inliers, False, False)
-    alone = np.linalg.inv(matrix.T @ matrix / NOISE**2 + information[:18, :18])
-    scale = np.sqrt(np.diag(alone))
-    np.testing.assert_allclose(
-        found.covariance[:18, :18] / np.outer(scale, scale), alone / np.outer(scale, scale),
-        atol=1e-8,
-    )  # fmt: skip
-    assert found.decided.max() == 0.0
 
 
 def fitted(observations, start, scales=(5e-3, 0.3), hyper=0.2, turns=True, smooth=True,
@@ -399,26 +312,6 @@ def test_a_small_plane_is_fitted_from_another_lean(seed):
     assert np.sum(fit.squared_errors) < np.sum(observations.squared_errors(state))
 
 
-def test_more_than_a_motion_is_chosen_by_the_evidence_only_if_there_is_more():
-    """Evidence of a fit with an in-frame turn beside one without, of the same inliers."""
-    swing = 0.004 * np.array([0.6, 0.8, 0.3])
-    cycles = CYCLES[5]
-    for shakes in (False, True):
-        gains = []
-        for seed in range(5):
-            observations, truth = frame(
-                seed, 0.02, 0.3, 100,
-                swing=lambda tau, s=shakes: s * np.sin(2 * np.pi * cycles * tau)[:, None] * swing,
-            )  # fmt: skip
-            with_turn = fitted(observations, truth, smooth=False)
-            none = fitted(observations, truth, (1e-6, 1e-6), 1e6, smooth=False)
-            if with_turn.inliers.sum() == none.inliers.sum():
-                gains.append(with_turn.evidence - none.evidence)
-            else:
-                gains.append(np.inf if with_turn.inliers.sum() > none.inliers.sum() else -np.inf)
-        assert np.median(gains) > 10.0 if shakes else np.median(gains) < 3.0
-
-
 def test_scales_cost_what_is_known_of_them_and_gain_what_is_not():
     """The hyperprior's Gaussian, and Laplace's volume, with plain matrices."""
     rng = np.random.default_rng(5)
@@ -497,3 +390,26 @@ def test_the_covariance_is_beside_the_smooth_error_and_allows_for_it(of_map):
     np.testing.assert_allclose(fit.covariance / np.outer(deviations, deviations),
                                own / np.outer(deviations, deviations), atol=0.02)  # fmt: skip
     assert (np.diag(whole)[:6] > 1.2 * np.diag(own)[:6]).any()
+
+
+def test_neighbours_agree_where_errors_are_shared_and_not_where_they_are_noise():
+    rng = np.random.default_rng(5)
+    tau, everything = rng.uniform(-0.5, 0.5, 60), np.ones(60, dtype=bool)
+    rays = np.column_stack([rng.uniform(-0.6, 0.6, 60), tau])
+    noise = np.array(
+        [neighbours_agree(rng.normal(size=(60, 2)), tau, rays, everything) for _ in range(3000)]
+    )
+    assert abs(noise.mean()) < 0.1
+    assert noise.std() == pytest.approx(1.0, abs=0.06)
+    shared = np.column_stack([np.sin(9 * tau), np.cos(9 * tau)]) + rng.normal(size=(60, 2))
+    assert neighbours_agree(shared, tau, rays, everything) > 2.5
+    # Rows that do not count stand between no neighbours.
+    strewn = np.where(np.arange(60)[:, None] % 3, shared, 100.0 * rng.normal(size=(60, 2)))
+    counting = np.arange(60) % 3 > 0
+    assert neighbours_agree(strewn, tau, rays, counting) == pytest.approx(
+        neighbours_agree(strewn[counting], tau[counting], rays[counting], everything[counting])
+    )
+    assert neighbours_agree(shared, tau, rays, ~everything) == 0.0
+    # Nor do those that stand together in the image.
+    corner = np.where(np.arange(60)[:, None] == 0, 1.0, 0.001 * rays)
+    assert abs(neighbours_agree(shared, tau, corner, everything)) < 2.0

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from rs_localizer.core.rig import Mounts
-from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import decided, maximum_a_posteriori, noise_deviation
 from rs_localizer.estimation.prior import held_terms, motion_terms
 from rs_localizer.estimation.refine import inverted
@@ -35,12 +33,7 @@ def observe(scene, speed, noise, count, seed, outliers=0):
     )
     rng = np.random.default_rng(seed)
     measured[:outliers] = rng.uniform([0, 0], [639, 479], (outliers, 2))
-    rays = camera.rays(measured)
-    observations = Observations.of(
-        points, rays, camera.row_time(measured), camera.pixel_jacobian(rays),
-        Mounts.one(camera.row_time_gradient),
-    )  # fmt: skip
-    return observations, scene.state_of(motion)
+    return scene.observe(camera, points, measured), scene.state_of(motion)
 
 
 def test_inliers_are_those_within_the_noise_even_beyond_the_threshold(scene):

@@ -2,23 +2,33 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop with mock solvers: what it draws, when it stops, what it keeps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from rs_localizer.core.rig import Mounts
-from rs_localizer.estimation.observations import Observations
+from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import motion_terms
 from rs_localizer.estimation.ransac import (
     NOTHING,
     Candidate,
     Draws,
     Hypotheses,
-    Pool,
+    Pools,
+    best_models,
+    draw,
     generator,
+    optimize,
+    pools_of,
+    prefix_sizes,
     search,
+    state_of_model,
 )
+from rs_localizer.estimation.residuals import truncated_cost
+from rs_localizer.solvers.table import find_solver
 
-IDENTITY = np.eye(3)
 FREE = motion_terms((0.0, 0.0), (0.0, 0.0))
 ROWS = 1.0  # range of the row times
 
@@ -28,11 +38,10 @@ class Solver:
 
     def __init__(self, model, outliers, always_wrong=False):
         self.model, self.outliers, self.always_wrong = model, outliers, always_wrong
-        self.samples, self.rotations = [], []
+        self.samples = []
 
     def __call__(self, points, rays, tau, samples, rotations, iterations, models):
         self.samples.append(samples.copy())
-        self.rotations.append(rotations[0].copy())
         good = ~self.outliers[samples].any(axis=1) & (not self.always_wrong)
         wrong = self.model.copy()
         wrong[9] += 1.0
@@ -46,11 +55,7 @@ def problem(scene):
         outliers = np.arange(count) < outlier_share * count
         rng = np.random.default_rng(seed)
         measured[outliers] = rng.uniform([0, 0], [639, 479], (outliers.sum(), 2))
-        rays = camera.rays(measured)
-        observations = Observations.of(
-            points, rays, camera.row_time(measured), camera.pixel_jacobian(rays),
-            Mounts.one(camera.row_time_gradient),
-        )  # fmt: skip
+        observations = scene.observe(camera, points, measured)
         w = -motion.angular_velocity
         drift = np.cross(w, motion.translation) - motion.linear_velocity
         model = np.concatenate([motion.rotation.ravel(), motion.translation, w, drift])
@@ -59,24 +64,29 @@ def problem(scene):
     return make
 
 
-def run(observations, solver, pools, max_samples=2000, confidence=0.99, rotations=(IDENTITY,),
-        start=NOTHING, seed=1):  # fmt: skip
-    hypotheses = Hypotheses(
-        solve=solver, sample_size=6, solutions=1, block=50, score_scale=8.0, final_scale=2.0,
-        noise=1.0,
-    )  # fmt: skip
-    draws = Draws(rotations, pools, confidence, max_samples, generator(seed))
+def run(observations, solver, pools, max_samples=2000, start=NOTHING):
+    mock = replace(find_solver("r6p_vcwt"), solve=solver)
+    hypotheses = Hypotheses(mock, 50, 8.0, 2.0, 1.0, 5)
+    draws = Draws(np.eye(3), pools, 0.99, max_samples, generator(1))
     return search(observations, hypotheses, FREE, draws, start)
 
 
-def everything(observations):
-    return Pool(np.arange(len(observations)), ROWS)
+def pools_from(*points, ranked=False):
+    """Pools of equal shares."""
+    ends, count = np.cumsum([len(each) for each in points]), len(points)
+    return Pools(
+        np.concatenate(points), ends, np.full(count, ROWS), np.full(count, ranked), np.ones(count)
+    )
+
+
+EVERYTHING = np.arange(100)
+ALL = pools_from(EVERYTHING)
 
 
 def test_it_finds_the_inliers_and_stops_when_it_is_sure(problem):
     observations, model, outliers = problem(0.5)
     solver = Solver(model, outliers)
-    found = run(observations, solver, [everything(observations)])
+    found = run(observations, solver, ALL)
     inliers = observations.squared_errors(found.state) < 4.0
     assert (inliers == ~outliers).mean() > 0.97
     # log(0.01) / log(1 - 0.5^6) = 293 samples, in blocks of 50.
@@ -87,65 +97,65 @@ def test_it_finds_the_inliers_and_stops_when_it_is_sure(problem):
 def test_it_gives_up_after_the_most_samples(problem):
     observations, model, outliers = problem(0.5)
     solver = Solver(model, outliers, always_wrong=True)
-    found = run(observations, solver, [everything(observations)], max_samples=120)
+    found = run(observations, solver, ALL, max_samples=120)
     assert found.samples == 120
     assert [len(block) for block in solver.samples] == [50, 50, 20]
-
-
-def test_without_outliers_one_block_is_enough(problem):
-    observations, model, outliers = problem(0.0)
-    assert run(observations, Solver(model, outliers), [everything(observations)]).samples == 50
 
 
 def test_a_better_start_is_kept(problem, scene):
     observations, model, outliers = problem(0.3)
     start = Candidate(np.arange(24.0), 1e-6)
-    found = run(observations, Solver(model, outliers), [everything(observations)], start=start)
+    found = run(observations, Solver(model, outliers), ALL, start=start)
     assert found.state is start.state
 
 
 def test_good_pools_stop_the_search_early_and_all_are_drawn_from(problem):
     observations, model, outliers = problem(0.7)
     solver = Solver(model, outliers)
-    good = Pool(np.flatnonzero(~outliers), ROWS)
-    found = run(observations, solver, [good, everything(observations)])
+    found = run(observations, solver, pools_from(np.flatnonzero(~outliers), EVERYTHING))
     assert found.samples == 50
     (samples,) = solver.samples
     assert not outliers[samples[:25]].any()
     assert outliers[samples[25:]].any()
 
 
-def test_pools_that_are_too_small_are_left_out(problem):
+def test_pools_are_of_each_camera_that_has_enough_points():
+    """Near a start, by rank and not, and of all points; a camera of five has no sample of six."""
+    camera, tau = np.repeat([0, 1, 2], [20, 5, 10]), np.linspace(-0.5, 0.5, 35)
+    near, ranking = np.arange(35) % 2 == 0, np.random.default_rng(0).permutation(35)
+    found = pools_of(camera, tau, 3, 6, near, ranking, True)
+    parts = np.split(found.points, found.ends[:-1])
+    by_rank = [ranking[camera[ranking] == k] for k in (0, 2)]
+    expected = [np.arange(0, 20, 2), *by_rank, np.arange(20), np.arange(25, 35)]
+    assert [part.tolist() for part in parts] == [each.tolist() for each in expected]
+    assert found.ranked.tolist() == [False, True, True, False, False]
+    np.testing.assert_allclose(found.shares * [18, 35, 35, 35, 35], [10, 20, 10, 20, 10])
+    np.testing.assert_allclose(found.row_ranges, np.array([19, 19, 9, 19, 9]) / 34)
+    some = pools_of(camera, tau, 3, 6, near, np.zeros(0, np.int64), False)
+    assert some.points.tolist() == list(range(0, 20, 2))
+    assert len(pools_of(camera, tau, 3, 30, near, ranking, True).ends) == 0
+
+
+def test_without_pools_there_is_nothing(problem):
     observations, model, outliers = problem(0.0)
-    found = run(
-        observations, Solver(model, outliers), [Pool(np.arange(5), ROWS), everything(observations)]
-    )
-    assert found.found
-    nothing = run(observations, Solver(model, outliers), [Pool(np.arange(5), ROWS)])
-    assert not nothing.found
-    assert nothing.samples == 0
-
-
-def test_initial_rotations_take_turns(problem):
-    observations, model, outliers = problem(0.5)
-    solver = Solver(model, outliers, always_wrong=True)
-    rotations = [np.eye(3), 2 * np.eye(3), 3 * np.eye(3)]
-    run(observations, solver, [everything(observations)], max_samples=300, rotations=rotations)
-    assert {rotation[0, 0] for rotation in solver.rotations} == {1.0, 2.0, 3.0}
+    nothing = pools_of(observations.camera, observations.tau, 1, 6, outliers, EVERYTHING, False)
+    found = run(observations, Solver(model, outliers), nothing)
+    assert not found.found
+    assert found.samples == 0
 
 
 def test_scores_put_good_samples_first(problem):
     observations, model, outliers = problem(0.7)
-    ranked = Pool(np.argsort(outliers, kind="stable"), ROWS, ranked=True)
+    ranked = pools_from(np.argsort(outliers, kind="stable"), ranked=True)
     solver = Solver(model, outliers)
-    run(observations, solver, [ranked], max_samples=1000)
+    run(observations, solver, ranked, max_samples=1000)
     assert not outliers[solver.samples[0]].any()
 
 
 def test_it_goes_on_from_where_another_search_stopped(problem):
     """The samples of the first count: towards the most, and towards being sure."""
     observations, model, outliers = problem(0.5)
-    pools = [everything(observations)] * 2
+    pools = pools_from(EVERYTHING, EVERYTHING)
     first = run(observations, Solver(model, outliers, always_wrong=True), pools, max_samples=200)
     solver = Solver(model, outliers)
     later = run(observations, solver, pools, max_samples=250, start=first)
@@ -155,3 +165,101 @@ def test_it_goes_on_from_where_another_search_stopped(problem):
     sure = run(observations, Solver(model, outliers), pools)
     before = Candidate(sure.state, sure.cost, 280)
     assert run(observations, solver, pools, start=before).samples == 330
+
+
+def samples_of(pool, count, size, tau=None, seed=0, prefixes=None):
+    tau = np.linspace(-0.5, 0.5, 1000) if tau is None else tau
+    samples = np.full((count, size), -1, dtype=np.int64)
+    if prefixes is None:
+        prefixes = np.full(count, len(pool), dtype=np.int64)
+    draw(np.asarray(pool, np.int64), prefixes, tau, float(np.ptp(tau)), generator(seed), samples)
+    return samples
+
+
+@given(st.integers(6, 40), st.integers(1, 6), st.integers(0, 2**31 - 1))
+def test_samples_are_distinct_points_of_the_pool(total, size, seed):
+    pool = np.arange(total) * 7
+    samples = samples_of(pool, 20, size, seed=seed)
+    assert np.isin(samples, pool).all()
+    assert all(len(set(sample)) == size for sample in samples)
+
+
+def test_all_points_are_drawn_equally_often():
+    pool = np.random.default_rng(0).permutation(1000)[:50]
+    counts = np.bincount(samples_of(pool, 20000, 6).ravel(), minlength=1000)[pool]
+    expected = 20000 * 6 / 50
+    # Five standard deviations of a count.
+    assert np.abs(counts - expected).max() < 5 * np.sqrt(expected)
+
+
+def test_samples_spread_over_the_rows_where_they_can():
+    tau = np.concatenate([np.full(90, 0.1), np.linspace(-0.5, 0.5, 10)])
+    spread = np.ptp(tau[samples_of(np.arange(100), 1000, 6, tau)], axis=1)
+    without = np.ptp(
+        tau[np.array([np.random.default_rng(k).choice(100, 6, False) for k in range(1000)])], axis=1
+    )
+    assert np.mean(spread < 0.25) < 0.2 * np.mean(without < 0.25)
+    # Where all rows are the same, samples come nevertheless.
+    assert (samples_of(np.arange(10), 5, 6, np.zeros(10)) >= 0).all()
+
+
+def prefixes(total, first, count, size=6):
+    sizes = np.empty(count, np.int64)
+    prefix_sizes(total, first, size, sizes)
+    return sizes
+
+
+def test_ranked_pools_begin_with_the_best_and_end_with_all():
+    sizes = prefixes(200, 0, 1000)
+    assert sizes[0] < 40
+    assert prefixes(200, 200_000, 1) == 200
+    assert (np.diff(sizes) >= 0).all()
+    parts = [prefixes(200, k, 100) for k in range(0, 1000, 100)]
+    np.testing.assert_array_equal(sizes, np.concatenate(parts))
+    samples = samples_of(np.arange(200), 1000, 6, prefixes=sizes)
+    assert (samples.max(axis=1) < sizes).all()
+    assert (prefixes(6, 0, 10) == 6).all()
+
+
+def test_models_become_states_by_the_motion_model(scene):
+    model = np.random.default_rng(0).normal(size=18)
+    rotation, c, w, drift = model[:9].reshape(3, 3), model[9:12], model[12:15], model[15:18]
+    motion = Motion(rotation, c, -w, np.cross(w, c) - drift)
+    np.testing.assert_allclose(state_of_model(model), scene.state_of(motion), atol=1e-15)
+
+
+def models_near(motion, count, rng):
+    """Models (2,18,count) of model A, worse and worse, in shuffled order; some are NaN."""
+    w = -motion.angular_velocity
+    true = np.concatenate(
+        [
+            motion.rotation.ravel(), motion.translation, w,
+            np.cross(w, motion.translation) - motion.linear_velocity,
+        ]
+    )  # fmt: skip
+    size = rng.permutation(2 * count) * 1e-4
+    models = true[:, None] + size * rng.normal(size=(18, 1))
+    models[:, ::5] = np.nan
+    return np.ascontiguousarray(models.reshape(18, 2, count).transpose(1, 0, 2)), models
+
+
+def test_the_best_models_are_those_of_a_full_sort(scene):
+    camera, motion, points, _, measured = scene.frame(noise=1.0, count=50)
+    data = scene.pack(camera, points, measured)
+    models, flat = models_near(motion, 40, np.random.default_rng(1))
+    states, costs = best_models(models, data, 8.0, 4, np.inf)
+    alive = [state_of_model(column) for column in flat.T if np.isfinite(column).all()]
+    expected = sorted(truncated_cost(data, s, 8.0, np.inf) for s in alive)[:4]
+    np.testing.assert_allclose(costs, expected, rtol=1e-12)
+    for state, cost in zip(states, costs, strict=True):
+        assert truncated_cost(data, state, 8.0, np.inf) == cost
+
+
+def test_places_without_a_model_stay_infinite(scene):
+    camera, _, points, _, measured = scene.frame()
+    data = scene.pack(camera, points, measured)
+    nothing = np.full((1, 18, 3), np.nan)
+    states, costs = best_models(nothing, data, 8.0, 2, np.inf)
+    assert np.isinf(costs).all()
+    _, cost = optimize(states, costs, data, 16.0, 2.0, FREE, 1.0)
+    assert np.isinf(cost)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.estimation.prior import held_terms, motion_terms
+from rs_localizer.estimation.prior import motion_terms
 from rs_localizer.estimation.refine import (
     apply_step,
     inverted,
@@ -76,21 +76,6 @@ def test_the_cost_never_rises_and_outliers_lose_their_weight(scene):
     # Within the noise: the translation along the axis is known to centimetres here.
     deviations = 0.5 * np.sqrt(np.diag(inverted(information)))
     assert distance(scene, state, motion) < 4 * deviations.max()
-
-
-def test_the_noise_decides_between_prior_and_data(scene):
-    camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
-    data = scene.pack(camera, points, measured)
-    start = scene.state_of(motion)
-    held = refine(data, start, 1e3, 0.0, held_terms(), 1.0, 2, 30, 1e-6)[0]
-    np.testing.assert_allclose(held[12:], 0.0, atol=1e-9)
-    prior = motion_terms((0.1, 0.1), (0.1, 0.1))
-    free, weak, strong = (
-        refine(data, start, 1e3, 0.0, p, noise, 2, 30, 1e-6)[0][12:]
-        for p, noise in ((NO_PRIOR, 1.0), (prior, 0.5), (prior, 50.0))
-    )
-    assert np.linalg.norm(weak) < np.linalg.norm(free)
-    assert np.linalg.norm(strong) < 0.8 * np.linalg.norm(weak)
 
 
 def test_the_minimum_has_no_slope_of_the_posterior(scene):

@@ -14,10 +14,6 @@ from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.observations import find_usable, packed, relinearized
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.localizer import Localizer
-from rs_localizer.simulation.frames import simulate_frames
-from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import ConstantVelocity
 
 K = np.array([[250.0, 0.0, 319.5], [0.0, 250.0, 239.5], [0.0, 0.0, 1.0]])
 FISHEYE = Camera(
@@ -80,18 +76,6 @@ def test_few_points_and_lost_ones_keep_their_derivatives():
     observations = packed(EXPOSURE, points, usable)
     found = relinearized(EXPOSURE, observations, state_in(far, usable.centre), None)
     np.testing.assert_allclose(by_ray(found), by_ray(observations), rtol=1e-6)
-
-
-def test_thousands_of_points_of_a_fisheye_show_no_error_of_its_lens():
-    """Once these frames were refused for errors of 1 px."""
-    motion = ConstantVelocity(np.array([0.05, -0.1, 0.15]), np.array([0.5, 0.02, -0.3]), 0.1)
-    points = room(np.zeros((1, 3)), np.random.default_rng(0), count=20_000)
-    settings = FrameSettings(points=2500, noise=1.0, outliers=0.0)
-    for frame in simulate_frames(FISHEYE, motion, points, settings):
-        found = Localizer(FISHEYE).localize(frame.points, frame.pixels)
-        assert found, found
-        assert found.model_error < 0.25
-        assert np.linalg.norm(found.position - frame.middle_row.positions[0]) < 0.005
 
 
 def test_the_noise_of_a_fisheyes_points_is_no_lens_that_is_off():

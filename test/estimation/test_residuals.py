@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from rs_localizer.estimation import observations, residuals
+from rs_localizer.estimation import residuals
 from rs_localizer.estimation.refine import apply_step
 
 DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
@@ -90,14 +90,3 @@ def test_points_behind_the_camera_are_outliers_and_disturb_nothing(scene):
         scene.pack(camera, points[1:], measured[1:]), state, 3.0, 0.0, 2, without, slope
     )
     np.testing.assert_allclose(information, without, rtol=1e-9, atol=1e-6)
-
-
-def test_weights_choose_the_points(scene):
-    camera, motion, points, _, measured = scene.frame(noise=1.0)
-    state = scene.state_of(motion)
-    data = scene.pack(camera, points, measured)
-    data = observations.weighted(data, (np.arange(len(points)) < 13).astype(float))
-    expected = residuals.truncated_cost(
-        scene.pack(camera, points[:13], measured[:13]), state, 1e3, np.inf
-    )
-    assert residuals.truncated_cost(data, state, 1e3, np.inf) == pytest.approx(expected)

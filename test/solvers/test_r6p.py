@@ -8,7 +8,6 @@ matrix, and polishes in all twelve unknowns of the camera model itself.
 """
 
 import itertools
-import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -225,30 +224,6 @@ def test_the_truth_is_among_the_solutions(motion):
     assert np.mean(np.nanmin(error, axis=1) < 1e-7) > 0.999
 
 
-def test_the_bound_is_a_parameter():
-    p = problems(1000, 11, physical=True, noise=1.0)
-    narrow, usual, wide = (solutions(p, bound=b)[0] for b in (0.1, 0.6, 3.0))
-    lengths = np.linalg.norm(usual, axis=2)
-    np.testing.assert_allclose(
-        np.nan_to_num(narrow), np.where(lengths[..., None] < 0.1, usual, 0.0), atol=1e-12
-    )
-    in_range = np.linalg.norm(wide, axis=2) < 0.6
-    assert in_range.sum() == np.isfinite(lengths).sum()
-    assert np.isfinite(wide[..., 0]).sum() > 1.5 * in_range.sum()
-    check_residuals(p, *solutions(p, bound=3.0))
-
-
-def batch(points, rays, tau, rotations):
-    """The kernel's own interface: (h,20,18)."""
-    h = len(points)
-    models = np.zeros((20, 18, h))
-    r6p.solve_batch(
-        points.reshape(-1, 3), rays.reshape(-1, 2), tau.ravel(),
-        np.arange(6 * h).reshape(h, 6), rotations, 1, models,
-    )  # fmt: skip
-    return np.moveaxis(models, (2, 0), (0, 1))
-
-
 def test_the_unit_of_length_and_the_origin_do_not_matter():
     p = problems(500, 13, physical=True, noise=1.0)
     v, c, w, t = solutions(p)
@@ -262,74 +237,3 @@ def test_the_unit_of_length_and_the_origin_do_not_matter():
         if not np.any(shift):
             assert np.nanmedian(np.abs(other[1] / factor - c)) < 1e-11
             assert np.nanmedian(np.abs(other[3] / factor - t)) < 1e-11
-
-
-def one_number(values, value):
-    """The same with one sixth of a sample replaced."""
-
-    def change(p, rng):
-        changed = getattr(p, values).copy()
-        changed[np.arange(len(changed)), rng.integers(0, 6, len(changed))] = value
-        return {values: changed}
-
-    return change
-
-
-def coplanar(p, rng):
-    normal = directions(rng, np.ones(len(p.points)))
-    return {"points": p.points - (p.points @ normal[..., None]) * normal[:, None]}
-
-
-def collinear(p, rng):
-    along = rng.uniform(-1, 1, (len(p.points), 6, 1)) * p.points[:, 1:2]
-    return {"points": p.points[:, :1] + along}
-
-
-def repeated(p, rng):
-    i, j = rng.integers(0, 6, (2, len(p.points)))
-    order = np.tile(np.arange(6), (len(i), 1))
-    order[np.arange(len(i)), i] = j
-    rows = np.arange(len(i))[:, None]
-    return {name: getattr(p, name)[rows, order] for name in ("points", "rays", "tau")}
-
-
-# What changes of samples that are degenerate in one way.
-DEGENERATE = {
-    "coplanar": coplanar,
-    "frontal": lambda p, _: {"points": p.points * [1.0, 1.0, 0.0]},
-    "collinear": collinear,
-    "one point": lambda p, _: {"points": np.repeat(p.points[:, :1], 6, axis=1)},
-    "one bearing": lambda p, _: {"rays": np.repeat(p.rays[:, :1], 6, axis=1)},
-    "repeated": repeated,
-    "one row": lambda p, _: {"tau": np.repeat(p.tau[:, :1], 6, axis=1)},
-    "two rows": lambda p, _: {"tau": np.where(np.arange(6) % 2, p.tau[:, :1], p.tau[:, 1:2])},
-    "behind": lambda p, _: {"points": p.points - [0.0, 0.0, 10.0]},
-    "zero": lambda p, _: {name: 0.0 * getattr(p, name) for name in ("points", "rays", "tau")},
-    "huge": lambda p, _: {"points": 1e200 * p.points},
-    "tiny": lambda p, _: {"points": 1e-200 * p.points},
-    "no number": one_number("points", np.nan),
-    "infinite": one_number("rays", np.inf),
-    "integers": lambda p, _: {
-        "points": p.points.round(), "rays": p.rays.round(1), "tau": p.tau.round(1),
-    },
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", DEGENERATE)
-def test_degenerate_samples_end_without_noise_and_leave_others_alone(kind):
-    p = problems(600, 14, physical=True)
-    spoilt = DEGENERATE[kind](p, np.random.default_rng(15))
-    bad = [spoilt.get(name, getattr(p, name)) for name in ("points", "rays", "tau")]
-    good = batch(p.points, p.rays, p.tau, np.eye(3)[None])
-    odd = np.arange(len(p.points)) % 2 == 1
-    mixed = [np.where(odd.reshape(-1, *[1] * (x.ndim - 1)), y, x) for x, y in
-             zip((p.points, p.rays, p.tau), bad, strict=True)]  # fmt: skip
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        found = batch(*mixed, np.eye(3)[None])
-        alone = batch(*bad, np.eye(3)[None])
-    np.testing.assert_array_equal(found[~odd], good[~odd])
-    for models in (found, alone):
-        assert not np.isinf(models).any()
-        exists = np.isfinite(models)
-        assert (exists.all(axis=2) == exists.any(axis=2)).all()

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What vibration that hides in the noise does to a motion, against sums over dense Gaussians."""
+"""What is not fitted: score statistics, and vibration that hides, against dense Gaussians."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,17 @@ from scipy.stats import chi2
 from benchmarks.frames.conditions import HAND, Condition, moving
 from benchmarks.frames.judged import judge
 from benchmarks.independent.scenes import Rich
-from rs_localizer.estimation.undetected_vibration import undetected_vibration
+from rs_localizer.core.shake import COMBINATIONS, CYCLES
+from rs_localizer.estimation.first_look import (
+    score_products,
+    score_statistics,
+    undetected_vibration,
+)
+from rs_localizer.estimation.frame_fit import products_of
+from rs_localizer.estimation.posterior import maximum_a_posteriori
+from rs_localizer.estimation.residuals import linearized
+
+from .frames import PRIOR, frame
 
 COLUMNS, NOISE, FREEDOM = 9, 0.5, 1e7  # so many that the noise is known
 
@@ -66,3 +76,50 @@ def test_a_calm_hand_is_not_said_to_shake():
     assert (np.mean(squared < chi2.ppf(0.95, 6), axis=0) >= 0.93).all()
     # Claimed over actual deviation of the turn rate, three dimensions.
     assert np.sqrt(chi2.median(3) / np.median(found.of("angular"))) < 1.7
+
+
+def test_scores_are_of_the_columns_of_a_fit():
+    """Of the combinations that the rows resolve exactly; of a frequency but for what they leave."""
+    observations, state = frame(0, 0.02, 0.5, 60)
+    best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
+    packed, count = observations.packed, observations.count
+    lines = linearized(packed, count, best.state, np.zeros((count, 6)))
+    whole = products_of(lines, best.inliers, lines.errors, True, False, np.zeros((0, 0)))
+    found, _ = score_products(packed, count, best.state, best.inliers, PRIOR, 0.25, True)
+    turns, motion = whole.products[18:, 18:], whole.products[18:, :18]
+    combined = np.kron(COMBINATIONS, np.eye(3))
+    size = np.sqrt(np.outer(*2 * [np.diag(combined.T @ turns @ combined)]))
+    np.testing.assert_allclose(
+        found.together / size, combined.T @ turns @ combined / size, atol=1e-9
+    )
+    np.testing.assert_allclose(found.together_by_motion, combined.T @ motion, rtol=1e-7, atol=1e-6)
+    np.testing.assert_allclose(
+        found.together_along, combined.T @ whole.with_errors[18:], rtol=1e-7, atol=1e-6
+    )
+    for f in range(len(CYCLES)):
+        one = slice(6 * f, 6 * f + 6)
+        size = np.sqrt(np.diag(turns[one, one]))
+        difference = (found.own[f] - turns[one, one]) / np.outer(size, size)
+        assert np.abs(difference).max() < 3e-2, f
+        away = (found.along[f] - whole.with_errors[18:][one]) / (size * best.noise)
+        assert np.abs(away).max() < 0.1, f
+
+
+@pytest.mark.bench
+def test_scores_are_chi_squared_where_there_is_nothing():
+    """Mean 6 of each frequency, and 14 of a smooth error: the motion mimics six of its twenty."""
+    statistics = []
+    for seed in range(200):
+        observations, state = frame(seed, 0.02, 0.5, 60)
+        best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
+        statistic, *_ = score_statistics(
+            observations.packed, len(observations), best.state,
+            best.inliers, PRIOR, 0.5, best.freedom, 0.0, 1.0, True,
+        )  # fmt: skip
+        statistics.append(statistic)
+    mean = np.mean(statistics, axis=0)
+    # Sampling errors: sqrt(2 x 6 / 200) = 0.24, and 0.45. What half a cycle and a whole one look
+    # like is an acceleration, for which the prior has room that these frames do not use.
+    np.testing.assert_allclose(mean[2:-1], 6.0, atol=1.0)
+    assert np.all((mean[:2] > 3.5) & (mean[:2] < 6.5))
+    assert mean[-1] == pytest.approx(14.0, abs=1.8)
