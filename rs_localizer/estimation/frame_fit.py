@@ -33,7 +33,14 @@ from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, noise_deviation
 from rs_localizer.estimation.prior import PriorTerms, add_prior
-from rs_localizer.estimation.refine import LEAST_NOISE, TINY, apply_step, half_inverse, squared
+from rs_localizer.estimation.refine import (
+    LEAST_NOISE,
+    TINY,
+    apply_step,
+    half_inverse,
+    inverted,
+    squared,
+)
 from rs_localizer.estimation.residuals import POINT_SIZE, Lines, linearized, squared_errors
 
 SMOOTH_DEGREE = 3
