@@ -39,13 +39,11 @@ def replayed(count, **settings):
     return frames, notices
 
 
-def jitter(frames) -> tuple[float, float]:
-    """Second difference of the orientation (deg): median and 95 %."""
+def jitter(frames):
+    """Second differences of the orientation (deg)."""
     poses = [Rotation.from_matrix(frame.pose.rotation) for frame in frames]
     turns = [(a.inv() * b).as_rotvec() for a, b in pairwise(poses)]
-    return tuple(
-        np.quantile(np.degrees(np.linalg.norm(np.diff(turns, axis=0), axis=1)), (0.5, 0.95))
-    )
+    return np.degrees(np.linalg.norm(np.diff(turns, axis=0), axis=1))
 
 
 @cache
@@ -64,9 +62,11 @@ def test_a_global_shutter_stays_one(name, count):
     frames, notices = replayed(count, **SETTINGS[name])
     p3p = jitter_of_p3p(count)
     if count == 450:
-        assert p3p == pytest.approx((0.22, 0.73), abs=0.01)
+        assert np.quantile(p3p, (0.5, 0.95)) == pytest.approx((0.22, 0.73), abs=0.01)
     assert any("(a global shutter)" in text for text in notices) == ("20 ms" in name)
-    median, most = jitter(frames)
+    own = jitter(frames)
+    # Frame by frame: medians of the same poses differ by a twentieth by chance.
+    median, most = np.median(own / p3p), np.quantile(own, 0.95) / np.quantile(p3p, 0.95)
     still = []
     for frame in frames:
         twist = twist_at(frame.estimate, 0.0, 1.0)  # per readout
@@ -75,10 +75,9 @@ def test_a_global_shutter_stays_one(name, count):
             not np.any(velocities)
             or velocities @ np.linalg.solve(twist.covariance, velocities) < REGION
         )
-    found = f"jitter {median:.3f} and {most:.3f} deg, {np.mean(still):.1%} insignificant"
+    found = f"jitter {median:.3f} and {most:.3f} of P3P's, {np.mean(still):.1%} insignificant"
     # Who remembers finds out that map and lens are a little off, and which readout time is wrong,
     # that after a second or two. Frames that stand alone are wrong now and then.
     allowed = {"default": 1.01, "20 ms, tracked": 1.05, "20 ms, single": 1.08}[name]
-    assert median <= allowed * p3p[0], found
-    assert most <= allowed * p3p[1], found
+    assert max(median, most) <= allowed, found
     assert np.mean(still) >= (0.93 if name == "20 ms, single" else 0.99), found
