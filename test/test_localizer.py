@@ -261,6 +261,13 @@ def test_copies_of_points_are_no_further_evidence(distinct):
         assert np.array_equal(copied.inliers[::10], once.inliers)
 
 
+def test_what_an_estimate_says_of_scales_is_its_own():
+    points, pixels, _ = frame(camera(), Path(), count=60, noise=1.0)
+    first, second = (rsl.Localizer(camera()).localize(points, pixels) for _ in range(2))
+    for one, other in zip(first.scales, second.scales, strict=True):
+        assert not np.shares_memory(one, other)
+
+
 def test_normalized_coordinates_are_not_taken_for_pixels():
     rng = np.random.default_rng(0)
     camera = rsl.Camera(width=640, height=480, K=np.diag([500.0, 500.0, 1.0]))
