@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer.config import CalibrationErrors
+from rs_localizer.estimation.observations import checked
 from rs_localizer.solvers.table import SOLVERS, find_solver
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 590.0, 239.5], [0.0, 0.0, 1.0]])
@@ -259,6 +260,23 @@ def test_copies_of_points_are_no_further_evidence(distinct):
     if once and copied:
         np.testing.assert_allclose(copied.covariance, once.covariance, rtol=1e-9)
         assert np.array_equal(copied.inliers[::10], once.inliers)
+
+
+def test_what_an_estimate_says_of_scales_is_its_own():
+    points, pixels, _ = frame(camera(), Path(), count=60, noise=1.0)
+    first, second = (rsl.Localizer(camera()).localize(points, pixels) for _ in range(2))
+    for one, other in zip(first.scales, second.scales, strict=True):
+        assert not np.shares_memory(one, other)
+
+
+def test_read_only_arrays_need_no_kernels_of_their_own():
+    points, pixels, _ = frame(camera(), Path())
+    points.flags.writeable = pixels.flags.writeable = False
+    given = checked(points, pixels, None)
+    assert given[0].flags.writeable
+    assert given[1].flags.writeable
+    np.testing.assert_array_equal(given[0], points)
+    np.testing.assert_array_equal(given[1], pixels)
 
 
 def test_normalized_coordinates_are_not_taken_for_pixels():

@@ -26,6 +26,7 @@ from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.rate_spline import multiplied
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.scales import Scales
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
@@ -344,7 +345,8 @@ def estimate_of(
         undetected_covariance=posterior.undetected + beside[:MOTION_PARAMETERS, :MOTION_PARAMETERS],
         shake=posterior.shake,
         model_error=posterior.model_error,
-        scales=posterior.scales,
+        # Posteriors share the default of what they leave open.
+        scales=Scales(*(part.copy() for part in posterior.scales)),
         global_shutter_inliers=still,
         iterations=samples,
         turn=turn,

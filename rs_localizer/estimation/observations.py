@@ -60,11 +60,14 @@ def checked(
 ) -> tuple[Array, Array, Array | None]:
     """Points (n,3), pixels (n,2) and scores (n,) as contiguous float64 arrays.
 
+    Those that are read-only are copied: to Numba they are another type, whose kernels nothing has
+    compiled yet.
+
     Raises:
         ValueError: wrong shapes, or values that are not finite.
     """
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    pixels = np.ascontiguousarray(pixels, dtype=np.float64)
+    points = np.require(points, np.float64, ["C", "W"])
+    pixels = np.require(pixels, np.float64, ["C", "W"])
     if points.size == 0 and pixels.size == 0:  # empty lists have no second dimension
         points, pixels = points.reshape(0, 3), pixels.reshape(0, 2)
     n = len(points)

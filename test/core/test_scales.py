@@ -56,3 +56,12 @@ def test_excess_of_chance_stays_chance_and_what_is_shared_adds_up():
     for _ in range(30):
         known = joined(known, says(0.0, 0.0, excess=1.0))
     assert known.excess.min() > 3.3  # half of a deviation in each frame would never be looked at
+
+
+def test_what_frames_agree_on_settles():
+    """Scales to a tenth, as they wander; speeds as a third of ten frames."""
+    known = Scales.nothing()
+    for _ in range(300):
+        known = joined(known, says(-5.0, 50.0, speeds=-2.0))
+    assert known.precisions.max() == pytest.approx(100.0)
+    np.testing.assert_allclose(known.speeds, -2.0 * 0.3 / (1.0 - 0.9))

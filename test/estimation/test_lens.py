@@ -19,7 +19,7 @@ from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.experience import Experience
-from rs_localizer.estimation.lens import decided, odds_of, refuted
+from rs_localizer.estimation.lens import decided, joined, odds_of, refuted
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.localizer import Localizer
@@ -98,6 +98,18 @@ def gaussian(mean, deviation):
     return LensError(
         np.array([*mean, 0.0, 0.0, 0.0, 0.0]), np.diag(np.square([*deviation, *OTHERS])), 400.0
     )
+
+
+def test_frames_are_joined_by_their_information():
+    prior = np.diag(1.0 / np.square([0.05, 0.05, *OTHERS]))
+    one, other = gaussian([0.01, 0.0], [0.01, 0.02]), gaussian([0.03, 0.01], [0.02, 0.01])
+    both = joined(one, other, 0.5)
+    old, new = (np.linalg.inv(lens.covariance) for lens in (one, other))
+    np.testing.assert_allclose(
+        np.linalg.inv(both.covariance), 0.5 * (old - prior) + (new - prior) + prior
+    )
+    pulled = 0.5 * old @ one.mean + new @ other.mean
+    np.testing.assert_allclose(np.linalg.solve(both.covariance, both.mean), pulled)
 
 
 def test_odds_are_for_lenses_that_are_off_by_many_deviations():

@@ -11,7 +11,7 @@ from scenes import READOUT, camera, walk
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.mapping.observations import MapFreedom
 from rs_localizer.mapping.refine import RefinedMap, refine
-from rs_localizer.mapping.shutter_fit import ShutterFit, fit_shutter
+from rs_localizer.mapping.shutter_fit import ShutterFit, fit_shutter, likely_axes
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
 # The wrong axis first.
@@ -59,3 +59,9 @@ def test_images_that_no_smooth_motion_joins_have_poses_of_their_own():
     assert refined.apart
     assert refined.fit_share > 0.95
     assert refined.deviation == pytest.approx(0.3, rel=0.15)
+
+
+def test_the_rows_of_sensors_lie_along_the_longer_side():
+    assert likely_axes((640, 480), None) == BOTH[::-1]
+    assert likely_axes((450, 800), None) == BOTH
+    assert likely_axes((450, 800), "bottom_to_top") == [ScanDirection.BOTTOM_TO_TOP]

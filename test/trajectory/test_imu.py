@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.calibration import calibrate
-from rs_localizer.trajectory.gyro import MOUNT, GyroMount, GyroSamples
+from rs_localizer.trajectory.gyro import MOUNT, GyroMount, GyroSamples, first_mount
 from rs_localizer.trajectory.gyro_terms import GyroTerms
 from rs_localizer.trajectory.imu import ImuRecording
 from rs_localizer.trajectory.model import State
@@ -91,3 +91,14 @@ def test_offset_rotation_and_bias_are_found():
     assert np.all(np.abs(mount.mount.shape - truth) < 5.0 * mount.shape_deviations)
     assert mount.noise == pytest.approx(0.01, rel=0.2)
     assert abs(found.readout_time - readout) < 4.0 * found.deviation < 2e-4
+
+
+def test_a_turn_about_one_axis_leaves_the_rotation_about_it_open():
+    """A rotation that is given stands in where the motion says nothing."""
+    rng = np.random.default_rng(2)
+    motion = projector.Motion.random(rng)
+    motion.amplitudes[1:3] = 0.0
+    samples = GyroSamples(*gyroscope(rng, motion, 3.0, np.zeros((3, 3))))
+    mount = first_mount(samples, spline_of(motion, 3.0, 1 / 30), CAMERA_FROM_IMU)
+    assert abs(mount.delay - OFFSET) < 5e-3
+    assert mount.turned_from(CAMERA_FROM_IMU) < np.radians(3.0)
