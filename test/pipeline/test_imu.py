@@ -32,6 +32,7 @@ from rs_localizer.pipeline.imu import in_camera_axes
 
 READOUT_TIME = 0.03
 CONFIG = NodeConfig(readout_time=READOUT_TIME)
+WITHOUT = NodeConfig(readout_time=READOUT_TIME, imu=Imu(use="none"))
 MS = 1_000_000
 # A camera in a hand that shakes by a tenth of a degree: alone, it is localized, if badly.
 FLIGHT = (
@@ -109,8 +110,9 @@ def fly(
     config: NodeConfig = CONFIG,
     mounting: Any = None,
     most: int = 1000,
+    late: float = 0.0,
 ) -> Flown:
-    """Localize a flight, or so many of its frames."""
+    """Localize a flight, or so many of its frames; nobody waits for readings that are late (s)."""
     flown = Flown(flight)
     tree = TransformTree()
     if mounting is not False:
@@ -118,7 +120,10 @@ def fly(
     frames = FrameLocalizer(config, lambda name, _: flown.notices.update((name,)), tree)
 
     def changed() -> Iterable[Item]:
-        for topic, recorded_ns, message in flight.items:
+        comes = {"/imu": round(1e9 * late)}
+        for topic, recorded_ns, message in sorted(
+            flight.items, key=lambda item: item[1] + comes.get(item[0], 0)
+        ):
             if topic != "/imu":
                 yield topic, recorded_ns, message
                 continue
@@ -126,7 +131,8 @@ def fly(
                 yield topic, recorded_ns, item
 
     def awaits(item: Item) -> bool:
-        return item[0] == "/correspondences" and frames.awaits_imu(stamp_ns(item[2]), 1.0)
+        frame = item[0] == "/correspondences" and not late
+        return frame and frames.awaits_imu(stamp_ns(item[2]), 1.0)
 
     for topic, _, message in imu_first(changed(), "/imu", awaits):
         if len(flown.results) == most:
@@ -162,7 +168,7 @@ def test_it_makes_poses_better(flight):
     assert np.median(both.errors()[0]) < 0.75 * np.median(alone.errors()[0])
     # An IMU that is not used changes nothing, to the last bit.
     for other in (
-        fly(flight, config=NodeConfig(readout_time=READOUT_TIME, imu=Imu(use="none")), most=30),
+        fly(flight, config=WITHOUT, most=30),
         fly(flight, mounting=False, most=30),
     ):
         for a, b in zip(other.frames, alone.frames[:30], strict=True):
@@ -202,6 +208,14 @@ def test_the_camera_goes_on_alone(flight, fault):
     lasts = fault not in ("is cut", "begins late")
     assert flown.notices[reason] == lasts  # told once, not at every frame
     assert (flown.state.unused is not None) == lasts
+
+
+def test_readings_that_come_after_their_frames_are_late(flight):
+    flown, alone = fly(flight, most=30, late=0.1), fly(flight, config=WITHOUT, most=30)
+    assert flown.state.mostly.reason == ImuReason.LATE
+    assert "older than the last row" in flown.state.mostly.detail
+    for a, b in zip(flown.frames, alone.frames, strict=True):
+        assert np.array_equal(a.pose.position, b.pose.position)
 
 
 def test_a_gyroscope_at_the_end_of_its_range(tmp_path):
