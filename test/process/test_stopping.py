@@ -106,7 +106,7 @@ ASK = """
 import ctypes, re
 import numpy, scipy.linalg
 found = []
-for path in set(re.findall(r"/\\S*openblas\\S*", open("/proc/self/maps").read())):
+for path in set(re.findall(r"/.*openblas.*", open("/proc/self/maps").read())):
     library = ctypes.CDLL(path)
     for prefix in ("", "scipy_"):
         for suffix in ("", "64_"):
