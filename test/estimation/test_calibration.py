@@ -5,6 +5,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -14,12 +15,42 @@ from rs_localizer.config import CalibrationErrors
 from rs_localizer.core import so3
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.core.state import POSE
+from rs_localizer.estimation.calibration import _columns
 
 CAMERA = rsl.Camera(
     640, 480, np.array([[450.0, 0.0, 319.5], [0.0, 450.0, 239.5], [0.0, 0.0, 1.0]]),
     readout_time=0.02,
 )  # fmt: skip
 EXACT = CalibrationErrors(0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("coefficients", [0, 5, 8, 12])
+def test_errors_of_a_lens_move_pixels_as_differences_of_opencv_say(coefficients):
+    """By focal length and distortion, of which one deviation moves the image's corners."""
+    rng = np.random.default_rng(coefficients)
+    K = np.array([[430.0, 0.0, 310.0], [0.0, 470.0, 250.0], [0.0, 0.0, 1.0]])
+    D = rng.uniform(-0.05, 0.05, coefficients)
+    rays = rng.uniform([-0.7, -0.5], [0.7, 0.5], (20, 2))
+    deviation, step = CalibrationErrors(0.7, 0.01, 1.3), 1e-5
+    model = "rational_polynomial" if coefficients > 5 else "plumb_bob"
+    found = _columns(rsl.Camera(640, 480, K, D=D, distortion_model=model), rays, deviation)
+
+    def pixels(focal, k1):
+        lens = np.append(D, np.zeros(max(5 - len(D), 0)))
+        lens[0] += k1
+        points = np.column_stack([rays, np.ones(len(rays))])
+        scaled = K * [[1.0 + focal, 1.0, 1.0], [1.0, 1.0 + focal, 1.0], [1.0, 1.0, 1.0]]
+        return cv2.projectPoints(points, np.zeros(3), np.zeros(3), scaled, lens)[0][:, 0]
+
+    by_focal = (pixels(step, 0.0) - pixels(-step, 0.0)) / (2.0 * step)
+    by_k1 = (pixels(0.0, step) - pixels(0.0, -step)) / (2.0 * step)
+    focal = K[0, 0] * K[1, 1]
+    corner = 400.0 / np.sqrt(focal)  # focal lengths, of 640 x 480
+    k1 = 1.3 / (np.sqrt(focal) * corner**3)
+    np.testing.assert_allclose(found[:, :, 0], 0.7 * np.tile([1.0, 0.0], (20, 1)))
+    np.testing.assert_allclose(found[:, :, 1], 0.7 * np.tile([0.0, 1.0], (20, 1)))
+    np.testing.assert_allclose(found[:, :, 2], 0.01 * by_focal, atol=1e-6)
+    np.testing.assert_allclose(found[:, :, 3], k1 * by_k1, rtol=1e-6, atol=1e-6)
 
 
 def off(principal_point: float = 0.0, focal_length: float = 0.0) -> rsl.Camera:
