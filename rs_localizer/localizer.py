@@ -24,7 +24,7 @@ from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation import motion_model, observations, ransac
-from rs_localizer.estimation.acceptance import estimate_of, refusal, uncertain
+from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
 from rs_localizer.estimation.lens import decided, find_lens, may_be_lens, refuted, told_of_lens
@@ -51,6 +51,7 @@ from rs_localizer.estimation.prior import (
     with_motion,
 )
 from rs_localizer.estimation.ransac import Candidate, generator
+from rs_localizer.estimation.result import estimate_of
 from rs_localizer.estimation.searching import MotionSearch
 from rs_localizer.solvers.table import find_solver, start_solver
 

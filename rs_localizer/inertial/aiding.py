@@ -75,7 +75,7 @@ class OffsetSearch:
     supposed in turn, and its cost, twice the negative log-likelihood, summed over the frames:
 
     * of the rows, what the motion that is best beside the turn of this offset leaves of the errors,
-      as in :mod:`rs_localizer.estimation.acceptance`;
+      as in :mod:`rs_localizer.estimation.result`;
     * of the orientations ``R``, what a first orientation, a bias and the scales of the gyroscope
       leave of ``log(G^T R)``, with the turn ``G`` since the first frame (linear least squares; the
       normal matrix is the same for all offsets).
