@@ -288,7 +288,8 @@ def read_log(video: Path) -> Telemetry | None:
         return None
     columns, clock = (_SEPARATE, 3) if log.forces is not None else (_TOGETHER, 0)
     readings, frames = _Table.read(log.readings, columns, clock), _Table.read(log.frames, 1)
-    starts = frames.values[:, 0] * frames.second
+    stamps = frames.named("timestamp")
+    starts = (frames.values[:, 0] if stamps is None else stamps) * frames.second
     exposure = _median(frames.named("exposure time"), frames.second)
     readout = _median(frames.named("frame readout time"), frames.second)
     if log.forces is not None:  # x, y, z, time
