@@ -1,5 +1,7 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
+import subprocess
+import sys
 import warnings
 
 import cv2
@@ -246,3 +248,28 @@ def test_no_samples_give_no_solutions(name):
     n, k = find_solver(name).sample_size, find_solver(name).solutions
     found = solve_minimal(name, np.zeros((0, n, 3)), np.zeros((0, n, 2)), np.zeros((0, n)))
     assert [part.shape for part in found] == [(0, k, 3, 3), (0, k, 3), (0, k, 3), (0, k, 3)]
+
+
+OF_ANOTHER_GLOBAL_SHUTTER = """
+import numpy as np
+from rs_localizer.solvers import p3p
+from rs_localizer.solvers.table import SOLVERS, Row
+
+calls = []
+p3p.solve_too = lambda *args: (calls.append(args), p3p.solve_batch(*args))
+SOLVERS["p4p"] = Row("p3p", "solve_too", rolling_shutter=False)
+import rs_localizer as rsl
+
+camera = rsl.Camera(640, 480, np.array([[450, 0, 319.5], [0, 450, 239.5], [0, 0, 1.0]]))
+points = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 5], (40, 3))
+pixels = 450.0 * points[:, :2] / points[:, 2:] + [319.5, 239.5]
+pixels += np.random.default_rng(1).normal(scale=0.3, size=pixels.shape)
+estimate = rsl.Localizer(camera, solver="p4p").localize(points, pixels)
+assert np.linalg.norm(estimate.position) < 0.01, estimate
+assert calls
+"""
+
+
+def test_another_global_shutter_solver_of_the_table_is_called():
+    """A row was accepted once, and P3P called."""
+    subprocess.run([sys.executable, "-c", OF_ANOTHER_GLOBAL_SHUTTER], check=True)
