@@ -25,7 +25,7 @@ from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation import motion_model, observations, ransac
 from rs_localizer.estimation.acceptance import refusal, uncertain
-from rs_localizer.estimation.calibration import NO_EFFECT, calibration_effect
+from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
 from rs_localizer.estimation.lens import decided, find_lens, may_be_lens, refuted, told_of_lens
 from rs_localizer.estimation.observations import (
@@ -105,6 +105,8 @@ class Localizer:
             raise ValueError(f"give either config or settings, got both: {', '.join(settings)}")
         self.config = config or localizer_config(settings)
         self.rig = camera
+        self.error_modes: ErrorModes | None = None
+        """Of the map whose points are given, where it tells; covariances then have them."""
         self._solver = find_solver(self.config.solver)
         self._search = MotionSearch(
             camera.focal_length, self.config, self._solver, start_solver(self._solver)
@@ -388,7 +390,9 @@ class Localizer:
         effect = NO_EFFECT
         enough = np.count_nonzero(posterior.inliers) >= self.config.min_inliers
         if enough and posterior.determined and np.all(np.isfinite(posterior.state)):
-            effect = calibration_effect(observed, posterior, own_terms, self.config.calibration)
+            effect = calibration_effect(
+                observed, posterior, own_terms, self.config.calibration, self.error_modes
+            )
         known = math.hypot(posterior.declared, effect.residual)  # px, of map and calibration
         failure = refusal(
             observed.observations,

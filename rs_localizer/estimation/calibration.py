@@ -3,7 +3,8 @@
 """What errors of the calibration and of the map, the same in all frames, do to a pose.
 
 Centre, focal length and distortion of an ordinary calibration have errors; so has a map that is
-bent, or whatever else a smooth error was fitted for. No tracker averages them away: they join what
+bent, or whatever else a smooth error was fitted for; and landmarks that were found together are off
+together, as the map may tell (:class:`ErrorModes`). No tracker averages them away: they join what
 is published of a frame, and not what goes on to the next. To first order a calibration that moves
 the pixels by ``b`` moves motion and smooth error by ``-H^-1 A^T b``, with the derivatives ``A`` of
 the pixels by both and the information ``H = A^T A + noise^2 P`` of points and prior; and a smooth
@@ -24,7 +25,7 @@ from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.scales import SPEEDS
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE
+from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, rotation_of
 from rs_localizer.estimation.frame_fit import SMOOTH_TERMS, smooth_terms
 from rs_localizer.estimation.mirror import longest_axis
 from rs_localizer.estimation.observations import Observed, rays_of_lens
@@ -40,8 +41,33 @@ _NO_PART = 0.02
 _CONFIGURED = np.array([speed == 1.0 for speed in SPEEDS], float)
 
 
+# Points this near (m) to a landmark are that landmark, in single precision as far as 8 km.
+_SAME = 0.001
+
+
+class ErrorModes:
+    """Independent errors that the landmarks of a map share, by the landmarks' places.
+
+    Args:
+        points: (n,3) m, of the landmarks.
+        modes: (n,3,k) m, by how much one standard deviation of each error moves them.
+    """
+
+    def __init__(self, points: Array, modes: np.ndarray) -> None:
+        from scipy.spatial import cKDTree  # only for maps that have them
+
+        self._tree = cKDTree(points)
+        self._modes = np.concatenate([modes, np.zeros((1, *modes.shape[1:]), modes.dtype)])
+
+    def at(self, points: Array) -> Array:
+        """Of points (m,3): (m,3,k), zeros for those that are no landmarks."""
+        _, rows = self._tree.query(points, distance_upper_bound=_SAME)  # n: there is none
+        modes: Array = self._modes[rows].astype(np.float64)
+        return modes
+
+
 class CalibrationEffect(NamedTuple):
-    """What the calibration's errors, one standard deviation of each, do to a frame."""
+    """What the errors of calibration and map, one standard deviation of each, do to a frame."""
 
     covariance: Array  # (12,12) of pose and velocities
     residual: float  # px, root mean square of what no motion takes up; a smooth error may
@@ -53,12 +79,14 @@ NO_EFFECT = CalibrationEffect(np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)), 
 
 
 def calibration_effect(
-    observed: Observed, posterior: Posterior, terms: PriorTerms, deviation: CalibrationErrors
-) -> CalibrationEffect:
+    observed: Observed, posterior: Posterior, terms: PriorTerms, deviation: CalibrationErrors,
+    of_map: ErrorModes | None = None,
+) -> CalibrationEffect:  # fmt: skip
     """The effect on the motion of a frame.
 
     Args:
         terms: what is known of the motion but for poses of other frames, which are off by as much.
+        of_map: errors of the points; None: they have none.
     """
     observations, chosen = observed.observations, posterior.inliers
     exposure = observed.sighted.exposure
@@ -79,6 +107,12 @@ def calibration_effect(
                 columns[here, :, first : first + _ERRORS] = _columns(
                     side.camera, side.towards(rays[here]), deviation
                 )
+    if of_map is not None:
+        sighted = observed.sighted
+        moved = of_map.at(sighted.points[sighted.usable.indices[chosen]])
+        # A point that moves one way is a camera that moves the other way.
+        by_point = by_motion[:, :, MOVE] @ rotation_of(posterior.state)
+        columns = np.concatenate([columns, by_point @ moved], axis=2)
     bend = posterior.bend[chosen] if posterior.bend.shape[1] else np.zeros((len(rays), 0))
     parts = posterior.speeds if len(posterior.speeds) else _CONFIGURED
     effect: CalibrationEffect = _effect(

@@ -12,7 +12,7 @@ as a whole (LAPACK): 300 images on their own have 7200 unknowns, which is a few 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,7 +20,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve
+from scipy.linalg.blas import dtrmv
 from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.sparse import diags
+from scipy.sparse.linalg import LinearOperator, eigsh
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.simd.jit import inlined, kernel
@@ -299,6 +302,8 @@ def covariances(rows: Rows, sequence: IntArray, inverse: Array, out: Array) -> N
 
 
 _WORKERS = 2
+# Of the eigenvalue of a mode: a hundredth of what it makes of a deviation.
+_MODE_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -362,6 +367,29 @@ class Reduced:
         reduced, landmarks = self.solve(-self._slope[:, None], -own[:, :, None])
         return reduced[: self._controls, 0], reduced[self._controls :, 0], landmarks[:, :, 0]
 
+    def modes(self, normal: MapNormal, count: int) -> Array:
+        """Independent errors (N,count) of controls and shared numbers, one deviation of each.
+
+        All N of them have the covariance ``S^-1``; these are the ones by which landmarks that know
+        nothing else of each other move the most, in their own deviations: the eigenvectors of
+        ``H x = (1 + l) S x``, of which ``l`` is the squared sum of these moves.
+        """
+        solve = partial(cho_solve, (self._factor, False), check_finite=False)
+        shape = (self.size, self.size)
+
+        def reduced(x: Array) -> Array:
+            return np.asarray(dtrmv(self._factor, dtrmv(self._factor, x.ravel()), trans=1))
+
+        start = np.random.default_rng(0).normal(size=self.size)  # the same images, the same map
+        _, modes = eigsh(
+            LinearOperator(shape, _information(normal), dtype=float),
+            min(count, self.size - 1),
+            LinearOperator(shape, reduced, dtype=float),
+            Minv=LinearOperator(shape, solve, dtype=float),
+            which="LA", v0=start, tol=_MODE_TOLERANCE,
+        )  # fmt: skip
+        return np.asarray(modes[:, ::-1])
+
     def covariances(self) -> tuple[Array, Array]:
         """Of each landmark (p,3,3) and of the shared numbers (s,s); the factors are used up."""
         inverse, failed = dpotri(self._factor, lower=0, overwrite_c=1)
@@ -395,6 +423,25 @@ def _dense(motion: Normal, damping: float) -> Array:
     diagonal = np.arange(len(system))
     system[diagonal, diagonal] *= 1.0 + damping
     return system
+
+
+def _information(normal: MapNormal) -> Callable[[Array], Array]:
+    """What multiplies (N,) with ``H``, the information that landmarks of known place would give."""
+    motion = normal.motion.whole
+    count = motion.band.shape[1]
+    below = range(1, min(len(motion.band), count))
+    lines = [motion.band[d, : count - d] for d in below]
+    band = diags([motion.band[0], *lines, *lines], [0, *(-d for d in below), *below], format="csr")
+    corner = np.tril(motion.corner) + np.tril(motion.corner, -1).T
+
+    def times(x: Array) -> Array:
+        own, shared = np.split(x.ravel(), [count])
+        by_own = band @ own + motion.cross @ shared
+        by_shared = motion.cross.T @ own + corner @ shared
+        held: Array = normal.held @ (normal.held.T @ x.ravel())
+        return np.concatenate([by_own, by_shared]) + held
+
+    return times
 
 
 class MapStep(NamedTuple):

@@ -150,12 +150,18 @@ def _row(anchors: Anchors, name: str) -> int:
     return anchors.corners + anchors.names.index(name)
 
 
+def determined_corners(marker_map: MarkerMap, triangulated: Triangulated) -> BoolArray:
+    """Which corners (c,) of the map hold it: those that three images or more see."""
+    count = len(marker_map.points)
+    places, counts = triangulated.points[:count], triangulated.counts[:count]
+    determined: BoolArray = np.isfinite(places).all(axis=1) & (counts > 2)
+    return determined
+
+
 def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
     truth = marker_map.points
     places = triangulated.points[: len(truth)]
-    determined: BoolArray = np.isfinite(places).all(axis=1) & (
-        triangulated.counts[: len(truth)] > 2
-    )
+    determined = determined_corners(marker_map, triangulated)
     if np.count_nonzero(determined) < _LEAST_CORNERS:
         raise MappingError(
             f"{np.count_nonzero(determined)} corners of the marker map are seen by three images or "

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.mapping.triangulation import Triangulated
 from rs_localizer.trajectory.bodies import BODY, PLACE
 from rs_localizer.trajectory.spline import Spline
 
@@ -159,6 +160,20 @@ def as_held(covariances: Array, spread: Array, every: Array, of_kept: Array) -> 
         covariances - crossed - np.swapaxes(crossed, 1, 2)
         + every @ of_whole @ np.swapaxes(every, 1, 2)
     )  # fmt: skip
+    return out
+
+
+def laid_on_held(points: Array, moves: Array, held: Triangulated, by: Array) -> Array:
+    """Moves (n,3,k) of points (n,3) when the whole is laid back by others that hold it.
+
+    Args:
+        held: the others, which count as they are known.
+        by: (m,3,k) how they move, too.
+    """
+    middle, weights = held.points.mean(axis=0), 1.0 / held.spread[:, None, None]
+    motions = (weights * generators(held.points, middle)).reshape(-1, 7)
+    of_whole = np.linalg.lstsq(motions, (weights * by).reshape(len(motions), -1), rcond=None)[0]
+    out: Array = moves - generators(points, middle) @ of_whole
     return out
 
 

@@ -183,6 +183,7 @@ class MapFreedom:
     # Standard deviations of the lens: focal lengths and centre by focal length, distortion.
     lens_deviations: tuple[float, float] = (0.02, 0.1)
     apart: bool = False  # nothing is known of the motion between images, of a global shutter
+    drifts: int = 0  # how many of the errors that landmarks share are asked for
 
 
 def shared_landmarks(observations: MapObservations) -> BoolArray:

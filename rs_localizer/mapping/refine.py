@@ -186,6 +186,8 @@ class Preparation:
 
 __all__ = ["MapFreedom", "MapObservations", "RefinedMap", "Start", "refine", "refine_rig"]
 
+DRIFT = 0.01
+"""Of a deviation: so little that landmarks follow in proportion, however large that is."""
 # A landmark that is not known to this part of the map's size is not refined.
 _KNOWN = 0.1
 # Nor one that is known worse than to so many times what landmarks usually moved by: seen from one
@@ -212,6 +214,9 @@ class RefinedMap:
     times: Array  # (g,) s, of the images' middle rows
     tells_readout: bool  # images follow each other closely enough to tell the readout time
     apart: bool = False  # each image has a pose of its own, of no common motion
+    # The motion and the cameras, off by DRIFT deviations of an error that landmarks share, each: as
+    # many as were asked for, the largest first, in frames of their own.
+    drifts: tuple[RefinedMap, ...] = ()
 
     @property
     def fit_share(self) -> float:
@@ -356,7 +361,7 @@ class _Refinement:
         ends = np.cumsum([len(own.points) for own in self.seen])[:-1]
         for k, own in enumerate(np.split(squared, ends)):
             all_squared[prepared.keypoints(k)] = own
-        return RefinedMap(
+        found = RefinedMap(
             points=np.where(refined[:, None], placed.points, prepared.start.points),
             covariances=np.where(refined[:, None, None], covariances, np.nan),
             refined=refined,
@@ -373,6 +378,24 @@ class _Refinement:
             tells_readout=prepared.tells_readout,
             apart=prepared.freedom.apart,
         )
+        return replace(found, drifts=self._drifts(found, problem, deviation, inflation))
+
+    def _drifts(
+        self, found: RefinedMap, problem: MapProblem, deviation: float, inflation: float
+    ) -> tuple[RefinedMap, ...]:
+        count = self.prepared.freedom.drifts
+        if not count:
+            return ()
+        normal, drifts = problem.normal(self.state, deviation)[1], []
+        for mode in DRIFT * math.sqrt(inflation) * Reduced(normal).modes(normal, count).T:
+            step = mode[: -problem.motion.border or None], mode[len(mode) - problem.motion.border :]
+            state = problem.motion.moved(self.state, normal.motion, step)
+            cameras = tuple(
+                _as_in(one, moved)
+                for one, moved in zip(found.cameras, problem.motion.states(state), strict=True)
+            )
+            drifts.append(replace(found, spline=state.spline, cameras=cameras))
+        return tuple(drifts)
 
     def _cluster_robust(self, problem: MapProblem, deviation: float, independent: float) -> float:
         """The covariances' inflation, with what errors of a second pull together."""
@@ -405,20 +428,17 @@ class _Refinement:
             self.prepared.rig, asked, motion.cameras, motion.columns, motion.states(self.state),
             strict=True,
         ):  # fmt: skip
-            readout_time = float(state.readout_time)
             spread = np.sqrt(np.diag(shared)[columns])
             mounted = own.mount_column >= 0
-            camera = replace(one.camera, readout_time=abs(readout_time))
-            found.append(
-                Adjusted(
-                    with_lens(camera, state.lens),
-                    readout_time,
-                    float(spread[0]) if self.freedom.readout_time else math.nan,
-                    wanted,
-                    state.extrinsics,
-                    spread[own.mount_column :][:EXTRINSICS] if mounted else np.zeros(EXTRINSICS),
-                )
+            given = Adjusted(
+                one.camera,
+                0.0,
+                float(spread[0]) if self.freedom.readout_time else math.nan,
+                wanted,
+                state.extrinsics,
+                spread[own.mount_column :][:EXTRINSICS] if mounted else np.zeros(EXTRINSICS),
             )
+            found.append(_as_in(given, state))
         return tuple(found)
 
     def _asked(self, deviation: float, inflation: float) -> list[ReadoutCheck | None]:
@@ -448,3 +468,10 @@ class _Refinement:
             given, change = float(one.readout_time), float(changes[columns[0]])
             checks.append(ReadoutCheck(given, given + change, float(np.sqrt(variance))))
         return checks
+
+
+def _as_in(one: Adjusted, state: State) -> Adjusted:
+    """A camera with the lens, the readout time and the extrinsics of a state."""
+    readout_time = float(state.readout_time)
+    camera = with_lens(replace(one.camera, readout_time=abs(readout_time)), state.lens)
+    return replace(one, camera=camera, readout_time=readout_time, extrinsics=state.extrinsics)

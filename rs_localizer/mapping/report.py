@@ -26,8 +26,11 @@ def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
         views: of them that were looked at.
     """
     refined, covariances, structure = built.refined, built.landmarks.covariances, built.structure
+    modes = built.landmarks.error_modes
     assert covariances is not None
+    assert modes is not None
     spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+    shared = np.linalg.norm(modes, axis=(1, 2))
     unit = "mm" if built.placement.scaled else "units of the map / 1000"
     joined = f"{structure.parts[0]} of {len(built.keyframes)}"
     others = structure.parts[1:]
@@ -38,6 +41,7 @@ def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
         ("images with a pose", f"{len(built.posed)} of {views}"),
         ("landmarks", f"{len(built.landmarks)} of {len(structure.points)} points"),
         ("deviation of a landmark", f"{1e3 * np.median(spread):.1f} {unit} (median)"),
+        ("deviation that landmarks share", f"{1e3 * np.median(shared):.1f} {unit} (median)"),
         ("noise before the refinement", f"{refined.before:.2f} px"),
         ("noise after it", f"{refined.after:.2f} px"),
         *_of_shutter(built),

@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -41,6 +42,20 @@ class Triangulated:
     covariances: Array  # (p,3,3), of the keypoints' noise alone
     counts: IntArray  # (p,) keypoints that fit
     deviation: float  # px, of the noise of u and of v
+    weights: Array = field(default_factory=lambda: np.zeros(0))  # (n,) of the keypoints, 0 to 1
+
+    @property
+    def spread(self) -> Array:
+        """Standard deviation (p,) of a point's place."""
+        spread: Array = np.sqrt(np.trace(self.covariances, axis1=1, axis2=2))
+        return spread
+
+    def chosen(self, rows: IntArray) -> Triangulated:
+        """Some (p,) of the points, with the keypoints of all."""
+        return replace(
+            self, points=self.points[rows], covariances=self.covariances[rows],
+            counts=self.counts[rows],
+        )  # fmt: skip
 
 
 def triangulate(camera: Camera, sights: Sights, count: int) -> Triangulated:
@@ -73,8 +88,32 @@ def triangulate(camera: Camera, sights: Sights, count: int) -> Triangulated:
     determined = (counts > 1) & np.isfinite(points).all(axis=1)
     covariances = np.where(determined[:, None, None], deviation**2 * _inverses(normal), np.nan)
     return Triangulated(
-        np.where(determined[:, None], points, np.nan), covariances, counts, deviation
+        np.where(determined[:, None], points, np.nan), covariances, counts, deviation, weights
     )
+
+
+def moves(
+    camera: Camera, sights: Sights, triangulated: Triangulated,
+    others: Sequence[tuple[Camera, Sights]],
+) -> Array:  # fmt: skip
+    """By how much points would lie elsewhere (p,3,k) if the same keypoints were seen otherwise.
+
+    To first order, with the weights that they have.
+
+    Args:
+        camera, sights: what the points are triangulated from.
+        others: (k) lenses and poses that are hardly different.
+    """
+    points, count = triangulated.points, len(triangulated.points)
+    errors, jacobians = _errors(camera, sights, points)
+    weighted = triangulated.weights[:, None, None] * np.nan_to_num(jacobians)
+    inverses = triangulated.covariances / triangulated.deviation**2
+    every = np.empty((count, 3, len(others)))
+    for k, (lens, seen) in enumerate(others):
+        change = np.nan_to_num(_errors(lens, seen, points)[0] - errors)
+        slope = _sums(np.einsum("nij,ni->nj", weighted, change), sights.points, count)
+        every[:, :, k] = -np.einsum("pij,pj->pi", inverses, slope)
+    return every
 
 
 def _nearest_to_rays(camera: Camera, sights: Sights, count: int) -> Array:

@@ -18,6 +18,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import (
@@ -55,6 +56,7 @@ class Landmarks:
     def __init__(self, notice: Notify) -> None:
         self._notice = notice
         self._matcher: Matcher | None = None
+        self.error_modes: ErrorModes | None = None
         self.lacking = False
         """Whether keypoints have come before a map, and no frame has been localized since."""
 
@@ -71,6 +73,8 @@ class Landmarks:
         for name, text in oddities_of_map(landmarks, previous).items():
             self._notice(name, text)
         self._matcher = Matcher(landmarks)
+        modes = landmarks.error_modes
+        self.error_modes = None if modes is None else ErrorModes(landmarks.points, modes)
         self.lacking = False
 
     def how(self, keypoints: Keypoints, settings: Matching) -> MatchBy | Refusal:
@@ -415,6 +419,7 @@ class FrameLocalizer:
         tracker.of_rest = watch.of_rest
         tracker.trusts_readout_time = watch.trusted
         tracker.readout_time_deviation = deviation
+        tracker.localizer.error_modes = self._landmarks.error_modes
         matches = (cloud.points, cloud.pixels, cloud.scores)
         result = self.imu.track(tracker, config, time_ns, frame, self.transforms, matches)
         adopted = watch.add(Watched(time_ns, cloud, result, config, camera))

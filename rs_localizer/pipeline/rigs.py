@@ -259,6 +259,7 @@ class RigLocalizer(FrameLocalizer):
         origin_ns = images[0].start_ns
         starts = {image.camera: 1e-9 * (image.start_ns - origin_ns) for image in images}
         matches = {image.camera: _matches(image.cloud, images) for image in images}
+        self._tracker.localizer.error_modes = self._landmarks.error_modes
         result = self._tracker.localize(origin_ns, matches, stamps=starts)
         self.watch.judge(bool(result))
         if not result:

@@ -26,7 +26,9 @@ def room() -> Map:
     level[:4, 2] = 0.0
     covariances = np.tile(np.diag([1.0, 4.0, 9.0]) * 1e-4, (20, 1, 1))
     points = (2.0 * level + [3.0, 1.0, 2.0]) @ TURN.T
-    return Map(points, np.arange(20), None, "map", covariances=covariances)
+    modes = np.zeros((20, 3, 2), np.float32)
+    modes[:, :, 1] = level
+    return Map(points, np.arange(20), None, "map", covariances=covariances, error_modes=modes)
 
 
 def test_floor_size_and_origin():
@@ -42,6 +44,10 @@ def test_floor_size_and_origin():
     np.testing.assert_allclose(after, scale * before, atol=1e-12)
     traces = np.trace(found.covariances, axis1=1, axis2=2)
     np.testing.assert_allclose(traces, scale**2 * 14e-4)
+    lengths = np.linalg.norm(room().error_modes[:, :, 1], axis=1)
+    np.testing.assert_allclose(
+        np.linalg.norm(found.error_modes, axis=1), scale * lengths[:, None] * [0.0, 1.0], rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 2.0), (0.0, 0.0, -1.0), (1.0, -2.0, 0.5)])

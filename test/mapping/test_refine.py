@@ -20,6 +20,7 @@ from scenes import (
     is_mounted_back,
     walk,
 )
+from scipy.linalg import eigh
 from scipy.stats import chi2
 
 from rs_localizer.core import so3
@@ -104,6 +105,21 @@ def test_covariances_are_those_of_the_dense_system():
         np.testing.assert_allclose(covariance, inverse[at, at], rtol=1e-5, atol=1e-12)
     at = slice(size - problem.motion.border, size)
     np.testing.assert_allclose(shared, inverse[at, at], rtol=1e-5, atol=1e-12)
+
+
+def test_modes_are_the_errors_of_the_motion_that_move_landmarks_most():
+    """By dense algebra: whitened, and the largest of landmarks in their own deviations."""
+    problem, state = small_problem()
+    normal = problem.normal(state, 5.0)[1]
+    matrix = dense(normal)[0]
+    size = normal.motion.whole.band.shape[1] + problem.motion.border
+    of_motion, crossed, own = matrix[:size, :size], matrix[:size, size:], matrix[size:, size:]
+    reduced = of_motion - crossed @ np.linalg.solve(own, crossed.T)
+    modes = Reduced(normal).modes(normal, 12)
+    np.testing.assert_allclose(modes.T @ reduced @ modes, np.eye(12), atol=1e-5)
+    moves = np.linalg.solve(own, crossed.T @ modes)
+    expected = eigh(of_motion, reduced, eigvals_only=True)[:-13:-1] - 1.0
+    np.testing.assert_allclose(np.einsum("ik,ij,jk->k", moves, own, moves), expected, rtol=0.02)
 
 
 def test_the_slope_is_the_derivative_of_the_cost():

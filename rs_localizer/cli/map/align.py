@@ -120,7 +120,12 @@ def moved(landmarks: Map, by: Similarity) -> Map:
     covariances = landmarks.covariances
     if covariances is not None:
         covariances = by.covariances(covariances)
-    return replace(landmarks, points=by(landmarks.points), covariances=covariances)
+    modes = landmarks.error_modes
+    if modes is not None:
+        modes = np.asarray(by.scale * by.rotation @ modes, np.float32)
+    return replace(
+        landmarks, points=by(landmarks.points), covariances=covariances, error_modes=modes
+    )
 
 
 def moved_markers(marker_map: MarkerMap, by: Similarity) -> MarkerMap:

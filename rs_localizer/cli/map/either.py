@@ -144,6 +144,9 @@ def _of_landmarks(landmarks: Map) -> list[tuple[str, str]]:
         finite = spread[np.isfinite(spread)]
         middle = f"{1e3 * np.median(finite):.2f} mm (median)" if len(finite) else "none"
         rows.append(("deviations known", f"{len(finite)}, {middle}"))
+    if landmarks.error_modes is not None:
+        shared = np.sqrt(np.sum(landmarks.error_modes**2, axis=(1, 2)))
+        rows.append(("deviations shared", f"{1e3 * np.median(shared):.2f} mm (median)"))
     return rows
 
 

@@ -184,7 +184,9 @@ def _tell(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> 
 def _write(
     args: argparse.Namespace, landmarks: Map, result: RefinedMap, names: Sequence[str]
 ) -> None:
-    refined = replace(landmarks, points=result.points, covariances=result.covariances)
+    refined = replace(
+        landmarks, points=result.points, covariances=result.covariances, error_modes=None
+    )
     writers: dict[Path, Callable[[Path], object]] = {
         args.out: lambda part: WRITERS[args.out.suffix](part, refined)
     }

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files that hold maps: which there are, and how they are read and written.
 
-NumPy archives hold ``points`` (n,3) and what else is known: ``ids`` (n,), ``descriptors`` (n,d)
-and ``covariances`` (n,3,3; m^2, NaN: not known). Nothing in them is ever unpickled, and nothing is
-allocated before the headers of the arrays, the sizes in the archive and the size of the file agree.
+NumPy archives hold ``points`` (n,3) and what else is known: ``ids`` (n,), ``descriptors`` (n,d),
+``covariances`` (n,3,3; m^2, NaN: not known) and ``error_modes`` (n,3,k; m). Nothing in them is
+ever unpickled, and nothing is allocated before the headers of the arrays, the sizes in the archive
+and the size of the file agree.
 """
 
 import math
@@ -24,7 +25,7 @@ from rs_localizer.io.maps.landmarks import Map, MapError, make_map
 from rs_localizer.io.maps.ply import read_ply, write_ply
 from rs_localizer.io.remote import Location, local_copy
 
-_ARRAYS = ("points", "ids", "descriptors", "covariances")
+_ARRAYS = ("points", "ids", "descriptors", "covariances", "error_modes")
 # Of all arrays together, unpacked: ten million landmarks with 128 bytes each, say.
 _MOST_BYTES = 2 * 2**30
 # Deflate packs no better than this.
@@ -45,7 +46,7 @@ def read_npz(path: Path, frame: str) -> Map:
         arrays = _arrays(file)
     return make_map(
         arrays["points"], arrays.get("ids"), arrays.get("descriptors"), frame,
-        arrays.get("covariances"),
+        arrays.get("covariances"), arrays.get("error_modes"),
     )  # fmt: skip
 
 

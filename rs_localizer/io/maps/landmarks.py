@@ -40,6 +40,8 @@ class Map:
         dropped: landmarks that were left out because they held NaN or infinity, or because no
             descriptor of theirs is known.
         covariances: (n,3,3) m^2, NaN for those of which none is known; or None.
+        error_modes: (n,3,k) float32, m: by how much one standard deviation of each of k independent
+            errors moves them all; beside ``covariances``, in which these are not; or None.
 
     Raises:
         MapError: without a landmark, a frame, or with points that are nowhere.
@@ -51,6 +53,7 @@ class Map:
     frame: str
     dropped: int = 0
     covariances: Array | None = None
+    error_modes: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         if len(self) == 0:
@@ -72,6 +75,7 @@ class Map:
             and _equal(self.ids, other.ids)
             and _equal(self.descriptors, other.descriptors)
             and _equal(self.covariances, other.covariances)
+            and _equal(self.error_modes, other.error_modes)
         )
 
     @property
@@ -92,8 +96,9 @@ def make_map(
     descriptors: NDArray[Any] | None,
     frame: str,
     covariances: NDArray[Any] | None = None,
+    error_modes: NDArray[Any] | None = None,
 ) -> Map:
-    """A map of arrays as read: points (n,3), integers (n,), descriptors (n,d), covariances (n,3,3).
+    """A map of arrays as read, with the shapes of :class:`Map`.
 
     Landmarks with a value that is not finite are dropped and counted.
 
@@ -121,16 +126,24 @@ def make_map(
         if covariances.shape != (len(points), 3, 3) or covariances.dtype.kind not in "fiu":
             raise MapError(f"covariances must be ({len(points)},3,3), found {covariances.shape}")
         covariances = np.ascontiguousarray(covariances, dtype=np.float64)
+    if error_modes is not None:
+        shape, kind = error_modes.shape, error_modes.dtype.kind
+        if len(shape) != 3 or shape[:2] != points.shape or kind not in "fiu":
+            raise MapError(f"error_modes must be ({len(points)},3,k), found {shape}")
+        with np.errstate(over="ignore"):
+            error_modes = np.ascontiguousarray(error_modes, dtype=np.float32)
+        finite &= np.isfinite(error_modes).all(axis=(1, 2))
     dropped = len(points) - int(np.count_nonzero(finite))
     if dropped:
         points = points[finite]
         ids = None if ids is None else ids[finite]
         descriptors = None if descriptors is None else descriptors[finite]
         covariances = None if covariances is None else covariances[finite]
+        error_modes = None if error_modes is None else error_modes[finite]
     if ids is not None:
         _check_ids(ids)  # before they are converted, which may wrap them
         ids = np.ascontiguousarray(ids, dtype=np.int64)
-    return Map(points, ids, descriptors, frame, dropped, covariances)
+    return Map(points, ids, descriptors, frame, dropped, covariances, error_modes)
 
 
 def map_rows(landmarks: Map) -> NDArray[Any]:

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rs_localizer.io.maps.files import read_map_file
-from rs_localizer.io.maps.landmarks import MapError
+from rs_localizer.io.maps.files import read_map_file, write_map_file
+from rs_localizer.io.maps.landmarks import Map, MapError
 
 COLMAP = Path(__file__).parent / "colmap"
 
@@ -51,6 +51,26 @@ def test_ply_of_another_author(tmp_path, form):
     assert found.points.tolist() == [[i, -i, 2.5 * i] for i in range(4)]
     assert found.ids.tolist() == [7, 8, 9, 10]
     assert found.descriptors.tolist() == [[i, 1, 2] for i in range(4)]
+
+
+def test_an_archive_with_errors_that_landmarks_share(tmp_path):
+    """They come back bit by bit, but for landmarks that are dropped; older archives have none."""
+    rng, path = np.random.default_rng(0), tmp_path / "map.npz"
+    points, modes = rng.normal(size=(5, 3)), rng.normal(size=(5, 3, 2)).astype(np.float32)
+    write_map_file(path, Map(points, np.arange(5), None, "map", error_modes=modes))
+    found = read_map_file(path, "map")
+    np.testing.assert_array_equal(found.error_modes, modes)
+    assert found.error_modes.dtype == np.float32
+    modes[1, 2, 0] = np.nan
+    np.savez(path, points=points, ids=np.arange(5), error_modes=modes.astype(float))
+    found = read_map_file(path, "map")
+    assert found.dropped == 1
+    np.testing.assert_array_equal(found.error_modes, modes[[0, 2, 3, 4]])
+    np.savez(path, points=points, ids=np.arange(5))
+    assert read_map_file(path, "map").error_modes is None
+    np.savez(path, points=points, ids=np.arange(5), error_modes=modes[:, 0])
+    with pytest.raises(MapError, match=r"error_modes must be \(5,3,k\), found \(5, 2\)"):
+        read_map_file(path, "map")
 
 
 @pytest.mark.parametrize("form", ["binary", "text"])
