@@ -57,7 +57,7 @@ _CLIPPED = 6.0
 # Products of a turn of three axes with the motion and the errors.
 _OUTER = 3 * PARAMETERS + 3
 # Points just outside of the gate that are no chance: shaking may have moved them there.
-_NEAR_OUTLIERS, _NEAR_PART, _NEAR_GATE = 5, 0.2, 8.0
+_NEAR_PART, _NEAR_GATE = 0.2, 8.0
 # Hyperprior of the scales where no frame says more: an ordinary vibration, a decade up or down
 # within one deviation; a map and a lens of 0.03 px, to a factor of e: surveyed tags before a
 # calibrated lens have 0.2 (two deviations).
@@ -445,7 +445,7 @@ def near_outliers(squared_errors: Array, inliers: BoolArray, threshold: float) -
     """Points just beyond the gate, where they are too many to be chance; else 0."""
     within = squared_errors < (_NEAR_GATE * threshold) ** 2
     count = int(np.count_nonzero(within & ~inliers))
-    return count if count >= max(_NEAR_OUTLIERS, _NEAR_PART * np.count_nonzero(inliers)) else 0
+    return count if count >= _NEAR_PART * np.count_nonzero(inliers) else 0
 
 
 @kernel

@@ -20,7 +20,7 @@ from rs_localizer.core.scales import SPEEDS
 from rs_localizer.core.shake import CYCLES
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.first_look import Hyperprior, first_look, near_outliers
-from rs_localizer.estimation.frame_fit import FrameFit, bend_of, fit_frame
+from rs_localizer.estimation.frame_fit import FrameFit, at_speed, bend_of, fit_frame
 from rs_localizer.estimation.mirror import farthest
 from rs_localizer.estimation.modes import (
     FAR_LESS_PROBABLE,
@@ -36,7 +36,7 @@ from rs_localizer.estimation.modes import (
 )
 from rs_localizer.estimation.observations import MOST_POINTS, NEAREST, Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior
-from rs_localizer.estimation.prior import Assumed, PriorTerms, terms_at
+from rs_localizer.estimation.prior import Assumed, PriorTerms
 
 # An in-frame turn is fitted where chance explains as much in three frames of ten, because one that
 # hides in the noise spoils regions and a fit from near by is cheap; a smooth error in one of
@@ -50,9 +50,6 @@ _ASKS_REMEMBERED = 3.3
 _RESTS, _NOTHING = np.array([speed == 0.0 for speed in SPEEDS], float), np.zeros(len(SPEEDS))
 # Shaking of up to this (rad, 2 deg) moves points out of the gate of a motion without it.
 _LARGEST_SHAKE = 0.035
-# Steps from the next faster speed. More change nothing but times (benchmarks.frames); with five,
-# curled sheets jitter (benchmarks.real, single `sj`: 7.7 times as much as P3P; 12 and 25: 2.5).
-_WARM_STEPS = 12
 # A mode that loses more inliers than this part leaves is another group of points.
 _KEPT = 0.9
 # Probability that does not count.
@@ -78,16 +75,6 @@ class _Frame(NamedTuple):
     smooth: bool  # beside a smooth error
     planar: bool
     bend: Array  # (n,b) of a smooth error of the map (see frame_fit); (n,0): of the image
-
-
-class _Start(NamedTuple):
-    """Where a fit with an in-frame turn starts."""
-
-    state: Array  # (24,)
-    gate: float  # px
-    noise: float  # px
-    log_scales: Array  # (15,)
-    steps: int
 
 
 def frame_posterior(
@@ -204,8 +191,7 @@ def _shaken(
         gate = max(2.0 * WIDEST_GATE * threshold, _LARGEST_SHAKE * assumed.focal_length)
         noise = threshold
     starts = (best.state,) if other is None else (best.state, other)
-    begins = [_Start(state, gate, noise, frame.hyper.first, STEPS) for state in starts]
-    fits = [fit for begin in begins if (fit := _fit(frame, frame.terms, begin)).finite]
+    fits = [fit for one in starts if (fit := _fit(frame, one, gate, noise)).finite]
     if not fits:
         return None
     most = max(np.count_nonzero(fit.inliers) for fit in fits)
@@ -219,69 +205,56 @@ def _shaken(
     return _at_any_speed(frame, fit, slowest)
 
 
-def _fit(frame: _Frame, terms: PriorTerms, start: _Start) -> FrameFit:
-    """Motion and in-frame turn."""
+def _fit(frame: _Frame, start: Array, gate: float, noise: float) -> FrameFit:
+    """Motion and in-frame turn, from a state (24,) and a gate and noise (px)."""
     return fit_frame(
-        frame.observations.packed, frame.observations.count, start.state, terms, frame.threshold,
-        start.gate, start.noise, start.log_scales, frame.hyper.mean, frame.hyper.precision,
-        True, frame.smooth, frame.bend, start.steps,
+        frame.observations.packed, frame.observations.count, start, frame.terms, frame.threshold,
+        gate, noise, *frame.hyper, True, frame.smooth, frame.bend, STEPS,
     )  # fmt: skip
 
 
-def _at_any_speed(frame: _Frame, fastest: FrameFit, slowest: int) -> tuple[Posterior, float]:
+def _at_any_speed(frame: _Frame, fit: FrameFit, slowest: int) -> tuple[Posterior, float]:
     """The mixture of all typical speeds of a camera that turns within the frame; its evidence."""
-    inliers, (odds, by_turn), last = _inliers(frame), _odds_of_speeds(frame), len(SPEEDS) - 1
+    (odds, by_turn), last = _odds_of_speeds(frame), len(SPEEDS) - 1
     weighed = slowest < last or frame.smooth or frame.planar  # as those without a turn
     if not weighed:
         odds, by_turn = _NOTHING, _NOTHING
-    fits: list[FrameFit] = []
-    evidences = np.full(len(SPEEDS), -math.inf)
-    for speed in range(last, slowest - 1, -1):
-        terms, fit = frame.terms, fastest
-        if fits:
-            start, turn_known = fits[-1].state.copy(), frame.assumed.turn is not None
-            terms = terms_at(terms, SPEEDS[speed], turn_known)
-            if speed == 0:
-                start[12:] = 0.0
-            gate = WIDEST_GATE * frame.threshold
-            begin = _Start(start, gate, fits[-1].noise, fits[-1].log_scales, _WARM_STEPS)
-            fit = _fit(frame, terms, begin)
-            if not fit.finite:
-                break
-        evidence = log_evidence(
-            fit.log_determinant, fit.left + fit.prior_cost, terms, inliers, fit.inliers, fit.noise
+    evidence = log_evidence(
+        fit.log_determinant, fit.left + fit.prior_cost, frame.terms, _inliers(frame), fit.inliers,
+        fit.noise,
+    )  # fmt: skip
+    parts = [(fit.state, fit.turns, fit.covariance)]
+    own = [odds[last] + by_turn[last] + evidence]
+    turn_known = frame.assumed.turn is not None
+    for speed in range(last - 1, slowest - 1, -1):
+        if own[-1] < max(own) - FAR_LESS_PROBABLE / TEMPER:
+            break
+        state, turns, covariance, ratio = at_speed(
+            *parts[0], fit.freedom, frame.terms, SPEEDS[speed], turn_known
         )
-        if fits and not math.isfinite(evidence):
-            break
-        fits.append(fit)
-        evidences[speed] = odds[speed] + by_turn[speed] + evidence
-        if evidences[speed] < evidences.max() - FAR_LESS_PROBABLE / TEMPER:
-            break
-    total = float(np.logaddexp.reduce(evidences))
+        parts.append((state, turns, covariance))
+        own.append(odds[speed] + by_turn[speed] + evidence + ratio)
+    posterior, total = _of_fit(frame, fit), float(np.logaddexp.reduce(own))
     if weighed:
         total -= math.log(len(SPEEDS))
-    if len(fits) == 1:
-        return _of_fit(frame, fastest), total
-    own = evidences[::-1][: len(fits)]
-    probable = np.exp(own - own.max())
-    if len(fits) == len(SPEEDS):
-        probable[-1] *= math.exp(REST_ODDS)
-    possible = np.exp(TEMPER * (own - own.max()))
+    if len(parts) == 1:
+        return posterior, total
+    evidences = np.full(len(SPEEDS), -math.inf)
+    evidences[::-1][: len(own)] = own
+    probable = np.exp(evidences + REST_ODDS * _RESTS - evidences.max())
+    possible = np.exp(TEMPER * (evidences - evidences.max()))
     probable, possible = probable / probable.sum(), possible / possible.sum()
-    best = fits[int(probable.argmax())]
-    state, turns, covariance = mixed(
-        [(fit.state, fit.turns, fit.covariance) for fit in fits], probable, possible
-    )
-    weights, own, posterior = np.zeros(len(SPEEDS)), evidences - odds, _of_fit(frame, best)
-    weights[::-1][: len(fits)] = possible
+    used = slice(last, last - len(parts) if len(parts) <= last else None, -1)
+    state, turns, covariance = mixed(parts, probable[used], possible[used])
+    likelihoods = evidences - odds
     posterior = posterior._replace(
         state=state,
         covariance=covariance,
         shake=turns,
-        model_error=fastest.smooth,
-        shared=math.sqrt(possible @ np.array([fit.smooth for fit in fits]) ** 2),
-        speeds=weights,
-        scales=posterior.scales._replace(speeds=np.maximum(own - own.max(), LEAST_LIKELY)),
+        speeds=possible,
+        scales=posterior.scales._replace(
+            speeds=np.maximum(likelihoods - likelihoods.max(), LEAST_LIKELY)
+        ),
     )
     return posterior, total
 

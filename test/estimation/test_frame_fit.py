@@ -17,6 +17,7 @@ from rs_localizer.estimation.frame_fit import (
     TURNS,
     _by_scales,
     _of_scales,
+    at_speed,
     fit_frame,
     full_prior,
     neighbours_agree,
@@ -27,7 +28,7 @@ from rs_localizer.estimation.frame_fit import (
 )
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import maximum_a_posteriori
-from rs_localizer.estimation.prior import add_prior, motion_terms
+from rs_localizer.estimation.prior import add_prior, motion_terms, terms_at
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.estimation.residuals import Lines, linearized
 
@@ -143,6 +144,48 @@ def test_the_prior_is_of_the_motion_without_its_turn():
             for a, b in itertools.product((1, -1), repeat=2)
         )
         assert whole[i, j] == pytest.approx(second / 8e-6, abs=1e-4 * np.abs(whole).max())
+
+
+@pytest.mark.parametrize("speed", [0.3, 0.03, 0.0])
+def test_a_slower_motion_is_the_same_fit_under_another_prior(speed):
+    """State, covariance and evidence against those of whole matrices, the noise being known."""
+    rng = np.random.default_rng(5)
+    size, terms = 18 + TURNS, motion_terms((0.2, 0.1), (0.05, 0.03))
+    half = rng.normal(size=(size, size)) * 10.0 ** rng.uniform(-3.0, -1.0, size)
+    half[:, 18:] *= 1e-2
+    before, turns = half.T @ half, 1e-4 * rng.normal(size=(FUNCTIONS, 3))
+    state = np.append(STATE[:12], rng.normal(size=12) * np.repeat([0.2, 0.1, 0.05, 0.03], 3))
+    found = at_speed(state, turns, before, 1e12, terms, speed, False)
+    # What is known better: rates of the motion without its waves, and what follows them.
+    own, slower = (
+        np.diag(one.informations[0])[6:] for one in (terms, terms_at(terms, speed, False))
+    )
+    chosen, more = slower > own, slower - own
+    without = np.eye(size)[6:18]
+    without[:3, 18:] = -np.kron(np.ravel([[0.0, np.pi * k] for k in range(1, 15)]), np.eye(3))
+    without, more = without[chosen], more[chosen]
+    values = np.concatenate([np.zeros(6), state[12:], turns.ravel()])
+    mean, spread = without @ values, without @ before @ without.T + np.diag(1.0 / more)
+    gain = np.linalg.solve(spread, without @ before).T
+    step, covariance = -gain @ mean, before - gain @ without @ before
+    deviations = np.sqrt(np.diag(before))
+    np.testing.assert_allclose(
+        found[2] / np.outer(deviations, deviations),
+        covariance / np.outer(deviations, deviations), atol=1e-9,
+    )  # fmt: skip
+    np.testing.assert_allclose(found[0], apply_step(state, step[:18]), atol=1e-9)
+    np.testing.assert_allclose(found[1].ravel(), turns.ravel() + step[18:], atol=1e-12)
+    if speed > 0.0:
+        # The mean of the ratio of both priors over the fit: Gaussian integrals.
+        volumes = np.linalg.slogdet(np.eye(len(more)) + without @ before @ without.T * more)[1]
+        volumes += np.sum(np.log(own[chosen] / slower[chosen]))
+        assert found[3] == pytest.approx(
+            -0.5 * (mean @ np.linalg.solve(spread, mean) + volumes), rel=1e-6
+        )
+    else:
+        np.testing.assert_allclose(
+            without @ np.concatenate([np.zeros(6), found[0][12:], found[1].ravel()]), 0.0, atol=1e-9
+        )
 
 
 HYPER_MEAN, HYPER_PRECISION = np.full(SCALES, np.log(3e-4)), np.full(SCALES, 0.2)
