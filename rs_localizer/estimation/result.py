@@ -175,7 +175,7 @@ def estimate_of(
         shake=posterior.shake,
         model_error=posterior.model_error,
         # Posteriors share the default of what they leave open.
-        scales=Scales(*(part.copy() for part in posterior.scales)),
+        scales=Scales(*map(np.copy, posterior.scales)),
         global_shutter_inliers=still,
         iterations=samples,
         turn=turn,
