@@ -128,7 +128,7 @@ def told_of_lens(observed: Observed, posterior: Posterior) -> tuple[Posterior, L
         posterior.model_error > posterior.noise
         or is_plane(observed.observations.points, posterior.inliers)
         or _too_few(observed.sighted, posterior)
-        or _shakes(observed, posterior)
+        or shakes(observed, posterior)
     )
     if silent and believed is None:
         return posterior, None
@@ -151,7 +151,7 @@ def _too_few(sighted: Sighted, posterior: Posterior) -> bool:
     return int(np.count_nonzero(posterior.inliers)) < needed
 
 
-def _shakes(observed: Observed, posterior: Posterior) -> bool:
+def shakes(observed: Observed, posterior: Posterior) -> bool:
     """Whether the points swing by more than a part of the noise."""
     turns = shake_at(observed.observations.tau, posterior.shake)[:, :3]
     swing = observed.sighted.camera.focal_length * math.sqrt(np.square(turns).sum(axis=1).mean())
