@@ -27,7 +27,14 @@ from rs_localizer.estimation import motion_model, observations, ransac
 from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
-from rs_localizer.estimation.lens import decided, find_lens, may_be_lens, refuted, told_of_lens
+from rs_localizer.estimation.lens import (
+    decided,
+    find_lens,
+    may_be_lens,
+    refuted,
+    shakes,
+    told_of_lens,
+)
 from rs_localizer.estimation.observations import (
     NEAREST,
     Observed,
@@ -309,6 +316,8 @@ class Localizer:
             observed, observations=mended.observations, sighted=mended.sighted, lens=mended.lens
         )
         settled = self._settle(again, Candidate(mended.state, 0.0), observed.terms)
+        if shakes(again, settled):  # which explains what the plain motion beside it does not
+            return found
         # Beside a motion alone: a smooth error explains what a lens that is off leaves, too.
         plain = maximum_a_posteriori(
             observed.observations, posterior.state, observed.terms, threshold

@@ -251,7 +251,7 @@ class Tracker:
             prior = None if predicted is None else predicted.prior
             if prior is None:
                 prior = self._prior(time_ns, turn, span)
-            if self._track is not None:
+            if self._track is not None and prior is not None:
                 prior = self._track.experience.with_lens(prior)
             found = self.localizer.find(points, pixels, scores, prior, share, turn, stamps)
             return found, prior
@@ -300,10 +300,13 @@ class Tracker:
         elif self._memory is Memory.MAP_AND_LENS:
             experience = Experience.of(result) if track is None else track.experience.and_of(result)
             self._track = _Track(result, time_ns, 0.0, experience, np.ones(2))
-        if track is not None and self._track is not None and not self._trusts_motion:
+        if track is None or self._track is None or self._trusts_motion:
+            return
+        seconds = 1e-9 * (time_ns - track.time_ns)
+        if 0.0 < seconds < _LONGEST_GAP:
             self._track.experience = self._track.experience.moving(
-                track.experience.scales.speeds, track.estimate, result,
-                1e-9 * (time_ns - track.time_ns), self.localizer.config.velocity_prior,
+                track.experience.scales.speeds, track.estimate, result, seconds,
+                self.localizer.config.velocity_prior,
             )  # fmt: skip
 
     def _before(self, time_ns: int) -> Before | None:

@@ -34,14 +34,14 @@ class Scales(NamedTuple):
 
 # A frame remembers the one before it by this: scales of shaking hold for about a second of video,
 # what a speed was holds for a third of one.
-_MEMORY, _SPEED_MEMORY = 0.95, 0.9
+_MEMORY, SPEED_MEMORY = 0.95, 0.9
 # Frames of one second show much the same: what they say together is less than their sum.
-_INDEPENDENT = 0.3
+INDEPENDENT = 0.3
 
 
 def joined(before: Scales, newest: Scales) -> Scales:
     """What the frames so far say together, the newest the most."""
-    old, new = _MEMORY * before.precisions, _INDEPENDENT * newest.precisions
+    old, new = _MEMORY * before.precisions, INDEPENDENT * newest.precisions
     both = old + new
     means = (old * before.means + new * newest.means) / np.maximum(both, 1e-12)
     # The logarithm of a scale that itself wanders: never known to more than a tenth.
@@ -49,5 +49,5 @@ def joined(before: Scales, newest: Scales) -> Scales:
         means,
         np.minimum(both, 100.0),
         _MEMORY * before.excess + np.sqrt(1.0 - _MEMORY**2) * newest.excess,
-        _SPEED_MEMORY * before.speeds + _INDEPENDENT * newest.speeds,
+        SPEED_MEMORY * before.speeds + INDEPENDENT * newest.speeds,
     )

@@ -110,7 +110,8 @@ def calibration_effect(
     if of_map is not None:
         sighted = observed.sighted
         moved = of_map.at(sighted.points[sighted.usable.indices[chosen]])
-        # A point that moves one way is a camera that moves the other way.
+        # A camera that moves as the point does would move it the other way: of a deviation either
+        # sign will do.
         by_point = by_motion[:, :, MOVE] @ rotation_of(posterior.state)
         columns = np.concatenate([columns, by_point @ moved], axis=2)
     bend = posterior.bend[chosen] if posterior.bend.shape[1] else np.zeros((len(rays), 0))

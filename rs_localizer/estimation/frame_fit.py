@@ -721,7 +721,8 @@ def at_speed(
 
     Near the fit all is linear, and what is known better are the velocities and accelerations of the
     motion without its in-frame turn: that each is zero, one after the other (Kalman 1960). Inliers
-    and scales stay, the noise is unknown (Student's form).
+    and scales stay, where those of a fit of its own would grow, so that rest has less evidence than
+    such a fit gives it in some frames; the noise is unknown (Student's form).
 
     Args:
         state, turns, covariance: (24,), (28,3), (18 + 84,18 + 84).

@@ -15,12 +15,19 @@ import numpy as np
 from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.blocks import add_block
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.shake import MIDDLE_RATES, MIDDLE_VALUES
 from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import ANGULAR, PARAMETERS
+from rs_localizer.core.state import (
+    ANGULAR,
+    ANGULAR_ACCELERATION,
+    LINEAR,
+    LINEAR_ACCELERATION,
+    MOVE,
+    PARAMETERS,
+    TURN,
+)
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.refine import inverted
 
@@ -28,10 +35,6 @@ from rs_localizer.estimation.refine import inverted
 FADING = 0.1
 # Below this part of the time of fading the closed form of the noise is rounding errors.
 _SHORT = 0.03
-# Part of a variance that rounding may take.
-_ROUNDING = 1e-9
-# Where the parts of a step begin (see :mod:`rs_localizer.core.state`).
-_TURN, _MOVE, _ANGULAR, _LINEAR, _CHANGE, _ACCELERATION = range(0, PARAMETERS, 3)
 
 
 def predict(
@@ -62,26 +65,25 @@ def _later(
     turned = so3.right_jacobian_of(angle)
     velocity = back @ (linear + faster * acceleration)
     transport = np.zeros((PARAMETERS, PARAMETERS))
-    add_block(transport, _TURN, _TURN, 1.0, back)
-    add_block(transport, _TURN, _ANGULAR, readouts, turned)
-    add_block(transport, _TURN, _CHANGE, farther, turned)
-    add_block(transport, _MOVE, _MOVE, 1.0, back)
-    add_block(transport, _MOVE, _TURN, -1.0, back @ so3.hat_of(way))
-    add_block(transport, _MOVE, _LINEAR, readouts, back)
-    add_block(transport, _MOVE, _ACCELERATION, farther, back)
-    add_block(transport, _LINEAR, _LINEAR, 1.0, back)
-    add_block(transport, _LINEAR, _ACCELERATION, faster, back)
-    add_block(transport, _ACCELERATION, _ACCELERATION, left, back)
+    transport[TURN, TURN] = back
+    transport[TURN, ANGULAR] = readouts * turned
+    transport[TURN, ANGULAR_ACCELERATION] = farther * turned
+    transport[MOVE, MOVE] = back
+    transport[MOVE, TURN] = -(back @ so3.hat_of(way))
+    transport[MOVE, LINEAR] = readouts * back
+    transport[MOVE, LINEAR_ACCELERATION] = farther * back
+    transport[LINEAR, LINEAR] = back
+    transport[LINEAR, LINEAR_ACCELERATION] = faster * back
+    transport[LINEAR_ACCELERATION, LINEAR_ACCELERATION] = left * back
     across = so3.hat_of(velocity) @ turned
-    add_block(transport, _LINEAR, _ANGULAR, readouts, across)
-    add_block(transport, _LINEAR, _CHANGE, farther, across)
+    transport[LINEAR, ANGULAR] = readouts * across
+    transport[LINEAR, ANGULAR_ACCELERATION] = farther * across
     # Without acceleration the body rate stays what it is, however far the camera turns.
     mean = farther / readouts
-    add_block(transport, _ANGULAR, _CHANGE, faster - mean, turned)
-    for axis in range(3):
-        transport[_ANGULAR + axis, _ANGULAR + axis] = 1.0
-        transport[_ANGULAR + axis, _CHANGE + axis] += mean
-        transport[_CHANGE + axis, _CHANGE + axis] = left
+    transport[ANGULAR, ANGULAR_ACCELERATION] = (faster - mean) * turned
+    transport[ANGULAR, ANGULAR] = np.eye(3)
+    transport[ANGULAR, ANGULAR_ACCELERATION] += mean * np.eye(3)
+    transport[ANGULAR_ACCELERATION, ANGULAR_ACCELERATION] = left * np.eye(3)
     later = (
         back @ rotation, back @ (translation - way), turned @ (angular + faster * change), velocity,
         left * change, left * (back @ acceleration),
@@ -154,18 +156,16 @@ def _unshaken(motion: Numbers, shake: Array, joint: Array) -> tuple[Numbers, Arr
             turn[axis] += values[k] * shake[k, axis]
             rate[axis] += slopes[k] * shake[k, axis]
             square += shake[k, axis] * shake[k, axis] / 3.0
-        for axis in range(3):
-            swing[_TURN + axis, _TURN + axis] += values[k] * values[k] * square
-            swing[_ANGULAR + axis, _ANGULAR + axis] += slopes[k] * slopes[k] * square
+        swing[TURN, TURN] += values[k] * values[k] * square * np.eye(3)
+        swing[ANGULAR, ANGULAR] += slopes[k] * slopes[k] * square * np.eye(3)
     # Derivatives of the motion without its shaking by motion and coefficients.
     jacobian = np.zeros((PARAMETERS, len(joint)))
     for i in range(PARAMETERS):
         jacobian[i, i] = 1.0
     for k in range((len(joint) - PARAMETERS) // 3):
-        for axis in range(3):
-            place = PARAMETERS + 3 * k + axis
-            jacobian[_TURN + axis, place] = -values[k]
-            jacobian[_ANGULAR + axis, place] = -slopes[k]
+        place = PARAMETERS + 3 * k
+        jacobian[TURN, place : place + 3] = -values[k] * np.eye(3)
+        jacobian[ANGULAR, place : place + 3] = -slopes[k] * np.eye(3)
     # As if turned back in its own axes: exp(-[-turn]x) R.
     turned = so3.exp(turn)
     beside = (
@@ -178,8 +178,6 @@ def _unshaken(motion: Numbers, shake: Array, joint: Array) -> tuple[Numbers, Arr
         for j in range(i):
             covariance[i, j] = 0.5 * (covariance[i, j] + covariance[j, i])
             covariance[j, i] = covariance[i, j]
-        if len(joint) > PARAMETERS:
-            covariance[i, i] += _ROUNDING * joint[i, i]
     return beside, covariance, swing
 
 

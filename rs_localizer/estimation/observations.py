@@ -120,20 +120,6 @@ def checked_of_rig(
     )
 
 
-def distinct(points: Array, pixels: Array, camera: IntArray, chosen: IntArray) -> IntArray:
-    """The chosen correspondences without those that repeat another one: a copy says nothing new.
-
-    ``camera`` (n,): which one saw each of the points.
-    """
-    # Equal pixels have equal keys; nearly always there are none, and one sort says so.
-    keys = np.sort(pixels[chosen, 0] + math.pi * pixels[chosen, 1])
-    if np.all(keys[1:] != keys[:-1]):
-        return chosen
-    pairs = np.hstack([points[chosen], pixels[chosen], camera[chosen, None]])
-    first = np.unique(pairs, axis=0, return_index=True)[1]
-    return chosen[np.sort(first)]
-
-
 def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Failure | None:
     """Why points cannot carry a pose whatever the motion, or None.
 
@@ -280,7 +266,7 @@ class Observations:
 # More points than this only take time.
 MOST_POINTS = 2500
 NEAREST = 1e-6  # m; points nearer than this would make any map useless
-# What fewer points see of it is lost in their noise.
+# What fewer points see of it is lost in their noise, and takes time.
 _MANY = 300
 # Errors beyond which (px) the motion says nothing of where a point ought to be.
 _NEAR = 10.0

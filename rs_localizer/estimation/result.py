@@ -42,6 +42,7 @@ from rs_localizer.estimation.calibration import CalibrationEffect
 from rs_localizer.estimation.modes import along_arcs
 from rs_localizer.estimation.observations import Observations, Observed
 from rs_localizer.estimation.posterior import Posterior
+from rs_localizer.estimation.refine import TINY
 from rs_localizer.estimation.residuals import linearized
 
 # Turns (rad) that are not worth the time: a tenth of what a good frame tells of its pose.
@@ -52,7 +53,6 @@ _FARTHEST, _NEAREST, _STEP = 3.0, 2.0, 1.0 / 60.0
 # What another delay has to cost beyond the best one (noise variances), at this distance from it
 # (steps), for that to be believed.
 _CLEARLY, _OTHER = 12.0, 3
-_TINY = 1e-12
 
 
 def delay_of(
@@ -100,7 +100,7 @@ def _costs(
     )
     inliers = posterior.inliers & np.isfinite(observations.squared_errors(posterior.state))
     free = by_motion[inliers].reshape(-1, PARAMETERS)
-    scale = np.sqrt(np.einsum("ni,ni->i", free, free)) + _TINY
+    scale = np.sqrt(np.einsum("ni,ni->i", free, free)) + TINY
     base, _ = np.linalg.qr(free / scale)
     shown, _ = turn.at_rows(tau)
     middles, _ = turn.at_rows(-delays)
@@ -131,9 +131,6 @@ def _turned(errors: Array, by_turn: Array, shown: Array, rotations: Array, middl
     return turned
 
 
-_NO_DELAY = (0.0, math.inf)
-
-
 def estimate_of(
     observed: Observed, posterior: Posterior, still: int, samples: int, effect: CalibrationEffect,
     of_lens: LensError | None,
@@ -160,7 +157,7 @@ def estimate_of(
         alone = np.zeros((1, PARAMETERS)), covariance[None, :PARAMETERS, :PARAMETERS].copy()
         arched = along_arcs(covariance, state[STATE_TRANSLATION], np.ones(1), *alone)
     beside = posterior.inflation * arched - covariance
-    delay = _NO_DELAY
+    delay = 0.0, math.inf
     if turn is not None:
         rate, change = rate + turn.rate, change + turn.change
         delay = delay_of(observed.observations, posterior, turn)
@@ -178,7 +175,7 @@ def estimate_of(
         shake=posterior.shake,
         model_error=posterior.model_error,
         # Posteriors share the default of what they leave open.
-        scales=Scales(*(part.copy() for part in posterior.scales)),
+        scales=Scales(*map(np.copy, posterior.scales)),
         global_shutter_inliers=still,
         iterations=samples,
         turn=turn,
