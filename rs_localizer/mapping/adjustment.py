@@ -23,7 +23,7 @@ from scipy.linalg import cho_solve
 from scipy.linalg.blas import dtrmv
 from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.sparse import diags
-from scipy.sparse.linalg import LinearOperator, eigsh
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.simd.jit import inlined, kernel
@@ -372,7 +372,8 @@ class Reduced:
 
         All N of them have the covariance ``S^-1``; these are the ones by which landmarks that know
         nothing else of each other move the most, in their own deviations: the eigenvectors of
-        ``H x = (1 + l) S x``, of which ``l`` is the squared sum of these moves.
+        ``H x = (1 + l) S x``, of which ``l`` is the squared sum of these moves. Fewer where these
+        do not converge.
         """
         solve = partial(cho_solve, (self._factor, False), check_finite=False)
         shape = (self.size, self.size)
@@ -381,13 +382,16 @@ class Reduced:
             return np.asarray(dtrmv(self._factor, dtrmv(self._factor, x.ravel()), trans=1))
 
         start = np.random.default_rng(0).normal(size=self.size)  # the same images, the same map
-        _, modes = eigsh(
-            LinearOperator(shape, _information(normal), dtype=float),
-            min(count, self.size - 1),
-            LinearOperator(shape, reduced, dtype=float),
-            Minv=LinearOperator(shape, solve, dtype=float),
-            which="LA", v0=start, tol=_MODE_TOLERANCE,
-        )  # fmt: skip
+        try:
+            _, modes = eigsh(
+                LinearOperator(shape, _information(normal), dtype=float),
+                min(count, self.size - 1),
+                LinearOperator(shape, reduced, dtype=float),
+                Minv=LinearOperator(shape, solve, dtype=float),
+                which="LA", v0=start, tol=_MODE_TOLERANCE,
+            )  # fmt: skip
+        except ArpackNoConvergence as stopped:  # after all the work that a map is: what there is
+            modes = stopped.eigenvectors
         return np.asarray(modes[:, ::-1])
 
     def covariances(self) -> tuple[Array, Array]:
