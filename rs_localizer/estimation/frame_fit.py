@@ -109,6 +109,8 @@ class FrameFit(NamedTuple):
     turns: Array  # (28,3) rad, coefficients of the in-frame turn; zeros without one
     # (18 + 84,18 + 84), or (18,18) without an in-frame turn: by the noise and what the prior allows
     covariance: Array
+    # (18 + 84,q), or (18,q): what a smooth error of the size of its scale does to them
+    by_smooth: Array
     noise: float  # px
     freedom: float
     inliers: BoolArray  # (n,)
@@ -705,7 +707,7 @@ def fit_frame(
     if with_turns:
         own += _by_scales(solved.covariance[:chosen], coefficients, scales, groups, spread)
     return FrameFit(
-        state, turns, own, noise, solved.freedom, inliers, squared, scales,
+        state, turns, own, by_smooth, noise, solved.freedom, inliers, squared, scales,
         solved.decided, smooth, agreement, evidence,
         left, prior_cost, log_determinant, finite,
     )  # fmt: skip
@@ -713,8 +715,8 @@ def fit_frame(
 
 @kernel
 def at_speed(
-    state: Array, turns: Array, covariance: Array, freedom: float, terms: PriorTerms, speed: float,
-    turn_known: bool,
+    state: Array, turns: Array, covariance: Array, by_smooth: Array, freedom: float,
+    terms: PriorTerms, speed: float, turn_known: bool,
 ) -> tuple[Array, Array, Array, float]:  # fmt: skip
     """A fit under the prior of a slower motion: state, turns and covariance; and by how much the
     logarithm of the evidence changes.
@@ -725,40 +727,42 @@ def at_speed(
     such a fit gives it in some frames; the noise is unknown (Student's form).
 
     Args:
-        state, turns, covariance: (24,), (28,3), (18 + 84,18 + 84).
+        state, turns, covariance, by_smooth: (24,), (28,3), (18 + 84,18 + 84), (18 + 84,q).
         freedom: of the errors.
         terms: of the fit.
         speed: part of the configured one.
     """
     before, after = terms.informations[0], terms_at(terms, speed, turn_known).informations[0]
-    size, covariance = len(covariance), covariance.copy()
+    size, moved = len(covariance), by_smooth.copy()
+    covariance = covariance + moved @ moved.T
     step, squared, volume = np.zeros(size), 0.0, 0.0
     for k in range(POSE.stop, PARAMETERS):
         known, more = before[k, k], after[k, k] - before[k, k]
         if not (known > 0.0 and more > 0.0):
             continue
-        value, pulled, waves = state[6 + k] + step[k], covariance[k].copy(), k < ANGULAR.stop
+        value, pulled, by = state[6 + k] + step[k], covariance[k].copy(), moved[k].copy()
+        waves = k < ANGULAR.stop
         for j in range(1, FUNCTIONS if waves else 0, 2):  # of the sines
             axis = k - ANGULAR.start
             place = PARAMETERS + 3 * j + axis
             value -= MIDDLE_RATES[j] * (turns[j, axis] + step[place])
-            for i in range(size):
-                pulled[i] -= MIDDLE_RATES[j] * covariance[place, i]
+            pulled -= MIDDLE_RATES[j] * covariance[place]
+            by -= MIDDLE_RATES[j] * moved[place]
         variance = 1.0 / more + pulled[k]
         for j in range(1, FUNCTIONS if waves else 0, 2):
             variance -= MIDDLE_RATES[j] * pulled[PARAMETERS + 3 * j + k - ANGULAR.start]
         for i in range(size):
             part = pulled[i] / variance
             step[i] -= part * value
-            for j in range(size):
-                covariance[i, j] -= part * pulled[j]
+            covariance[i] -= part * pulled
+            moved[i] -= part * by
         squared += value * value / variance
         volume += math.log(variance * known * more / after[k, k])
     freedom = max(freedom, 6.0)
     ratio = -0.5 * (freedom * math.log1p(squared / freedom) + volume)
     return (
         apply_step(state, step[:PARAMETERS]), turns + step[PARAMETERS:].copy().reshape(turns.shape),
-        covariance, ratio,
+        covariance - moved @ moved.T, ratio,
     )  # fmt: skip
 
 

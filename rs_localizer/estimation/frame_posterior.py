@@ -230,7 +230,7 @@ def _at_any_speed(frame: _Frame, fit: FrameFit, slowest: int) -> tuple[Posterior
         if own[-1] < max(own) - FAR_LESS_PROBABLE / TEMPER:
             break
         state, turns, covariance, ratio = at_speed(
-            *parts[0], fit.freedom, frame.terms, SPEEDS[speed], turn_known
+            *parts[0], fit.by_smooth, fit.freedom, frame.terms, SPEEDS[speed], turn_known
         )
         parts.append((state, turns, covariance))
         own.append(odds[speed] + by_turn[speed] + evidence + ratio)
