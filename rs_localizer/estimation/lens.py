@@ -61,7 +61,8 @@ _GATES = (4.0, 2.0, 1.0, 1.0, 1.0)
 # thresholds, or a smooth one, or one that explains so much more than chance (standard normal;
 # shaking alone leaves less).
 _MUCH_NOISE, _MUCH_MODEL_ERROR, _SMOOTH_EXCESS = 0.6, 0.1, 5.0
-# Logarithm of the odds for a lens that is off, or against one that others told of, to be believed.
+# Logarithm of the odds for a lens that is off, or against one that others told of, to be believed:
+# as they are read, one such belief in twenty thousand is wrong.
 DECIDED = 10.0
 # Swing of the points, in parts of the noise, beyond which a frame says nothing of a lens. With any
 # in-frame turn, which a lens that is off looks like, 25 instead of 27 of 30 twists are inside

@@ -6,11 +6,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from rs_localizer.config import VelocityPrior
+from rs_localizer.config import LocalizerConfig, VelocityPrior
 from rs_localizer.core import so3
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Rig
 from rs_localizer.core.scales import SCALES, SPEEDS, Scales
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.experience import Experience
+from rs_localizer.estimation.prior import Prior, assumptions, told_speed
+from rs_localizer.solvers.table import find_solver
 
 
 def says(mean, excess=0.0):
@@ -75,3 +79,20 @@ def test_they_forget_it():
     for _ in range(5):
         faster = faster.moving(faster.scales.speeds, *step, 1.0 / 30.0, VelocityPrior())
     assert np.argmax(faster.scales.speeds) == 4
+
+
+def test_what_frames_deny_is_no_prior_of_the_next():
+    camera = Camera(640, 480, np.diag([500.0, 500.0, 1.0]), readout_time=0.02)
+    terms, _ = assumptions(
+        camera.readout_time, Rig.of(camera), LocalizerConfig(), find_solver("r6p_vcwt")
+    )
+    calm = speeds_after(0.003, 0.005).prior
+    slow, prior = told_speed(terms, calm)
+    own, told = (one.informations[0].diagonal()[6:12] for one in (terms, slow))
+    np.testing.assert_allclose(np.sqrt(told / own), 10.0)
+    assert prior is not None
+    # Of a tenth of the speed: what the frames say of 0, 0.03 and 0.1 stands at 0, 0.3 and 1.
+    np.testing.assert_allclose(prior.scales.speeds[[0, 3, 4]], calm.scales.speeds[:3], atol=1e-9)
+    assert prior.scales.speeds[4] < -4.0
+    for same in (speeds_after(0.1, 0.2).prior, Prior(), None):
+        assert told_speed(terms, same) == (terms, same)

@@ -11,6 +11,7 @@ from benchmarks.frames.judged import judge
 from benchmarks.independent.scenes import Rich
 from rs_localizer.core.shake import COMBINATIONS, CYCLES
 from rs_localizer.estimation.first_look import (
+    near_outliers,
     score_products,
     score_statistics,
     undetected_vibration,
@@ -123,3 +124,13 @@ def test_scores_are_chi_squared_where_there_is_nothing():
     np.testing.assert_allclose(mean[2:-1], 6.0, atol=1.0)
     assert np.all((mean[:2] > 3.5) & (mean[:2] < 6.5))
     assert mean[-1] == pytest.approx(14.0, abs=1.8)
+
+
+@pytest.mark.parametrize(
+    ("inliers", "near", "told"),
+    [(12, 3, 3), (13, 2, 0), (16, 4, 0), (20, 4, 0), (20, 5, 5), (40, 7, 0), (40, 8, 8)],
+)
+def test_points_just_beyond_the_gate_are_told_unless_they_are_one_marker(inliers, near, told):
+    """Distances of 3 and 12 px around a gate of 4 px, and of wrong points at 100."""
+    squared = np.square(np.repeat([3.0, 12.0, 100.0], [inliers, near, 6]))
+    assert near_outliers(squared, squared < 16.0, 2.0) == told
