@@ -66,7 +66,6 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   honesty                          against P3P, a real global shutter, rendered walls
   mapping                          refined maps and surveyed markers
   experiments.mapped_room          a map of a rendered room by markers, and poses in it
-  experiments.room_by_imu          the same by an IMU
   fuzzing                          wrong input for everything that reads
   profiling, frame_times           where the time of a frame goes
   size                             lines, modules, constants, and calls of one cloud

@@ -22,7 +22,7 @@ from rs_localizer.io.calibration import CalibrationError, read_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences, read_keypoints, read_map
 from rs_localizer.io.images import read_compressed_image, read_image
-from rs_localizer.io.imu import ImuFileError, read_imu, read_imu_csv
+from rs_localizer.io.imu import read_imu
 from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError
@@ -56,7 +56,6 @@ rs_localizer:
 _ASSIGNMENTS = (b"readout_time:=0.03", b"matching.by:=id", b"tracking:=false", b"map_file:=''")
 _TUM = b"# t x y z qx qy qz qw\n1.5 0 0 1 0 0 0 1\n2.5 1 0 1 0 0 0.6 0.8\n"
 _TWISTS = b"# t wx wy wz vx vy vz\n1.5 0 0 1 0 0 0\n2.5 1 0 1 0 0 0.6\n"
-_IMU = b"#timestamp [ns],wx,wy,wz,ax,ay,az\n1000,0.1,0.2,0.3,0,9.8,0\n2000,0.1,0.2,0.3,0,9.8,0\n"
 _QUERIES = (
     b"q/1.jpg OPENCV 640 480 500 500 320 240 0.1 0 0 0\n2.jpg PINHOLE 640 480 500 500 320 240\n"
 )
@@ -176,9 +175,6 @@ def _more_files(folder: Path) -> dict[str, Target]:
         ),
         "twists": Target(
             _bytes((_TWISTS,)), _file(folder / "twists.txt", read_twists), (TrajectoryError,)
-        ),
-        "imu .csv": Target(
-            _bytes((_IMU,)), _file(folder / "imu.csv", read_imu_csv), (ImuFileError,)
         ),
         "images.bin": Target(_bytes([binary]), _images(folder / "ib", "images.bin"), error),
         "images.txt": Target(_bytes([text]), _images(folder / "it", "images.txt"), error),

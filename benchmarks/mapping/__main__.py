@@ -1,8 +1,8 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of ``docs/mapping.md`` and of an IMU in ``docs/map_build.md``:
+"""The figures of ``docs/mapping.md``:
 
-python -m benchmarks.mapping bend bound large surveys rendered coverage rigs weighing
+python -m benchmarks.mapping bend bound large regions surveys rendered coverage rigs
 """
 
 from __future__ import annotations
@@ -11,14 +11,13 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator
 
-from benchmarks.mapping.refining import bend, bound, large
+from benchmarks.mapping.refining import bend, bound, large, regions
 from benchmarks.mapping.surveying import coverage, rendered, rigs, surveys
-from benchmarks.mapping.weighing import weighing
 from rs_localizer.cli import integer
 
 _PARTS: dict[str, Callable[[int], Iterator[str]]] = {
-    "bend": bend, "bound": bound, "large": large, "surveys": surveys,
-    "rendered": rendered, "coverage": coverage, "rigs": rigs, "weighing": weighing,
+    "bend": bend, "bound": bound, "large": large, "regions": regions, "surveys": surveys,
+    "rendered": rendered, "coverage": coverage, "rigs": rigs,
 }  # fmt: skip
 
 

@@ -26,6 +26,7 @@ from rs_localizer.trajectory.model import Freedom, start_state
 
 _NOISE, _OFF = 0.3, 0.02  # px, m
 _READOUT = 0.03
+_UNIT = 1.7  # m
 
 
 def _errors(points: Array, truth: Array, of: BoolArray) -> str:
@@ -130,3 +131,23 @@ def large(seed: int) -> Iterator[str]:
         f"{_errors(start.points, points, found.refined)}, after "
         f"{_errors(found.points, points, found.refined)}"
     )
+
+
+def regions(seed: int, walks: int = 8) -> Iterator[str]:
+    """Landmarks of walks, in units of their own, by the deviations that are told of them."""
+    every = []
+    for k in range(walks):
+        camera, rng = Camera(), np.random.default_rng([seed, k])
+        walk, points = a_walk(rng, 0.5), walls(rng, 1500)
+        film = Film(camera, walk, np.arange(0.0, 12.0, 1.0 / 15.0))
+        start = film.near(points, _OFF, rng)
+        start = replace(start, points=start.points / _UNIT, positions=start.positions / _UNIT)
+        seen = film.see(points, _NOISE, rng, 80)
+        found = refine(estimators_camera(camera, _READOUT), seen, start)
+        own, true = found.points[found.refined], points[found.refined]
+        variances = np.einsum("nii->ni", found.covariances[found.refined])
+        every.append(np.abs(own - through(true, own)(true)) / np.sqrt(variances))
+        inside = (100.0 * np.mean(every[-1] < q) for q in (1.0, 1.96, 3.0))
+        yield "walk {}: inside 68, 95, 99.7 %: {:.1f}, {:.1f}, {:.1f}".format(k, *inside)
+    inside = (100.0 * np.mean(np.concatenate(every) < q) for q in (1.0, 1.96, 3.0))
+    yield "coordinates of landmarks inside 68, 95, 99.7 %: {:.1f}, {:.1f}, {:.1f}".format(*inside)

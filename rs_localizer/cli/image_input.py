@@ -134,7 +134,7 @@ def _telemetry(path: Path) -> Telemetry | None:
 def video_imu(telemetry: Telemetry, start_ns: int = DEFAULT_START_NS) -> ImuRecording:
     """The readings of a video whose first image has this stamp."""
     stamps = start_ns + np.round(1e9 * telemetry.times).astype(np.int64)
-    return ImuRecording(stamps, telemetry.rates, np.eye(3), telemetry.forces)
+    return ImuRecording(stamps, telemetry.rates, np.eye(3))
 
 
 def add_telemetry(parser: argparse._ActionsContainer) -> None:

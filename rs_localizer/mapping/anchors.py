@@ -70,10 +70,6 @@ class Anchors:
     def count(self) -> int:
         return self.corners + len(self.names)
 
-    @property
-    def tell_scale(self) -> bool:
-        return self.marker_map is not None or bool(self.distances)
-
     def seen(self, views: Sequence[View]) -> tuple[IntArray, IntArray, Array]:
         """Views (n,), anchors (n,) and pixels (n,2) of all sights."""
         names = self.names

@@ -35,12 +35,6 @@ from rs_localizer.mapping.anchors import (
 )
 from rs_localizer.mapping.colmap import Effort, Stage, Structure, build_structure
 from rs_localizer.mapping.gauge import Similarity, laid_on_held, scaled
-from rs_localizer.mapping.inertial_metres import (
-    GivenImu,
-    InertialPlace,
-    place_by_imu,
-    refuse_early,
-)
 from rs_localizer.mapping.observations import MapObservations, Start, most_observed
 from rs_localizer.mapping.refine import DRIFT, RefinedMap, refine
 from rs_localizer.mapping.shutter_fit import (
@@ -84,7 +78,6 @@ class Given:
     readout_time: float | None = None  # s, 0: a global shutter; None: estimated
     scan_direction: str | None = None  # None: unknown
     frame: str = "map"
-    imu: GivenImu | None = None
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -134,7 +127,7 @@ class Built:
 
     landmarks: Map
     camera: Camera  # with its lens, readout time and scan direction, as they were found
-    place: InertialPlace
+    placement: Placement
     keyframes: IntArray  # rows of the views that COLMAP got
     blurred: BoolArray  # of the views
     structure: Structure  # as COLMAP had it, moved into this frame as a whole
@@ -144,10 +137,6 @@ class Built:
     posed: IntArray  # (g,) rows of the views with a pose
     rotations: Array  # (g,3,3) map_from_camera at their middle rows
     positions: Array  # (g,3)
-
-    @property
-    def placement(self) -> Placement:
-        return self.place.placement
 
     def middle_rows(self, stamps_ns: Sequence[int]) -> tuple[IntArray, Array, Array]:
         """Times (g,) ns of the middle rows, positions (g,3), quaternions (g,4) of the poses.
@@ -167,8 +156,6 @@ def build_map(inputs: Given, work: Workshop) -> Built:
         ValueError: when the images make no map, saying what was found.
     """
     check_views(inputs.views)
-    if inputs.imu is not None and not inputs.anchors.tell_scale:
-        refuse_early(inputs.imu, inputs.stamps_ns)
     unsharp = blurred(inputs.views)
     keyframes = choose_keyframes(inputs.stamps_ns, inputs.views)
     structure = _structure(inputs, keyframes, work)
@@ -187,9 +174,8 @@ def build_map(inputs: Given, work: Workshop) -> Built:
     triangulated = triangulate(refined.camera, motion.sights(*seen), len(structure.points))
     anchors = inputs.anchors.seen(inputs.views)
     held = triangulate(refined.camera, motion.sights(*anchors), inputs.anchors.count)
-    by_anchors = placement(inputs.anchors, held, *refined.poses())
-    place = place_by_imu(by_anchors, refined, inputs.imu)
-    similarity = place.placement.similarity
+    place = placement(inputs.anchors, held, *refined.poses())
+    similarity = place.similarity
     kept = _kept(triangulated, motion)
     modes = motion.moves(seen, triangulated)[kept]
     holding, by = triangulated.chosen(kept), modes
@@ -203,7 +189,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
             triangulated.chosen(kept), modes, structure.descriptors[kept], similarity, inputs.frame
         ),
         camera=refined.camera_as_found,
-        place=place,
+        placement=place,
         keyframes=keyframes,
         blurred=unsharp,
         structure=structure.moved(similarity),

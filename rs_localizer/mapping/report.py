@@ -10,7 +10,6 @@ import numpy as np
 
 from rs_localizer.core.arrays import BoolArray
 from rs_localizer.mapping.build import Built
-from rs_localizer.mapping.inertial_metres import InertialPlace
 from rs_localizer.mapping.views import View
 
 PICTURES = ("map.png", "residuals.png")
@@ -48,7 +47,6 @@ def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
         ("lens", _lens(built)),
         ("scale", built.placement.basis),
         ("z is up", built.placement.up),
-        *_of_imu(built.place),
     ]
 
 
@@ -125,23 +123,3 @@ def _when(rows: BoolArray, seconds: np.ndarray) -> str:
     marks = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(int)))
     parts = sorted(zip(marks[::2], marks[1::2] - 1, strict=True), key=lambda p: p[0] - p[1])[:3]
     return "from " + ", ".join(f"{seconds[a]:.1f} to {seconds[b]:.1f} s" for a, b in sorted(parts))
-
-
-def _of_imu(place: InertialPlace) -> list[tuple[str, str]]:
-    """What an IMU says, beside scale and up where it gives them."""
-    metres = place.metres
-    if metres is None:
-        return []
-    mount, metric = metres.mount, metres.metric
-    rows = []
-    if place.checked:
-        more = "larger" if place.larger > 0.0 else "smaller"
-        share = 100.0 * np.array([abs(place.larger), metres.share])
-        tilts = np.degrees([place.tilt, metric.gravity_deviation])
-        rows = [
-            ("scale by the IMU", f"{share[0]:.2f} % {more}, +- {share[1]:.2f} %"),
-            ("gravity by the IMU", f"{tilts[0]:.2f} deg from -z, +- {tilts[1]:.2f} deg"),
-        ]
-    offset = f"{1e3 * mount.mount.delay:+.2f} +- {1e3 * mount.delay_deviation:.2f} ms"
-    bias = " ".join(f"{value:.2f}" for value in metric.bias)
-    return [*rows, ("imu.time_offset", offset), ("bias of the accelerometer", f"{bias} m/s^2")]

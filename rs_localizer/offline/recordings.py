@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """All correspondences, or the whole IMU, of a recording at once: for estimators of many images."""
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -85,9 +84,6 @@ def read_recording(
     return Recorded(calibration, tuple(clouds))
 
 
-_NO_FORCE = (math.nan, math.nan, math.nan)
-
-
 def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> ImuRecording:
     """What an IMU measured, and how TF says that it hangs on the camera, if it does.
 
@@ -100,7 +96,7 @@ def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> 
         RecordingError: when none of its messages can be used, with the reason.
     """
     topic = find_topic(bag, (IMU_TYPE,), topic, "--imu")
-    stamps, rates, forces, frame, fault = [], [], [], "", ""
+    stamps, rates, frame, fault = [], [], "", ""
     for _, _, message in bag.messages([topic]):
         try:
             reading = read_imu(message)
@@ -110,17 +106,13 @@ def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> 
         frame = reading.frame
         stamps.append(reading.stamp_ns)
         rates.append(reading.angular_velocity)
-        forces.append(reading.linear_acceleration or _NO_FORCE)
     if not stamps:
         raise RecordingError(f"{bag.path} has no usable message on {topic}{fault}")
-    specific_forces = np.array(forces)
     hung = transform_between(bag, camera_frame, frame)
     return ImuRecording(
         np.array(stamps, np.int64),
         np.array(rates),
         None if hung is None else hung.rotation,
-        specific_forces if np.isfinite(specific_forces).any() else None,
-        None if hung is None else hung.translation,
     )
 
 

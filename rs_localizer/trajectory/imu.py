@@ -15,7 +15,6 @@ from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.fit import Fit, fit
 from rs_localizer.trajectory.gyro import DELAY, MOUNT, GyroMount, GyroSamples, first_mount
 from rs_localizer.trajectory.gyro_terms import GyroTerms
-from rs_localizer.trajectory.metric import ForceSamples
 from rs_localizer.trajectory.model import Observations
 from rs_localizer.trajectory.online_readout import REVERSED
 from rs_localizer.trajectory.spline import refined
@@ -38,24 +37,13 @@ class ImuRecording:
     stamps_ns: IntArray  # (k,)
     angular_velocities: Array  # (k,3) rad/s, in its own axes
     camera_from_imu: Array | None = None  # (3,3) as others say: checked, not believed
-    # (k,3) m/s^2, specific force in its own axes, NaN where there is none; None: no accelerometer
-    specific_forces: Array | None = None
-    imu_in_camera: Array | None = None  # (3,) m, where it is by the camera's axes, as others say
 
     def samples(self, start_ns: int) -> GyroSamples:
         """Its finite samples in the order of time, one for each stamp, from a time 0 on."""
-        return GyroSamples(*self._finite(self.angular_velocities, start_ns))
-
-    def forces(self, start_ns: int, delay: float) -> ForceSamples:
-        """The accelerometer's finite samples likewise, their times later by ``delay`` (s)."""
-        assert self.specific_forces is not None
-        times, forces = self._finite(self.specific_forces, start_ns)
-        return ForceSamples(times + delay, forces)
-
-    def _finite(self, values: Array, start_ns: int) -> tuple[Array, Array]:
-        finite = np.isfinite(values).all(axis=1)
+        finite = np.isfinite(self.angular_velocities).all(axis=1)
         stamps, order = np.unique(self.stamps_ns[finite], return_index=True)
-        return (stamps - start_ns).astype(float) * 1e-9, values[finite][order]
+        times = (stamps - start_ns).astype(float) * 1e-9
+        return GyroSamples(times, self.angular_velocities[finite][order])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -62,7 +62,7 @@ def test_demonstrations_become_trajectories(filmed, tmp_path, capsys):
 
     folder, lens = filmed.folder, ["--calibration", str(filmed.folder / "camera.json")]
     words = ["map", "build", str(folder / "room" / "room.mp4"), "--out", str(tmp_path / "room")]
-    assert main([*words, *lens, "--markers", str(folder / "wall.yaml"), "--no-imu"]) == 0
+    assert main([*words, *lens, "--markers", str(folder / "wall.yaml")]) == 0
     said = capsys.readouterr().out
     assert "MARS Logger (gyro_accel.csv): gyroscope at 200 Hz, readout time 30.00 ms" in said
     words = ["replay", *map(str, filmed.demos), "--map", str(tmp_path / "room"), *lens, "--smooth"]

@@ -6,20 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import projector
-from felt import Felt
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.mapping.observations import Adjusted, MapObservations, Start
-from rs_localizer.mapping.refine import RefinedMap
 from rs_localizer.mapping.unknown_markers import Spotted
-from rs_localizer.trajectory.imu import ImuRecording
 from rs_localizer.trajectory.model import Extrinsics, Mounting
 
 READOUT = 0.03
-# A motion with an IMU.
-SECONDS, START_NS = 6.0, 1_700_000_000 * 10**9
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
 
@@ -151,25 +146,3 @@ def spot_along(
         found = quads[whole] + rng.normal(0.0, noise, (len(whole), 4, 2))
         spotted.append(Spotted(10**12 + round(1e9 * float(stamp)), whole, found))
     return spotted
-
-
-def refined_of(felt: Felt) -> RefinedMap:
-    """A refined map of which only the motion counts."""
-    none, empty = np.zeros((0, 3)), np.zeros(0)
-    return RefinedMap(
-        points=none, covariances=np.zeros((0, 3, 3)), refined=empty > 0, sights=np.zeros(0, int),
-        cameras=(Adjusted(camera(), 0.02, np.nan, None, Extrinsics.none(), np.zeros(7)),),
-        deviation=0.1, squared_errors=empty, inliers=empty > 0, before=1.0, after=0.1,
-        spline=felt.spline(SECONDS), start_ns=START_NS, times=np.arange(0.0, SECONDS, 1 / 15),
-        tells_readout=True,
-    )  # fmt: skip
-
-
-def imu_of(felt: Felt, rate: float = 200.0) -> ImuRecording:
-    stamps, rng = felt.stamps(SECONDS, rate), np.random.default_rng(0)
-    rates, forces = felt.rates(stamps), felt.forces(stamps)
-    return ImuRecording(
-        START_NS + np.round(1e9 * stamps).astype(np.int64),
-        rates + rng.normal(0.0, 2e-3, rates.shape),
-        specific_forces=forces + rng.normal(0.0, 0.03, forces.shape),
-    )

@@ -11,8 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from felt import Felt
-from scenes import imu_of, refined_of
 from scipy.spatial.transform import Rotation
 
 from benchmarks.experiments.mapped_room import Errors, localized
@@ -29,7 +27,6 @@ from rs_localizer.mapping.anchors import Anchors
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_fit
 from rs_localizer.mapping.colmap import SPARSE, Effort
 from rs_localizer.mapping.gauge import through
-from rs_localizer.mapping.inertial_metres import InertialPlace, inertial_metres
 from rs_localizer.mapping.report import written
 from rs_localizer.mapping.views import View
 from rs_localizer.simulation.frames import middle_stamp
@@ -146,17 +143,6 @@ def test_other_images_are_localized(room, views, built):
     assert np.median(ours.positions) < 0.015
     assert np.median(ours.angles) < 0.25
     assert np.median(theirs.positions) > 2.0 * np.median(ours.positions)
-
-
-def test_the_report_says_what_an_imu_says(built, views):
-    felt = Felt.random(0)
-    metres = inertial_metres(refined_of(felt), imu_of(felt))
-    place = InertialPlace(built.placement, metres, checked=True)
-    page = written(replace(built, place=place), 60, views)
-    assert "| gravity by the IMU | " in page
-    assert f"{100 * abs(felt.scale / built.placement.similarity.scale - 1):.0f}" in page
-    assert "| imu.time_offset | +5.0" in page
-    assert "| z is up | as in the marker map |" in page
 
 
 @pytest.mark.bench

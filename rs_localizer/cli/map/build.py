@@ -16,11 +16,9 @@ from rs_localizer.cli.image_input import (
     add_source_arguments,
     opened,
     shutter_values,
-    telemetry_of,
     tell_left_out,
     tell_telemetry,
     time_faults,
-    video_imu,
 )
 from rs_localizer.config import FeatureConfig
 
@@ -32,27 +30,19 @@ if WORKING:
     from rs_localizer.core.camera import Camera
     from rs_localizer.core.scanning import ScanDirection
     from rs_localizer.io.atomic_files import atomic_directory
-    from rs_localizer.io.bags import is_bag, open_bag
     from rs_localizer.io.calibration import write_calibration
-    from rs_localizer.io.image_clock import DEFAULT_START_NS
-    from rs_localizer.io.imu import read_imu_csv
     from rs_localizer.io.maps.files import write_npz
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
-    from rs_localizer.io.topics import IMU
     from rs_localizer.io.trajectories import Trajectory, write_tum
     from rs_localizer.mapping.anchors import Anchors, Distance, PointSight
     from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_features
     from rs_localizer.mapping.colmap import Effort, require
-    from rs_localizer.mapping.inertial_metres import GivenImu
     from rs_localizer.mapping.report import advice, rows, written
     from rs_localizer.mapping.views import Looker, View
     from rs_localizer.offline.detect import Cameras
     from rs_localizer.offline.image_sources import Carried
-    from rs_localizer.offline.recordings import RecordingError, optical_frame, read_imu_recording
-    from rs_localizer.offline.replay import imu_topics
     from rs_localizer.pipeline.refusal import Refusal
     from rs_localizer.settings import build, write_parameters
-    from rs_localizer.trajectory.imu import ImuRecording
 
 # After so many, images without features are refused: two seconds of a usual video.
 _EARLY_VIEWS = 30
@@ -136,65 +126,6 @@ def look_at_images(args: argparse.Namespace, looker: Looker) -> Looked:
     return Looked(views, camera, images, tuple(sights))
 
 
-def add_imu_arguments(group: argparse._ArgumentGroup) -> None:
-    """Options that :func:`imu_of` reads."""
-    group.add_argument(
-        "--imu",
-        nargs="?",
-        const="",
-        metavar="TOPIC|FILE.csv",
-        help="the IMU that went along: no map without its scale. A topic of the bag (default: the "
-        "only one; used without this option, too, if it gives a scale), or that inside a video; "
-        "beside a video or a folder a file as EuRoC's imu0/data.csv, with the clock of the images",
-    )
-    group.add_argument("--no-imu", action="store_true", help="without that of the bag")
-
-
-def imu_of(args: argparse.Namespace) -> GivenImu | None:
-    """The IMU, where there is one.
-
-    Raises:
-        UsageError: for options that do not go together.
-        ValueError: when one that is asked for cannot be read.
-    """
-    if args.imu is not None and args.no_imu:
-        raise UsageError("give --imu or --no-imu, not both")
-    if args.no_imu:
-        return None
-    if is_bag(args.images):
-        return _of_bag(args)
-    if not args.imu:
-        telemetry = telemetry_of(args.images, args)
-        if telemetry is not None and args.rate is None:
-            start_ns = DEFAULT_START_NS if args.start is None else round(1e9 * args.start)
-            return GivenImu(video_imu(telemetry, start_ns), asked=args.imu is not None)
-        if args.imu is None:
-            return None
-        raise UsageError("this video or folder has no IMU of its own: give --imu FILE.csv")
-    stamps, rates, forces = read_imu_csv(Path(args.imu))
-    return GivenImu(ImuRecording(stamps, rates, specific_forces=forces), asked=True)
-
-
-def _of_bag(args: argparse.Namespace) -> GivenImu | None:
-    with open_bag(args.images) as bag:
-        topics = imu_topics(bag)
-        named = [topic for topic in topics if topic.split("/")[-1] == IMU]
-        candidates = named if len(named) == 1 else topics
-        if args.imu is None and len(candidates) != 1:
-            if candidates:
-                print(f"no IMU is used: choose {' or '.join(candidates)} with --imu")
-            return None
-        topic = args.imu or (candidates[0] if len(candidates) == 1 else None)
-        frame = optical_frame(bag, args.camera_info, args.image)
-        try:
-            return GivenImu(read_imu_recording(bag, topic, frame), asked=args.imu is not None)
-        except RecordingError as error:
-            if args.imu is not None:
-                raise
-            print(f"no IMU is used: {error}")
-            return None
-
-
 COLMAP, POSES, REPORT = "colmap", "poses.txt", "report.md"
 # A hand's motion is held by so many images a second.
 _IMAGES_PER_SECOND = 15.0
@@ -208,7 +139,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "images", type=Path, metavar="VIDEO|BAG|FOLDER", help="images of one camera, as for detect"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="to create")
-    scale = parser.add_argument_group("scale and place (default: the IMU of the bag)")
+    scale = parser.add_argument_group("scale and place")
     scale.add_argument(
         "--markers", type=Path, metavar="FILE", help="marker map; some of it is in the images"
     )
@@ -229,7 +160,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("NAME", "NAME", "METRES"),
         help="between two of these points",
     )
-    add_imu_arguments(scale)
     add_source_arguments(parser)
     add_overwrite(parser)
     work = parser.add_argument_group("the work")
@@ -263,7 +193,7 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"{args.images} does not exist")
     markers = None if args.markers is None else read_checked_map(args.markers)
     tell_telemetry(args, lens=False)
-    shutter, imu = shutter_of(args), imu_of(args)
+    shutter = shutter_of(args)
     with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
         with TemporaryDirectory(dir=out) as images:
@@ -271,7 +201,7 @@ def run(args: argparse.Namespace) -> None:
             anchors = Anchors(markers, looked.points, tuple(args.distance))
             inputs = Given(
                 looked.views, looked.camera, anchors, shutter.readout_time,
-                shutter.scan_direction, MAP_FRAME if markers is None else markers.map_frame, imu,
+                shutter.scan_direction, MAP_FRAME if markers is None else markers.map_frame,
             )  # fmt: skip
             folder = out / COLMAP
             folder.mkdir()
@@ -298,10 +228,8 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     shutter = {
         "readout_time": built.camera.readout_time,
         "scan_direction": str(built.camera.scan_direction),
-        "imu.time_offset": built.place.time_offset,
     }
-    values = {name: value for name, value in shutter.items() if value is not None}
-    write_parameters(out / PARAMETERS, values)
+    write_parameters(out / PARAMETERS, shutter)
     stamps, positions, quaternions = built.middle_rows([view.stamp_ns for view in looked.views])
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
     if looked.camera is None:
@@ -319,14 +247,13 @@ def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
     if not built.placement.scaled:
         print(
             "warning: nothing determines the scale: poses and velocities are in units of the map; "
-            "give --markers, --point and --distance, or --imu"
+            "give --markers, or --point and --distance"
         )
     check = built.refined.readout_check
     if check is not None and check.differs:
         print(f"warning: {check.message}")
-    for doubt in (built.placement.doubt, *built.place.doubts):
-        if doubt:
-            print(f"warning: {doubt}")
+    if built.placement.doubt:
+        print(f"warning: {built.placement.doubt}")
     for text in advice(built, looked.views):
         print(f"to film otherwise: {text}")
     out = shlex.quote(str(args.out))
