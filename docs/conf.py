@@ -10,7 +10,9 @@ from typing import Any
 
 project = "rs_localizer"
 author = "rs_localizer maintainers"
-extensions = ["myst_parser", "sphinxcontrib.mermaid"]
+extensions = ["myst_parser", "sphinxcontrib.mermaid", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+autodoc_member_order = "groupwise"
+autodoc_typehints = "signature"
 myst_heading_anchors = 4
 myst_fence_as_directive = ["mermaid"]
 highlight_language = "text"  # of indented blocks: shell commands and what they print
@@ -22,8 +24,8 @@ by_rosdoc2 = "confpy_succeeded" in globals()  # which runs this file inside its 
 PAGES = {
     "Start": "concepts install camera cameras/index",
     "Use": "node reasons detector features imu rigs recordings calibration mapping map_build maps "
-    "simulation viewing integrations library security",
-    "Understand": "solvers estimator honesty benchmarks architecture api stability",
+    "simulation viewing integrations library policy",
+    "Understand": "solvers estimator honesty benchmarks architecture api",
 }
 OTHERS = (
     *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README"),

@@ -1,0 +1,53 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Writes the first part of ``docs/reasons.md`` from the table that ``replay`` prints from.
+
+    python docs/make_reasons.py
+
+What follows there is written by hand, and kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from rs_localizer.pipeline.refusal import IMU_REASONS, REASONS, Meaning
+
+REASONS_PAGE = Path(__file__).with_name("reasons.md")
+_REASONS_INTRODUCTION = """\
+# Reasons, notices and states: what it says, and what to do
+
+## Why a frame has no pose
+
+Written by `python docs/make_reasons.py` from `rs_localizer/pipeline/refusal.py`. The reasons are
+the same in the library (`Failure.reason`), in `replay`, in the log and in `/diagnostics`.
+
+| reason | means | look at |
+|---|---|---|
+"""
+_IMU_INTRODUCTION = """
+## Why the IMU is not used for an image
+
+The camera continues alone, and the image still has its pose: [imu.md](imu.md).
+
+| reason | means | look at |
+|---|---|---|
+"""
+_BY_HAND = "\n<!-- From here on written by hand"
+
+
+def reasons_page() -> str:
+    """The page of the reasons, with the part that is written by hand as it stands."""
+    written = REASONS_PAGE.read_text(encoding="utf-8")
+    by_hand = written[written.index(_BY_HAND) :]
+    tables = _REASONS_INTRODUCTION + _rows(REASONS) + _IMU_INTRODUCTION + _rows(IMU_REASONS)
+    return tables + by_hand
+
+
+def _rows(reasons: Mapping[str, Meaning]) -> str:
+    return "".join(f"| `{name}` | {means} | {look} |\n" for name, (means, look) in reasons.items())
+
+
+if __name__ == "__main__":
+    REASONS_PAGE.write_text(reasons_page(), encoding="utf-8")
