@@ -76,6 +76,7 @@ setup(
         "evo": ["evo"],
         "fleet": ["dask", "distributed", "matplotlib"],
         "hloc": ["h5py"],
+        "peers": ["poselib"],  # of the benchmarks
         "mapping": ["pycolmap", "matplotlib"],
         "plots": ["matplotlib", "Pillow>=9.1"],
         "table": ["fsspec", "pyarrow"],

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``python -m benchmarks.real FOLDER``: a table and a picture of real videos of boards.
 
+``python -m benchmarks.real gyro RECORDING --gyroscope FILE``: turn rates before a gyroscope.
+
 FOLDER holds videos and ``index.csv``, a line for each: file, inner corners, side of a square (m),
 as ``walk.mp4,8x6,0.025``. Settings of the method as everywhere: ``-p map_deviation:=0.0005``.
 """
@@ -11,16 +13,19 @@ from __future__ import annotations
 import argparse
 import csv
 import math
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 
+from benchmarks.real import gyro
 from benchmarks.real.calibrations import report
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
+from benchmarks.real.peers import PEERS
 from rs_localizer.cli.settings_args import add_settings, given_settings
 
 mpl.use("Agg")
@@ -30,11 +35,11 @@ Row = Mapping[str, float]
 # What the text shows of the table, in parts.
 _PARTS = {
     "localized images": (
-        "images", "p3p_localized", "solvepnp_localized", *(f"{name}_localized" for name in METHODS),
+        "images", *(f"{name}_localized" for name in (*PEERS, *METHODS)),
     ),
-    "jitter over that of P3P": tuple(
+    "jitter over that of solvePnP": tuple(
         f"{name}_{what}"
-        for name in METHODS
+        for name in (*METHODS, "poselib")
         for what in (
             *("turn50", "turn50_low", "turn50_high", "turn95", "turn95_low", "turn95_high"),
             *("move50", "move95"),
@@ -48,7 +53,7 @@ _PARTS = {
         ),
         "random_turn_claimed",
     ),
-    "held-out corners over P3P's": (
+    "held-out corners over solvePnP's": (
         "held_px",
         "single_held", "single_held_low", "single_held_high",
         "tracked_held", "tracked_held_low", "tracked_held_high",
@@ -68,8 +73,15 @@ _PARTS = {
 }  # fmt: skip
 
 
-def main() -> None:
+JUDGES = {"gyro": gyro.main}
+"""Beside the boards, by the first argument."""
+
+
+def main(argv: Sequence[str]) -> None:
     """Run it."""
+    if argv and argv[0] in JUDGES:
+        JUDGES[argv[0]](argv[1:])
+        return
     parser = argparse.ArgumentParser(prog="python -m benchmarks.real", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, default=Path("real"), help="table, text and picture")
@@ -80,7 +92,7 @@ def main() -> None:
         "--calibrations", action="store_true", help="calibrate's halves and thirds instead"
     )
     add_settings(parser)
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     cache = args.cache or args.out / "cache"
     config = given_settings(args)
     if args.calibrations:
@@ -145,10 +157,10 @@ def _number(value: float | None) -> str:
 
 
 def _draw(rows: Mapping[str, Row], file: Path) -> None:
-    """Localized, jitter, halves, held-out corners: the line at 1 is P3P, or what is claimed."""
+    """Localized, jitter, halves, held-out corners: the line at 1 is solvePnP, or the claim."""
     panels = {
-        "localized / P3P": [f"{name}_localized" for name in METHODS],
-        "jitter of orientation / P3P, median": [f"{name}_turn50" for name in METHODS],
+        "localized / solvePnP": [f"{name}_localized" for name in METHODS],
+        "jitter of orientation / solvePnP, median": [f"{name}_turn50" for name in METHODS],
         "inside 95 % regions": ["single_inside", "tracked_inside"],
         "held-out corners / global shutter": ["motion_held", "tracked_held", "backward_held"],
     }
@@ -156,7 +168,7 @@ def _draw(rows: Mapping[str, Row], file: Path) -> None:
     places = np.arange(len(rows))
     for panel, (title, columns) in zip(axes.flat, panels.items(), strict=True):
         for k, column in enumerate(columns):
-            scale = "p3p_localized" if title.startswith("localized") else None
+            scale = "solvepnp_localized" if title.startswith("localized") else None
             values = [
                 row.get(column, np.nan) / (max(row[scale], 1.0) if scale else 1.0)
                 for row in rows.values()
@@ -170,4 +182,4 @@ def _draw(rows: Mapping[str, Row], file: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

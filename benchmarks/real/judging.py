@@ -10,10 +10,10 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from benchmarks.real.clips import Clip, Shutter, halved
+from benchmarks.real.peers import PEERS, GlobalPose
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
@@ -21,7 +21,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.core.state import ANGULAR, POSE, TURN, VELOCITIES
+from rs_localizer.core.state import ANGULAR, POSE, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Memory, Tracker
@@ -32,8 +32,11 @@ from rs_localizer.trajectory.observe import Observed, collect
 from rs_localizer.trajectory.online_readout import REVERSED
 from rs_localizer.trajectory.problem import LIMIT, Problem
 
-Poses = list[Estimate | Failure]
+Pose = Estimate | GlobalPose
+Poses = Sequence[Pose | Failure | None]
 METHODS = ("default", "tracked", "single")
+PEER = "solvepnp"
+"""With which the methods are compared."""
 # 95 % quantile of chi-squared with six degrees of freedom, and the median with three.
 _INSIDE, _MEDIAN = 12.592, 2.366
 _INSIDE_3 = 7.815  # likewise with three degrees of freedom
@@ -54,20 +57,20 @@ def judged(clip: Clip, lens: Camera, shutter: Shutter, config: NodeConfig) -> di
     camera = replace(lens, readout_time=shutter.readout_time, scan_direction=shutter.scan_direction)
     whole = list(clip.images)
     poses: dict[str, Poses] = {}
-    for name in (*METHODS, "p3p"):
+    for name in (*METHODS, *PEERS):
         begin = time.process_time()
         poses[name] = localized(name, camera, whole, config)
         row[f"{name}_localized"] = sum(map(bool, poses[name]))
         row[f"{name}_ms"] = 1e3 * (time.process_time() - begin) / len(whole)
-        for reason, count in Counter(str(x.reason) for x in poses[name] if not x).items():
-            row[f"{name}_{reason}"] = count
-    found = [one for name in METHODS for one in poses[name] if one]
+        reasons = [str(one.reason) for one in poses[name] if isinstance(one, Failure)]
+        row |= {f"{name}_{reason}": count for reason, count in Counter(reasons).items()}
+    found = [one for name in METHODS for one in poses[name] if isinstance(one, Estimate)]
     row["lens_notices"] = float(np.mean([one.lens is not None for one in found] or [False]))
-    row["solvepnp_localized"] = sum(_solve_pnp(lens, image) for image in whole)
-    for name in METHODS:
-        row |= {f"{name}_{key}": x for key, x in _jitter(clip, poses[name], poses["p3p"]).items()}
+    for name in (*METHODS, "poselib"):
+        of_name = _jitter(clip, poses[name], poses[PEER])
+        row |= {f"{name}_{key}": x for key, x in of_name.items()}
     for name in METHODS[1:]:
-        of_name = _twists(clip, poses[name], poses["p3p"], shutter.readout_time)
+        of_name = _twists(clip, poses[name], poses[PEER], shutter.readout_time)
         row |= {f"{name}_{key}": x for key, x in of_name.items()}
     row |= _halves(camera, whole, config) | _shutter_gain(clip)
     return row
@@ -77,7 +80,7 @@ def localized(name: str, camera: Camera, images: Sequence[Observed], config: Nod
     """Each image, by one of the methods.
 
     default: as a node without any parameter; single: with the readout time, each image alone;
-    tracked: with it, one after the other.
+    tracked: with it, one after the other. Or by one of the peers.
     """
     if name == "default":
         localizer = Localizer(replace(camera, readout_time=0.0), config)
@@ -89,12 +92,10 @@ def localized(name: str, camera: Camera, images: Sequence[Observed], config: Nod
         tracker = Tracker(Localizer(camera, config))
         tracker.readout_time_deviation = config.readout_time_deviation
         return [tracker.localize(image.stamp_ns, image.points, image.pixels) for image in images]
-    localizer = Localizer(camera, replace(config, solver="p3p") if name == "p3p" else config)
+    if name in PEERS:
+        return [PEERS[name](camera, image.points, image.pixels) for image in images]
+    localizer = Localizer(camera, config)
     return [localizer.localize(image.points, image.pixels) for image in images]
-
-
-def _solve_pnp(lens: Camera, image: Observed) -> bool:
-    return bool(cv2.solvePnP(image.points, image.pixels, lens.K, lens.D)[0])
 
 
 def _jitter(clip: Clip, poses: Poses, others: Poses) -> dict[str, float]:
@@ -124,7 +125,7 @@ def _jitter(clip: Clip, poses: Poses, others: Poses) -> dict[str, float]:
     return found
 
 
-def _second_difference(triple: Sequence[Estimate]) -> tuple[float, float]:
+def _second_difference(triple: Sequence[Pose]) -> tuple[float, float]:
     """rad, m."""
     a, b, c = triple
     turn = so3.log(c.rotation @ b.rotation.T) - so3.log(b.rotation @ a.rotation.T)
@@ -132,17 +133,20 @@ def _second_difference(triple: Sequence[Estimate]) -> tuple[float, float]:
     return float(np.linalg.norm(turn)), float(np.linalg.norm(move))
 
 
-def _twists(clip: Clip, poses: Poses, p3p: Poses, readout_time: float) -> dict[str, float]:
-    """Turn rates against the poses (P3P) of the neighbours, and the share inside 95 % regions."""
+def _twists(clip: Clip, poses: Poses, peer: Poses, readout_time: float) -> dict[str, float]:
+    """Turn rates against a peer's poses of the neighbours, and the share inside 95 % regions."""
     errors, rates, inside = [], [], []
     for k in range(1, len(poses) - 1):
-        before, here, after = p3p[k - 1], poses[k], p3p[k + 1]
+        before, here, after = peer[k - 1], poses[k], peer[k + 1]
         seconds = 1e-9 * (clip.images[k + 1].stamp_ns - clip.images[k - 1].stamp_ns)
         if not (before and here and after and seconds < 3.0 * clip.interval):
             continue
+        assert isinstance(here, Estimate)
+        assert isinstance(before, GlobalPose)
+        assert isinstance(after, GlobalPose)
         rate = so3.log(before.rotation @ after.rotation.T) / seconds
         error = here.angular_velocity / readout_time - rate
-        of_rate = (before.joint_covariance + after.joint_covariance)[TURN, TURN] / seconds**2
+        of_rate = (before.turn_covariance + after.turn_covariance) / seconds**2
         spread = here.covariance[ANGULAR, ANGULAR] / readout_time**2 + of_rate
         inside.append(error @ np.linalg.solve(spread, error) < _INSIDE_3)
         errors.append(np.linalg.norm(error))
@@ -170,7 +174,7 @@ def _halves(camera: Camera, images: Sequence[Observed], config: NodeConfig) -> d
         row |= {f"{name}_{key}": x for key, x in _agreement(*sides, shared=False).items()}
     parts = _parts(images, lambda image, seed: halved(len(image.points), seed))
     reverse = replace(camera, scan_direction=str(REVERSED[ScanDirection(camera.scan_direction)]))
-    cameras = {"single": camera, "tracked": camera, "reversed": reverse, "p3p": camera}
+    cameras = {"single": camera, "tracked": camera, "reversed": reverse, PEER: camera}
     fits = {
         name: localized("tracked" if name == "reversed" else name, by, parts[0], config)
         for name, by in cameras.items()
@@ -180,10 +184,10 @@ def _halves(camera: Camera, images: Sequence[Observed], config: NodeConfig) -> d
     row["random_turn_claimed"] = halves.get("turn_claimed", math.nan)
     errors = {name: _errors(by, fits[name], parts[1]) for name, by in cameras.items()}
     for name in ("single", "tracked", "reversed"):
-        low, middle, high = _ratio(errors[name], errors["p3p"])
+        low, middle, high = _ratio(errors[name], errors[PEER])
         row |= {f"{name}_held": middle, f"{name}_held_low": low, f"{name}_held_high": high}
     row["tracked_over_single"] = _ratio(errors["tracked"], errors["single"])[1]
-    row["held_px"] = float(np.sqrt(np.nanmean(errors["p3p"])))
+    row["held_px"] = float(np.sqrt(np.nanmean(errors[PEER])))
     return row
 
 
@@ -247,7 +251,7 @@ def _agreement(ones: Poses, others: Poses, *, shared: bool) -> dict[str, float]:
     """
     inside, turns, moves = [], [], []
     for one, other in zip(ones, others, strict=True):
-        if not (one and other):
+        if not (isinstance(one, Estimate) and isinstance(other, Estimate)):
             continue
         step = np.concatenate(
             [
@@ -291,7 +295,8 @@ def _errors(camera: Camera, poses: Poses, held_out: Sequence[Observed]) -> Array
     errors = np.full(len(poses), np.nan)
     for k, (pose, image) in enumerate(zip(poses, held_out, strict=True)):
         if pose:
-            by = camera if pose.lens is None else pose.lens.mended(camera)
+            lens = pose.lens if isinstance(pose, Estimate) else None
+            by = camera if lens is None else lens.mended(camera)
             pixels = project_rolling(by, pose.at_rows, image.points)[0]
             errors[k] = np.mean(np.sum((pixels - image.pixels) ** 2, axis=1))
     return errors

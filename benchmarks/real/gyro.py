@@ -1,0 +1,264 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m benchmarks.real gyro RECORDING --gyroscope FILE``: turn rates before a real truth.
+
+RECORDING is a bag with ``camera_info`` and correspondences, FILE a text of lines ``t wx wy wz`` (s
+by the clock of the stamps, rad/s in the camera's optical axes) that no estimator sees. Beside
+twists there are the turns from pose to pose, of which estimators without a shutter have some, too.
+
+    python -m benchmarks.real gyro rec --gyroscope gyroscope.txt -p readout_time:=0.0318 \\
+        -p stamp_offset:=-0.0028
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+
+from benchmarks.real.peers import PEERS, GlobalPose, solve_pnp_ransac
+from benchmarks.real.recordings import Recording, read_bag
+from rs_localizer.cli.settings_args import add_settings, given_settings
+from rs_localizer.config import LocalizerConfig
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.state import ANGULAR
+from rs_localizer.core.types import Estimate
+from rs_localizer.localizer import Localizer
+from rs_localizer.tracking import Tracker
+
+mpl.use("Agg")
+from matplotlib import pyplot as plt
+
+_INSIDE = 7.815  # 95 % quantile of chi-squared with three degrees of freedom
+_QUANTILE = 1.96  # of a normal number, both sides of 95 %
+_NEAR = 1.0  # px
+_FASTEST = 15  # images
+_NS = 1e-9
+_AXES = "xyz"
+SINGLE, TRACKED = "single", "tracked"
+
+Poses = Mapping[int, "Estimate | GlobalPose"]
+"""By the place of the image."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gyroscope:
+    """Turn rates (k,3) rad/s in camera axes at times (k,) s."""
+
+    times: Array
+    rates: Array
+
+    @classmethod
+    def read(cls, path: Path) -> Gyroscope:
+        """A text of ``t wx wy wz``; raises ``ValueError`` for another."""
+        table = np.atleast_2d(np.loadtxt(path))
+        if table.shape[1] != 4 or len(table) < 2 or not np.all(np.diff(table[:, 0]) > 0.0):
+            raise ValueError(
+                f"{path} must hold lines t wx wy wz (s, rad/s) in the order of time, found "
+                f"{table.shape[0]} of {table.shape[1]} numbers"
+            )
+        return cls(table[:, 0], table[:, 1:])
+
+    def mean_rate(self, first: Array, last: Array) -> Array:
+        """Mean rates (n,3) rad/s between times (n,) s."""
+        step = 0.5 * (self.rates[1:] + self.rates[:-1]) * np.diff(self.times)[:, None]
+        angles = np.vstack([np.zeros(3), np.cumsum(step, axis=0)])
+
+        def at(time: Array) -> Array:
+            return np.stack([np.interp(time, self.times, angles[:, k]) for k in range(3)], axis=1)
+
+        rate: Array = (at(last) - at(first)) / (last - first)[:, None]
+        return rate
+
+
+def localized(recording: Recording, config: LocalizerConfig) -> dict[str, Poses]:
+    """Each image by each method."""
+    camera, frames = recording.camera, recording.frames
+    found: dict[str, Poses] = {}
+    for name, peer in (PEERS | {"solvepnp": solve_pnp_ransac}).items():
+        poses = [peer(camera, frame.points, frame.pixels) for frame in frames]
+        found[name] = {k: pose for k, pose in enumerate(poses) if pose}
+    localizer = Localizer(camera, config)
+    single = [localizer.localize(frame.points, frame.pixels) for frame in frames]
+    found[SINGLE] = {k: one for k, one in enumerate(single) if one}
+    tracker = Tracker(Localizer(camera, config))
+    results = [tracker.localize(frame.middle_ns, frame.points, frame.pixels) for frame in frames]
+    found[TRACKED] = {k: one for k, one in enumerate(results) if one}
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What one method says of the recording; rates in deg/s."""
+
+    localized: int
+    between: tuple[float, float]  # turn between neighbours, median and 95 %
+    central: tuple[float, float]  # central difference as turn rate of the image between
+    twist: tuple[float, float] | None  # turn rate of the image
+    claimed: float  # root mean square deviation of it
+    ratio: float  # of it over the root mean square error
+    inside: float  # share of the truths in 95 % regions
+    near: float  # share of the points within a pixel
+    near_fastest: float  # likewise in the fastest images
+
+
+def judge(recording: Recording, gyroscope: Gyroscope, config: LocalizerConfig) -> Judged:
+    """All methods before the gyroscope."""
+    times = _NS * np.array([frame.middle_ns for frame in recording.frames])
+    half = 0.5 * recording.camera.readout_time
+    truth = gyroscope.mean_rate(times - half, times + half)
+    fastest = np.argsort(-np.linalg.norm(truth, axis=1))[:_FASTEST]
+    is_fast = np.zeros(len(times), np.bool_)
+    is_fast[fastest] = True
+    poses = localized(recording, config)
+    rows = {
+        name: _row(of, times, truth, is_fast, gyroscope, recording.camera.readout_time)
+        for name, of in poses.items()
+    }
+    return Judged(times, truth, poses, rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """The table, and what it was made of."""
+
+    times: Array  # (f,) s, of the middle rows
+    truth: Array  # (f,3) rad/s
+    poses: Mapping[str, Poses]
+    rows: Mapping[str, Row]
+
+
+def _row(
+    poses: Poses, times: Array, truth: Array, is_fast: BoolArray, gyroscope: Gyroscope,
+    readout_time: float,
+) -> Row:  # fmt: skip
+    near = {k: float(np.mean(np.asarray(one.residuals) < _NEAR)) for k, one in poses.items()}
+    twist, claimed, ratio, inside = None, np.nan, np.nan, np.nan
+    estimates = {k: one for k, one in poses.items() if isinstance(one, Estimate)}
+    if estimates:
+        rates, covariances = rates_of(estimates, readout_time)
+        errors = rates - truth[list(estimates)]
+        twist = _spread(errors)
+        squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+        claimed = np.sqrt(np.mean(np.trace(covariances, axis1=1, axis2=2)))
+        ratio = float(claimed / np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+        inside = float(np.mean(squared < _INSIDE))
+    return Row(
+        len(poses), _turns(poses, times, gyroscope), _central(poses, times, truth), twist,
+        float(np.rad2deg(claimed)), ratio, inside,
+        float(np.mean(list(near.values()))),
+        float(np.mean([value for k, value in near.items() if is_fast[k]])),
+    )  # fmt: skip
+
+
+def rates_of(estimates: Mapping[int, Estimate], readout_time: float) -> tuple[Array, Array]:
+    """Turn rates (n,3) rad/s of estimates, and their covariances (n,3,3)."""
+    rates = np.array([one.angular_velocity for one in estimates.values()]) / readout_time
+    covariances = np.array([one.covariance[ANGULAR, ANGULAR] for one in estimates.values()])
+    return rates, covariances / readout_time**2
+
+
+def _turns(poses: Poses, times: Array, gyroscope: Gyroscope) -> tuple[float, float]:
+    """Errors of the mean turn rate between neighbours: median and 95 %, deg/s."""
+    places = [k for k in poses if k + 1 in poses]
+    true = gyroscope.mean_rate(times[places], times[np.array(places, int) + 1])
+    return _spread(np.array([_rate(poses, times, k, k + 1) for k in places]) - true)
+
+
+def _central(poses: Poses, times: Array, truth: Array) -> tuple[float, float]:
+    """Errors of central differences as the turn rate of the image: median and 95 %, deg/s."""
+    places = [k for k in poses if k - 1 in poses and k + 1 in poses]
+    return _spread(np.array([_rate(poses, times, k - 1, k + 1) for k in places]) - truth[places])
+
+
+def _rate(poses: Poses, times: Array, first: int, last: int) -> Array:
+    turn = so3.log(np.ascontiguousarray(poses[first].rotation @ poses[last].rotation.T))
+    rate: Array = turn / (times[last] - times[first])
+    return rate
+
+
+def _spread(errors: Array) -> tuple[float, float]:
+    """Median and 95 % quantile of errors (n,3) rad/s, in deg/s."""
+    if not len(errors):
+        return np.nan, np.nan
+    median, high = np.rad2deg(np.percentile(np.linalg.norm(errors, axis=1), [50, 95]))
+    return float(median), float(high)
+
+
+_HEADINGS = (
+    "localized", "turn between neighbours", "central differences", "twist", "claimed",
+    "over actual", "inside", "within 1 px", "fastest",
+)  # fmt: skip
+
+
+def text(judged: Judged) -> str:
+    """The table: median and 95 % of errors in deg/s, shares in %."""
+
+    def pair(values: tuple[float, float] | None) -> str:
+        return "" if values is None else f"{values[0]:.2f}, {values[1]:.1f}"
+
+    def number(value: float, form: str) -> str:
+        return "" if np.isnan(value) else format(value, form)
+
+    lines = ["| | " + " | ".join(_HEADINGS) + " |", "|" + "---|" * (len(_HEADINGS) + 1)]
+    for name, row in judged.rows.items():
+        cells = (
+            f"{row.localized} of {len(judged.times)}", pair(row.between), pair(row.central),
+            pair(row.twist), number(row.claimed, ".1f"), number(row.ratio, ".2f"),
+            number(100.0 * row.inside, ".0f"), f"{row.near:.3f}", f"{row.near_fastest:.3f}",
+        )  # fmt: skip
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def draw(judged: Judged, gyroscope: Gyroscope, readout_time: float, file: Path) -> None:
+    """Turn rates of single images, with 95 % bars, over the gyroscope's line."""
+    estimates = {k: x for k, x in judged.poses[SINGLE].items() if isinstance(x, Estimate)}
+    rates, covariances = rates_of(estimates, readout_time)
+    bars = _QUANTILE * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    start = judged.times[0]
+    seconds = judged.times[list(estimates)] - start
+    shown = (gyroscope.times > start) & (gyroscope.times < judged.times[-1])
+    figure, panels = plt.subplots(3, 1, figsize=(9, 6), sharex=True, layout="constrained")
+    for k, panel in enumerate(panels):
+        panel.plot(
+            gyroscope.times[shown] - start, np.rad2deg(gyroscope.rates[shown, k]),
+            color="#b04a00", linewidth=1.0, label="gyroscope (no estimator sees it)",
+        )  # fmt: skip
+        panel.errorbar(
+            seconds, np.rad2deg(rates[:, k]), np.rad2deg(bars[:, k]), fmt="o", color="#1f4e9c",
+            markersize=3, linewidth=0.7, label="one image each, with 95 %",
+        )  # fmt: skip
+        panel.set_ylabel(f"{_AXES[k]} (deg/s)")
+        panel.grid(alpha=0.3)
+    panels[0].legend(loc="upper right", fontsize="small", ncols=2)
+    panels[-1].set_xlabel("time (s)")
+    figure.savefig(file, dpi=100)
+    plt.close(figure)
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.real gyro", description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("recording", type=Path, help="a bag")
+    parser.add_argument("--gyroscope", type=Path, required=True, help="t wx wy wz, held back")
+    parser.add_argument("--out", type=Path, default=Path("real"), help="table and picture")
+    add_settings(parser)
+    args = parser.parse_args(argv)
+    config = given_settings(args)
+    recording = read_bag(args.recording, config)
+    gyroscope = Gyroscope.read(args.gyroscope)
+    judged = judge(recording, gyroscope, config)
+    args.out.mkdir(parents=True, exist_ok=True)
+    table = text(judged)
+    print(table)
+    (args.out / "gyro.md").write_text(table + "\n", encoding="utf-8")
+    draw(judged, gyroscope, recording.camera.readout_time, args.out / "gyro.png")

@@ -1,0 +1,105 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The judge before a gyroscope, on a miniature that the independent simulator makes."""
+
+import numpy as np
+import pytest
+
+from benchmarks.independent import motions
+from benchmarks.independent.cameras import Camera as TrueCamera
+from benchmarks.independent.frames import Frames, simulate
+from benchmarks.independent.scenes import Rich
+from benchmarks.real import __main__ as command
+from benchmarks.real.gyro import Gyroscope, judge
+from benchmarks.real.peers import PEERS, solve_pnp
+from benchmarks.real.recordings import read_bag
+from rs_localizer.config import CalibrationErrors, NodeConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.recording import write_frame
+
+TRUE = TrueCamera()
+LENGTH = 8
+# The lens is exact.
+CONFIG = NodeConfig(readout_time=TRUE.readout_time, calibration=CalibrationErrors(0.0, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def frames() -> Frames:
+    return simulate(TRUE, motions.hand, Rich(80), 1, LENGTH, seed=3)
+
+
+@pytest.fixture(scope="module")
+def recording(frames, tmp_path_factory):
+    path = tmp_path_factory.mktemp("gyro") / "rec"
+    camera = Camera(TRUE.width, TRUE.height, K=TRUE.matrix, D=np.array(TRUE.distortion))
+    with BagWriter(path) as bag:
+        for k in range(LENGTH):
+            points, pixels = frames.seen(k, 0.1)
+            write_frame(
+                bag, camera, int(frames.stamp_ns[k]), points, pixels, np.arange(len(points))
+            )
+    return path
+
+
+@pytest.fixture(scope="module")
+def gyroscope(frames) -> Gyroscope:
+    """Exact: motions are made of the same seed as the frames."""
+    moving = motions.hand(1, np.random.default_rng(3))
+    start = -0.5e-9 * (frames.stamp_ns[-1] - frames.stamp_ns[0]) - 0.5 * TRUE.readout_time
+    local = np.arange(start - 0.1, -start + 0.1, 1e-3)
+    rates = moving.states(np.zeros(len(local), np.int64), local).angular
+    return Gyroscope(local - start + 1e-9 * frames.stamp_ns[0], rates)
+
+
+def test_mean_rates_are_those_of_the_turn_between_two_times():
+    times = np.linspace(0.0, 1.0, 1001)
+    rates = np.column_stack([times, 2.0 * np.ones_like(times), -times])
+    mean = Gyroscope(times, rates).mean_rate(np.array([0.2]), np.array([0.6]))
+    np.testing.assert_allclose(mean, [[0.4, 2.0, -0.4]], atol=1e-12)
+
+
+def test_right_twists_are_near_and_turned_round_ones_far(recording, gyroscope):
+    read = read_bag(recording, CONFIG)
+    rows = judge(read, gyroscope, CONFIG).rows
+    for name in ("single", "tracked"):
+        assert rows[name].localized == LENGTH
+        assert rows[name].twist[0] < 1.5
+        assert rows[name].between[0] < 0.5
+        assert 0.3 < rows[name].ratio < 4.0
+        assert rows[name].near > 0.98
+    assert rows["single"].between[0] < 0.3 * rows["solvepnp"].between[0]
+    backwards = judge(read, Gyroscope(gyroscope.times, -gyroscope.rates), CONFIG).rows
+    assert backwards["single"].twist[0] > 20.0
+    assert backwards["single"].inside < 0.2
+
+
+def test_the_command_writes_table_and_picture(recording, gyroscope, tmp_path):
+    text = tmp_path / "gyroscope.txt"
+    np.savetxt(text, np.column_stack([gyroscope.times, gyroscope.rates]), fmt="%.9f")
+    command.main(["gyro", str(recording), "--gyroscope", str(text), "--out", str(tmp_path),
+                  "-p", f"readout_time:={TRUE.readout_time}"])  # fmt: skip
+    table = (tmp_path / "gyro.md").read_text().splitlines()
+    assert len(table) == 2 + len(PEERS) + 2
+    assert (tmp_path / "gyro.png").stat().st_size > 10_000
+
+
+def test_what_is_no_gyroscope_is_refused(tmp_path):
+    (tmp_path / "three.txt").write_text("0 1 2\n1 1 2\n")
+    with pytest.raises(ValueError, match=r"in the order of time, found 2 of 3"):
+        Gyroscope.read(tmp_path / "three.txt")
+    with pytest.raises(ValueError, match=r"readout_time:=0\.03"):
+        read_bag(tmp_path, NodeConfig())
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_peers_find_a_still_camera(name):
+    rng = np.random.default_rng(0)
+    camera = Camera(640, 480, K=TRUE.matrix, D=np.array(TRUE.distortion))
+    points = rng.uniform([-1.0, -1.0, 3.0], [1.0, 1.0, 5.0], (60, 3))
+    pixels = camera.project(points)
+    pose = PEERS[name](camera, points, pixels)
+    np.testing.assert_allclose(pose.rotation, np.eye(3), atol=1e-4)
+    np.testing.assert_allclose(pose.position, 0.0, atol=1e-3)
+    assert pose.residuals.max() < 0.1
+    assert solve_pnp(camera, points[:3], pixels[:3]) is None
