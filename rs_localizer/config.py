@@ -496,7 +496,7 @@ class NodeConfig(LocalizerConfig):
     )
     map_file: str = setting(
         "",
-        "Map that keypoints are matched with: a .npz or .ply file or a sparse model of COLMAP; "
+        "Map that keypoints are matched with: a .npz file or a sparse model of COLMAP; "
         "empty: none, or the one published on map_points",
         fixed=True,
     )

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import io
-import sqlite3
 import struct
 import tempfile
 import zlib
@@ -26,7 +25,6 @@ from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.files import write_npz
 from rs_localizer.io.maps.landmarks import Map, map_rows
-from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room
 from rs_localizer.simulation.settings import FrameSettings
@@ -251,17 +249,14 @@ def _maps() -> list[Map]:
     ]
 
 
-def map_files() -> dict[str, list[bytes]]:
-    """Maps by the suffix of their files."""
-    found: dict[str, list[bytes]] = {".npz": [], ".ply": []}
+def map_files() -> list[bytes]:
+    """Maps as files."""
+    found = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map"
         for landmarks in _maps():
             write_npz(path, landmarks)
-            found[".npz"].append(path.read_bytes())
-            for binary in (True, False):
-                write_ply(path, landmarks, binary=binary)
-                found[".ply"].append(path.read_bytes())
+            found.append(path.read_bytes())
     return found
 
 
@@ -273,33 +268,6 @@ def arrays() -> list[bytes]:
         np.save(stream, array)
         found.append(stream.getvalue())
     return found
-
-
-def model() -> tuple[bytes, bytes]:
-    """Points of COLMAP, binary and as text: two, seen by two images."""
-    binary, text = struct.pack("<Q", 2), "# ID X Y Z R G B ERROR TRACK\n"
-    for point in (4, 9):
-        binary += struct.pack("<Q3d3BdQ", point, 1.0, 2.0, point, 1, 2, 3, 0.5, 2)
-        binary += struct.pack("<4I", 1, point % 3, 2, 1)
-        text += f"{point} 1.0 2.0 {point} 1 2 3 0.5 1 {point % 3} 2 1\n"
-    return binary, text.encode()
-
-
-def database() -> bytes:
-    """COLMAP's, with the descriptors of those images."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "database.db"
-        tables = sqlite3.connect(path)
-        tables.execute("PRAGMA page_size = 512")
-        tables.execute(
-            "CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY, type, rows, cols, data)"
-        )
-        for image_id in (1, 2):
-            data = bytes(range(128)) * 3
-            tables.execute("INSERT INTO descriptors VALUES (?, 0, 3, 128, ?)", (image_id, data))
-        tables.commit()
-        tables.close()
-        return path.read_bytes()
 
 
 def recordings() -> dict[str, list[bytes]]:
@@ -339,17 +307,6 @@ def _imu_message() -> Any:
         linear_acceleration=vector(0.2, -9.7, 0.4),
         linear_acceleration_covariance=np.zeros(9),
     )
-
-
-def model_images() -> tuple[bytes, bytes]:
-    """Images of COLMAP, binary and as text: two with two features each."""
-    binary, text = struct.pack("<Q", 2), "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
-    for number in (1, 2):
-        binary += struct.pack("<I7dI", number, 1, 0, 0, 0, 0, 0, number, 1)
-        binary += f"{number}.jpg".encode() + b"\0" + struct.pack("<Q", 2)
-        binary += struct.pack("<ddqddq", 3, 4, 4, 5, 6, -1)
-        text += f"{number} 1 0 0 0 0 0 {number} 1 {number}.jpg\n3 4 4 5 6 -1\n"
-    return binary, text.encode()
 
 
 def features_h5() -> bytes:

@@ -23,12 +23,11 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences, read_keypoints, read_map
 from rs_localizer.io.images import read_compressed_image, read_image
 from rs_localizer.io.imu import read_imu
-from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum, read_twists
-from rs_localizer.io.video import VideoError, read_video
+from rs_localizer.io.video import Video, VideoError
 from rs_localizer.markers.formats import Unsaid, read_any
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
@@ -92,7 +91,6 @@ class Target:
 
 def targets(folder: Path) -> dict[str, Target]:
     """All of them; files are written into the folder."""
-    maps, (binary, text) = seeds.map_files(), seeds.model()
     clouds = (
         seeds.cloud(*seeds.XYZ, *seeds.UV, ("score", "<f8"), ("id", "<u2")),
         seeds.cloud(*seeds.UV, ("other", "<f4"), *seeds.XYZ, height=2),
@@ -106,9 +104,6 @@ def targets(folder: Path) -> dict[str, Target]:
         seeds.cloud(*seeds.XYZ, seeds.NUMBERS, big_endian=True),
     )
     pictures = tuple(map(seeds.image, ("mono8", "bgr8", "mono16", "yuv422_yuy2")))
-    model_folder = folder / "model"
-    model_folder.mkdir()
-    (model_folder / "points3D.bin").write_bytes(binary)
     message, map_error = (MessageError,), (MapError,)
     frames, shown = seeds.frames()
     return {
@@ -123,14 +118,8 @@ def targets(folder: Path) -> dict[str, Target]:
         "imu": Target(_messages((seeds.imu(),)), read_imu, message),
         "image": Target(_messages(pictures), read_image, message),
         "image/compressed": Target(_pictures, _compressed, message),
-        "map .npz": Target(_bytes(maps[".npz"]), _file(folder / "a.npz", _map), map_error),
+        "map .npz": Target(_bytes(seeds.map_files()), _file(folder / "a.npz", _map), map_error),
         "map .npz, arrays": Target(_archives, _file(folder / "b.npz", _map), map_error),
-        "map .ply": Target(_bytes(maps[".ply"]), _file(folder / "a.ply", _map), map_error),
-        "points3D.bin": Target(_bytes([binary]), _model(folder / "bin", "points3D.bin"), map_error),
-        "points3D.txt": Target(_bytes([text]), _model(folder / "txt", "points3D.txt"), map_error),
-        "database.db": Target(
-            _bytes([seeds.database()]), _file(model_folder / "database.db", _model_map), map_error
-        ),
         "params file": Target(
             _bytes((_PARAMS, _ANCHORED_PARAMS)),
             _file(folder / "params.yaml", _read_params),
@@ -152,8 +141,8 @@ def targets(folder: Path) -> dict[str, Target]:
 
 
 def _more_files(folder: Path) -> dict[str, Target]:
-    """Recordings, tables, and what COLMAP and hloc write."""
-    bags, (binary, text), error = seeds.recordings(), seeds.model_images(), (MapError,)
+    """Recordings, tables, and what hloc writes."""
+    bags = seeds.recordings()
     broken = folder / "broken"
     broken.mkdir()
     (broken / "mcap.mcap").write_bytes(bags[".mcap"][0])
@@ -176,8 +165,6 @@ def _more_files(folder: Path) -> dict[str, Target]:
         "twists": Target(
             _bytes((_TWISTS,)), _file(folder / "twists.txt", read_twists), (TrajectoryError,)
         ),
-        "images.bin": Target(_bytes([binary]), _images(folder / "ib", "images.bin"), error),
-        "images.txt": Target(_bytes([text]), _images(folder / "it", "images.txt"), error),
         "queries": Target(
             _bytes((_QUERIES,)), _file(folder / "queries.txt", read_queries), (HlocError,)
         ),
@@ -211,11 +198,6 @@ def _packed(good: Sequence[bytes]) -> Callable[[Random], bytes]:
     return make
 
 
-def _images(folder: Path, name: str) -> Callable[[bytes], object]:
-    folder.mkdir()
-    return _file(folder / name, lambda path: read_images(path.parent))
-
-
 def _read_bag(path: Path) -> object:
     with open_bag(path) as bag:
         return sum(1 for _ in bag.messages(list(bag.topics)))
@@ -231,7 +213,7 @@ def _read_field(path: Path) -> object:
 
 
 def _read_film(path: Path) -> object:
-    return sum(1 for _ in read_video(path))
+    return sum(1 for _ in Video(path))
 
 
 class _Localizer:
@@ -293,15 +275,6 @@ def _file(path: Path, read: Callable[[Path], object]) -> Callable[[bytes], objec
         return read(path)
 
     return run
-
-
-def _model(folder: Path, name: str) -> Callable[[bytes], object]:
-    folder.mkdir()
-    return _file(folder / name, lambda path: _map(path.parent))
-
-
-def _model_map(path: Path) -> object:
-    return _map(path.parent)
 
 
 def _map(path: Path) -> object:

@@ -15,7 +15,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.camera import Camera, DistortionModel
-from rs_localizer.io.video import read_video
+from rs_localizer.io.video import Video
 from rs_localizer.markers.boards import find_chessboard
 from rs_localizer.markers.prints import Chessboard
 from rs_localizer.trajectory import verdict
@@ -84,7 +84,7 @@ def _clip(path: Path, board: Chessboard, cache: Path, most: int) -> Clip:
 
 def _detect(path: Path, board: Chessboard, file: Path) -> None:
     times, corners, shown, previous, size = [], [], [], None, (0, 0)
-    for image in read_video(path):
+    for image in Video(path):
         size = image.image.shape[::-1]
         pixels = find_chessboard(image.image, board, previous)
         times.append(math.nan if image.seconds is None else image.seconds)

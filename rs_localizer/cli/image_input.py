@@ -26,7 +26,7 @@ if WORKING:
 
     from rs_localizer.core.camera import Camera
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
-    from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_log, read_telemetry
+    from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_telemetry
     from rs_localizer.io.video import count_lenses, has_times
     from rs_localizer.offline.image_sources import (
         IMAGE_TYPES,
@@ -110,11 +110,15 @@ def shutter_values(args: argparse.Namespace) -> dict[str, Any]:
     telemetry = telemetry_of(args.images, args)
     if telemetry is not None and telemetry.readout_time is not None:
         values.setdefault("readout_time", telemetry.readout_time)
+    calibration = getattr(args, "calibration", None)
+    if calibration is not None and not {"readout_time", "cameras"} & set(values):
+        known = read_calibration(calibration).readout_time  # of Gyroflow's profiles
+        values |= {"readout_time": known} if known else {}
     return values
 
 
 def telemetry_of(path: Path, args: argparse.Namespace) -> Telemetry | None:
-    """What a video, or a log beside it, says of its camera; None: nothing, or it is not to be used.
+    """What a video says of its camera; None: nothing, or it is not to be used.
 
     Raises:
         ValueError: for telemetry that cannot be read.
@@ -126,9 +130,12 @@ def telemetry_of(path: Path, args: argparse.Namespace) -> Telemetry | None:
 def _telemetry(path: Path) -> Telemetry | None:
     if not path.is_file() or is_bag(path):
         return None
-    if has_telemetry(path) and importlib.util.find_spec("telemetry_parser") is not None:
-        return read_telemetry(path)
-    return read_log(path)
+    return read_telemetry(path) if has_telemetry(path) and _can_read() else None
+
+
+def _can_read() -> bool:
+    """Whether the extra ``video`` is there; PyAV has one clock for images and gyroscope."""
+    return all(importlib.util.find_spec(name) is not None for name in ("telemetry_parser", "av"))
 
 
 def video_imu(telemetry: Telemetry, start_ns: int = DEFAULT_START_NS) -> ImuRecording:
@@ -142,7 +149,7 @@ def add_telemetry(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--no-telemetry",
         action="store_true",
-        help="ignore the gyroscope and the readout time inside a video, or in a log beside it",
+        help="ignore the gyroscope and the readout time inside a video",
     )
 
 
@@ -168,8 +175,7 @@ def tell_telemetry(
             print(f"note: of {', '.join(names)} the first one is used; calibrate --rig takes all")
     telemetry = _telemetry(path)
     if telemetry is None:
-        missing = importlib.util.find_spec("telemetry_parser") is None
-        if missing and path.is_file() and not is_bag(path) and has_telemetry(path):
+        if not _can_read() and path.is_file() and not is_bag(path) and has_telemetry(path):
             print("note: the video has a gyroscope; to use it: pip install 'rs_localizer[video]'")
         return
     if telemetry.stabilizer:

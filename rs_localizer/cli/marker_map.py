@@ -14,7 +14,7 @@ import numpy as np
 from rs_localizer.cli import WORKING, UsageError, number, read_counts
 
 if WORKING:
-    from rs_localizer.markers.consistency import other_units
+    from rs_localizer.markers.map_check import other_units
     from rs_localizer.markers.map_files import read_marker_map
     from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.markers.poses import Pose

@@ -15,7 +15,7 @@ from rs_localizer.markers.printing import PAGES, page_files, plan, write_pages
 
 if WORKING:
     from rs_localizer.io.atomic_files import atomic_files
-    from rs_localizer.markers.consistency import problems
+    from rs_localizer.markers.map_check import other_units
     from rs_localizer.markers.map_files import read_marker_map, write_marker_map
     from rs_localizer.markers.maps import MarkerMap, wall
     from rs_localizer.markers.poses import Pose
@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check = commands.add_parser(
         "check",
         help="check a map file",
-        description="Read a map and look for overlaps, mirrored markers and sizes in other units.",
+        description="Read a map and look for sizes in other units.",
     )
     check.add_argument("map", type=Path, metavar="MAP")
     for action in (make, check):
@@ -96,9 +96,8 @@ def _make(args: argparse.Namespace) -> dict[str, object]:
         marker_map = _map(args)
     except ValueError as error:  # the arguments are all that can be wrong with it
         raise UsageError(str(error)) from error
-    faults = problems(marker_map)
-    if faults:
-        raise UsageError(faults[0])
+    for fault in other_units(marker_map):
+        raise UsageError(fault)
     # An ending would be lost with a dot in the name.
     target = Path(f"{args.out}.{args.format}")
     map_file = Path(f"{args.out}.yaml")
@@ -152,7 +151,7 @@ def _refuse(args: argparse.Namespace, what: str, *names: str) -> None:
 
 def _check(path: Path) -> dict[str, object]:
     marker_map = read_marker_map(path)
-    faults = problems(marker_map)
+    faults = list(other_units(marker_map))
     for text in faults:
         print(text)
     if faults:

@@ -82,7 +82,6 @@ class Notice(StrEnum):
     # Of markers in images.
     UNKNOWN_MARKERS = "unknown_markers"
     REPEATED_MARKERS = "repeated_markers"
-    WRONG_MAP = "wrong_map"
     # Of nodes.
     NOT_BROADCAST = "not_broadcast"
     INCOMPATIBLE_PUBLISHER = "incompatible_publisher"

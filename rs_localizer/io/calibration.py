@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration files of other programs -> Camera.
 
-Read are YAML of ROS' camera_calibration and of BoofCV, YAML and XML of OpenCV's FileStorage,
-Kalibr's camchain, COLMAP's ``cameras.txt``, and JSON (or plain YAML) with the usual names. Of a
-file of several cameras, the wanted one's name stands behind a ``#``: ``camchain.yaml#cam1``.
+Which program wrote a file, what it holds tells; what each calls a lens is a row of
+:data:`_PROGRAMS`. Of a file of several cameras, the wanted one's name stands behind a ``#``:
+``camchain.yaml#cam1``.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from xml.etree import ElementTree
 
 import numpy as np
@@ -23,27 +23,125 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.io.yaml_text import YamlError, check_tree, file_faults, load_yaml
 
-# OpenCV writes "%YAML:1.0" where YAML has "%YAML 1.0", and a tag of its own before matrices, which
-# are plain mappings of rows, cols, dt and data.
-_DIRECTIVE = re.compile(r"\A\ufeff?%YAML[: ][0-9.]+\s*\n")
-_TAG = re.compile(r"!!opencv[-_a-z]*")
-# XML may define names that stand for ever longer text; OpenCV defines none.
-_FORBIDDEN = "<!ENTITY"
+# Order of OpenCV's coefficients, by their names.
+_ORDER = {
+    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
+    "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "equidistant": ("k1", "k2", "k3", "k4"),
+}
+_RATIONAL = len(_ORDER["rational_polynomial"])
+# What programs call the models.
+_MODELS = {
+    "fisheye": "equidistant", "opencv_fisheye": "equidistant", "kannalabrandt8": "equidistant",
+    "radtan": "plumb_bob", "pinhole": "plumb_bob", "none": "plumb_bob",
+    "opencv_standard": "plumb_bob", "lensmodel_opencv": "plumb_bob",
+    "double_sphere": str(DistortionModel.DOUBLE_SPHERE),
+}  # fmt: skip
 
 
-def _load_tree(text: str) -> Any:
-    """Mappings, lists and plain values of a file's text; YamlError for any other."""
-    start = text.lstrip()[:1]
-    if start == "<":
-        return _load_xml(text)
-    if start == "{":
+class _Program(NamedTuple):
+    """Where a program's files have a lens: dotted paths in the tree, the first that is there.
+
+    ``K`` is a matrix, or a mapping of ``fx fy cx cy``; ``D`` a list, or a mapping of ``k1 k2 p1 p2
+    k3 ...``; an empty path is the tree itself.
+    """
+
+    K: tuple[str, ...]
+    D: tuple[str, ...]
+    size: tuple[str, ...] = ("", "image_size", "imageSize", "img_size", "resolution", "size")
+    model: tuple[str, ...] = ("distortion_model", "camera_model", "model", "model_type")
+    default: str = ""  # model of files that do not say it; empty: OpenCV's, by the number
+    readout_ms: str = ""  # for all rows
+
+
+_GYROFLOW = _Program(
+    ("fisheye_params.camera_matrix",), ("fisheye_params.distortion_coeffs",), ("calib_dimension",),
+    default="opencv_fisheye", readout_ms="frame_readout_time",
+)  # fmt: skip
+_PROGRAMS = (
+    _GYROFLOW,
+    _Program(("cameraIntrinsics",), ("distCoeffs",), model=("lensmodel",)),  # PhotonVision
+    _Program(("projection_parameters",), ("distortion_parameters",)),  # VINS, camodocal
+    # ORB-SLAM
+    _Program(("Camera1", "Camera"), ("Camera1", "Camera"), ("Camera",), ("Camera.type",)),
+    _Program(  # ROS' camera_calibration, OpenCV, and whatever has the usual names
+        ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "mtx", ""),
+        ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs",
+         "dist_coeff", "distortion", "dist", "D", ""),
+    ),
+)  # fmt: skip
+_WIDTH = ("image_width", "image_Width", "width", "w")
+_HEIGHT = ("image_height", "image_Height", "height", "h")
+CALIBRATION_KINDS = (
+    "calibration file of ROS' camera_calibration, OpenCV (YAML, XML), Kalibr (camchain), COLMAP "
+    "(cameras.txt), PhotonVision, Gyroflow, VINS, ORB-SLAM, or JSON with K, D, width and height"
+)
+# Who writes FILE#cam1 means a camera in a file; a name of a file may hold the sign, too.
+_CHOICE = re.compile(r"(.+)#([^/#]+)")
+
+
+class CalibrationError(ValueError):
+    """A calibration file that cannot be used; the message names the file and the fault."""
+
+
+def read_calibration(path: Path | str) -> Camera:
+    """Camera of a calibration file (see the module); its readout time is 0 where it is not said.
+
+    Args:
+        path: the file; ``FILE#NAME`` chooses one of several cameras in it.
+
+    Raises:
+        CalibrationError: for anything else, saying what was found.
+    """
+    path, chosen = Path(path), None
+    if (match := _CHOICE.fullmatch(str(path))) is not None and not path.exists():
+        path, chosen = Path(match[1]), match[2]
+    with calibration_faults(path, "YAML, JSON or XML", "not a usable calibration"):
+        text = path.read_text(encoding="utf-8-sig")
+        camera = _camera(text, chosen)
+    if camera is None:
+        raise CalibrationError(
+            f"{path} is not a calibration: expected a {CALIBRATION_KINDS}; {_fields_in_words(text)}"
+        )
+    x, y = camera.K[:2, 2]
+    if not (0.0 < x < camera.width and 0.0 < y < camera.height):
+        raise CalibrationError(
+            f"{path} is not a usable calibration: its principal point ({x:g}, {y:g}) lies outside "
+            f"its image of {camera.width}x{camera.height}: are width and height exchanged, or of "
+            "another resolution?"
+        )
+    return camera
+
+
+@contextlib.contextmanager
+def calibration_faults(path: Path, kind: str, unusable: str) -> Iterator[None]:
+    """Faults within ``with`` of a file, and of what it says, name the file."""
+    with file_faults(path, CalibrationError, kind):
         try:
-            tree = json.loads(text)
-        except (ValueError, RecursionError):
-            return load_yaml(text)  # flow style, and its message if that fails, too
-        check_tree(tree)
-        return tree
-    return load_yaml(_TAG.sub("", _DIRECTIVE.sub("", text)))
+            yield
+        except (YamlError, UnicodeDecodeError):
+            raise
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            fault = f"no {error}" if isinstance(error, KeyError) else str(error)
+            raise CalibrationError(f"{path} is {unusable}: {fault}") from error
+
+
+def _camera(text: str, chosen: str | None) -> Camera | None:
+    lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
+    if _LINE.match(next(lines, "")) is not None:
+        return colmap_camera(text, chosen)
+    tree = _load_tree(text)
+    if not isinstance(tree, dict):
+        return None
+    cameras = {name: item for name, item in tree.items() if _is_kalibr(item)}
+    if cameras:
+        return kalibr_camera(_choose(cameras, chosen))
+    if chosen is not None:
+        raise ValueError(f"it has no camera {chosen!r} to choose")
+    if _is_kalibr(tree):
+        return kalibr_camera(tree)
+    found = (_of_program(_nested(tree), program) for program in _PROGRAMS)
+    return next((camera for camera in found if camera is not None), None)
 
 
 T = TypeVar("T")
@@ -63,40 +161,156 @@ def _choose(cameras: Mapping[str, T], name: str | None) -> T:
     return cameras[name]
 
 
+# OpenCV writes "%YAML:1.0" where YAML has "%YAML 1.0", and a tag of its own before matrices, which
+# are plain mappings of rows, cols, dt and data.
+_DIRECTIVE = re.compile(r"\A%YAML[: ][0-9.]+\s*\n")
+_TAG = re.compile(r"!!opencv[-_a-z]*")
+
+
+def _load_tree(text: str) -> Any:
+    """Mappings, lists and plain values of a file's text; YamlError for any other."""
+    start = text.lstrip()[:1]
+    if start == "<":
+        return _load_xml(text)
+    if start == "{":
+        try:
+            tree = json.loads(text)
+        except (ValueError, RecursionError):
+            return load_yaml(text)  # flow style, and its message if that fails, too
+        check_tree(tree)
+        return tree
+    return load_yaml(_TAG.sub("", _DIRECTIVE.sub("", text)))
+
+
 def _load_xml(text: str) -> Any:
-    if _FORBIDDEN in text:
+    # XML may define names that stand for ever longer text; OpenCV defines none.
+    if "<!ENTITY" in text:
         raise YamlError("the XML defines entities")
     try:
-        root = ElementTree.fromstring(text)
-        return {item.tag: _value(item) for item in root}
+        return {item.tag: _xml_value(item) for item in ElementTree.fromstring(text)}
     except RecursionError:
         raise YamlError("the XML nests too deep") from None
     except (ElementTree.ParseError, ValueError) as error:
         raise YamlError(f"the XML cannot be read: {error}") from error
 
 
-def _value(item: ElementTree.Element) -> Any:
+def _xml_value(item: ElementTree.Element) -> Any:
     if len(item):
-        return {part.tag: _value(part) for part in item}
+        return {part.tag: _xml_value(part) for part in item}
     words = (item.text or "").split()
-    values = [_number(word) for word in words]
+    try:
+        values: list[Any] = [float(word) for word in words]
+    except ValueError:
+        values = words
     return values[0] if len(values) == 1 and item.tag != "data" else values
 
 
-def _number(word: str) -> Any:
-    try:
-        return int(word)
-    except ValueError:
-        pass
-    try:
-        return float(word)
-    except ValueError:
-        return word
+def _fields_in_words(text: str) -> str:
+    with contextlib.suppress(YamlError):
+        if isinstance(tree := _load_tree(text), dict):
+            return f"found {', '.join(sorted(map(str, tree))[:8]) or 'nothing'}"
+    return "found neither"
 
 
-# Parameters of each model behind its size, in the order of the models' numbers in COLMAP's binary
-# files; f stands for both focal lengths. Names of coefficients are those of OpenCV, whose order is
-# k1 k2 p1 p2 k3 k4 k5 k6 (fisheye: k1 k2 k3 k4).
+def _at(tree: dict[str, Any], paths: tuple[str, ...]) -> Iterator[Any]:
+    """What the tree has at each dotted path."""
+    for path in paths:
+        item: Any = tree
+        for name in path.split(".") if path else ():
+            item = item.get(name) if isinstance(item, dict) else None
+        if item is not None:
+            yield item
+
+
+def _nested(tree: dict[str, Any]) -> dict[str, Any]:
+    """The tree with a mapping for names before a dot, as ORB-SLAM's ``Camera1.fx``."""
+    nested = dict(tree)
+    for name, value in tree.items():
+        first, dot, rest = str(name).partition(".")
+        if dot and isinstance(nested.setdefault(first, {}), dict):
+            nested[first] = nested[first] | {rest: value}
+    return nested
+
+
+def _of_program(tree: dict[str, Any], program: _Program) -> Camera | None:
+    """The camera of a program's file; None: it is of another."""
+    lens = next((item for item in _at(tree, program.K) if _numbers(item) or "fx" in item), None)
+    if lens is None:
+        return None
+    size = next((both for item in _at(tree, program.size) if (both := _size(item))), None)
+    if size is None:
+        raise ValueError("it has no image size: add image_width and image_height")
+    said = next((item for item in _at(tree, program.model) if item), program.default)
+    name = "fisheye" if tree.get("fisheye_model") else str(said).lower()  # of OpenCV's example
+    model = _MODELS.get(name, name)
+    coefficients = (_distortion(item, model) for item in _at(tree, program.D))
+    D = next((found for found in coefficients if found is not None), None)
+    if D is None and _numbers(lens):  # which writers have before the coefficients
+        raise ValueError(
+            "it has a camera matrix and no distortion coefficients: is it cut off? A lens "
+            "without distortion says so: distortion_coefficients: {data: []}"
+        )
+    D = np.zeros(0) if D is None else D
+    # Without a name, OpenCV's own model: its first coefficients mean the same in all lengths.
+    if name in ("", "pinhole") or name.startswith("lensmodel_opencv"):
+        model = "rational_polynomial" if len(D) >= _RATIONAL else "plumb_bob"
+    seconds = 1e-3 * float(tree.get(program.readout_ms) or 0.0) * (size[1] - 1) / size[1]
+    return Camera(*size, _matrix(lens), D, model, readout_time=max(seconds, 0.0))
+
+
+def gyroflow_camera(tree: dict[str, Any]) -> Camera | None:
+    """The camera of a lens profile of Gyroflow; None: it is none.
+
+    Raises:
+        ValueError, KeyError, TypeError: when something is missing or impossible.
+    """
+    return _of_program(tree, _GYROFLOW)
+
+
+def _numbers(item: Any) -> bool:
+    """Whether it is a list, or a matrix of ROS or OpenCV, and no mapping of names."""
+    return not isinstance(item, dict) or "data" in item
+
+
+def _values(item: Any) -> Array:
+    return np.array(item["data"] if isinstance(item, dict) else item, np.float64).ravel()
+
+
+def _matrix(item: Any) -> Array:
+    if _numbers(item):
+        return _values(item).reshape(3, 3)
+    fx, cx, cy = (float(item[name]) for name in ("fx", "cx", "cy"))
+    return pinhole_matrix(fx, float(item.get("fy", fx)), cx, cy)
+
+
+def _size(item: Any) -> tuple[int, int] | None:
+    """Width and height of a pair or a mapping; None: it says neither."""
+    if isinstance(item, dict) and not _numbers(item):
+        sides = [next((item[n] for n in names if n in item), None) for names in (_WIDTH, _HEIGHT)]
+        if sides == [None, None]:
+            return None
+        if None in sides:
+            raise KeyError((_WIDTH, _HEIGHT)[sides.index(None)][0])
+    else:
+        sides = _values(item).tolist()
+    width, height = map(int, sides)
+    return width, height
+
+
+def _distortion(item: Any, model: str) -> Array | None:
+    """Coefficients of a list, or by their names; None: it has none of them."""
+    if _numbers(item):
+        return _values(item)
+    names = _ORDER["equidistant" if model == "equidistant" else "rational_polynomial"]
+    present = [name in item for name in names]
+    if not any(present):
+        return None
+    last = len(names) - present[::-1].index(True)
+    count = 4 if last <= 4 else 5 if last == 5 else _RATIONAL
+    return np.array([float(item.get(name, 0.0)) for name in names[:count]])
+
+
+# Parameters of COLMAP's models behind its size; f stands for both focal lengths.
 _COLMAP_MODELS: dict[str, tuple[str, str]] = {
     "SIMPLE_PINHOLE": ("f cx cy", "plumb_bob"),
     "PINHOLE": ("fx fy cx cy", "plumb_bob"),
@@ -105,11 +319,8 @@ _COLMAP_MODELS: dict[str, tuple[str, str]] = {
     "OPENCV": ("fx fy cx cy k1 k2 p1 p2", "plumb_bob"),
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "equidistant"),
     "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "rational_polynomial"),
-}
-_ORDER = {
-    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
-    "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "equidistant": ("k1", "k2", "k3", "k4"),
+    "SIMPLE_RADIAL_FISHEYE": ("f cx cy k1", "equidistant"),
+    "RADIAL_FISHEYE": ("f cx cy k1 k2", "equidistant"),
 }
 _LINE = re.compile(r"^\s*(\d+)\s+([A-Z][A-Z_]+)((?:\s+[-+.\deE]+)+)\s*$", re.MULTILINE)
 # COLMAP has the corner of the first pixel at 0, 0; here that is its centre.
@@ -119,12 +330,6 @@ _HALF = 0.5
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
     """The camera matrix (3,3)."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def _is_colmap(text: str) -> bool:
-    """Whether the first line that is no comment is one of ``cameras.txt``."""
-    lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
-    return _LINE.match(next(lines, "")) is not None
 
 
 def colmap_camera(text: str, chosen: str | None) -> Camera:
@@ -145,19 +350,6 @@ def colmap_camera(text: str, chosen: str | None) -> Camera:
     D = [values.get(name, 0.0) for name in _ORDER[distortion]]
     K = pinhole_matrix(fx, fy, values["cx"] - _HALF, values["cy"] - _HALF)
     return Camera(int(words[0]), int(words[1]), K, np.array(D if any(D) else []), distortion)
-
-
-def colmap_line(number: int, model: int, width: int, height: int, parameters: Array) -> str:
-    """A camera of COLMAP's binary files as a line of its text files.
-
-    Raises:
-        ValueError: for a model that is not supported.
-    """
-    names = list(_COLMAP_MODELS)
-    if not 0 <= model < len(names):
-        raise ValueError(f"model must be one of {', '.join(names)}; found COLMAP's number {model}")
-    values = " ".join(repr(float(value)) for value in parameters)
-    return f"{number} {names[model]} {width} {height} {values}"
 
 
 def pixel_intrinsics(camera: Camera) -> tuple[Array, Array]:
@@ -189,187 +381,6 @@ def colmap_parameters(camera: Camera) -> dict[str, Any]:
         model = "FULL_OPENCV"
     names = _COLMAP_MODELS[model][0].split()
     return {"model": model, "params": [values.get(name, 0.0) for name in names]}
-
-
-_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "mtx")
-_DISTORTION = (
-    *("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs"),
-    *("dist_coeff", "distortion", "dist", "D"),
-)
-_WIDTH = ("image_width", "image_Width", "width", "w")
-_HEIGHT = ("image_height", "image_Height", "height", "h")
-_SIZE = ("image_size", "imageSize", "img_size", "resolution", "size")
-_NAMED = _ORDER["rational_polynomial"]
-_RATIONAL = 8  # coefficients and more
-# Other names of the models.
-_MODELS = {
-    "fisheye": DistortionModel.EQUIDISTANT,
-    "opencv_fisheye": DistortionModel.EQUIDISTANT,
-    "radtan": DistortionModel.PLUMB_BOB,
-    "pinhole": DistortionModel.PLUMB_BOB,
-    "none": DistortionModel.PLUMB_BOB,
-    "double_sphere": DistortionModel.DOUBLE_SPHERE,
-}
-
-
-def _has_fields(tree: dict[str, Any]) -> bool:
-    """Whether a mapping has a camera matrix, or focal lengths."""
-    return any(name in tree for name in (*_MATRIX, "fx"))
-
-
-def _of_fields(tree: dict[str, Any]) -> Camera:
-    width, height = _size(tree)
-    D = _distortion(tree)
-    return Camera(width, height, _matrix(tree), D, _model(tree, len(D)))
-
-
-def _first(tree: dict[str, Any], names: tuple[str, ...]) -> Any:
-    return next((tree[name] for name in names if name in tree), None)
-
-
-def _values(item: Any) -> Array:
-    """Numbers in a list, a list of lists, or the data of a matrix of ROS or OpenCV."""
-    if isinstance(item, dict):
-        item = item["data"]
-    return np.array(item, np.float64).ravel()
-
-
-def _size(tree: dict[str, Any]) -> tuple[int, int]:
-    width, height = _first(tree, _WIDTH), _first(tree, _HEIGHT)
-    if width is None and height is None:
-        both = _first(tree, _SIZE)
-        if both is None:
-            raise ValueError("it has no image size: add image_width and image_height")
-        width, height = _values(both).tolist()
-    if width is None or height is None:
-        raise KeyError((_WIDTH if width is None else _HEIGHT)[0])
-    return int(width), int(height)
-
-
-def _matrix(tree: dict[str, Any]) -> Array:
-    item = _first(tree, _MATRIX)
-    if item is not None:
-        return _values(item).reshape(3, 3)
-    fx, cx, cy = (float(tree[name]) for name in ("fx", "cx", "cy"))
-    return pinhole_matrix(fx, float(tree.get("fy", fx)), cx, cy)
-
-
-def _distortion(tree: dict[str, Any]) -> Array:
-    item = _first(tree, _DISTORTION)
-    if item is not None:
-        return _values(item)
-    present = [name in tree for name in _NAMED]
-    if not any(present):
-        if _first(tree, _MATRIX) is not None:  # which writers have before the coefficients
-            raise ValueError(
-                "it has a camera matrix and no distortion coefficients: is it cut off? A lens "
-                "without distortion says so: distortion_coefficients: {data: []}"
-            )
-        return np.zeros(0)
-    last = len(present) - present[::-1].index(True)
-    count = 4 if last <= 4 else 5 if last == 5 else _RATIONAL
-    return np.array([float(tree.get(name, 0.0)) for name in _NAMED[:count]])
-
-
-def _model(tree: dict[str, Any], count: int) -> str:
-    name = tree.get("distortion_model") or tree.get("camera_model") or tree.get("model")
-    if tree.get("fisheye_model"):  # of OpenCV's calibration example
-        return DistortionModel.EQUIDISTANT
-    if name is not None:
-        name = str(name).lower()
-        if name == "pinhole" and count >= _RATIONAL:
-            return DistortionModel.RATIONAL_POLYNOMIAL
-        return _MODELS.get(name, name)
-    # Without a name, OpenCV's own model: its first coefficients mean the same in all lengths.
-    rational = count >= _RATIONAL
-    return DistortionModel.RATIONAL_POLYNOMIAL if rational else DistortionModel.PLUMB_BOB
-
-
-CALIBRATION_KINDS = (
-    "calibration file of ROS' camera_calibration, OpenCV (YAML, XML), Kalibr (camchain), COLMAP "
-    "(cameras.txt), BoofCV, or JSON with K, D, width and height"
-)
-# Who writes FILE#cam1 means a camera in a file; a name of a file may hold the sign, too.
-_CHOICE = re.compile(r"(.+)#([^/#]+)")
-
-
-class CalibrationError(ValueError):
-    """A calibration file that cannot be used; the message names the file and the fault."""
-
-
-def read_calibration(path: Path | str) -> Camera:
-    """Camera of a calibration file (see the module), with the readout time left at 0.
-
-    Args:
-        path: the file; ``FILE#NAME`` chooses one of several cameras in it.
-
-    Raises:
-        CalibrationError: for anything else, saying what was found.
-    """
-    path, chosen = _split(Path(path))
-    with calibration_faults(path, "YAML, JSON or XML", "not a usable calibration"):
-        text = path.read_text(encoding="utf-8")
-        camera = _camera(text, chosen)
-    if camera is None:
-        raise CalibrationError(
-            f"{path} is not a calibration: expected a {CALIBRATION_KINDS}; {_fields_in_words(text)}"
-        )
-    x, y = camera.K[:2, 2]
-    if not (0.0 < x < camera.width and 0.0 < y < camera.height):
-        raise CalibrationError(
-            f"{path} is not a usable calibration: its principal point ({x:g}, {y:g}) lies outside "
-            f"its image of {camera.width}x{camera.height}: are width and height exchanged, or of "
-            "another resolution?"
-        )
-    return camera
-
-
-@contextlib.contextmanager
-def calibration_faults(path: Path, kind: str, unusable: str) -> Iterator[None]:
-    """Faults within ``with`` of a file, and of what it says, name the file."""
-    with file_faults(path, CalibrationError, kind):
-        try:
-            yield
-        except (YamlError, UnicodeDecodeError):
-            raise
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            fault = f"no {error}" if isinstance(error, KeyError) else str(error)
-            raise CalibrationError(f"{path} is {unusable}: {fault}") from error
-
-
-def _split(path: Path) -> tuple[Path, str | None]:
-    match = _CHOICE.fullmatch(str(path))
-    if match is None or path.exists():
-        return path, None
-    return Path(match[1]), match[2]
-
-
-def _camera(text: str, chosen: str | None) -> Camera | None:
-    if _is_colmap(text):
-        return colmap_camera(text, chosen)
-    tree = _load_tree(text)
-    if not isinstance(tree, dict):
-        return None
-    cameras = {name: item for name, item in tree.items() if _is_kalibr(item)}
-    if cameras:
-        return kalibr_camera(_choose(cameras, chosen))
-    if chosen is not None:
-        raise ValueError(f"it has no camera {chosen!r} to choose")
-    readers: tuple[tuple[bool, Callable[[dict[str, Any]], Camera]], ...] = (
-        (_is_kalibr(tree), kalibr_camera),
-        ("pinhole" in tree, _boofcv),
-        (_has_fields(tree), _of_fields),
-    )
-    return next((reader(tree) for fits, reader in readers if fits), None)
-
-
-def _fields_in_words(text: str) -> str:
-    try:
-        tree = _load_tree(text)
-    except YamlError:
-        tree = None
-    keys = sorted(map(str, tree)) if isinstance(tree, dict) else []
-    return f"found {', '.join(keys[:8]) or 'neither'}"
 
 
 # Kalibr's names of lenses, for pinholes; the others stand as camera_model.
@@ -431,22 +442,6 @@ def kalibr_fields(camera: Camera) -> dict[str, Any]:
         "distortion_coeffs": [] if plain else D[:4],
         "resolution": [camera.width, camera.height],
     }
-
-
-def _boofcv(tree: dict[str, Any]) -> Camera:
-    pinhole = tree["pinhole"]
-    if pinhole.get("skew", 0.0) != 0.0:
-        raise ValueError(f"skew must be 0, found {pinhole['skew']}")
-    lens = tree.get("radial_tangential", {})
-    if not lens and tree.get("model") != "pinhole":
-        raise ValueError("it has no radial_tangential: is it cut off?")
-    radial = [float(value) for value in lens.get("radial") or []]
-    if len(radial) > 3:
-        raise ValueError(f"at most 3 radial coefficients are supported, found {len(radial)}")
-    k1, k2, k3 = radial + [0.0] * (3 - len(radial))
-    D = np.array([k1, k2, float(lens.get("t1", 0.0)), float(lens.get("t2", 0.0)), k3])
-    K = pinhole_matrix(*(pinhole[name] for name in ("fx", "fy", "cx", "cy")))
-    return Camera(int(pinhole["width"]), int(pinhole["height"]), K, D)
 
 
 def write_calibration(path: Path, camera: Camera) -> None:

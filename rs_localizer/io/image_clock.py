@@ -5,7 +5,7 @@
 from dataclasses import dataclass
 
 DEFAULT_START_NS = 1_000_000_000
-"""Stamp of the first image where a file has only differences: to ROS, a time of 0 means none."""
+"""Stamp of the zero of a video's clock, which all its streams have: to ROS, 0 means none."""
 
 # Rates that differ by less are called the same by cameras and by those who give --rate: 29.97, 30.
 _SAME_RATE = 0.02
@@ -22,13 +22,15 @@ class ImageClock:
     Args:
         rate: images per second instead of the file's own times; None: these.
         start_ns: stamp of the first image; None: its own where the file has absolute times,
-            otherwise :data:`DEFAULT_START_NS`.
+            otherwise :data:`DEFAULT_START_NS` and its time in the file.
         zero_ns: own time that becomes ``start_ns``; None: that of the first image.
+        missing: what is to be said of images that could not be read.
     """
 
     rate: float | None = None
     start_ns: int | None = None
     zero_ns: int | None = None
+    missing: str | None = None
     _images: int = 0
     _first_ns: int = 0  # own time of the first image
     _last_ns: int = 0  # own time of the last image that has one
@@ -57,7 +59,8 @@ class ImageClock:
             if self._timed == 0:
                 self._first_ns = own_ns
             if self.zero_ns is None:
-                self.zero_ns = own_ns
+                starts_at_zero = self.start_ns is None and not self._absolute
+                self.zero_ns = 0 if starts_at_zero else own_ns
             self._last_ns = own_ns
             self._timed += 1
         if index == 0 and self.start_ns is None:
@@ -87,14 +90,15 @@ class ImageClock:
         source = own if self.rate is None else f"--rate {self.rate:g}"
         own_rate = self.own_rate
         pace = f", {own_rate:.4g} images/s on average" if own_rate and self.rate is None else ""
-        start = round((self.start_ns or 0) * 1e-9, 3)
+        first_ns = 0 if self.rate is not None else self._first_ns - (self.zero_ns or 0)
+        start = round(((self.start_ns or 0) + first_ns) * 1e-9, 3)
         return f"times: {source}{pace}; the first image at {start:.14g} s (--start sets it)"
 
     def fault(self) -> str | None:
-        """What speaks against a given rate."""
+        """What speaks against the images, or else against a given rate."""
         own_rate = self.own_rate
-        if self.rate is None or own_rate is None:
-            return None
+        if self.missing is not None or self.rate is None or own_rate is None:
+            return self.missing
         if abs(self.rate / own_rate - 1.0) <= _SAME_RATE:
             return None
         return (

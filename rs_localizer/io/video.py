@@ -3,8 +3,10 @@
 """Videos as JPEG images with their presentation times."""
 
 import contextlib
+import importlib.util
 import itertools
 import mmap
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,7 +35,129 @@ class VideoImage(NamedTuple):
 
     jpeg: bytes
     image: Image  # grey (height, width)
-    seconds: float | None  # presentation time since the first image; None: the file does not say
+    seconds: float | None  # presentation time by the file's clock; None: the file does not say
+
+
+class Video:
+    """The images of a video, in the order of presentation; to be iterated over once.
+
+    A plain stream of JPEG images (``.mjpeg``) keeps its bytes and has no times. Anything else is
+    read by PyAV, where it is installed, and compressed anew: it has one clock for all streams of
+    a file, decodes what OpenCV may have no decoder for (AV1), and says where it stops. OpenCV
+    counts from the first image on.
+
+    Args:
+        path: of the video.
+        lens: of :func:`count_lenses`, from 0 on; None: the first stream of images.
+
+    Raises:
+        VideoError: when the file is missing, or, as it is read, holds no image.
+        ImportError: with a lens, without PyAV.
+    """
+
+    def __init__(self, path: Path | str, lens: int | None = None) -> None:
+        self.path, self._lens = Path(path), lens
+        self.claimed = 0  # images by the container, once they are read; 0: it does not say
+        self.read = 0
+        if not self.path.is_file():
+            raise VideoError(f"{path} does not exist")
+
+    def __iter__(self) -> Iterator[VideoImage]:
+        with self.path.open("rb") as file:
+            is_stream = file.read(2) == _JPEG_START
+        if is_stream and self._lens is None:
+            images = _from_stream(self.path)
+        elif self._lens is not None or importlib.util.find_spec("av") is not None:
+            images = self._by_pyav()
+        else:
+            images = self._by_opencv()
+        for image in images:
+            self.read += 1
+            yield image
+        if not self.read:
+            raise VideoError(
+                f"{self.path} holds no image that can be read (pip install av, of the extra video "
+                "of rs_localizer, brings more decoders)"
+            )
+
+    @property
+    def fault(self) -> str | None:
+        """That images are missing, after all have been read: the end of a file is not believed."""
+        if self.read + _UNCOUNTED >= self.claimed:
+            return None
+        return (
+            f"{self.path.name} says that it has {self.claimed} images, {self.read} could be read: "
+            "it is damaged or cut off"
+        )
+
+    def _by_pyav(self) -> Iterator[VideoImage]:
+        with _container(self.path) as container:
+            lenses = _lenses(container)
+            lens = self._lens or 0
+            if lens >= len(lenses):
+                raise VideoError(f"{self.path} is of {len(lenses)} lenses, no number {lens + 1}")
+            stream = lenses[lens]
+            stream.thread_type = "AUTO"
+            timed = not container.format.flags & _NO_TIMES
+            self.claimed, last = _claimed(container, stream), -np.inf
+            for packet in container.demux(stream):
+                for frame in _decoded(packet):
+                    seconds = float(frame.time) if timed and frame.time is not None else last
+                    is_new, last = seconds > last, max(last, seconds)
+                    yield _compressed(frame.to_ndarray(format="bgr24"), seconds if is_new else None)
+
+    def _by_opencv(self) -> Iterator[VideoImage]:
+        # It gives up after so many packets of other streams in a row.
+        os.environ.setdefault("OPENCV_FFMPEG_READ_ATTEMPTS", str(2**31 - 1))
+        last = -1.0
+        video = cv2.VideoCapture(str(self.path))
+        # Raw rows: a note that the picture should be shown upright turns the shutter, too.
+        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        self.claimed = _whole(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        try:
+            while True:
+                read, color = video.read()
+                if not read:
+                    return
+                # Of the image just read. OpenCV 4.6 says 0 for those last images that a decoder
+                # with B frames holds back, and for all images of a raw stream.
+                seconds = 1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC))
+                is_new = seconds > last
+                last = max(last, seconds)
+                yield _compressed(color, seconds if is_new else None)
+        finally:
+            video.release()
+
+
+# FFmpeg's AVFMT_NOTIMESTAMPS, of raw streams.
+_NO_TIMES = 0x0080
+_UNCOUNTED = 1  # images: an edit list may hide one, and rates of a duration are rounded
+_MOST_IMAGES = 10**9
+
+
+def _whole(count: float) -> int:
+    return int(count) if 0.0 < count < _MOST_IMAGES else 0  # NaN compares false
+
+
+def _claimed(container: Any, stream: Any) -> int:
+    """How many images a container says that it has; 0: it says nothing."""
+    if stream.frames:
+        return _whole(stream.frames)
+    # Matroska says how long it is, of all streams: a second of another one at the end is usual.
+    if not container.duration or not stream.average_rate:
+        return 0
+    seconds = container.duration * 1e-6 - float((stream.start_time or 0) * stream.time_base)
+    return _whole((seconds - 1.0) * float(stream.average_rate))
+
+
+def _decoded(packet: Any) -> list[Any]:
+    """The images of a packet; of a damaged one none, as OpenCV has it."""
+    import av
+
+    try:
+        return list(packet.decode())
+    except av.FFmpegError:
+        return []
 
 
 def count_lenses(path: Path) -> int:
@@ -47,37 +171,6 @@ def count_lenses(path: Path) -> int:
         return len(_lenses(container))
 
 
-def read_video(path: Path | str, lens: int | None = None) -> Iterator[VideoImage]:
-    """The images of a video, in the order of presentation.
-
-    A plain stream of JPEG images (``.mjpeg``) keeps its bytes and has no times; anything else that
-    OpenCV reads is compressed anew.
-
-    Args:
-        path: of the video.
-        lens: of :func:`count_lenses`, from 0 on: its images, whose times are since the first image
-            of the first lens; None: the only stream, or the one that OpenCV takes.
-
-    Raises:
-        VideoError: when the file is missing or holds no image.
-        ImportError: with a lens, without PyAV.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise VideoError(f"{path} does not exist")
-    with path.open("rb") as file:
-        is_stream = file.read(2) == _JPEG_START
-    if lens is not None:
-        images = _of_lens(path, lens)
-    else:
-        images = _from_stream(path) if is_stream else _from_container(path)
-    first = next(images, None)
-    if first is None:
-        raise VideoError(f"{path} holds no image that OpenCV can read")
-    yield first
-    yield from images
-
-
 @contextlib.contextmanager
 def _container(path: Path) -> Iterator[Any]:
     import av
@@ -85,27 +178,19 @@ def _container(path: Path) -> Iterator[Any]:
     try:
         with av.open(str(path)) as container:
             yield container
-    except av.FFmpegError as error:
+    except (av.FFmpegError, ValueError, UnicodeDecodeError) as error:
+        if isinstance(error, VideoError):
+            raise
         raise VideoError(f"{path} cannot be read: {error}") from error
 
 
 def _lenses(container: Any) -> list[Any]:
-    streams = container.streams.video
-    return [stream for stream in streams if stream.format.width == streams[0].format.width
-            and stream.format.height == streams[0].format.height]  # fmt: skip
-
-
-def _of_lens(path: Path, lens: int) -> Iterator[VideoImage]:
-    """By PyAV: OpenCV opens one stream of a file only."""
-    with _container(path) as container:
-        lenses = _lenses(container)
-        if lens >= len(lenses):
-            raise VideoError(f"{path} is of {len(lenses)} lenses, and has no number {lens + 1}")
-        begin = float((lenses[0].start_time or 0) * lenses[0].time_base)
-        lenses[lens].thread_type = "AUTO"
-        for frame in container.decode(lenses[lens]):
-            color = frame.to_ndarray(format="bgr24")
-            yield _compressed(color, None if frame.time is None else float(frame.time) - begin)
+    """The streams of images that have a decoder, and the size of the first one."""
+    streams = [s for s in container.streams.video if s.codec_context is not None and s.width]
+    if not streams:
+        raise VideoError(f"{container.name} has no stream of images that can be decoded")
+    size = streams[0].width, streams[0].height
+    return [stream for stream in streams if (stream.width, stream.height) == size]
 
 
 def _from_stream(path: Path) -> Iterator[VideoImage]:
@@ -121,28 +206,8 @@ def has_times(path: Path | str) -> bool:
     Raises:
         VideoError: when it cannot be read.
     """
-    first = list(itertools.islice(read_video(path), 2))
+    first = list(itertools.islice(Video(path), 2))
     return first[-1].seconds is not None
-
-
-def _from_container(path: Path) -> Iterator[VideoImage]:
-    last = -1.0
-    video = cv2.VideoCapture(str(path))
-    # Raw rows: a note that the picture should be shown upright turns the shutter, too.
-    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    try:
-        while True:
-            read, color = video.read()
-            if not read:
-                return
-            # Of the image just read. OpenCV 4.6 says 0 for those last images that a decoder with
-            # B frames holds back, and for all images of a raw stream.
-            seconds = 1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC))
-            is_new = seconds > last
-            last = max(last, seconds)
-            yield _compressed(color, seconds if is_new else None)
-    finally:
-        video.release()
 
 
 def _compressed(color: Any, seconds: float | None) -> VideoImage:

@@ -9,18 +9,8 @@ the viewer, y is to the viewer's right. Sizes are not in the file::
                                  "rotation": {"quaternion": {"W": 1, "X": 0, "Y": 0, "Z": 0}}}}],
      "field": {"length": 16.54, "width": 8.02}}
 
-TagSLAM's ``tagslam.yaml``: the tags of its static bodies. Metres; ``rotation`` is a rotation vector
-(rad); x of a tag is to the right, y up, z toward the viewer. Tags without a pose, which TagSLAM is
-to find, are left out::
-
-    bodies:
-      - lab:
-          is_static: true
-          default_tag_size: 0.16
-          pose: {position: {x: 0, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}
-          tags: [{id: 0, size: 0.16, pose: {position: {x: 0, y: 0, z: 0}, rotation: ...}}]
-
-Bundles of apriltag_ros (ROS 1), YAML. Metres; axes as TagSLAM's (AprilRobotics/apriltag_ros #156).
+Bundles of apriltag_ros (ROS 1), YAML. Metres; x of a tag is to the right, y up, z toward the viewer
+(AprilRobotics/apriltag_ros #156).
 What is missing of a pose is that of the origin. Standalone tags have no place::
 
     tag_family: tag36h11
@@ -54,8 +44,6 @@ _NUMBER = (int, float)
 _TAG_FROM_PRINT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 # A field of WPILib does not say sizes: all are the same to this part.
 _SAME_SIZE = 1e-3
-# What TagSLAM is given for a tag whose errors are not known (m, rad), and of the body, the map.
-_POSITION_NOISE, _ROTATION_NOISE, _AT_REST = 0.001, 0.001, 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +53,7 @@ class Unsaid:
     family: Family | None = None  # None: as the file says, or the usual one
     size: float | None = None  # m
     map_frame: str = "map"
-    part: str = ""  # name of the bundle or body to take
+    part: str = ""  # name of the bundle to take
 
 
 def _read_wpilib(file: Entry, family: Family, unsaid: Unsaid) -> list[Marker]:
@@ -103,70 +91,6 @@ def _write_wpilib(marker_map: MarkerMap, family: str) -> str:
     length, width = np.maximum(marker_map.points.max(axis=0), 0.0)[:2]
     field = {"length": round(float(length), 6), "width": round(float(width), 6)}
     return json.dumps({_TAG_FAMILY: family, "tags": tags, "field": field}, indent=1) + "\n"
-
-
-def _read_tagslam(file: Entry, family: Family, unsaid: Unsaid) -> list[Marker]:
-    markers, names = list[Marker](), []
-    for item in file.entries("bodies", "body"):
-        for name in item.names():  # one
-            names.append(name)
-            body = Entry(item.take(name, dict), f"body {name}")
-            if (unsaid.part or name) == name and body.take("is_static", bool, True):
-                markers += _tagslam_body(body, family)
-    if unsaid.part and unsaid.part not in names:
-        raise MarkerMapError(f"it has no body {unsaid.part}; it has {', '.join(names) or 'none'}")
-    if not markers:
-        raise MarkerMapError("none of its static bodies has tags with a pose")
-    return markers
-
-
-def _tagslam_body(body: Entry, family: Family) -> list[Marker]:
-    size = body.take("default_tag_size", _NUMBER, None)
-    place, turn = _tagslam_pose(body) if "pose" in body else (np.zeros(3), np.eye(3))
-    markers = []
-    for tag in body.entries("tags", "tag"):
-        tag.where = f"{body.where}: {tag.where}"
-        number = _identifier(tag, "id")
-        side = float(tag.take("size", _NUMBER, *([] if size is None else [size])))
-        if "pose" not in tag:
-            continue
-        own_place, own_turn = _tagslam_pose(tag)
-        with tag.named():
-            pose = Pose(turn @ own_place + place, turn @ own_turn)
-            markers.append(Marker.at(family.name, number, side, pose))
-    return markers
-
-
-def _tagslam_pose(entry: Entry) -> tuple[Array, Array]:
-    from rs_localizer.core import so3
-
-    pose = _below(entry, "pose", ": pose")
-    place = _vector(_below(pose, "position", ": position"), "xyz")
-    return place, so3.exp(_vector(_below(pose, "rotation", ": rotation"), "xyz"))
-
-
-def _write_tagslam(marker_map: MarkerMap, family: str) -> str:
-    """One static body."""
-    from scipy.spatial.transform import Rotation
-
-    tags = []
-    for marker in marker_map.markers:
-        deviations = marker.deviations
-        if deviations is None:
-            deviations = np.repeat([_POSITION_NOISE, _ROTATION_NOISE], 3)
-        pose = {
-            "position": _xyz(marker.pose.position),
-            "rotation": _xyz(Rotation.from_matrix(marker.pose.rotation).as_rotvec()),
-            "position_noise": _xyz(deviations[:3]),
-            "rotation_noise": _xyz(deviations[3:]),
-        }
-        tags.append({"id": marker.id, "size": rounded([marker.size])[0], "pose": pose})
-    # Each of its own: YAML would refer from one to the other.
-    at_rest = {"position": _xyz(np.zeros(3)), "rotation": _xyz(np.zeros(3))}
-    at_rest |= {f"{name}_noise": _xyz(np.full(3, _AT_REST)) for name in ("position", "rotation")}
-    body = {"is_static": True, "type": "simple", "pose": at_rest, "tags": tags}
-    name = marker_map.map_frame
-    return _yaml({_TAG_FAMILY: family, "default_body": name, "bodies": [{name: body}]})
 
 
 def _read_apriltag_ros(file: Entry, family: Family, unsaid: Unsaid) -> list[Marker]:
@@ -210,12 +134,11 @@ def _write_apriltag_ros(marker_map: MarkerMap, family: str) -> str:
 OWN = "rs_localizer"
 # By its keys a file is recognized; its reader, its writer, and what messages call it.
 _KEYS = {
-    OWN: ("markers", "boards"), "wpilib": ("tags",), "tagslam": ("bodies",),
+    OWN: ("markers", "boards"), "wpilib": ("tags",),
     "apriltag_ros": ("tag_bundles", "standalone_tags"),
 }  # fmt: skip
 _FOREIGN = {
     "wpilib": (_read_wpilib, _write_wpilib, "a field of WPILib"),
-    "tagslam": (_read_tagslam, _write_tagslam, "TagSLAM"),
     "apriltag_ros": (_read_apriltag_ros, _write_apriltag_ros, "apriltag_ros"),
 }
 FORMATS = (OWN, *_FOREIGN)

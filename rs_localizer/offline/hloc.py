@@ -22,7 +22,7 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.calibration import colmap_camera
-from rs_localizer.io.maps.colmap import read_images, read_model
+from rs_localizer.io.maps.colmap import read_model
 from rs_localizer.localizer import Localizer
 
 NO_PAIRS = "no image of the model is paired with it"
@@ -45,18 +45,8 @@ class Reference:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.images = read_images(folder)
         model = read_model(folder)
-        self.points = model.points
-        owners = np.repeat(np.arange(len(model.points)), np.diff(model.starts))
-        order = np.argsort(model.tracks["image"], kind="stable")
-        numbers, starts = np.unique(model.tracks["image"][order], return_index=True)
-        ends = [*starts[1:].tolist(), len(order)]
-        self._rows = {
-            number: order[start:end]
-            for number, start, end in zip(numbers.tolist(), starts.tolist(), ends, strict=True)
-        }
-        self._features, self._owners = model.tracks["feature"].astype(np.int64), owners
+        self.images, self.points, self._ids = model.images, model.points, model.ids
 
     def points_of(self, image: str, keypoints: IntArray) -> IntArray:
         """The points (m,) that these keypoints (m,) of an image show; -1: none.
@@ -71,13 +61,10 @@ class Reference:
                 f"the matches are of keypoint {keypoints.max()} of {image}, which has "
                 f"{count} in the model: are model and matches of one run?"
             )
-        rows = self._rows.get(known.number)
-        if rows is None or not len(keypoints):
-            return np.full(len(keypoints), -1)
-        features = self._features[rows]
-        shown = np.full(max(int(features.max()), int(keypoints.max())) + 1, -1)
-        shown[features] = self._owners[rows]
-        return shown[keypoints]
+        shown = np.full(len(keypoints), -1) if not count else known.points[keypoints]
+        rows = np.searchsorted(self._ids, shown)  # they rise
+        there = np.isin(shown, self._ids)
+        return np.where(there, rows, -1)
 
 
 def localize_queries(

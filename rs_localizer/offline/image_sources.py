@@ -20,7 +20,7 @@ from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
 from rs_localizer.io.rigs import optical_frame
 from rs_localizer.io.telemetry import Telemetry
 from rs_localizer.io.topics import IMU
-from rs_localizer.io.video import read_video
+from rs_localizer.io.video import Video
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 
@@ -70,7 +70,8 @@ def from_video(
         ValueError: when it cannot be read, or has no times and the clock no rate.
     """
     frame = CAMERA_FRAME if lens is None else optical_frame(LENSES[lens])
-    for jpeg, gray, seconds in read_video(path, lens):
+    video = Video(path, lens)
+    for jpeg, gray, seconds in video:
         now = clock.relative(None if seconds is None else round(1e9 * seconds))
         if now is None:
             lost = Refusal(Reason.NO_TIME, "it has no presentation time")
@@ -78,6 +79,7 @@ def from_video(
         else:
             compressed = _compressed(now, frame, jpeg, "jpeg")
             yield Shot(Image(now, frame, gray), _info(camera, now, frame), compressed, now)
+    clock.missing = video.fault
 
 
 def with_telemetry(

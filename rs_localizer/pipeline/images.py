@@ -18,7 +18,6 @@ from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.messages import Make
 from rs_localizer.markers.detection import Detections, MarkerDetector, warm_up
-from rs_localizer.markers.map_check import MapCheck
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
@@ -26,8 +25,6 @@ from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unhea
 # Single precision is what RViz shows: 3e-5 px at the rim of an image, and 0.1 mm at the end of a
 # map of a kilometre. Larger ones (georeferenced) need more.
 _LARGE_MAP = 1000.0  # m
-# The map is held against every image until so many have agreed, then against one in so many.
-_AGREED, _ONE_IN = 20, 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,9 +79,7 @@ class FrameDetector:
         self.map = marker_map
         self._notice = notice
         self._detector = MarkerDetector(marker_map, config.min_side)
-        self._check = MapCheck(marker_map)
         self._row = _row_type(marker_map.points)
-        self._agreed = self._images = 0
 
     def warm_up(self) -> None:
         """Compile the kernels."""
@@ -110,12 +105,4 @@ class FrameDetector:
             if markers:
                 shown = ", ".join(markers[:8]) + (", ..." if len(markers) > 8 else "")
                 self._notice(name, f"the image shows {shown}, {text}")
-        self._images += 1
-        if self._agreed < _AGREED or self._images % _ONE_IN == 0:
-            fault = self._check.fault(detections)
-            if fault is not None:
-                self._agreed = 0
-                self._notice(Notice.WRONG_MAP, fault)
-            elif len(detections.ids):
-                self._agreed += 1
         return Detected(image, detections, self.map, self._row)

@@ -13,7 +13,7 @@ from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.detections import TagDetections, read_detections
 from rs_localizer.markers.detection import Detections
-from rs_localizer.markers.map_check import MapCheck
+from rs_localizer.markers.map_check import flat_misfit
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse
@@ -28,6 +28,9 @@ _ORDERS = [
     for first in range(4)
     if (first, step) != (0, 1)
 ]
+# How far corners are from where a homography has them, in sides: in the right order (also those of
+# a fisheye lens, of two neighbours), and in a wrong one.
+_FITS, _MISFITS = 0.1, 0.25
 _CORNERS = ("upper left", "upper right", "lower right", "lower left")  # ours
 _SHOWN = 8  # names in a sentence
 
@@ -43,7 +46,6 @@ class Tags:
     def __init__(self, marker_map: MarkerMap, notice: Notify) -> None:
         self._map = marker_map
         self._notice = notice
-        self._check = MapCheck(marker_map)
         self._points = marker_map.points
         self._rows = {(m.family.kind, m.id): 4 * k for k, m in enumerate(marker_map.markers)}
         self._kinds = {
@@ -91,21 +93,29 @@ class Tags:
         self._images += 1
         if len(detections.ids) < 2 or (self._agreed >= _AGREED and self._images % _ONE_IN):
             return None
-        fault = self._check.fault(self._detections(detections, detections.corners))
-        if fault is None:
+        pair = self._neighbours(detections)
+        points = self._points[(detections.ids[pair, None] + np.arange(4)).ravel()]
+        corners = detections.corners[pair]
+        misfit = flat_misfit(points, corners.reshape(-1, 2))
+        if not misfit > _MISFITS:  # NaN, of two planes, says nothing
             self._agreed += 1
             return None
         for order in _ORDERS:
-            reordered = self._detections(detections, detections.corners[:, order])
-            if self._check.fault(reordered) is None:
+            if flat_misfit(points, corners[:, order].reshape(-1, 2)) < _FITS:
                 # A message has ours backwards.
                 names = [_CORNERS[order.index(k)] for k in (3, 2, 1, 0)]
                 return (
                     f"the map fits corners in the order {', '.join(names)}; apriltag's is "
                     f"{', '.join(_CORNERS[::-1])}"
                 )
-        self._notice(Notice.WRONG_MAP, fault)
         return None
+
+    def _neighbours(self, detections: TagDetections) -> IntArray:
+        """The two tags (2,) whose middles are nearest to each other in the map."""
+        middles = self._points[detections.ids[:, None] + np.arange(4)].mean(axis=1)
+        apart = np.linalg.norm(middles[:, None] - middles, axis=2)
+        np.fill_diagonal(apart, np.inf)
+        return np.array(np.unravel_index(np.argmin(apart), apart.shape))
 
     def _detections(self, detections: TagDetections, corners: Array) -> Detections:
         rows = (detections.ids[:, None] + np.arange(4)).ravel()

@@ -1,7 +1,8 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What tests of commands read: a flight, transforms, an IMU, ROS 1 bags, videos, a phone's log."""
+"""What tests of commands read: a flight, transforms, an IMU, ROS 1 bags, videos."""
 
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
+from rs_localizer.io.telemetry import CAMERA_FROM_SENSOR
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.imu import make_imu
@@ -58,17 +60,44 @@ def write_mp4(path: Path, images: Iterable[Any], rate: float) -> Path:
     return path
 
 
-def write_phone_log(
-    folder: Path, times: Any, rates: Any, stamps: Any, readout: float, exposure: float = 0.0
-) -> None:
-    """What MARS Logger writes: rates (n,3) in the phone's axes at times (n,) ns; images' stamps."""
-    heading = "Timestamp[nanosec],gx[rad/s],gy[rad/s],gz[rad/s],ax[m/s^2],ay[m/s^2],az[m/s^2]\n"
-    rows = zip(np.asarray(times), np.asarray(rates).tolist(), strict=True)
-    lines = [f"{time:.0f},{x!r},{y!r},{z!r},0,0,9.8\n" for time, (x, y, z) in rows]
-    (folder / "gyro_accel.csv").write_text(heading + "".join(lines))
-    heading = "Timestamp[nanosec],Exposure time[nanosec],Frame readout time[nanosec]\n"
-    lines = [f"{stamp:.0f},{1e9 * exposure:.0f},{1e9 * readout:.0f}\n" for stamp in stamps]
-    (folder / "movie_metadata.csv").write_text(heading + "".join(lines))
+def field(tag: int, value: int | float | str | bytes) -> bytes:
+    """A field of a message of protobuf."""
+
+    def varint(number: int) -> bytes:
+        low = number & 0x7F
+        return bytes([low | 0x80]) + varint(number >> 7) if number > 0x7F else bytes([low])
+
+    if isinstance(value, int):
+        return varint(8 * tag) + varint(value)
+    if isinstance(value, float):
+        return varint(8 * tag + 1) + struct.pack("<d", value)
+    data = value.encode() if isinstance(value, str) else value
+    return varint(8 * tag + 2) + varint(len(data)) + data
+
+
+def insta360(readings: bytes, *about: bytes) -> bytes:
+    """What Insta360 appends to a video, as telemetry-parser's source describes it.
+
+    Args:
+        readings: rows of ms, three of the accelerometer, three of the gyroscope.
+        about: fields of the camera.
+    """
+    records = b""
+    for kind, style, data in ((3, 0, readings), (1, 1, b"".join(about))):
+        records += data + struct.pack("<BBI", style, kind, len(data))
+    end = bytes(32) + struct.pack("<II", len(records) + 72, 3)
+    return records + end + b"8db42d694ccc418790edff439fe026bf"
+
+
+def add_telemetry(path: Path, seconds: Any, rates: Any, readout: float) -> None:
+    """Append the gyroscope, rates (n,3) in the camera's axes at times (n,), to a video."""
+    sensor = np.asarray(rates) @ CAMERA_FROM_SENSOR
+    milliseconds = np.round(1e3 * np.asarray(seconds) + 1000).astype(int).tolist()
+    rows = zip(milliseconds, sensor.tolist(), strict=True)
+    readings = b"".join(struct.pack("<Q6d", t, 1.0, 0.0, 0.0, *rate) for t, rate in rows)
+    about = field(2, "Insta360 GO 3"), field(24, 1000), field(25, 1e3 * readout)
+    with path.open("ab") as file:
+        file.write(insta360(readings, *about))
 
 
 def write_ros1(path: Path, messages: Iterable[tuple[str, int, Any]]) -> Path:

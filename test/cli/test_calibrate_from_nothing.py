@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recorded import write_mp4, write_phone_log
+from recorded import add_telemetry, write_mp4
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
@@ -20,7 +20,6 @@ from rs_localizer.cli.marker_map import find_map
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.calibration import read_calibration, write_calibration
 from rs_localizer.io.rigs import RigParts, read_camchain, write_camchain
-from rs_localizer.io.telemetry import CAMERA_FROM_SENSOR
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.io.video import count_lenses
 from rs_localizer.markers.map_files import read_marker_map, write_marker_map
@@ -167,16 +166,14 @@ def test_lens_and_board_come_without_a_readout_time(film, tmp_path, capsys):
     assert len(read_tum(tmp_path / "camera_seen_poses" / "poses.txt").positions) > 20
 
 
-def test_a_video_with_the_log_of_a_phone(film, tmp_path, capsys):
+def test_a_video_with_a_gyroscope(film, tmp_path, capsys):
     """Its gyroscope agrees with the images, its readout time does not."""
     images = (cv2.imread(str(file), 0) for file in sorted(film.iterdir()))
     path = write_mp4(tmp_path / "movie.mp4", images, RATE)
     write_calibration(tmp_path / "lens.yaml", LENS)
     times, late = np.arange(0.0, SECONDS, 0.005), 0.003
     before, after = (Rotation.from_matrix(pose(times - late + d)[0]) for d in (-1e-4, 1e-4))
-    device = (before.inv() * after).as_rotvec() / 2e-4 @ CAMERA_FROM_SENSOR
-    stamps = 1e9 * (5.0 + np.arange(0.0, SECONDS, 1.0 / RATE))
-    write_phone_log(tmp_path, 1e9 * (5.0 + times), device, stamps, 0.016)
+    add_telemetry(path, times, (before.inv() * after).as_rotvec() / 2e-4, 0.016)
     words = ["calibrate", str(path), *BOARD]
     out = tmp_path / "shutter.yaml"
     words += ["--calibration", str(tmp_path / "lens.yaml"), "--imu"]

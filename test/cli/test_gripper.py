@@ -10,13 +10,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from recorded import write_mp4, write_phone_log
+from recorded import add_telemetry, write_mp4
 
 from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.evaluation.room_mapping import Piece, Room
-from rs_localizer.io.telemetry import CAMERA_FROM_SENSOR
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.mapping.gauge import through
 from rs_localizer.markers.map_files import write_marker_map
@@ -34,13 +33,13 @@ DEMOS = Piece(37.56, 0.5, RATE), Piece(38.3, 0.5, RATE)
 
 
 def film(room: Room, piece: Piece, path: Path) -> np.ndarray:
-    """A video, and the log of the phone that took it; the stamps of its images, ns."""
+    """A video with its gyroscope; the stamps of its images, ns."""
     path.parent.mkdir()
     write_mp4(path, (image.pixels for image in room.images(piece)), RATE)
     stamps = np.array(room.stamps(piece))
     seconds = np.arange(-0.1, piece.duration + 0.2, 0.005)
-    device = room.motion.state(int(stamps[0]), seconds).angular @ CAMERA_FROM_SENSOR
-    write_phone_log(path.parent, stamps[0] + 1e9 * seconds, device, stamps, READOUT)
+    rates = room.motion.state(int(stamps[0]), seconds).angular
+    add_telemetry(path, seconds, rates, READOUT)
     return stamps
 
 
@@ -64,7 +63,7 @@ def test_demonstrations_become_trajectories(filmed, tmp_path, capsys):
     words = ["map", "build", str(folder / "room" / "room.mp4"), "--out", str(tmp_path / "room")]
     assert main([*words, *lens, "--markers", str(folder / "wall.yaml")]) == 0
     said = capsys.readouterr().out
-    assert "MARS Logger (gyro_accel.csv): gyroscope at 200 Hz, readout time 30.00 ms" in said
+    assert "Insta360 GO 3: gyroscope at 200 Hz, readout time 30.00 ms" in said
     words = ["replay", *map(str, filmed.demos), "--map", str(tmp_path / "room"), *lens, "--smooth"]
     table, buffer = tmp_path / "demos.parquet", tmp_path / "demos.zarr"
     tables = ["--parquet", str(table), "--zarr", str(buffer), "--workers", "1"]

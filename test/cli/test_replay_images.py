@@ -4,14 +4,12 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from recorded import write_mp4, write_phone_log
+from recorded import write_mp4
 
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import open_bag
@@ -61,18 +59,6 @@ def test_poses_are_those_of_detect_and_replay(kind: str, walls: Path, tmp_path: 
     names = (splat / "names.txt").read_text().split()
     assert len(names) > 5
     assert all((splat / name).is_file() for name in names)
-
-
-def test_what_a_phones_log_says_is_exported(walls: Path, tmp_path: Path) -> None:
-    video = shutil.copy(walls.parent / "walls.mp4", tmp_path)
-    write_phone_log(tmp_path, [0, 9e6], np.zeros((2, 3)), [0, 0], READOUT, 0.004)
-    words = ["--calibration", str(walls.parent / "camera.yaml"), "--nerfstudio", "--no-imu"]
-    words += ["--map", str(walls / "marker_map.yaml"), "--out", str(tmp_path / "scene")]
-    assert main(["replay", str(video), *words]) == 0
-    told = json.loads((tmp_path / "scene" / "transforms.json").read_text())
-    assert told["exposure_time"] == pytest.approx(0.004)
-    height = told["h"]
-    assert told["rolling_shutter_time"] == pytest.approx(READOUT * height / (height - 1))
 
 
 @pytest.mark.parametrize(

@@ -18,11 +18,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rs_localizer.io import bags
 from rs_localizer.io.bags import BagError, BagWriter, make_message, open_bag
 from rs_localizer.io.calibration import CalibrationError, read_calibration
-from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum
-from rs_localizer.io.video import VideoError, read_video, split_jpegs
+from rs_localizer.io.video import Video, VideoError, split_jpegs
 from rs_localizer.offline.hloc import HlocError, open_h5, read_queries
 
 COLMAP = Path(__file__).parent / "maps" / "colmap"
@@ -48,7 +47,7 @@ def test_a_stream_of_images_that_claim_too_much(tmp_path):
     image = b"\xff\xd8\xff\xc0" + size + b"\xff\xda\x00\x02" + bytes(20) + b"\xff\xd9"
     (tmp_path / "a.mjpeg").write_bytes(image * 3)
     with pytest.raises(VideoError, match="holds no image"):
-        list(read_video(tmp_path / "a.mjpeg"))
+        list(Video(tmp_path / "a.mjpeg"))
 
 
 @pytest.mark.parametrize("text", [bytes(50_000_000), b"1" * 50_000_000, POSE + b"# " * 10**7])
@@ -81,24 +80,8 @@ def test_a_view_in_the_place_of_descriptors(tmp_path):
     with sqlite3.connect(tmp_path / "model" / "database.db") as tables:
         tables.execute(endless)
     tables.close()
-    with pytest.raises(MapError, match="no table of descriptors"):
+    with pytest.raises(MapError, match="takes longer than"):
         read_map_file(tmp_path / "model", "map")
-
-
-@pytest.mark.parametrize("features", [2**40, 2**62, 2**64 - 1])
-def test_counts_of_a_model_that_lie(tmp_path, features):
-    image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.jpg\0"
-    data = struct.pack("<Q", 2**64 - 1) + image + struct.pack("<Q", features) + image
-    (tmp_path / "images.bin").write_bytes(data)
-    with pytest.raises(MapError, match="truncated or damaged"):
-        read_images(tmp_path)
-
-
-@pytest.mark.parametrize("point", ["1e999", "-nan", "9" * 40, "0.5"])
-def test_a_feature_of_a_point_that_is_no_number_of_one(tmp_path, point):
-    (tmp_path / "images.txt").write_text(f"1 1 0 0 0 0 0 1 1 a.jpg\n3 4 -1 5 6 {point}\n")
-    with pytest.raises(MapError, match="expected ID QW"):
-        read_images(tmp_path)
 
 
 def test_a_query_that_is_no_camera(tmp_path):

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("telemetry_parser", reason="needs telemetry-parser (rs_localizer[video])")
 
 import telemetry_parser
+from recorded import field, insta360
 
 from rs_localizer.cli import image_input
 from rs_localizer.cli.main import main
@@ -33,8 +34,10 @@ from rs_localizer.io.telemetry import (
     Telemetry,
     TelemetryError,
     has_telemetry,
+    interpreted,
     read_telemetry,
 )
+from rs_localizer.io.telemetry_process import extract
 from rs_localizer.settings import load_params_file
 
 RATE = 200.0
@@ -76,6 +79,24 @@ def test_what_cannot_be_read_is_named(tmp_path):
     assert not has_telemetry(path)
 
 
+def test_a_panic_of_the_library_is_an_error_with_a_name(log):
+    """A line without its columns: an index out of bounds in Rust, which is no Exception."""
+    log.write_text(log.read_text().replace("t,gx,gy,gz,ax,ay,az\n", "t,gx,gy,gz,ax,ay,az\n1,2\n"))
+    with pytest.raises(TelemetryError, match=r"log\.gcsv: its telemetry cannot be read, --no-tel"):
+        read_telemetry(log)
+
+
+def test_a_small_file_gets_little_memory(tmp_path):
+    """A trailer of 178 bytes that says that it is 4.2 GB long."""
+    record = field(2, "X")
+    trailer = record + struct.pack("<BBI", 1, 1, 2**32 - 100)
+    path = tmp_path / "bomb.insv"
+    path.write_bytes(bytes(60) + trailer + bytes(32) + struct.pack("<II", 2**32 - 8, 3)
+                     + b"8db42d694ccc418790edff439fe026bf")  # fmt: skip
+    with pytest.raises(TelemetryError, match=r"bomb\.insv: its telemetry cannot be read"):
+        read_telemetry(path)
+
+
 PROFILE = {  # as telemetry-parser makes them of DJI's files; there they name no model
     "calibrated_by": "DJI",
     "calib_dimension": {"w": 160, "h": 120},
@@ -86,25 +107,50 @@ PROFILE = {  # as telemetry-parser makes them of DJI's files; there they name no
 }
 
 
-@pytest.fixture
-def dji(monkeypatch: Any) -> Any:
-    """Reads what telemetry-parser would say of a file of DJI."""
+def readings(**changes: Any) -> dict[str, Any]:
+    """Of a hundred readings, as the process leaves them."""
+    gyroscope = np.column_stack([5.0 * np.arange(100), np.full((100, 3), 10.0)])
+    said = {"name": "X", "values": changes.pop("values", {}), "profile": changes.pop("profile", {})}
+    arrays = {"gyroscope": gyroscope, "accelerometer": np.zeros((0, 4)), "turns": np.zeros((0, 5)),
+              "exposures": np.zeros(0)}  # fmt: skip
+    return arrays | {"said": json.dumps(said)} | changes
 
-    def read(tags: list[Any], samples: Any = list) -> Telemetry:
-        parser = SimpleNamespace(
-            camera="DJI", model="Action 4", normalized_imu=samples, telemetry=lambda readable: tags
-        )
-        monkeypatch.setattr(telemetry_parser, "Parser", lambda path: parser)
-        read_telemetry.cache_clear()
-        found = read_telemetry(Path("DJI_0001.MP4"))
-        read_telemetry.cache_clear()
-        return found
 
-    return read
+def test_numbers_that_no_gyroscope_gives():
+    some = readings()["gyroscope"]
+    some[[3, 7], [1, 0]] = np.nan, 4.0  # a reading, and a time that falls
+    found = interpreted(readings(gyroscope=some))
+    assert len(found.times) == 98
+    assert np.all(np.diff(found.times) > 0.0)
+    with pytest.raises(TelemetryError, match="of 100 readings of the gyroscope, 99 are no numbers"):
+        interpreted(readings(gyroscope=some * [-1.0, 1.0, 1.0, 1.0]))
+    with pytest.raises(TelemetryError, match="100 are no numbers"):
+        interpreted(readings(gyroscope=some + 1e5))
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [
+        {"fisheye_params": 3}, {"fisheye_params": {"camera_matrix": "x"}},
+        {"fisheye_params": {"camera_matrix": [[1e400]]}}, {"distortion_model": "insta360"},
+        PROFILE | {"calib_dimension": None}, PROFILE | {"distortion_model": 7},
+    ],
+)  # fmt: skip
+def test_profiles_of_other_types(profile):
+    found = interpreted(readings(profile=profile, values={"frame_readout_time": "soon"}))
+    assert (found.profile, found.readout_time) == (None, None)
+
+
+def dji(tags: list[Any], samples: Any = list) -> Telemetry | None:
+    """What is made of what telemetry-parser would say of a file of DJI."""
+    parser = SimpleNamespace(
+        camera="DJI", model="Action 4", normalized_imu=samples, telemetry=lambda readable: tags
+    )
+    return interpreted(extract(parser))
 
 
 @pytest.mark.parametrize(("model", "known"), [({}, True), ({"distortion_model": "gopro"}, False)])
-def test_lens_profiles(log, dji, model, known):
+def test_lens_profiles(log, model, known):
     samples = telemetry_parser.Parser(str(log)).normalized_imu
     found = dji([{"Lens": {"Data": PROFILE | model}}], samples)
     name = model.get("distortion_model", "opencv_fisheye")
@@ -117,7 +163,7 @@ def test_lens_profiles(log, dji, model, known):
         np.testing.assert_allclose(found.profile.project(points[0]), pixels[0], atol=1e-9)
 
 
-def test_orientations_take_the_place_of_a_gyroscope(dji):
+def test_orientations_take_the_place_of_a_gyroscope():
     """As of DJI; a camera that turns to the right and then lifts its view."""
     times = 0.01 * np.arange(40)
     turns = [
@@ -145,21 +191,6 @@ def test_orientations_take_the_place_of_a_gyroscope(dji):
 MEI = {"xi": 2.0, "f": 2870.0, "centre": (1280.0, 1290.0), "k": (0.05, -0.1, 0.1), "size": 2560}
 
 
-def field(tag: int, value: int | float | str | bytes) -> bytes:
-    """A field of a message of protobuf."""
-
-    def varint(number: int) -> bytes:
-        low = number & 0x7F
-        return bytes([low | 0x80]) + varint(number >> 7) if number > 0x7F else bytes([low])
-
-    if isinstance(value, int):
-        return varint(8 * tag) + varint(value)
-    if isinstance(value, float):
-        return varint(8 * tag + 1) + struct.pack("<d", value)
-    data = value.encode() if isinstance(value, str) else value
-    return varint(8 * tag + 2) + varint(len(data)) + data
-
-
 def test_a_file_of_insta360(tmp_path):
     """Its trailer, written by hand as telemetry-parser's source describes it; the lens is that of
     Mei and Rives, here by its own formula.
@@ -174,12 +205,8 @@ def test_a_file_of_insta360(tmp_path):
     readings = b"".join(
         struct.pack("<Q6d", 1000 + 5 * k, 1.0, 0.0, 0.0, 0.5, 0.0, 0.1) for k in range(400)
     )
-    records = b""
-    for kind, style, data in ((3, 0, readings), (1, 1, about)):
-        records += data + struct.pack("<BBI", style, kind, len(data))
     path = tmp_path / "VID_1.insv"
-    path.write_bytes(bytes(5000) + records + bytes(32) + struct.pack("<II", len(records) + 72, 3)
-                     + b"8db42d694ccc418790edff439fe026bf")  # fmt: skip
+    path.write_bytes(bytes(5000) + insta360(readings, about))
     assert has_telemetry(path)
     found = read_telemetry(path)
     assert found.camera == "Insta360 GO 3"

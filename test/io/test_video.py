@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.io.video import has_times, read_video, split_jpegs
+from rs_localizer.io.video import Video, has_times, split_jpegs
 
 
 def jpegs(count: int) -> list[bytes]:
@@ -43,13 +43,13 @@ def test_broken_images_are_left_out():
 def test_stream_and_container(tmp_path):
     images = jpegs(3)
     (tmp_path / "a.mjpeg").write_bytes(b"".join(images))
-    read = list(read_video(tmp_path / "a.mjpeg"))
+    read = list(Video(tmp_path / "a.mjpeg"))
     assert [jpeg for jpeg, *_ in read] == images
     assert {item.seconds for item in read} == {None}
     assert read[0][1].shape == (24, 32)
 
     levels = [np.full((48, 64, 3), level, np.uint8) for level in (50, 100, 150, 200)]
-    read = list(read_video(film(tmp_path / "a.avi", levels, "MJPG")))
+    read = list(Video(film(tmp_path / "a.avi", levels, "MJPG")))
     assert [round(float(image.mean()), -1) for _, image, _ in read] == [50, 100, 150, 200]
     assert all(cv2.imdecode(np.frombuffer(jpeg, np.uint8), 0) is not None for jpeg, *_ in read)
 
@@ -60,7 +60,7 @@ def test_rows_stay_as_the_sensor_read_them(tmp_path):
     plain = jpegs(1)[0]
     segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
     (tmp_path / "a.mjpeg").write_bytes(plain[:2] + segment + plain[2:])
-    ((_, image, _),) = read_video(tmp_path / "a.mjpeg")
+    ((_, image, _),) = Video(tmp_path / "a.mjpeg")
     np.testing.assert_array_equal(image, cv2.imdecode(np.frombuffer(plain, np.uint8), 0))
 
     picture = np.zeros((48, 64, 3), np.uint8)
@@ -72,7 +72,7 @@ def test_rows_stay_as_the_sensor_read_them(tmp_path):
     at = data.rfind(matrix)
     data[at : at + len(half)] = half
     (tmp_path / "a.mp4").write_bytes(data)
-    ((_, image, _),) = read_video(tmp_path / "a.mp4")
+    ((_, image, _),) = Video(tmp_path / "a.mp4")
     assert image[:20].mean() > 150 > image[28:].mean()
 
 
@@ -105,7 +105,7 @@ def test_images_of_a_variable_rate_have_their_presentation_times(tmp_path):
     # A dropped image, a pause, two quick ones.
     milliseconds = [33, 33, 67, 33, 10, 500, 33, 33]
     mp4(tmp_path / "a.mp4", milliseconds)
-    read = list(read_video(tmp_path / "a.mp4"))
+    read = list(Video(tmp_path / "a.mp4"))
     expected = np.concatenate([[0], np.cumsum(milliseconds)[:-1]]) * 1e-3
     assert [item.seconds for item in read] == pytest.approx(list(expected), abs=1e-6)
     # Each time is that of its own image.
@@ -133,5 +133,5 @@ def test_an_image_whose_time_is_not_told_has_none(monkeypatch, tmp_path):
 
     real = cv2.VideoCapture
     monkeypatch.setattr(cv2, "VideoCapture", Forgetful)
-    times = [item.seconds for item in read_video(tmp_path / "a.mp4")]
+    times = [item.seconds for item in Video(tmp_path / "a.mp4")]
     assert times == [0.0, pytest.approx(0.033), None]

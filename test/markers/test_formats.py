@@ -36,17 +36,6 @@ tag_bundles:
       {id: 3, size: 0.08, x: 0.5, qw: 0.7071068, qz: 0.7071068}]},
   ]
 """
-TAGSLAM = """
-bodies:
- - lab:
-     is_static: true
-     default_tag_size: 0.12
-     pose: {position: {x: 1, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 1.5707963267948966}}
-     tags:
-     - {id: 4, pose: {position: {x: 2, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}}
-     - {id: 5, size: 0.2}
- - rig: {is_static: false}
-"""
 
 
 def written(folder: Path, text: str, name: str = "map.yaml") -> Path:
@@ -76,15 +65,6 @@ def test_bundles_of_apriltag_ros(tmp_path):
     with pytest.raises(MarkerMapError, match="2 bundles, each in a frame of its own"):
         read_any(written(tmp_path, two))
     assert len(read_any(written(tmp_path, two), Unsaid(part="wall"))[0].markers) == 2
-
-
-def test_bodies_of_tagslam(tmp_path):
-    found, kind = read_any(written(tmp_path, TAGSLAM))
-    (marker,) = found.markers
-    assert (kind, marker.id) == ("tagslam", 4)
-    assert marker.size == pytest.approx(0.12)
-    np.testing.assert_allclose(marker.pose.position, [1.0, 2.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(marker.pose.rotation[:, 0], [0.0, 1.0, 0.0], atol=1e-12)
 
 
 def some_map(family: str = "apriltag_36h11") -> MarkerMap:

@@ -19,7 +19,7 @@ if WORKING:
     from rs_localizer.cli.map import check_readout, print_step
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.calibration import read_calibration
-    from rs_localizer.io.maps.colmap import read_camera, read_images, read_model, write_model
+    from rs_localizer.io.maps.colmap import read_model, write_model
     from rs_localizer.io.maps.landmarks import MapError
     from rs_localizer.mapping.global_shutter import GlobalShutterModel, Shutter, undo_shutter
     from rs_localizer.offline.image_sources import have_times
@@ -74,8 +74,8 @@ def run(args: argparse.Namespace) -> None:
         raise UsageError("a model of a global shutter needs no refinement")
     folder, args.out = args.colmap
     try:
-        model, images = read_model(folder), read_images(folder)
-        camera = read_camera(folder)
+        model = read_model(folder)
+        images, camera = model.images, model.camera
     except MapError as error:
         raise MapError(f"{folder}: {error}") from error
     if args.calibration is not None:

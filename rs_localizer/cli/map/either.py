@@ -9,7 +9,7 @@ from collections import Counter
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, UsageError, number, refuse_existing
-from rs_localizer.io.maps.files import WRITERS, read_map_file
+from rs_localizer.io.maps.files import SUFFIX, read_map_file
 from rs_localizer.markers.formats import (
     FORMATS,
     OWN,
@@ -25,16 +25,16 @@ if WORKING:
     import numpy as np
 
     from rs_localizer.io.atomic_files import atomic_files
+    from rs_localizer.io.maps.files import write_npz
     from rs_localizer.io.maps.landmarks import Map, make_map
-    from rs_localizer.io.maps.ply import write_ply
     from rs_localizer.markers.families import family
     from rs_localizer.markers.maps import MarkerMap
 
 _KINDS = (
-    "landmarks: a .npz or .ply file or a folder of COLMAP; markers: a .yaml or .json file of "
+    "landmarks: a .npz file or a folder of COLMAP; markers: a .yaml or .json file of "
     f"{', '.join(FORMATS)}"
 )
-_OUTPUTS = (*WRITERS, *SUFFIXES)
+_OUTPUTS = (SUFFIX, *SUFFIXES)
 
 
 def add_input(parser: argparse.ArgumentParser) -> None:
@@ -51,13 +51,12 @@ def add_input(parser: argparse.ArgumentParser) -> None:
     foreign.add_argument("--family", help=f"(default: that of the file, or {USUAL_FAMILY.name})")
     foreign.add_argument("--size", type=number(0.0, above=True), metavar="M", help="of all markers")
     foreign.add_argument("--map-frame", metavar="NAME", help="(default: map)")
-    foreign.add_argument("--part", metavar="NAME", help="of several bundles or bodies")
+    foreign.add_argument("--part", metavar="NAME", help="of several bundles")
 
 
 def add_output(parser: argparse.ArgumentParser) -> None:
     """Where to, and as what."""
     parser.add_argument("out", type=Path, metavar="OUT", help=f"ends in {', '.join(_OUTPUTS)}")
-    parser.add_argument("--text", action="store_true", help="write .ply as text")
     parser.add_argument(
         "--to", choices=FORMATS, help="of markers (default: .json is of wpilib, .yaml our own)"
     )
@@ -86,11 +85,9 @@ def check_output(args: argparse.Namespace) -> None:
     suffix = args.out.suffix
     if suffix not in _OUTPUTS:
         raise UsageError(f"OUT must end in {' or '.join(_OUTPUTS)}, got {args.out}")
-    if args.text and suffix != ".ply":
-        raise UsageError("--text goes with .ply")
     if args.to is not None and (suffix == ".json") != (args.to == "wpilib"):
         raise UsageError(f"{args.to} is written to {'.json' if args.to == 'wpilib' else '.yaml'}")
-    if args.to is not None and suffix in WRITERS:
+    if args.to is not None and suffix == SUFFIX:
         raise UsageError("--to is for markers")
     refuse_existing(args)
 
@@ -98,8 +95,8 @@ def check_output(args: argparse.Namespace) -> None:
 def write(args: argparse.Namespace, any_map: Map | MarkerMap) -> None:
     """Write the map to OUT: markers as landmarks, their corners, with ids of ``detect``."""
     path: Path = args.out
-    if isinstance(any_map, Map) and path.suffix not in WRITERS:
-        raise UsageError(f"{args.file} holds landmarks, which go to {' or '.join(WRITERS)}")
+    if isinstance(any_map, Map) and path.suffix != SUFFIX:
+        raise UsageError(f"{args.file} holds landmarks, which go to {SUFFIX}")
     with atomic_files(path) as (part,):
         if isinstance(any_map, MarkerMap) and path.suffix in SUFFIXES:
             write_any(part, any_map, args.to or ("wpilib" if path.suffix == ".json" else OWN))
@@ -108,10 +105,7 @@ def write(args: argparse.Namespace, any_map: Map | MarkerMap) -> None:
             if isinstance(landmarks, MarkerMap):  # corners, whose ids are rows of its points
                 ids = np.arange(len(landmarks.points))
                 landmarks = make_map(landmarks.points, ids, None, landmarks.map_frame)
-            if args.text:
-                write_ply(part, landmarks, binary=False)
-            else:
-                WRITERS[path.suffix](part, landmarks)
+            write_npz(part, landmarks)
     print(f"written to {path}")
 
 

@@ -19,7 +19,7 @@ from rs_localizer.cli.rig_input import (
     mounting_lines,
 )
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
-from rs_localizer.io.maps.files import WRITERS, read_map_file
+from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
 from rs_localizer.io.topics import IMU
 
 if WORKING:
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--map", type=Path, metavar="MAP", help="the map (default: the points of the recording)"
     )
-    parser.add_argument("--out", type=Path, metavar="OUT", help=" or ".join(WRITERS))
+    parser.add_argument("--out", type=Path, metavar="OUT", help=f"ends in {SUFFIX}")
     parser.add_argument("--overwrite", action="store_true", help="replace OUT")
     parser.add_argument(
         "--shutter",
@@ -100,8 +100,8 @@ def run(args: argparse.Namespace) -> None:
         return
     if not args.recordings or args.out is None:
         raise UsageError("give RECORDING and --out OUT, or --colmap IN OUT")
-    if args.out.suffix not in WRITERS:
-        raise UsageError(f"--out must end in {' or '.join(WRITERS)}, got {args.out}")
+    if args.out.suffix != SUFFIX:
+        raise UsageError(f"--out must end in {SUFFIX}, got {args.out}")
     config = given_settings(args)
     refuse_existing(args)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
@@ -188,7 +188,7 @@ def _write(
         landmarks, points=result.points, covariances=result.covariances, error_modes=None
     )
     writers: dict[Path, Callable[[Path], object]] = {
-        args.out: lambda part: WRITERS[args.out.suffix](part, refined)
+        args.out: lambda part: write_npz(part, refined)
     }
     for name, camera in zip(names, result.cameras, strict=True) if args.intrinsics else ():
         of = f"{args.out.stem}_{name}" if name else args.out.stem

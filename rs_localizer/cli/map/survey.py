@@ -31,7 +31,7 @@ if WORKING:
     from rs_localizer.io.images import Image
     from rs_localizer.mapping.survey import MISFIT, Survey, survey_rig
     from rs_localizer.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
-    from rs_localizer.markers.consistency import problems
+    from rs_localizer.markers.map_check import other_units
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.markers.prints import Marker
@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> None:
     surveyed = tuple(replace(marker, deviations=deviations) for marker, deviations in pairs)
     marker_map = MarkerMap(surveyed, map_frame=args.map_frame)
     write_all({args.out: partial(write_marker_map, marker_map=marker_map)})
-    for text in problems(marker_map):
+    for text in other_units(marker_map):
         print(f"warning: {text}")
 
 

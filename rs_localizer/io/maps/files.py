@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 
 from rs_localizer.io.maps.colmap import read_colmap
 from rs_localizer.io.maps.landmarks import Map, MapError, make_map
-from rs_localizer.io.maps.ply import read_ply, write_ply
 from rs_localizer.io.remote import Location, local_copy
 
+SUFFIX = ".npz"
 _ARRAYS = ("points", "ids", "descriptors", "covariances", "error_modes")
-# Of all arrays together, unpacked: ten million landmarks with 128 bytes each, say.
+# Of all arrays together, as floats of 8 bytes: ten million landmarks with 128 bytes each, say.
 _MOST_BYTES = 2 * 2**30
-# Deflate packs no better than this.
-_BEST_PACKING = 1032
+# Maps hold measured numbers, which deflate packs no better than this beside some bytes of zeros.
+_BEST_PACKING, _ZEROS = 20, 2**25
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _LONGEST_HEADER = 10_000
 # What zipfile, zlib and NumPy raise for damaged files.
@@ -58,8 +58,12 @@ def _arrays(file: IO[bytes]) -> dict[str, NDArray[Any]]:
             if "points.npy" not in members:
                 names = ", ".join(sorted(members)[:10]) or "none"
                 raise MapError(f"the archive has no array 'points'; found {names}")
-            if sum(info.file_size for info in wanted) > _MOST_BYTES:
-                raise MapError(f"the arrays are larger than {_MOST_BYTES // 2**30} GiB")
+            packed = sum(info.compress_size for info in wanted)
+            most = min(_MOST_BYTES, _BEST_PACKING * packed + _ZEROS)
+            if sum(_checked(archive, info) for info in wanted) > most:
+                raise MapError(
+                    f"the arrays are larger than {most / 1e6:.0f} MB: no measured map is"
+                )
             return {info.filename[:-4]: _read(archive, info) for info in wanted}
     except MapError:
         raise
@@ -75,16 +79,21 @@ def write_npz(path: Path, landmarks: Map) -> None:
         np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
 
 
-def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+def _checked(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
+    """Bytes that an array will take, if its header and its size in the archive agree."""
     name = info.filename
     if info.compress_type not in _COMPRESSIONS:
         raise MapError(f"{name} is packed by method {info.compress_type}, which NumPy never uses")
-    if info.file_size > _BEST_PACKING * max(info.compress_size, 1):
-        raise MapError(f"{name}: {info.compress_size} bytes cannot unpack to {info.file_size}")
     with archive.open(info) as file:
-        expected = _size(file, name)
-    if expected != info.file_size:
-        raise MapError(f"{name}: its shape takes {expected} bytes, found {info.file_size}")
+        header, count, itemsize = _size(file, name)
+    if header + count * itemsize != info.file_size:
+        raise MapError(
+            f"{name}: its shape takes {header + count * itemsize} bytes, found {info.file_size}"
+        )
+    return count * (itemsize if name == "descriptors.npy" else max(8, itemsize))
+
+
+def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
     with archive.open(info) as file:
         array: NDArray[Any] = np.lib.format.read_array(
             file, allow_pickle=False, max_header_size=_LONGEST_HEADER
@@ -92,8 +101,8 @@ def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
     return array
 
 
-def _size(file: IO[bytes], name: str) -> int:
-    """Bytes of the whole member by its header: how much NumPy would allocate, and the header."""
+def _size(file: IO[bytes], name: str) -> tuple[int, int, int]:
+    """Bytes of a member's header, and by it how many numbers of how many bytes follow."""
     version = np.lib.format.read_magic(file)
     readers = {
         (1, 0): np.lib.format.read_array_header_1_0,
@@ -106,15 +115,11 @@ def _size(file: IO[bytes], name: str) -> int:
         raise MapError(f"{name} must hold numbers, found {kind}")
     if min(shape, default=0) < 0:
         raise MapError(f"{name} has the shape {shape}")
-    return file.tell() + math.prod(shape) * kind.itemsize  # Python integers do not overflow
-
-
-_READERS = {".npz": read_npz, ".ply": read_ply}
-WRITERS = {".npz": write_npz, ".ply": write_ply}
+    return file.tell(), math.prod(shape), kind.itemsize  # Python integers do not overflow
 
 
 def read_map_file(path: Location, frame: str, database: Path | None = None) -> Map:
-    """Read a map: a folder of COLMAP, a NumPy archive (.npz) or a PLY file (.ply).
+    """Read a map: a folder of COLMAP or a NumPy archive (.npz).
 
     Args:
         path: of the file or folder, or its URL.
@@ -132,17 +137,14 @@ def read_map_file(path: Location, frame: str, database: Path | None = None) -> M
                 return read_colmap(file, frame, database)
             if database is not None:
                 raise MapError("it is not a folder of COLMAP, which alone has a database")
-            if file.suffix not in _READERS:
-                endings = ", ".join(_READERS)
-                raise MapError(f"expected a folder of COLMAP or a file ending in {endings}")
-            return _READERS[file.suffix](file, frame)
+            return read_npz(file, frame)
         except MapError as error:
             raise MapError(f"{path}: {error}") from error
 
 
 def write_map_file(path: Path | str, landmarks: Map) -> None:
-    """Write a map to a .npz or .ply file; raises MapError for another name, OSError as any file."""
+    """Write a map to a .npz file; raises MapError for another name, OSError as any file."""
     path = Path(path)
-    if path.suffix not in WRITERS:
-        raise MapError(f"{path}: maps are written to files ending in {', '.join(WRITERS)}")
-    WRITERS[path.suffix](path, landmarks)
+    if path.suffix != SUFFIX:
+        raise MapError(f"{path}: maps are written to files ending in {SUFFIX}")
+    write_npz(path, landmarks)

@@ -16,13 +16,33 @@ camera_matrix: {rows: 3, cols: 3, data: [500.0, 0, 320.5, 0, 510.0, 240.5, 0, 0,
 distortion_model: rational_polynomial
 distortion_coefficients: {rows: 1, cols: 8, data: [1, 2, 3, 4, 5, 6, 7, 8]}
 """
-BOOFCV = """
-pinhole: {fx: 500.0, fy: 510.0, cx: 320.5, cy: 240.5, width: 640, height: 480, skew: 0.0}
-model: pinhole_radial_tangential
-radial_tangential:
-  radial: [0.05, -0.16]
-  t1: 0.001
-  t2: 0.002
+PHOTONVISION = """{"resolution": {"width": 640.0, "height": 480.0}, "cameraIntrinsics":
+ {"rows": 3, "cols": 3, "type": 6, "data": [500.0, 0, 320.5, 0, 510.0, 240.5, 0, 0, 1]},
+ "distCoeffs": {"rows": 1, "cols": 8, "type": 6, "data": [1, 2, 3, 4, 0, 0, 0, 0]},
+ "calobjectSize": {"width": 7.0, "height": 7.0}, "lensmodel": "LENSMODEL_OPENCV"}"""
+GYROFLOW = """{"calib_dimension": {"w": 640, "h": 480}, "orig_dimension": {"w": 64, "h": 48},
+ "fisheye_params": {"camera_matrix": [[500, 0, 320.5], [0, 510, 240.5], [0, 0, 1]],
+ "distortion_coeffs": [0.1, 0.2, 0.3, 0.4]}, "frame_readout_time": 9.6}"""
+VINS = """%YAML:1.0
+---
+model_type: PINHOLE
+image_width: 640
+image_height: 480
+distortion_parameters: {k1: 1.0, k2: 2.0, p1: 3.0, p2: 4.0}
+projection_parameters: {fx: 500.0, fy: 510.0, cx: 320.5, cy: 240.5}
+"""
+ORB_SLAM = """%YAML:1.0
+Camera.type: "KannalaBrandt8"
+Camera1.fx: 500.0
+Camera1.fy: 510.0
+Camera1.cx: 320.5
+Camera1.cy: 240.5
+Camera1.k1: 0.1
+Camera1.k2: 0.2
+Camera1.k3: 0.3
+Camera1.k4: 0.4
+Camera.width: 640
+Camera.height: 480
 """
 
 
@@ -49,7 +69,13 @@ FIVE = [0.1, -0.2, 1e-3, 2e-3, 0.3]
         (KALIBR, "equidistant", [0.1, 0.2, 0.3, 0.4]),
         (KALIBR.replace("equidistant", "radtan"), "plumb_bob", [0.1, 0.2, 0.3, 0.4]),
         (ROS, "rational_polynomial", [1, 2, 3, 4, 5, 6, 7, 8]),
-        (BOOFCV, "plumb_bob", [0.05, -0.16, 0.001, 0.002, 0]),
+        (PHOTONVISION, "rational_polynomial", [1, 2, 3, 4, 0, 0, 0, 0]),
+        (GYROFLOW, "equidistant", [0.1, 0.2, 0.3, 0.4]),
+        (VINS, "plumb_bob", [1, 2, 3, 4]),
+        (ORB_SLAM, "equidistant", [0.1, 0.2, 0.3, 0.4]),
+        (ORB_SLAM.replace("KannalaBrandt8", "PinHole").replace(".k4: 0.4", ".p1: 0.4"),
+         "plumb_bob", [0.1, 0.2, 0.4, 0, 0.3]),
+        (COLMAP.format("SIMPLE_RADIAL_FISHEYE", "500 321 241 .1"), "equidistant", [0.1, 0, 0, 0]),
         # COLMAP's first pixel has its corner at 0, 0; its order has the tangential ones third.
         (COLMAP.format("OPENCV", "500 510 321 241 .1 .2 .3 .4"), "plumb_bob",
          [0.1, 0.2, 0.3, 0.4, 0]),
@@ -69,8 +95,11 @@ def test_other_programs(tmp_path, text, model, D):
     (tmp_path / "camera").write_text(text)
     camera = read_calibration(tmp_path / "camera")
     assert (camera.width, camera.height, camera.distortion_model) == (640, 480, model)
-    np.testing.assert_allclose(camera.K, [[500, 0, 320.5], [0, 510, 240.5], [0, 0, 1]])
+    fy = 500 if "SIMPLE" in text else 510
+    np.testing.assert_allclose(camera.K, [[500, 0, 320.5], [0, fy, 240.5], [0, 0, 1]])
     np.testing.assert_allclose(camera.D, D)
+    # Gyroflow counts all rows.
+    assert camera.readout_time == pytest.approx(0.0096 * 479 / 480 if text == GYROFLOW else 0.0)
 
 
 @pytest.mark.parametrize("ending", ["yaml", "xml", "json"])
@@ -112,7 +141,8 @@ def test_one_of_several_cameras(tmp_path):
         ("width: 3\nname: x", r"is not a calibration: .* found name, width"),
         (ROS.replace("image_width", "breite"), r"not a usable calibration: no 'image_width'"),
         (ROS.replace("rational_polynomial", "fov"), r"distortion_model must be .* got 'fov'"),
-        (BOOFCV.replace("skew: 0.0", "skew: 0.5"), r"skew must be 0, found 0.5"),
+        (VINS.replace("PINHOLE", "MEI").replace("fx", "gamma1"), "or JSON with K, D, width and"),
+        (VINS.replace("PINHOLE", "SCARAMUZZA"), r"distortion_model must be .* got 'scaramuzza'"),
         (ROS[: ROS.index("distortion_model")], r"no distortion coefficients: is it cut off"),
         (KALIBR.replace("pinhole", "omni"), r"must be pinhole, eucm or ds, found 'omni'"),
         (COLMAP.format("FOV", "500 510 321 241 1"), r"model must be one of .* found FOV"),

@@ -4,7 +4,7 @@
 
 The model in the folder colmap was written by pycolmap 4.2.1 (4 images, 14 points with noise, SIFT
 descriptors that differ from view to view); truth.json is what pycolmap's own reader says of it,
-with the medoids worked out beside it in plain loops.
+with the medoids worked out beside it in plain loops. Images and the camera beside them were written by hand.
 """
 
 import io
@@ -24,33 +24,6 @@ from rs_localizer.io.maps.files import read_map_file, write_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
 
 COLMAP = Path(__file__).parent / "colmap"
-
-
-VERTICES = [(i, 9, -i, 7 + i, 2.5 * i, 3, i, 1, 2, -1) for i in range(4)]
-PLY = {
-    "big": b"".join(struct.pack(">fBfIdH3fb", *row) for row in VERTICES),
-    "little": b"".join(struct.pack("<fBfIdH3fb", *row) for row in VERTICES),
-    "ascii": b"".join(b"%d %d %d %d %g  %d %d %d %d %d\n" % row for row in VERTICES),
-}
-
-
-@pytest.mark.parametrize("form", list(PLY))
-def test_ply_of_another_author(tmp_path, form):
-    """Properties in any order and type, an element before the vertices, faces after them."""
-    header = (
-        f"ply\nformat {form if form == 'ascii' else f'binary_{form}_endian'} 1.0\n"
-        "comment made by hand\nelement camera 2\nproperty uchar a\nproperty int8 b\n"
-        "element vertex 4\nproperty float x\nproperty uchar red\nproperty float32 y\n"
-        "property uint id\nproperty double z\nproperty list ushort float descriptor\n"
-        "property char more\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    before = b"1 2\n3 4\n" if form == "ascii" else b"\x01\x02\x03\x04"
-    path = tmp_path / "map.ply"
-    path.write_bytes(header.encode() + before + PLY[form] + b"and whatever follows")
-    found = read_map_file(path, "map")
-    assert found.points.tolist() == [[i, -i, 2.5 * i] for i in range(4)]
-    assert found.ids.tolist() == [7, 8, 9, 10]
-    assert found.descriptors.tolist() == [[i, 1, 2] for i in range(4)]
 
 
 def test_an_archive_with_errors_that_landmarks_share(tmp_path):
@@ -124,9 +97,9 @@ FIRST_FEATURE_OF_IMAGE_2 = (
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ("UPDATE descriptors SET rows = 4000000000000", "4000000000000 descriptors of 128 bytes"),
-        ("UPDATE descriptors SET cols = 64, rows = 2 * rows WHERE image_id = 2", "64 x uint8"),
-        ("DROP TABLE descriptors", "no table of descriptors"),
+        ("UPDATE descriptors SET rows = 4000000000000", "cannot reshape"),
+        ("UPDATE descriptors SET cols = 64, rows = 2 * rows WHERE image_id = 2", "of 2 kinds"),
+        ("DROP TABLE descriptors", "no such table"),
         (FIRST_FEATURE_OF_IMAGE_2, "no point of the model"),
     ],
 )
@@ -135,7 +108,7 @@ def test_a_bad_database(tmp_path, change, text):
     with pytest.raises(MapError, match=text):
         read_map_file(COLMAP / "binary", "map", file)
     file.write_bytes(b"no database at all, but long enough to look like one" * 30)
-    with pytest.raises(MapError, match="cannot be read as a database"):
+    with pytest.raises(MapError, match="file is not a database"):
         read_map_file(COLMAP / "binary", "map", file)
 
 
@@ -197,81 +170,45 @@ def changed_header(path: Path, offset: int, value: int) -> None:
 def test_sizes_that_an_archive_claims(tmp_path):
     path = archive(tmp_path / "a.npz", points=npy((1, 3), "<f8", ONE))
     changed_header(path, 24, 2**32 - 2)  # the size unpacked
-    with pytest.raises(MapError, match="larger than 2 GiB"):
-        read_map_file(path, "map")
-    path = archive(tmp_path / "b.npz", zipfile.ZIP_DEFLATED, points=npy((1, 3), "<f8", ONE))
-    changed_header(path, 24, 2**30)
-    with pytest.raises(MapError, match="cannot unpack to"):
+    with pytest.raises(MapError, match=rf"its shape takes .* found {2**32 - 2}"):
         read_map_file(path, "map")
     path = archive(tmp_path / "c.npz", zipfile.ZIP_LZMA, points=npy((1, 3), "<f8", ONE))
     with pytest.raises(MapError, match="packed by method 14"):
         read_map_file(path, "map")
 
 
-def ply(count: str = "1", properties: str = "", data: bytes = b"") -> bytes:
-    start = "ply\nformat binary_little_endian 1.0\n"
-    return f"{start}element vertex {count}\n{properties}end_header\n".encode() + data
-
-
-def text_ply(count: int, data: bytes, properties: str) -> bytes:
-    return ply(str(count), properties, data).replace(b"binary_little_endian", b"ascii")
-
-
-XYZ = "".join(f"property float {name}\n" for name in "xyz")
-LIST = XYZ + "property list uint float descriptor\n"
-
-
 @pytest.mark.parametrize(
-    ("data", "text"),
+    ("name", "data"),
     [
-        (b"", "the first line is not 'ply'"),
-        (b"ply\n" + b"comment\n" * 2000, "more than 1000 lines"),
-        (ply(str(10**12), XYZ), f"truncated: {10**12} x vertex take at least {12 * 10**12} bytes"),
-        (ply("1", LIST, bytes(12) + struct.pack("<I", 2**32 - 1)), "1 to 65535 values, found"),
-        (ply("2", LIST, bytes(12) + struct.pack("<If", 1, 0) + bytes(20)),
-         "must be equally long, found 0 to 1 values"),
-        (ply("2", XYZ + "property int id\n", bytes(32)), "1 ids stand for several .* first .* 0"),
-        (ply("1", XYZ, struct.pack("<3f", np.nan, 0, 0)), "no landmarks; 1 with NaN"),
-        (text_ply(2, b"1 2 30\n1   2", XYZ), "vertex 2 of 2 must have 3 numbers, found 2"),
-        (text_ply(1, b"1 2 256\n", XYZ.replace("float z", "uchar z")), "z holds what is not"),
-    ],
-)  # fmt: skip
-def test_a_bad_ply(tmp_path, data, text):
-    path = tmp_path / "map.ply"
-    path.write_bytes(data)
-    with pytest.raises(MapError, match=text):
-        read_map_file(path, "map")
-
-
-@pytest.mark.parametrize(
-    ("name", "data", "text"),
-    [
-        ("points3D.bin", struct.pack("<Q", 10**12), "truncated: 1000000000000 points"),
-        ("points3D.bin", struct.pack("<Q", 1) + bytes(43) + b"\xff" * 8, "truncated at point 1"),
-        ("points3D.txt", b"1 2 3\n", "line 1: expected ID X Y Z"),
-        ("cameras.bin", b"", "neither points3D.bin nor points3D.txt"),
+        ("points3D.bin", struct.pack("<Q", 10**12)),
+        ("points3D.bin", struct.pack("<Q", 1) + bytes(43) + b"\xff" * 8),
+        ("images.bin", struct.pack("<Q", 2**64 - 1) + bytes(80)),
+        ("cameras.bin", struct.pack("<QIiQQ", 1, 1, 9999, 640, 480)),
+        ("points3D.bin", None),
     ],
 )
-def test_a_bad_model(tmp_path, name, data, text):
-    (tmp_path / name).write_bytes(data)
-    with pytest.raises(MapError, match=text):
-        read_map_file(tmp_path, "map")
+def test_a_bad_model(tmp_path, name, data):
+    """What pycolmap makes of it, an abort or a terabyte, stays in its process."""
+    model = tmp_path / "model"
+    shutil.copytree(COLMAP / "binary", model)
+    (model / name).unlink() if data is None else (model / name).write_bytes(data)
+    with pytest.raises(MapError, match="is no model of COLMAP: it needs" if data is None else
+                       "pycolmap cannot read it: "):  # fmt: skip
+        read_map_file(model, "map")
 
 
-@pytest.mark.parametrize("name", ["a.npz", "b.ply", "c.ply", "d"])
-def test_hostile_sizes_allocate_nothing(tmp_path, name):
-    path = tmp_path / name
-    if name == "a.npz":
-        archive(path, points=npy((10**12, 3), "<f8", ONE))
-    elif name == "d":
-        path.mkdir()
-        (path / "points3D.bin").write_bytes(struct.pack("<Q", 10**12))
-    else:
-        lists = ply("1", LIST, bytes(12) + b"\xff\xff\x00\x00")
-        path.write_bytes(ply(str(10**12), XYZ) if name == "b.ply" else lists)
-    tracemalloc.start()
-    with pytest.raises(MapError):
-        read_map_file(path, "map")
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 2**20
+def test_hostile_sizes_allocate_nothing(tmp_path):
+    """An archive of a few bytes that stands for gigabytes, in headers or packed."""
+    paths = [archive(tmp_path / "a.npz", points=npy((10**12, 3), "<f8", ONE))]
+    zeros = npy((40_000_000, 3), "|u1", bytes(120_000_000))
+    paths.append(archive(tmp_path / "b.npz", zipfile.ZIP_DEFLATED, points=zeros))
+    del zeros
+    for path in paths:
+        tracemalloc.start()
+        with pytest.raises(
+            MapError, match=r"its shape takes|larger than 36 MB: no measured map is"
+        ):
+            read_map_file(path, "map")
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 2**20

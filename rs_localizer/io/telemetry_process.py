@@ -1,0 +1,81 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""telemetry-parser at work, run by its path (see ``limited.py``): a video -> its numbers and words.
+
+It takes what a file claims at its word: sizes of gigabytes, and panics of its Rust, come of
+damaged files. Whoever reads what is left here checks it; this only brings it into arrays.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_EXPOSURE, _TURNS, _LENS = "Exposure", "Quaternion", "Lens"
+
+
+def extract(parser: Any) -> dict[str, Any]:
+    """Arrays of a ``telemetry_parser.Parser``: readings, orientations, and what else is said.
+
+    Returns:
+        ``gyroscope`` and ``accelerometer`` (n,4) ms and three numbers, ``turns`` (k,5) ms and
+        x y z w, ``exposures`` (m,) s, and ``said``, JSON of the camera's ``name``, of ``values`` by
+        their names and of the lens ``profile``.
+    """
+    samples, tags = parser.normalized_imu(), parser.telemetry(False)
+    groups = [group for group in tags if isinstance(group, dict)]
+    found: dict[str, Any] = {
+        "gyroscope": _readings(samples, "gyro"), "accelerometer": _readings(samples, "accl"),
+        "turns": np.zeros((0, 5)), "exposures": np.zeros(0),
+    }  # fmt: skip
+    rows = [row for group in groups for row in _data(group, _TURNS, list)]
+    if rows:
+        found["turns"] = np.array(
+            [[row["t"], *(row["v"][axis] for axis in "xyzw")] for row in rows]
+        )
+    exposures = [np.ravel(_data(group, _EXPOSURE, list)).tolist() for group in groups]
+    found["exposures"] = np.array([x for some in exposures for x in some if isinstance(x, float)])
+    said = {
+        "name": " ".join(dict.fromkeys(f"{parser.camera} {parser.model or ''}".split())),
+        "values": _values(groups),
+        "profile": next((lens for group in groups if (lens := _data(group, _LENS, dict))), {}),
+    }
+    return found | {"said": json.dumps(said, default=str)}
+
+
+def _data(group: dict[str, Any], name: str, kind: type) -> Any:
+    part = group.get(name)
+    data = part.get("Data") if isinstance(part, dict) else None
+    return data if isinstance(data, kind) else kind()
+
+
+def _readings(samples: list[dict[str, Any]], name: str) -> Any:
+    rows = [(item["timestamp_ms"], *item[name]) for item in samples if item[name] is not None]
+    return np.array(rows, float).reshape(-1, 4)
+
+
+def _values(groups: list[dict[str, Any]]) -> dict[str, Any]:
+    """Values by name, whatever group they stand in; of one name, and of a list, the first."""
+    found: dict[str, Any] = {}
+    for part in reversed([part for group in groups for part in group.values()]):
+        if isinstance(part, dict):
+            nested = [item for item in part.values() if isinstance(item, dict)]
+            for items in (*nested, part):
+                first = {k: v[0] if isinstance(v, list) and v else v for k, v in items.items()}
+                found |= {k: v for k, v in first.items() if isinstance(v, (str, int, float))}
+    return found
+
+
+def main(path: str, out: str) -> None:
+    try:
+        import telemetry_parser
+
+        np.savez(out, **extract(telemetry_parser.Parser(path)))
+    except BaseException as error:  # panics of its Rust are none of Exception's
+        sys.exit(" ".join(str(error).split()) or type(error).__name__)
+
+
+if __name__ == "__main__":
+    main(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))["path"], sys.argv[2])
