@@ -286,15 +286,17 @@ def _matrix(item: Any) -> Array:
 def _size(item: Any) -> tuple[int, int] | None:
     """Width and height of a pair or a mapping; None: it says neither."""
     if isinstance(item, dict) and not _numbers(item):
-        sides = [next((item[n] for n in names if n in item), None) for names in (_WIDTH, _HEIGHT)]
+        sides: list[Any] = [
+            next((item[n] for n in names if n in item), None) for names in (_WIDTH, _HEIGHT)
+        ]
         if sides == [None, None]:
             return None
         if None in sides:
             raise KeyError((_WIDTH, _HEIGHT)[sides.index(None)][0])
     else:
         sides = _values(item).tolist()
-    width, height = map(int, sides)
-    return width, height
+    width, height = sides
+    return int(width), int(height)
 
 
 def _distortion(item: Any, model: str) -> Array | None:

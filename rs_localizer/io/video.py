@@ -3,11 +3,11 @@
 """Videos as JPEG images with their presentation times."""
 
 import contextlib
-import importlib.util
 import itertools
 import mmap
 import os
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,8 +57,8 @@ class Video:
 
     def __init__(self, path: Path | str, lens: int | None = None) -> None:
         self.path, self._lens = Path(path), lens
-        self.claimed = 0  # images by the container, once they are read; 0: it does not say
-        self.read = 0
+        self.claimed, self.read = 0, 0  # images by the container (0: it does not say), and read
+        self.lasts, self.until = 0.0, 0.0  # s, by the container (0: ...), and of the last image
         if not self.path.is_file():
             raise VideoError(f"{path} does not exist")
 
@@ -67,12 +67,13 @@ class Video:
             is_stream = file.read(2) == _JPEG_START
         if is_stream and self._lens is None:
             images = _from_stream(self.path)
-        elif self._lens is not None or importlib.util.find_spec("av") is not None:
+        elif self._lens is not None or find_spec("av") is not None:
             images = self._by_pyav()
         else:
             images = self._by_opencv()
         for image in images:
             self.read += 1
+            self.until = max(self.until, image.seconds or 0.0)
             yield image
         if not self.read:
             raise VideoError(
@@ -83,12 +84,13 @@ class Video:
     @property
     def fault(self) -> str | None:
         """That images are missing, after all have been read: the end of a file is not believed."""
-        if self.read + _UNCOUNTED >= self.claimed:
+        if self.read + _UNCOUNTED < self.claimed:
+            said = f"has {self.claimed} images, {self.read} could be read"
+        elif not self.claimed and self.until + _UNTIMED < self.lasts:
+            said = f"lasts {self.lasts:.1f} s, images could be read until {self.until:.1f} s"
+        else:
             return None
-        return (
-            f"{self.path.name} says that it has {self.claimed} images, {self.read} could be read: "
-            "it is damaged or cut off"
-        )
+        return f"{self.path.name} says that it {said}: it is damaged or cut off"
 
     def _by_pyav(self) -> Iterator[VideoImage]:
         with _container(self.path) as container:
@@ -99,7 +101,9 @@ class Video:
             stream = lenses[lens]
             stream.thread_type = "AUTO"
             timed = not container.format.flags & _NO_TIMES
-            self.claimed, last = _claimed(container, stream), -np.inf
+            # Matroska has no count, but says how long it lasts, of all streams.
+            self.claimed, last = stream.frames, -np.inf
+            self.lasts = (container.duration or 0) * 1e-6
             for packet in container.demux(stream):
                 for frame in _decoded(packet):
                     seconds = float(frame.time) if timed and frame.time is not None else last
@@ -113,7 +117,10 @@ class Video:
         video = cv2.VideoCapture(str(self.path))
         # Raw rows: a note that the picture should be shown upright turns the shutter, too.
         video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        self.claimed = _whole(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        with self.path.open("rb") as file:
+            start = file.read(8)
+        if start[4:] == b"ftyp" or start[:4] == b"RIFF":  # elsewhere it is a guess by the rate
+            self.claimed = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         try:
             while True:
                 read, color = video.read()
@@ -131,23 +138,8 @@ class Video:
 
 # FFmpeg's AVFMT_NOTIMESTAMPS, of raw streams.
 _NO_TIMES = 0x0080
-_UNCOUNTED = 1  # images: an edit list may hide one, and rates of a duration are rounded
-_MOST_IMAGES = 10**9
-
-
-def _whole(count: float) -> int:
-    return int(count) if 0.0 < count < _MOST_IMAGES else 0  # NaN compares false
-
-
-def _claimed(container: Any, stream: Any) -> int:
-    """How many images a container says that it has; 0: it says nothing."""
-    if stream.frames:
-        return _whole(stream.frames)
-    # Matroska says how long it is, of all streams: a second of another one at the end is usual.
-    if not container.duration or not stream.average_rate:
-        return 0
-    seconds = container.duration * 1e-6 - float((stream.start_time or 0) * stream.time_base)
-    return _whole((seconds - 1.0) * float(stream.average_rate))
+# Images, which an edit list may hide, and s that another stream may go on.
+_UNCOUNTED, _UNTIMED = 1, 2.0
 
 
 def _decoded(packet: Any) -> list[Any]:

@@ -80,8 +80,8 @@ def test_what_cannot_be_read_is_named(tmp_path):
 
 
 def test_a_panic_of_the_library_is_an_error_with_a_name(log):
-    """A line without its columns: an index out of bounds in Rust, which is no Exception."""
-    log.write_text(log.read_text().replace("t,gx,gy,gz,ax,ay,az\n", "t,gx,gy,gz,ax,ay,az\n1,2\n"))
+    """A log whose times cannot be read: Rust's ``unwrap``, whose panic is no Exception."""
+    log.write_text(log.read_text().replace("tscale,0.001", "tscale,soon"))
     with pytest.raises(TelemetryError, match=r"log\.gcsv: its telemetry cannot be read, --no-tel"):
         read_telemetry(log)
 

@@ -3,12 +3,15 @@
 """Streams of JPEGs are split where the images end, not where bytes look like it."""
 
 import struct
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from rs_localizer.io import video
+from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.video import Video, has_times, split_jpegs
 
 
@@ -133,5 +136,91 @@ def test_an_image_whose_time_is_not_told_has_none(monkeypatch, tmp_path):
 
     real = cv2.VideoCapture
     monkeypatch.setattr(cv2, "VideoCapture", Forgetful)
+    monkeypatch.setattr(video, "find_spec", lambda name: None)  # as without PyAV
     times = [item.seconds for item in Video(tmp_path / "a.mp4")]
     assert times == [0.0, pytest.approx(0.033), None]
+
+
+def muxed(path: Path, sound: int = 0, late: int = 0, images: int = 12) -> Path:
+    """Images at 10 Hz of grey levels 40, 50 ..., and packets of sound after the sixth.
+
+    Args:
+        late: ms at which the images begin, in the clock of both streams.
+    """
+    av = pytest.importorskip("av", reason="needs PyAV (rs_localizer[video])")
+    with av.open(str(path), "w") as container:
+        film = container.add_stream("mpeg4", rate=1000)
+        film.width, film.height, film.pix_fmt = 64, 48, "yuv420p"
+        other = container.add_stream("pcm_s16le", rate=8000) if sound else None
+        for k in range(images):
+            level = np.full((48, 64), min(40 + 10 * k, 200), np.uint8)
+            frame = av.VideoFrame.from_ndarray(level, format="gray").reformat(format="yuv420p")
+            frame.pts, frame.time_base = 100 * k + late, Fraction(1, 1000)
+            container.mux(film.encode(frame))
+            for j in range(sound if k == 5 else 0):
+                packet = av.Packet(bytes(4))
+                packet.stream, packet.time_base = other, Fraction(1, 1000)
+                packet.pts = packet.dts = 100 * k + 1 + j * 90 // sound
+                container.mux(packet)
+        container.mux(film.encode(None))
+    return path
+
+
+@pytest.mark.parametrize("with_pyav", [True, False])
+def test_packets_of_other_streams_end_no_video(tmp_path, monkeypatch, with_pyav):
+    """OpenCV gives up after 4096 of them in a row."""
+    path = muxed(tmp_path / "many.mkv", 6000)
+    if not with_pyav:
+        monkeypatch.setattr(video, "find_spec", lambda name: None)
+    found = Video(path)
+    assert [round(float(item.image.mean()), -1) for item in found] == [*range(40, 160, 10)]
+    assert found.fault is None
+
+
+@pytest.mark.parametrize("with_pyav", [True, False])
+def test_a_video_that_is_cut_off_says_so(tmp_path, monkeypatch, with_pyav):
+    """An MP4 whose table of images stands at its front, as after a download that broke off."""
+    whole = muxed(tmp_path / "whole.mp4").read_bytes()
+    data = bytearray(whole)
+    at, size = whole.index(b"mdat") - 4, len(whole)
+    images, tables = whole[at : whole.index(b"moov") - 4], data[whole.index(b"moov") - 4 :]
+    place = tables.index(b"stco") + 12
+    count = struct.unpack_from(">I", tables, place - 4)[0]
+    for k in range(count):
+        (offset,) = struct.unpack_from(">I", tables, place + 4 * k)
+        struct.pack_into(">I", tables, place + 4 * k, offset + len(tables))
+    path = tmp_path / "cut.mp4"
+    path.write_bytes(whole[:at] + tables + images[: len(images) // 2])
+    assert path.stat().st_size < size
+    if not with_pyav:
+        monkeypatch.setattr(video, "find_spec", lambda name: None)
+    found = Video(path)
+    read = len(list(found))
+    assert 3 < read < 11
+    assert f"cut.mp4 says that it has 12 images, {read} could be read: it is" in found.fault
+
+
+def test_matroska_says_how_long_it_lasts(tmp_path):
+    data = muxed(tmp_path / "whole.mkv", images=60).read_bytes()
+    whole = Video(tmp_path / "whole.mkv")
+    assert len(list(whole)) == 60
+    assert whole.fault is None
+    (tmp_path / "cut.mkv").write_bytes(data[: len(data) // 2])
+    found = Video(tmp_path / "cut.mkv")
+    assert 10 < len(list(found)) < 40
+    assert "cut.mkv says that it lasts 5.9 s, images could be read until" in str(found.fault)
+
+
+def test_images_that_begin_late_have_the_clock_of_the_file(tmp_path):
+    """As a video has that was cut without encoding it anew: its gyroscope has the same zero."""
+    path = muxed(tmp_path / "late.mp4", late=854)
+    times = [item.seconds for item in Video(path)]
+    assert times == pytest.approx([0.854 + 0.1 * k for k in range(12)], abs=1e-6)
+    clock = ImageClock()
+    stamps = [clock.relative(round(1e9 * seconds)) for seconds in times]
+    assert stamps[0] == pytest.approx(1_854_000_000, abs=10)
+    assert clock.at(0) == 1_000_000_000
+    assert "the first image at 1.854 s" in clock.description()
+    given = ImageClock(start_ns=5 * 10**9)
+    assert given.relative(854_000_000) == 5 * 10**9
+    assert given.at(0) == 4_146_000_000

@@ -93,10 +93,10 @@ def read_model(folder: Path, database: Path | None = None) -> Model:
     of_images = zip(found["names"].tolist(), found["images"].tolist(), parts, strict=False)
     images = {
         name: ModelImage(
-            *numbers, found["rotations"][k], found["translations"][k],
+            number, camera, found["rotations"][k], found["translations"][k],
             found["pixels"][rows], found["shown"][rows],
         )
-        for k, (name, numbers, rows) in enumerate(of_images)
+        for k, (name, (number, camera), rows) in enumerate(of_images)
     }  # fmt: skip
     if len(found["ids"]) and int(found["ids"].max()) >= 2**63:
         raise MapError(f"it has a point with the id {found['ids'].max()}")

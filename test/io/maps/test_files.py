@@ -4,7 +4,7 @@
 
 The model in the folder colmap was written by pycolmap 4.2.1 (4 images, 14 points with noise, SIFT
 descriptors that differ from view to view); truth.json is what pycolmap's own reader says of it,
-with the medoids worked out beside it in plain loops. Images and the camera beside them were written by hand.
+with the medoids worked out beside it in plain loops; images and camera were written by hand.
 """
 
 import io
