@@ -87,7 +87,7 @@ $(ready): setup.py pyproject.toml Makefile
 	        "On Debian and Ubuntu: sudo apt install python3-venv" >&2; exit 1; }
 	@echo "Preparing $(VENV) (once, takes a few minutes)"
 	@[ -e $@ ] || $(PYTHON) -m venv --clear $(VENV)
-	@$(python) -m pip install -qq --disable-pip-version-check --no-input --no-compile --editable '.[ros,evo,fleet,hloc,mapping,plots,table,video,view,zarr,test]'
+	@$(python) -m pip install -qq --disable-pip-version-check --no-input --no-compile --editable '.[ros,evo,fleet,examples,mapping,plots,table,video,test]'
 	@# Which pip does one file after the other, and the tests of other packages with them.
 	@$(python) -m compileall -qq -j 0 -x '/(tests|pip)/' $(VENV)/lib || true
 	@touch $@

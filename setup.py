@@ -74,19 +74,15 @@ setup(
         "completion": ["argcomplete"],
         "docs": ["sphinx", "myst-parser", "sphinxcontrib-mermaid"],
         "evo": ["evo"],
-        "fleet": ["dask", "distributed", "matplotlib"],
-        "hloc": ["h5py"],
+        "examples": ["h5py", "pyarrow", "pycolmap", "rerun-sdk"],
+        "fleet": ["dask", "distributed"],
         "peers": ["poselib"],  # of the benchmarks
         "mapping": ["pycolmap", "matplotlib"],
         "plots": ["matplotlib", "Pillow>=9.1"],
-        "table": ["fsspec", "pyarrow"],
-        "s3": ["pyarrow", "s3fs"],
-        "gs": ["gcsfs", "pyarrow"],
+        "table": ["pyarrow"],
         # Of telemetry-parser there is no wheel for 3.13, and a build needs Rust. PyAV reads the
         # second stream of files of two lenses, which OpenCV does not.
         "video": ["av", "telemetry-parser; python_version < '3.13'"],
-        "view": ["rerun-sdk"],
-        "zarr": ["fsspec", "pyarrow", "zarr>=3"],
         "test": [
             "build",
             "catkin_pkg",

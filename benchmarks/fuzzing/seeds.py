@@ -14,7 +14,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import cv2
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -307,14 +306,3 @@ def _imu_message() -> Any:
         linear_acceleration=vector(0.2, -9.7, 0.4),
         linear_acceleration_covariance=np.zeros(9),
     )
-
-
-def features_h5() -> bytes:
-    """Features and matches of two images as hloc writes them, in one file."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "features.h5"
-        with h5py.File(path, "w") as file:
-            for name in ("a.jpg", "b.jpg"):
-                file[f"{name}/keypoints"] = np.arange(8, dtype=np.float32).reshape(4, 2)
-            file["a.jpg/b.jpg/matches0"] = np.array([1, -1, 0, 2], np.int16)
-        return path.read_bytes()

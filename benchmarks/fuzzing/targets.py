@@ -31,7 +31,6 @@ from rs_localizer.io.video import Video, VideoError
 from rs_localizer.markers.formats import Unsaid, read_any
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
-from rs_localizer.offline.hloc import HlocError, open_h5, read_pairs, read_queries
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import build, load_params_file, parse_assignment
 
@@ -55,9 +54,6 @@ rs_localizer:
 _ASSIGNMENTS = (b"readout_time:=0.03", b"matching.by:=id", b"tracking:=false", b"map_file:=''")
 _TUM = b"# t x y z qx qy qz qw\n1.5 0 0 1 0 0 0 1\n2.5 1 0 1 0 0 0.6 0.8\n"
 _TWISTS = b"# t wx wy wz vx vy vz\n1.5 0 0 1 0 0 0\n2.5 1 0 1 0 0 0.6\n"
-_QUERIES = (
-    b"q/1.jpg OPENCV 640 480 500 500 320 240 0.1 0 0 0\n2.jpg PINHOLE 640 480 500 500 320 240\n"
-)
 _WPILIB = b"""{"tags": [{"ID": 1, "pose": {"translation": {"x": 1.0, "y": 0.0, "z": 1.5},
 "rotation": {"quaternion": {"W": 0.5, "X": 0.5, "Y": 0.5, "Z": 0.5}}}}],
 "field": {"length": 16.5, "width": 8.1}}"""
@@ -141,7 +137,7 @@ def targets(folder: Path) -> dict[str, Target]:
 
 
 def _more_files(folder: Path) -> dict[str, Target]:
-    """Recordings, tables, and what hloc writes."""
+    """Recordings and tables."""
     bags = seeds.recordings()
     broken = folder / "broken"
     broken.mkdir()
@@ -164,17 +160,6 @@ def _more_files(folder: Path) -> dict[str, Target]:
         ),
         "twists": Target(
             _bytes((_TWISTS,)), _file(folder / "twists.txt", read_twists), (TrajectoryError,)
-        ),
-        "queries": Target(
-            _bytes((_QUERIES,)), _file(folder / "queries.txt", read_queries), (HlocError,)
-        ),
-        "pairs": Target(
-            _bytes((b"q.jpg a.jpg\nq.jpg b.jpg\n",)),
-            _file(folder / "p.txt", read_pairs),
-            (HlocError,),
-        ),
-        "features.h5": Target(
-            _bytes([seeds.features_h5()]), _file(folder / "f.h5", _read_h5), (HlocError,)
         ),
         "video .mjpeg": Target(
             _bytes([2 * seeds.compressed(".jpg")]),
@@ -201,11 +186,6 @@ def _packed(good: Sequence[bytes]) -> Callable[[Random], bytes]:
 def _read_bag(path: Path) -> object:
     with open_bag(path) as bag:
         return sum(1 for _ in bag.messages(list(bag.topics)))
-
-
-def _read_h5(path: Path) -> object:
-    with open_h5(path) as file:
-        return file.keypoints("a.jpg"), file.matches("b.jpg", "a.jpg")
 
 
 def _read_field(path: Path) -> object:

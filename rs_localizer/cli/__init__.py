@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import math
 import os
 import shutil
 import threading
@@ -17,8 +16,11 @@ from typing import Any
 
 from tqdm import tqdm
 
-from rs_localizer.io.atomic_files import atomic_files
-from rs_localizer.io.remote import check_writable
+from rs_localizer.cli.options import UsageError as UsageError
+from rs_localizer.cli.options import add_options
+from rs_localizer.cli.options import integer as integer
+from rs_localizer.cli.options import number as number
+from rs_localizer.io.atomic_files import atomic_files, check_writable
 
 # Bars are shown by one process. tqdm's own lock for several is a semaphore, of which Python 3.14
 # says that it leaked when a signal ends the command.
@@ -27,10 +29,6 @@ tqdm.set_lock(threading.RLock())
 WORKING = True
 """Whether commands work: where one only shows or completes its arguments, its module imports no
 more than these need."""
-
-
-class UsageError(ValueError):
-    """Wrong arguments that argparse cannot see by itself."""
 
 
 # Of every command, wherever they stand behind its name.
@@ -64,7 +62,11 @@ class LateParser(argparse.ArgumentParser):
     def _add_arguments(self) -> None:
         name, self._module = self._module, ""
         if name:
-            importlib.import_module(name).add_arguments(self)
+            module = importlib.import_module(name)
+            if hasattr(module, "Options"):
+                add_options(self, module.Options)
+            else:
+                module.add_arguments(self)
 
     def parse_known_args(self, *args: Any, **kwargs: Any) -> Any:
         self._add_arguments()
@@ -161,47 +163,3 @@ def stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
     """A progress bar for a person who waits; what moves it on."""
     with tqdm(total=total, desc=name, disable=None) as bar:
         yield bar.update
-
-
-def number(
-    minimum: float = -math.inf, maximum: float = math.inf, *, above: bool = False
-) -> Callable[[str], float]:
-    """A finite number from ``minimum`` to ``maximum``, for ``add_argument(type=...)``.
-
-    Args:
-        above: the minimum itself is refused.
-    """
-
-    def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise argparse.ArgumentTypeError(f"must be a number, got {text!r}")
-        if not minimum <= value <= maximum or (above and value == minimum):
-            raise argparse.ArgumentTypeError(f"{_range(minimum, maximum, above)}, got {text}")
-        return value
-
-    return parse
-
-
-def integer(minimum: int) -> Callable[[str], int]:
-    """A whole number that is not less than ``minimum``, for ``add_argument(type=...)``."""
-
-    def parse(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"must be a whole number, got {text!r}") from None
-        if value < minimum:
-            raise argparse.ArgumentTypeError(f"must be {minimum} or more, got {text}")
-        return value
-
-    return parse
-
-
-def _range(minimum: float, maximum: float, above: bool) -> str:
-    if math.isfinite(maximum):
-        return f"must lie between {minimum:g} and {maximum:g}"
-    return f"must be more than {minimum:g}" if above else f"must be {minimum:g} or more"

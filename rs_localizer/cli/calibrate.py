@@ -23,7 +23,6 @@ from rs_localizer.cli import (
     with_values,
     write_all,
 )
-from rs_localizer.cli.batch import add_batch_arguments, folder_name, is_batch, run_batch
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.rig_input import cameras_of, mounting_lines, numbers
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
@@ -51,7 +50,7 @@ if WORKING:
     from rs_localizer.markers.boards import BoardSizes
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
-    from rs_localizer.offline.fleet.task import Figures, Kind
+    from rs_localizer.offline.fleet import Figures
     from rs_localizer.offline.image_sources import (
         Carried,
         Shot,
@@ -153,8 +152,7 @@ def imu_parameters(found: Calibration, config: NodeConfig) -> str:
 # Beside FILE.yaml, as FILE_...
 _LENS, _MAP = "camera_info.yaml", "map.yaml"
 _TRANSFORMS, _CAMCHAIN = "transforms.launch.xml", "camchain.yaml"
-# Of each result of many.
-_SHUTTER, _SHARED = "shutter.yaml", ("share.csv", "share.json")
+_SHARED = ("share.csv", "share.json")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -164,7 +162,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="RECORDING",
         help="a bag of correspondences or keypoints; or, with --map or --board, images: a video, "
-        "a folder, a bag; several: see many recordings",
+        "a folder, a bag; several with --rig",
     )
     above = number(0.0, above=True)
     parser.add_argument(
@@ -206,14 +204,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         type=Path,
         metavar="FILE.yaml",
-        help="parameters for node and replay --params; of many recordings, a directory",
+        help="parameters for node and replay --params",
     )
     add_overwrite(parser)
     parser.add_argument(
         "--plots",
         type=Path,
         metavar="DIR",
-        help="directory for pictures; of many recordings, its name in the folder of each",
+        help="directory for pictures",
     )
     parser.add_argument(
         "--force",
@@ -224,11 +222,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--share",
         metavar="CAMERA",
         help="also write a row of this camera for the table of readout times, to send as a pull "
-        "request: FILE_share.csv beside --out, and FILE_share.json for other programs; of many "
-        "recordings, share.csv and share.json with what they say together",
+        "request: FILE_share.csv beside --out, and FILE_share.json for other programs",
     )
     parser.add_argument("--firmware", default="", metavar="TEXT", help="for --share: the camera's")
-    add_batch_arguments(parser)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -246,12 +242,10 @@ class _Source:
 def run(args: argparse.Namespace) -> Figures | None:
     if args.rig:
         _calibrate_rig(args)
-    elif is_batch(args):
-        given_settings(args)  # refuses wrong ones before there are workers
-        _calibrate_batch(args)
-    else:
-        return calibrate_one(with_values(args, recording=args.recordings[0]))
-    return None
+        return None
+    if len(args.recordings) > 1:
+        raise UsageError("several recordings are those of a --rig")
+    return calibrate_one(with_values(args, recording=args.recordings[0]))
 
 
 def _finds_lens(args: argparse.Namespace, recording: Path) -> bool:
@@ -283,12 +277,12 @@ def calibrate_one(args: argparse.Namespace) -> Figures:
     if args.share:
         _share(args, found)
     return {
-        "readout time (ms)": 1e3 * verdict.readout_time(found),
-        "deviation (ms)": 1e3 * found.deviation,
-        "scan direction": str(verdict.scan_direction(found)),
+        "readout_time_ms": 1e3 * verdict.readout_time(found),
+        "deviation_ms": 1e3 * found.deviation,
+        "scan_direction": str(verdict.scan_direction(found)),
         "images": found.images,
-        "with a pose": len(found.posed.times),
-        "noise (px)": float(found.fit.deviation),
+        "with_a_pose": len(found.posed.times),
+        "noise_px": float(found.fit.deviation),
     }
 
 
@@ -330,17 +324,6 @@ def _share(args: argparse.Namespace, found: Calibration) -> None:
         deviation=found.deviation,
         scan_direction=str(verdict.scan_direction(found)),
     )
-
-
-def share_all(args: argparse.Namespace, folders: Sequence[Path]) -> None:
-    """The rows that many recordings give together, one for each mode."""
-    modes: dict[str, list[tuple[float, float]]] = {}
-    for folder in folders:
-        (one,) = json.loads((folder / f"shutter_{_SHARED[1]}").read_text(encoding="utf-8"))
-        modes.setdefault(one["mode"], []).append((one["median"], one["deviation"]))
-    entries = [measured(args.share, *each, args.firmware) for each in modes.items()]
-    if entries:
-        _write_shared(args.out / "share", entries)
 
 
 def _write_shared(path: Path, entries: Sequence[Known], **more: float | str) -> None:
@@ -447,7 +430,7 @@ def _tell(found: Calibration, rate: float | None) -> None:
         ("readout time", f"{1e3 * verdict.readout_time(found):.3f} ms"),
         ("standard deviation", f"{1e3 * found.deviation:.3f} ms"),
         ("of it by noise alone", f"{1e3 * found.formal_deviation:.3f} ms"),
-        ("scan direction", str(direction)),
+        ("scan_direction", str(direction)),
         ("interval between images", f"{1e3 * found.stamps.interval:.3f} ms"),
         ("images with a pose", f"{len(found.posed.times)} of {found.images}"),
         ("noise of the keypoints", f"{found.fit.deviation:.3f} px"),
@@ -688,33 +671,3 @@ def _next_of_rig(args: argparse.Namespace) -> str:
 def _words(options: Mapping[str, object]) -> list[str]:
     given = {name: str(value) for name, value in options.items() if value is not None}
     return [word for option in given.items() for word in option]
-
-
-def _calibrate_batch(args: argparse.Namespace) -> None:
-    options = ("intrinsics", "imu", "board", "map")
-    given = [name for name in options if getattr(args, name) not in (None, False)]
-    kind = Kind("calibrate", _calibrate_of_many, " ".join(["calibrate", *given]), _calibrate_warm)
-    run_batch(
-        with_values(args, plots=folder_name("--plots", args.plots)),
-        kind,
-        lambda _: (args.map, args.calibration, args.params),
-        args.overwrite,
-        partial(share_all, args) if args.share else None,
-    )
-
-
-def _calibrate_warm(_: argparse.Namespace) -> None:
-    from rs_localizer.markers.detection import warm_up as warm_up_markers
-    from rs_localizer.pipeline.frames import FrameLocalizer
-    from rs_localizer.trajectory.warm_up import warm_up
-
-    warm_up_markers()
-    FrameLocalizer(NodeConfig()).warm_up()
-    warm_up()
-
-
-def _calibrate_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
-    out.mkdir(parents=True)
-    plots = None if args.plots is None else out / args.plots
-    own = with_values(args, recording=recording, out=out / _SHUTTER, plots=plots)
-    return calibrate_one(own)

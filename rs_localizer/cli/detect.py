@@ -20,7 +20,6 @@ from rs_localizer.cli import (
     replaced,
     with_values,
 )
-from rs_localizer.cli.batch import add_batch_arguments, is_batch, run_batch
 from rs_localizer.cli.image_input import (
     add_source_arguments,
     opened,
@@ -45,9 +44,8 @@ if WORKING:
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.rigs import make_mounts, read_camchain
     from rs_localizer.io.topics import TF_STATIC
-    from rs_localizer.markers import detection
     from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
-    from rs_localizer.offline.fleet.task import Figures, Kind
+    from rs_localizer.offline.fleet import Figures
     from rs_localizer.offline.image_sources import Carried, Shot
     from rs_localizer.pipeline.images import FrameDetector
     from rs_localizer.pipeline.keypoints import FrameExtractor
@@ -62,12 +60,11 @@ _OF_MARKERS = ("map", "board", "pattern", "square", "min_side")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "recordings",
+        "images",
         type=Path,
-        nargs="+",
         metavar="VIDEO|BAG|FOLDER",
         help="a video (also a stream of JPEG images, .mjpeg), a rosbag2 or ROS 1 bag with raw or "
-        "compressed images, or a folder of .jpg or .png files; several: see many recordings",
+        "compressed images, or a folder of .jpg or .png files",
     )
     wanted = parser.add_argument_group("what to look for")
     wanted.add_argument("--map", type=Path, metavar="FILE", help="marker map")
@@ -89,7 +86,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--timing", action="store_true", help="say how long it took, and how much of it OpenCV did"
     )
-    add_batch_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> Figures | None:
@@ -97,22 +93,12 @@ def run(args: argparse.Namespace) -> Figures | None:
         raise UsageError("--max-keypoints goes with --features")
     if args.features is None and args.map is None and args.board is None:
         raise UsageError("give --map, --board or --features")
-    if is_batch(args):
-        if args.features is not None:
-            raise UsageError("--features takes one recording")
-        if args.timing:
-            raise UsageError("--timing is for one recording: beside others it means little")
-        find_map(args)  # refuses wrong ones before there are workers
-        kind = Kind("detect", _detect_of_many, "detect", _warm)
-        run_batch(args, kind, lambda _: (args.map, args.calibration, args.params), args.overwrite)
-        return None
-    alone = with_values(args, images=args.recordings[0])
     if args.features is None:
-        figures = detect_one(alone)
-        tell_next(alone)
+        figures = detect_one(args)
+        tell_next(args)
         return figures
-    detect_features(alone)
-    tell_next(alone, " --map MAP")
+    detect_features(args)
+    tell_next(args, " --map MAP")
     return None
 
 
@@ -149,9 +135,9 @@ def detect_one(args: argparse.Namespace) -> Figures:
     tell_telemetry(args)
     return {
         "images": sum(one.images for one in every),
-        "with corners": sum(one.with_corners for one in every),
+        "with_corners": sum(one.with_corners for one in every),
         "corners": min(one.corners for one in every),
-        "residual of a still pose (px)": max(one.residual for one in every),
+        "residual_of_a_still_pose_px": max(one.residual for one in every),
         "warnings": "; ".join(fault for one in every for fault in one.faults),
     }
 
@@ -253,11 +239,3 @@ def detect_features(args: argparse.Namespace) -> None:
     if args.timing:
         milliseconds = 1e3 * extractor.seconds / images
         print(f"time per image: {milliseconds:.1f} ms, {1e3 / milliseconds:.0f} images/s")
-
-
-def _warm(_: argparse.Namespace) -> None:
-    detection.warm_up()
-
-
-def _detect_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
-    return detect_one(with_values(args, images=recording, out=out, overwrite=False))

@@ -18,15 +18,16 @@ import math
 import os
 import sys
 import traceback
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import rs_localizer
-from rs_localizer.cli import COMMON, LateParser, UsageError, add_common
+from rs_localizer.cli import COMMON, LateParser, add_common
+from rs_localizer.cli.options import Parser, UsageError, add_options, read
 from rs_localizer.io.atomic_files import remove_unfinished
-from rs_localizer.io.remote import is_url, placed_beside
 from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import INTERRUPTED, StopRequest
 
@@ -42,8 +43,8 @@ _STEERING = {
 class Command:
     """A command: what it does, and a line that a user can try.
 
-    Its module, imported only when it is chosen, offers ``add_arguments(parser)`` and
-    ``run(arguments)``, which prints, and returns what ``--json`` prints instead, or None.
+    Its module, imported only when it is chosen, offers the dataclass ``Options`` and
+    ``run(options)``, which prints, and returns what ``--json`` prints instead, or None.
     """
 
     module: str
@@ -98,24 +99,6 @@ COMMANDS = {
         "make a map of a room or of markers; refine, align, convert and describe it",
         "rs_localizer map build walk.mp4 --calibration lens.yaml --params shutter.yaml --out room",
     ),
-    "rectify": Command(
-        "rs_localizer.cli.rectify",
-        "images as a global shutter would have taken them, from the poses of replay",
-        "rs_localizer rectify video.mp4 --calibration lens.yaml --params shutter.yaml "
-        "--poses poses --depth plane --map wall.yaml --out global",
-    ),
-    "watch": Command(
-        "rs_localizer.cli.watch",
-        "how a live localizer is: rate, pose, speeds, deviations, state; refreshed in place",
-        "rs_localizer watch front/rs_localizer",
-    ),
-    "localize-hloc": Command(
-        "rs_localizer.cli.localize_hloc",
-        "poses and velocities of what hloc has matched, with the rolling shutter",
-        "rs_localizer localize-hloc --reference-sfm sfm --queries queries.txt "
-        "--retrieval pairs.txt --features features.h5 --matches matches.h5 --results poses.txt "
-        "-p readout_time:=0.03",
-    ),
     "warm": Command(
         "rs_localizer.cli.warm",
         "compile all kernels now, for images and installers; the first start is then as any other",
@@ -139,64 +122,25 @@ def main(
     """
     words = list(sys.argv[1:] if argv is None else argv)
     common, words = _common_options(words)
-    if (url := _url_of_out(words)) is None:
-        return _run(words, common, importing)
+    name = ""
     try:
-        if "--scheduler" in words:
-            raise UsageError("--out: workers need a folder that all of them see, not a URL")
-        with placed_beside(url) as place:
-            code = _run(
-                [str(place) if word == url else word for word in words], common, importing,
-                lambda text: text.replace(str(place), url.rstrip("/")),
-            )  # fmt: skip
-            if code:
-                raise SystemExit(code)  # nothing of it is placed
-    except SystemExit as end:
-        return int(end.code or 0)
-    except Exception as error:
-        if (fault := _said(words[0], error)) is not None:
-            return fault
-        raise
-    return code
-
-
-def _url_of_out(words: Sequence[str]) -> str | None:
-    """Where the result is to be, if that is no place of this machine."""
-    at = words.index("--out") + 1 if "--out" in words else 0
-    return words[at] if 0 < at < len(words) and is_url(words[at]) else None
-
-
-def _run(
-    words: Sequence[str],
-    common: set[str],
-    importing: Callable[[str], AbstractContextManager[object]],
-    shown: Callable[[str], str] = str,
-) -> int:
-    """Run one command; ``shown`` changes what it prints."""
-    try:
-        name = _parser().parse_args(words[:1]).command
-        command = COMMANDS[name]
+        name, rest = _chosen(words)
         with importing(f"rs_localizer {name}"):
-            module = importlib.import_module(command.module)
-        summary = command.summary
-        parser = _described(
-            f"rs_localizer {name}", f"{summary[0].upper()}{summary[1:]}.",
-            f"example:\n  {command.example}",
-        )  # fmt: skip
-        add_common(parser)
-        module.add_arguments(parser)
-        arguments = parser.parse_args(words[1:])
+            module = importlib.import_module(COMMANDS[name].module)
+        options = parse(name, module, rest)
     except SystemExit as end:  # argparse has said all there is to say
         return int(end.code or 0)
+    except UsageError as error:
+        return _fail(name, f"{error} (--help says more)", 2)
     except ImportError as error:
         return _fail(name, explain(error), 1)
     StopRequest.clean_up.append(remove_unfinished)
     try:
-        with _output(name, common, shown):
-            result = module.run(arguments)
+        with _output(common):
+            result = module.run(options)
             printed = sys.stdout
         if "--json" in common and isinstance(printed, io.StringIO):
-            print(shown(_json(name, result, printed.getvalue())))
+            print(_json(name, result, printed.getvalue()))
         sys.stdout.flush()
     except Exception as error:
         if "--verbose" in common:
@@ -209,6 +153,73 @@ def _run(
         remove_unfinished()  # it may have come while that was being removed
         return _fail(name, "interrupted", INTERRUPTED)
     return 0
+
+
+def parse(name: str, module: ModuleType, words: Sequence[str]) -> Any:
+    """The options of a command.
+
+    Raises:
+        UsageError: for words that it does not understand.
+    """
+    parser = parser_of(name, module)
+    found = parser.parse_args(list(words))
+    return read(module.Options, found) if hasattr(module, "Options") else found
+
+
+def parser_of(name: str, module: ModuleType) -> Parser:
+    """The parser of a command, by its dataclass of options."""
+    summary = COMMANDS[name].summary
+    parser = Parser(
+        prog=f"rs_localizer {name}",
+        description=f"{summary[0].upper()}{summary[1:]}.",
+        epilog=f"example:\n  {COMMANDS[name].example}",
+    )
+    if hasattr(module, "Options"):
+        add_options(parser, module.Options)
+    else:
+        module.add_arguments(parser)
+    add_common(parser)
+    return parser
+
+
+def _chosen(words: Sequence[str]) -> tuple[str, Sequence[str]]:
+    """The command, of one or two words, and what follows it."""
+    for count in (2, 1):
+        if (name := " ".join(words[:count])) in COMMANDS:
+            return name, words[count:]
+    if words and (of_group := [name for name in COMMANDS if name.startswith(f"{words[0]} ")]):
+        if len(words) == 1 or words[1] in ("-h", "--help"):
+            print(_listed(of_group))
+            raise SystemExit(0 if len(words) > 1 else 2)
+        raise UsageError(_unknown(" ".join(words[:2]), of_group))
+    if words and not words[0].startswith("-"):
+        groups = list(dict.fromkeys(name.split()[0] for name in COMMANDS))
+        raise UsageError(_unknown(words[0], groups))
+    parser = Parser(
+        prog="rs_localizer",
+        usage="rs_localizer COMMAND ...",
+        description="Position, orientation and velocity of a rolling-shutter camera.",
+        epilog=f"commands:\n{_listed(COMMANDS)}\n\nrs_localizer COMMAND --help says more.",
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"rs_localizer {rs_localizer.__version__}"
+    )
+    parser.parse_args(list(words))
+    raise UsageError("give a COMMAND")
+
+
+def _unknown(name: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(known)}"
+    return f"there is no command {name!r}; {hint}"
+
+
+def _listed(names: Iterable[str]) -> str:
+    width = max(map(len, COMMANDS))
+    return "\n".join(
+        f"  {name:{width}}  {COMMANDS[name].summary}\n  {'':{width}}  $ {COMMANDS[name].example}"
+        for name in names
+    )
 
 
 def _said(name: str, error: Exception) -> int | None:
@@ -231,24 +242,21 @@ def _common_options(words: Sequence[str]) -> tuple[set[str], list[str]]:
     """Options of all commands that are among the words, and the other words."""
     names = {"-q": "--quiet", "-v": "--verbose"} | {name: name for name, _ in COMMON}
     end = words.index("--") if "--" in words else len(words)
-    first, rest = list(words[1:end]), list(words[end:])
-    common = {names[word] for word in first if word in names}
-    return common, [*words[:1], *(word for word in first if word not in names), *rest]
+    common = {names[word] for word in words[:end] if word in names}
+    return common, [*(word for word in words[:end] if word not in names), *words[end:]]
 
 
 @contextlib.contextmanager
-def _output(name: str, common: Collection[str], shown: Callable[[str], str]) -> Iterator[None]:
+def _output(common: Collection[str]) -> Iterator[None]:
     """Within ``with``, what is printed cannot steer the terminal, and goes where options say."""
-    if name == "watch":
-        yield
-    elif "--json" in common or "--quiet" in common:
+    if "--json" in common or "--quiet" in common:
         # No bar either, which is for a person who waits.
         sys.stderr.isatty = lambda: False  # type: ignore[method-assign]
         with contextlib.redirect_stdout(io.StringIO()):
             yield
     else:
         output, write = sys.stdout, sys.stdout.write
-        output.write = lambda text: write(shown(text).translate(_STEERING))  # type: ignore
+        output.write = lambda text: write(text.translate(_STEERING))  # type: ignore
         try:
             yield
         finally:
@@ -295,7 +303,7 @@ def complete() -> None:
 
 def _fail(name: str, text: str, code: int) -> int:
     shown = " ".join(text.split()).translate(_STEERING)
-    print(f"rs_localizer {name}: {shown}", file=sys.stderr)
+    print(f"{' '.join(['rs_localizer', *name.split()])}: {shown}", file=sys.stderr)
     return code
 
 
@@ -305,38 +313,3 @@ def _unheard() -> int:
         # What is left in the buffer would be written at the end of the process, and fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return _SIGPIPE
-
-
-def _described(name: str, description: str, end: str) -> argparse.ArgumentParser:
-    return argparse.ArgumentParser(
-        prog=name, description=description, epilog=end, allow_abbrev=False,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
-
-
-def _parser() -> argparse.ArgumentParser:
-    width = max(map(len, COMMANDS))
-    lines = [
-        f"  {name:{width}}  {command.summary}\n  {'':{width}}  $ {command.example}"
-        for name, command in COMMANDS.items()
-    ]
-    parser = _described(
-        "rs_localizer",
-        "Position, orientation and velocity of a rolling-shutter camera.",
-        "\n".join(["commands:", *lines, "", "rs_localizer COMMAND --help says more."]),
-    )
-    parser.add_argument(
-        "--version", action="version", version=f"rs_localizer {rs_localizer.__version__}"
-    )
-    parser.add_argument(
-        "command", metavar="COMMAND", type=_command, help=f"one of {', '.join(COMMANDS)}"
-    )
-    return parser
-
-
-def _command(name: str) -> str:
-    if name not in COMMANDS:
-        close = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(COMMANDS)}"
-        raise argparse.ArgumentTypeError(f"invalid choice: {name!r}; {hint}")
-    return name

@@ -7,138 +7,43 @@ Frames are written as they come; of each, some numbers stay (250 bytes).
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import json
 import shutil
 import textwrap
 from array import array
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import WORKING, replaced
-from rs_localizer.cli.settings_args import row_time
-from rs_localizer.io.remote import Location, check_writable, is_url, location
+from rs_localizer.cli import WORKING
 
 if WORKING:
     from rs_localizer.config import NodeConfig, PoseTime
     from rs_localizer.core import so3
     from rs_localizer.core.arrays import Array, IntArray
-    from rs_localizer.core.camera import Camera
-    from rs_localizer.io import neural_reconstruction as neural
     from rs_localizer.io.atomic_files import atomic_directory
-    from rs_localizer.io.bags import BagReader, BagWriter
+    from rs_localizer.io.bags import BagWriter
     from rs_localizer.io.image_clock import readout_fault
-    from rs_localizer.io.messages import stamp_ns
     from rs_localizer.io.outputs import Localized, messages
     from rs_localizer.io.topics import TF
     from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
     from rs_localizer.io.transforms import TransformError, make_transform
-    from rs_localizer.offline.fleet.task import LOG, MARKER, Figures
-    from rs_localizer.offline.image_sources import IMAGE_TYPES
+    from rs_localizer.offline.fleet import LOG, MARKER, Figures
     from rs_localizer.offline.replay import TF_TYPE
     from rs_localizer.offline.smoothed import SmoothedFrames
-    from rs_localizer.offline.table import ZARR_MARK, FrameTable
+    from rs_localizer.offline.table import FrameTable
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.pipeline.imu import ImuState
-    from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
     from rs_localizer.pipeline.published import broadcast
     from rs_localizer.pipeline.refusal import Refusal, explained
     from rs_localizer.settings import NODE_NAME
     from rs_localizer.solvers.table import find_solver
 
-TRANSFORMS, IMAGES, NCORE = "transforms.json", "images", "ncore.json"
-_ROW_FILES = "poses_{}.txt"
-_PNG = b"\x89PNG"
 POSES, TWISTS = "poses.txt", "twists.txt"
 _UNKNOWN_TWIST = (np.nan,) * 6
-
-
-def add_export_arguments(parser: argparse._ActionsContainer) -> None:
-    """For :class:`Exports`."""
-    parser.add_argument(
-        "--row",
-        dest="rows",
-        action="append",
-        default=[],
-        metavar="ROW",
-        type=_named_row,
-        help="also write poses_ROW.txt (TUM), at the exposure of this row of each image: first, "
-        "middle, last, or a row time from -0.5 to 0.5; may be repeated",
-    )
-    parser.add_argument(
-        "--nerfstudio",
-        action="store_true",
-        help=f"also write {TRANSFORMS}, with velocities and rolling-shutter time, and to "
-        f"{IMAGES}/ the compressed images of the recording",
-    )
-
-    parser.add_argument(
-        "--gsplat",
-        type=Path,
-        metavar="DIR",
-        help="also make a directory for gsplat: poses at the first and the last row as viewmats, "
-        "intrinsics, a text model of COLMAP, and the compressed images of the recording",
-    )
-    parser.add_argument(
-        "--ncore",
-        type=Path,
-        metavar="DIR",
-        help=f"also make a directory with {NCORE}, as NCore has cameras and frames: "
-        "T_sensor_world when the first and the last row are exposed, and the images",
-    )
-    parser.add_argument(
-        "--parquet",
-        type=location,
-        metavar="FILE",
-        help="also write one table, a row a frame, of all recordings: poses, twists, covariances, "
-        "why frames were refused; a path or a URL (pip install 'rs_localizer[table]')",
-    )
-    parser.add_argument(
-        "--zarr",
-        type=Path,
-        metavar="DIR",
-        help="also write the localized frames as a replay buffer of robot learning, an episode a "
-        "recording: poses, velocities, covariances (pip install 'rs_localizer[zarr]')",
-    )
-
-
-# Directories of exports, and what an earlier one has.
-_MARKS = {"gsplat": "viewmats.npy", "ncore": NCORE}
-
-
-def check_places(args: argparse.Namespace, out: Path | None) -> None:
-    """Refuse what could not be written, before the work.
-
-    Args:
-        args: of :func:`add_export_arguments`, and ``overwrite``.
-        out: directory of the result; None: of many recordings, whose tables any run replaces.
-
-    Raises:
-        ValueError: naming the place.
-    """
-    for option, mark in (*_MARKS.items(), ("parquet", ""), ("zarr", ZARR_MARK)):
-        place: Location | None = getattr(args, option)
-        if place is None:
-            continue
-        check_writable(place)
-        path = Path(place)
-        if out and option in _MARKS and out.absolute() in (path / mark).absolute().parents:
-            raise ValueError(f"--{option} has to be a directory beside {out}, not in it")
-        if is_url(place) or not (any(path.iterdir()) if path.is_dir() else path.is_file()):
-            continue  # nothing is there, or what takes all that comes, such as /dev/stdout
-        own = (path / mark).is_file()
-        if own and option == "parquet":
-            with path.open("rb") as file:
-                own = file.read(4) == b"PAR1"
-        if not own:
-            raise ValueError(f"{path} is no earlier result of --{option}, and stays as it is")
-        if out and not args.overwrite:
-            raise ValueError(f"{path} exists; choose another --{option}, or --overwrite")
 
 
 class Track:
@@ -194,142 +99,7 @@ class Track:
         return len(self._stamps_ns) - len(stamps), bool(moving.any())
 
 
-class Exports:
-    """What other programs want of each frame, as it comes.
-
-    Args:
-        args: of :func:`add_export_arguments`; ``smooth`` among them, and ``exposure`` (s) where a
-            video says it.
-        localizer: that makes the frames; it has their camera.
-        out: directory of the result.
-    """
-
-    def __init__(self, args: argparse.Namespace, localizer: FrameLocalizer, out: Path) -> None:
-        self._args, self._localizer, self._out = args, localizer, out
-        self._rows = {name: (tau, Track()) for name, tau in args.rows}
-        self._views: dict[int, neural.View] = {}
-        self._rolling: dict[int, Array] = {}  # (3,4,4) at the first, middle and last row
-        self._exposed: dict[int, tuple[int, int]] = {}  # ns, the first and the last row
-
-    def add(self, frame: Localized) -> None:
-        """Take a frame."""
-        stamp = frame.input_stamp_ns
-        if self._args.gsplat is not None or self._args.ncore is not None:
-            first, last = neural.exposed_rows(self._camera)
-            rows = [self._of_camera(frame, tau) for tau in (first, 0.0, last)]
-            poses = [np.column_stack([row.pose.rotation, row.pose.position]) for row in rows]
-            self._rolling[stamp] = np.stack([np.vstack([pose, np.eye(4)[3]]) for pose in poses])
-            self._exposed[stamp] = rows[0].stamp_ns, rows[2].stamp_ns
-        for tau, track in self._rows.values():
-            then = self._localizer.mounted(self._of_camera(frame, tau))
-            if isinstance(then, Localized):
-                track.add(then)
-        if self._args.nerfstudio:
-            then = self._of_camera(frame, neural.middle_of_image(self._camera))
-            speeds = (None, None) if then.twist is None else (then.twist.linear, then.twist.angular)
-            file = f"{IMAGES}/{stamp}.jpg"
-            self._views[stamp] = neural.View(file, then.pose.rotation, then.pose.position, *speeds)
-
-    def write(self, bag: BagReader) -> None:
-        """Write the files, with images of the recording."""
-        for name, (_, track) in self._rows.items():
-            stamps, rows = track.once()
-            if len(stamps):
-                write_tum(
-                    self._out / _ROW_FILES.format(name),
-                    Trajectory(stamps, rows[:, :3], rows[:, 3:7]),
-                    [f"map_from_body; t: s, the exposure of the row {name} (-0.5 first, 0.5 last)"],
-                )
-        if self._views:
-            self._write_transforms(bag)
-        if not self._rolling:
-            return
-        images, landmarks = sorted(self._rolling), self._localizer.map
-        poses = np.stack([self._rolling[stamp] for stamp in images])
-        if self._args.gsplat is not None:
-            points = np.zeros((0, 3)) if landmarks is None else landmarks.points
-            with self._folder("gsplat", bag, images) as (folder, names):
-                neural.write_gsplat(folder, self._camera, names, poses, points)
-        if self._args.ncore is not None:
-            exposed = np.array([self._exposed[stamp] for stamp in images], np.int64)
-            with self._folder("ncore", bag, images) as (folder, names):
-                content = neural.sequence(self._camera, names, exposed, poses[:, [0, 2]])
-                (folder / NCORE).write_text(json.dumps(content, indent=1), encoding="utf-8")
-
-    @contextlib.contextmanager
-    def _folder(
-        self, option: str, bag: BagReader, stamps: list[int]
-    ) -> Iterator[tuple[Path, list[str]]]:
-        """Within ``with``, a new folder with the images of these stamps, and their names."""
-        folder: Path = getattr(self._args, option)
-        with atomic_directory(folder, replaced(self._args, _MARKS[option], folder)) as built:
-            built.mkdir()
-            files = _write_images(bag, set(stamps), built)
-            yield built, [files.get(stamp, f"{IMAGES}/{stamp}.jpg") for stamp in stamps]
-        print(f"written to {folder}: poses of {len(stamps)} images at the first and the last row")
-
-    @property
-    def _camera(self) -> Camera:
-        calibration, config = self._localizer.calibration, self._localizer.config
-        assert calibration is not None  # without one there is no frame
-        return calibration.camera(config.readout_time, config.scan_direction)
-
-    def _of_camera(self, frame: Localized, tau: float) -> Localized:
-        """The frame of the camera at the exposure of a row."""
-        config = self._localizer.config
-        middle = middle_row_ns(config, self._camera, frame.input_stamp_ns)
-        stamp = middle + round(1e9 * config.readout_time * tau)
-        # A sample of a smoothed motion is centred on its own moment instead of the middle row.
-        if self._args.smooth:
-            tau = (stamp - frame.stamp_ns) * 1e-9 / config.readout_time
-        known, readout_time = frame.twist is not None, config.readout_time
-        return replace(
-            frame,
-            stamp_ns=stamp,
-            body_frame=self._localizer.camera_frame,
-            pose=pose_at(frame.estimate, tau),
-            twist=twist_at(frame.estimate, tau, readout_time) if known else None,
-        )
-
-    def _write_transforms(self, bag: BagReader) -> None:
-        files = _write_images(bag, set(self._views), self._out)
-        views = [
-            replace(view, file=files.get(stamp, view.file))
-            for stamp, view in sorted(self._views.items())
-        ]
-        exposure = getattr(self._args, "exposure", None) or 0.0
-        text = json.dumps(neural.transforms(self._camera, views, exposure), indent=1)
-        (self._out / TRANSFORMS).write_text(text, encoding="utf-8")
-        if missing := len(views) - len(files):
-            print(
-                f"{missing} images of {TRANSFORMS} are not in the recording (detect --images keeps "
-                f"them): put them to {IMAGES}/STAMP_IN_NS.jpg"
-            )
-
-
-def _named_row(text: str) -> tuple[str, float]:
-    return text, row_time(text)
-
-
-def _write_images(bag: BagReader, stamps: set[int], out: Path) -> dict[int, str]:
-    """The compressed images of these stamps; their files by stamp."""
-    topics = [topic for topic, kind in bag.topics.items() if kind == IMAGE_TYPES[1]]
-    files: dict[int, str] = {}
-    if len(topics) != 1:
-        return files
-    (out / IMAGES).mkdir(exist_ok=True)
-    for _, _, message in bag.messages(topics):
-        stamp = stamp_ns(message)
-        if stamp in stamps:
-            data = bytes(message.data)
-            suffix = "png" if data.startswith(_PNG) else "jpg"
-            files[stamp] = f"{IMAGES}/{stamp}.{suffix}"
-            (out / files[stamp]).write_bytes(data)
-    return files
-
-
 RESULT, BRIDGED = "result", "bridged.txt"
-VIEW = "view.rrd"
 """What replay writes into its output directory."""
 
 # Notices of a frame that could not follow the one before.
@@ -351,12 +121,8 @@ def fresh(out: Path, overwrite: bool) -> Iterator[Path]:
 
 
 def _remove_results(out: Path) -> None:
-    if (out / MARKER).exists():  # of many recordings: what follows is no result of what it says
-        (out / MARKER).unlink()
-        (out / LOG).unlink(missing_ok=True)
-    own = (POSES, TWISTS, BRIDGED, VIEW, _ROW_FILES.format("*"), TRANSFORMS, f"{IMAGES}/*")
-    for path in [path for name in own for path in out.glob(name)]:
-        path.unlink(missing_ok=True)
+    for name in (POSES, TWISTS, BRIDGED, MARKER, LOG):
+        (out / name).unlink(missing_ok=True)
     shutil.rmtree(out / RESULT, ignore_errors=True)
 
 
@@ -462,13 +228,13 @@ def figures(tally: Tally) -> Figures:
     return {
         "frames": tally.total,
         "localized": tally.localized,
-        "residual (px)": float(np.median(tally.column("residual"))),
+        "residual_px": float(np.median(tally.column("residual"))),
         "inliers": float(np.median(tally.column("inliers"))),
-        "with twist": int(np.count_nonzero(tally.column("twist"))),
-        "mostly refused for": next((reason for reason, _ in tally.refused.most_common(1)), ""),
+        "with_twist": int(np.count_nonzero(tally.column("twist"))),
+        "mostly_refused_for": next((reason for reason, _ in tally.refused.most_common(1)), ""),
         "noticed": ", ".join(f"{name} {count}" for name, (count, _) in tally.notices.items()),
-        "readout time seen (ms)": 1e3 * readout_time,
-        "its deviation (ms)": 1e3 * deviation,
+        "readout_time_seen_ms": 1e3 * readout_time,
+        "readout_time_seen_deviation_ms": 1e3 * deviation,
     }
 
 

@@ -36,7 +36,7 @@ def add_settings(
 
 
 def given_values(
-    args: argparse.Namespace,
+    args: Any,
     also: Sequence[str] = (),
     check: Callable[[NodeConfig], object] | None = None,
 ) -> dict[str, Any]:
@@ -65,7 +65,7 @@ def given_values(
 
 
 def given_settings(
-    args: argparse.Namespace,
+    args: Any,
     also: Sequence[str] = (),
     check: Callable[[NodeConfig], object] | None = None,
 ) -> NodeConfig:
@@ -95,12 +95,25 @@ def row_time(text: str) -> float:
 
 
 def add_topics(group: argparse._ArgumentGroup, but: Collection[str] = ()) -> None:
-    """An option for each input, but for some."""
-    for name, item in INPUTS.items():
-        if name not in but:
-            group.add_argument(item.option, metavar="TOPIC", help=item.help)
+    """``-r``, for :func:`given_topics`."""
+    known = ", ".join(name for name in INPUTS if name not in but)
+    group.add_argument(
+        "-r", dest="remaps", action="append", default=[], metavar="INPUT:=TOPIC",
+        help=f"another topic of an input ({known}); may be repeated",
+    )  # fmt: skip
 
 
-def given_topics(args: argparse.Namespace, but: Collection[str] = ()) -> dict[str, str | None]:
-    """What was given, by input; None: nothing."""
-    return {name: getattr(args, name) for name in INPUTS if name not in but}
+def given_topics(options: Any, but: Collection[str] = ()) -> dict[str, str | None]:
+    """Topics that were given by ``-r``, by input.
+
+    Raises:
+        UsageError: for what is no input of the command.
+    """
+    known = [name for name in INPUTS if name not in but]
+    topics: dict[str, str | None] = {}
+    for text in options.remaps:
+        name, given, topic = text.partition(":=")
+        if not given or not topic or name not in known:
+            raise UsageError(f"-r: expected INPUT:=TOPIC of {', '.join(known)}; got {text!r}")
+        topics[name] = topic if topic.startswith("/") else f"/{topic}"
+    return topics

@@ -79,6 +79,18 @@ def atomic_files(*files: Path) -> Iterator[tuple[Path, ...]]:
                     part.replace(file)
 
 
+def check_writable(place: Path) -> None:
+    """Refuse a place where nothing can be written, before the work whose result it shall have.
+
+    Raises:
+        OutputError: what writing there would raise.
+    """
+    target = place.absolute()
+    above = next(path for path in target.parents if path.exists())
+    with atomic_files(above / target.name):
+        pass
+
+
 def remove_unfinished() -> None:
     """What a process that ends in the middle of its work removes."""
     for path in tuple(_unfinished):

@@ -33,7 +33,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from rs_localizer.io.detections import DEFINITIONS
-from rs_localizer.io.remote import Location, is_url, local_copy
 from rs_localizer.io.topics import TF_STATIC
 from rs_localizer.io.yaml_text import load_yaml
 
@@ -134,7 +133,7 @@ def make_message(type_name: str, **fields: Any) -> Any:
 class BagReader:
     """An open recording (see :func:`open_bag`)."""
 
-    def __init__(self, path: Location, reader: AnyReader) -> None:
+    def __init__(self, path: Path, reader: AnyReader) -> None:
         self.path = path
         self._reader = reader
         self.topics: dict[str, str] = {
@@ -178,17 +177,16 @@ class BagReader:
 
 
 @contextlib.contextmanager
-def open_bag(path: Location) -> Iterator[BagReader]:
-    """Open a rosbag2 directory, ``.mcap``, ``.db3`` or ``.bag``; of a URL, a copy.
+def open_bag(path: Path | str) -> Iterator[BagReader]:
+    """Open a rosbag2 directory, ``.mcap``, ``.db3`` or ``.bag``.
 
     Raises:
         BagError: when there is no such recording, or it is damaged or empty.
     """
-    path = path if is_url(path) else Path(path)
+    path = Path(path)
     with contextlib.ExitStack() as stack:
-        local = stack.enter_context(local_copy(path))
         with _explained(path):
-            file = _storage(local)
+            file = _storage(path)
             reader = stack.enter_context(AnyReader([file], default_typestore=typestore()))
             bag = BagReader(path, reader)
             if bag.count(bag.topics) == 0:
@@ -242,7 +240,7 @@ def _storage(path: Path) -> Path:
 
 
 @contextlib.contextmanager
-def _explained(path: Location) -> Iterator[None]:
+def _explained(path: Path) -> Iterator[None]:
     """Turn whatever goes wrong while a recording is read into a BagError."""
     try:
         yield

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
+import json
 import os
-import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,13 +14,16 @@ import numpy as np
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
-from rs_localizer.io.atomic_files import atomic_directory
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.atomic_files import atomic_files, write_errors
 from rs_localizer.io.bags import open_bag
+from rs_localizer.io.calibration import pixel_intrinsics
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.remote import Location, is_url, local_copy, placed
-from rs_localizer.offline.fleet.task import compiled_elsewhere
+from rs_localizer.offline.fleet import compiled_elsewhere
 from rs_localizer.offline.replay import NO_FRAMES, prepare, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.settings import build, load_params_file, unknown
 
@@ -39,37 +42,38 @@ COLUMNS = {
     "map_frame": "string",
     "body_frame": "string",
     **dict.fromkeys(("x", "y", "z", "qx", "qy", "qz", "qw"), "double"),
-    "pose_covariance": "list",
+    "pose_covariance": "list 36",
     **dict.fromkeys(("wx", "wy", "wz", "vx", "vy", "vz"), "double"),
-    "twist_covariance": "list",
+    "twist_covariance": "list 36",
     "points": "int32",
     "inliers": "int32",
     "residual": "double",
     "tracked": "bool_",
+    "camera": "string",
+    **dict.fromkeys(("first_row", "middle_row", "last_row"), "list 7"),
 }
-"""Names and types (docs/integrations.md says more); list: 36 doubles, a 6x6 matrix by rows."""
+"""Names and types; list: so many doubles (docs/recordings.md says more)."""
 
 _ROWS = 1000  # that are Python's objects before they become Arrow's
 
 
 def schema() -> Schema:
-    """Of all tables.
+    """Columns of all tables.
 
     Raises:
         ImportError: without pyarrow.
     """
     import pyarrow as pa
 
-    matrix = pa.list_(pa.float64(), 36)
-    fields = [
-        pa.field(
-            name,
-            matrix if kind == "list" else pa.float64() if kind == "double" else getattr(pa, kind)(),
-            nullable=name not in ("recording", "stamp_ns", "state"),
-        )
-        for name, kind in COLUMNS.items()
-    ]
-    return pa.schema(fields)
+    def arrow(kind: str) -> Any:
+        if kind.startswith("list"):
+            return pa.list_(pa.float64(), int(kind.split()[1]))
+        return pa.float64() if kind == "double" else getattr(pa, kind)()
+
+    always = ("recording", "stamp_ns", "state")
+    return pa.schema(
+        [pa.field(name, arrow(kind), nullable=name not in always) for name, kind in COLUMNS.items()]
+    )
 
 
 class FrameTable:
@@ -77,11 +81,16 @@ class FrameTable:
 
     Args:
         recording: the place, as the column says it.
+        localizer: that makes the frames; it has their camera.
+        smoothed: whether each frame is centred on its own moment instead of the middle row.
     """
 
-    def __init__(self, recording: Location) -> None:
+    def __init__(
+        self, recording: Path | str, localizer: FrameLocalizer, smoothed: bool = False
+    ) -> None:
         self._schema = schema()
-        self._recording = recording if is_url(recording) else os.path.abspath(recording)
+        self._recording = os.path.abspath(recording)
+        self._localizer, self._smoothed = localizer, smoothed
         self._rows: list[dict[str, Any]] = []
         self._batches: list[Any] = []
 
@@ -89,12 +98,31 @@ class FrameTable:
         """Take what became of the frame with this stamp."""
         row: dict[str, Any] = {"recording": self._recording, "stamp_ns": stamp_ns}
         if result:
-            row |= _localized(result)
+            row |= _localized(result) | self._at_rows(result)
         else:
             row |= {"state": REFUSED, "reason": str(result.reason)}
         self._rows.append(row)
         if len(self._rows) == _ROWS:
             self._flush()
+
+    def _at_rows(self, frame: Localized) -> dict[str, Any]:
+        """The camera, and its pose at the first, the middle and the last row of the image."""
+        config, calibration = self._localizer.config, self._localizer.calibration
+        assert calibration is not None  # without one there is no frame
+        camera = calibration.camera(config.readout_time, config.scan_direction)
+        middle_ns = middle_row_ns(config, camera, frame.input_stamp_ns)
+        first, last = exposed_rows(camera)
+        of_estimate = 0.0
+        if self._smoothed and config.readout_time > 0.0:
+            of_estimate = (middle_ns - frame.stamp_ns) * 1e-9 / config.readout_time
+        rows = {"first_row": first, "middle_row": 0.5 * (first + last), "last_row": last}
+        delay = (middle_ns - frame.input_stamp_ns) * 1e-9
+        exposed = [delay + config.readout_time * tau for tau in (first, last)]
+        poses = {name: pose_at(frame.estimate, tau + of_estimate) for name, tau in rows.items()}
+        return {"camera": _as_json(camera, exposed)} | {
+            name: [*pose.position.tolist(), *_quaternion(pose.rotation)]
+            for name, pose in poses.items()
+        }
 
     def _flush(self) -> None:
         import pyarrow as pa
@@ -110,9 +138,31 @@ class FrameTable:
         return pa.Table.from_batches(self._batches, self._schema).sort_by("stamp_ns")
 
 
+def exposed_rows(camera: Camera) -> tuple[float, float]:
+    """Row times of the first and of the last exposed row of the delivered image."""
+    width, height = camera.size
+    times = camera.row_time(np.array([[0.0, 0.0], [width - 1.0, height - 1.0]]))
+    return float(times.min()), float(times.max())
+
+
+def _as_json(camera: Camera, exposed: list[float]) -> str:
+    """Lens and shutter of the delivered image; the centre of its first pixel is at 0, 0."""
+    (fx, fy), (cx, cy) = (values.tolist() for values in pixel_intrinsics(camera))
+    width, height = camera.size
+    return json.dumps({
+        "width": width, "height": height, "fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5,
+        "distortion_model": str(camera.distortion_model), "D": camera.D.tolist(),
+        "scan_direction": str(camera.scan_direction),
+        "first_row_s": exposed[0], "last_row_s": exposed[1],
+    })  # fmt: skip
+
+
+def _quaternion(rotation: Array) -> list[float]:
+    return [float(part) for part in so3.quaternion(np.ascontiguousarray(rotation))]
+
+
 def _localized(frame: Localized) -> dict[str, Any]:
     pose, twist, estimate = frame.pose, frame.twist, frame.estimate
-    quaternion = so3.quaternion(np.ascontiguousarray(pose.rotation))
     inliers = int(np.count_nonzero(estimate.inliers))
     row = {
         "state": LOCALIZED,
@@ -120,7 +170,7 @@ def _localized(frame: Localized) -> dict[str, Any]:
         "map_frame": frame.map_frame,
         "body_frame": frame.body_frame,
         **dict(zip("xyz", pose.position.tolist(), strict=True)),
-        **dict(zip(("qx", "qy", "qz", "qw"), quaternion.tolist(), strict=True)),
+        **dict(zip(("qx", "qy", "qz", "qw"), _quaternion(pose.rotation), strict=True)),
         "pose_covariance": pose.covariance.ravel().tolist(),
         "points": len(estimate.inliers),
         "inliers": inliers,
@@ -134,19 +184,24 @@ def _localized(frame: Localized) -> dict[str, Any]:
     return row
 
 
-def write_parquet(tables: Iterable[Table], place: Location) -> int:
+def write_parquet(tables: Iterable[Table], place: Path) -> int:
     """Write tables one after the other into one Parquet file; how many rows.
 
     The bytes depend on the rows and the version of pyarrow: each table is a row group.
 
     Raises:
-        ValueError: when it cannot be written.
+        OutputError: when it cannot be written.
         ImportError: without pyarrow.
     """
     import pyarrow.parquet as pq
 
     rows = 0
-    with placed(place) as part, pq.ParquetWriter(part, schema(), compression="zstd") as writer:
+    with write_errors(place):
+        place.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        atomic_files(place) as (part,),
+        pq.ParquetWriter(part, schema(), compression="zstd") as writer,
+    ):
         for table in tables:
             rows += table.num_rows
             writer.write_table(table.combine_chunks(), row_group_size=max(table.num_rows, 1))
@@ -160,104 +215,37 @@ def read_parquet(file: Path) -> Table:
     return pq.read_table(file)
 
 
-# Of a Zarr group: columns of the table, and how many numbers each frame has.
-_ARRAYS: dict[str, tuple[tuple[str, ...], tuple[int, ...]]] = {
-    "stamp_ns": (("stamp_ns",), ()),
-    "position": (("x", "y", "z"), (3,)),
-    "quaternion": (("qx", "qy", "qz", "qw"), (4,)),
-    "pose_covariance": (("pose_covariance",), (6, 6)),
-    "linear_velocity": (("vx", "vy", "vz"), (3,)),
-    "angular_velocity": (("wx", "wy", "wz"), (3,)),
-    "twist_covariance": (("twist_covariance",), (6, 6)),
-}
-ZARR_MARK = ".zgroup"
-
-
-def write_zarr(tables: Iterable[Table], place: Path) -> int:
-    """Write the localized frames of tables, an episode each, as a group of Zarr; how many.
-
-    As replay buffers of robot learning: the group ``data`` has an array for all frames, one episode
-    after the other, ``meta/episode_ends`` where each ends (a table without a frame has none), and
-    ``meta`` the attribute ``recordings``. Format 2, which all versions of Zarr read.
-
-    Args:
-        tables: one a recording.
-        place: directory to write; an earlier group is replaced.
-
-    Raises:
-        ValueError: when it cannot be written.
-        ImportError: without Zarr.
-    """
-    import zarr
-
-    parts: dict[str, list[Any]] = {name: [] for name in _ARRAYS}
-    ends, names = [0], []
-    for table in tables:
-        rows = [row for row in table.to_pylist() if row["state"] == LOCALIZED]
-        if not rows:
-            continue
-        ends.append(ends[-1] + len(rows))
-        names.append(rows[0]["recording"])
-        for name, (columns, shape) in _ARRAYS.items():
-            kind = np.int64 if name == "stamp_ns" else np.float64
-            values = [[_numbers(row[column], shape) for column in columns] for row in rows]
-            parts[name].append(np.array(values, kind).reshape(len(rows), *shape))
-    earlier = (place / ZARR_MARK).is_file()
-    with atomic_directory(place, _clear if earlier else None) as part:
-        root = zarr.open_group(str(part), mode="w", zarr_format=2)
-        data, meta = root.create_group("data"), root.create_group("meta")
-        for name, (_, shape) in _ARRAYS.items():
-            empty = np.zeros((0, *shape), np.int64 if name == "stamp_ns" else np.float64)
-            data.create_array(name, data=np.concatenate([empty, *parts[name]]))
-        meta.create_array("episode_ends", data=np.array(ends[1:], np.int64))
-        meta.attrs["recordings"] = names
-    return ends[-1]
-
-
-def _numbers(value: Any, shape: tuple[int, ...]) -> Any:
-    """A value of a table; what is not known is NaN."""
-    return value if value is not None else np.full(36, np.nan) if len(shape) > 1 else np.nan
-
-
-def _clear(directory: Path) -> None:
-    for item in ("data", "meta"):
-        shutil.rmtree(directory / item, ignore_errors=True)
-    for file in (ZARR_MARK, ".zattrs", ".zmetadata"):
-        (directory / file).unlink(missing_ok=True)
-
-
 def localize_recording(
-    source: Location,
-    map: Location | None = None,  # noqa: A002  (what users call it)
-    settings: Mapping[str, Any] | Location | None = None,
+    source: Path | str,
+    map: Path | str | None = None,  # noqa: A002  (what users call it)
+    settings: Mapping[str, Any] | Path | str | None = None,
 ) -> Table:
     """Localize each frame of a recording, as ``replay`` does; a table with a row a frame.
 
-    A pure function that can be pickled: for Dask, Ray, Spark and jobs of Kubernetes
-    (docs/integrations.md). Same content, same arguments: the same bytes, in whichever process.
-    Progress and notices are not printed.
+    A pure function that can be pickled: for Dask, Ray, Spark and shell loops. Same content, same
+    arguments: the same bytes, in whichever process. Progress and notices are not printed.
 
     Args:
-        source: the recording, a path or a URL of fsspec.
-        map: of keypoints, likewise; None: that of the recording, if it has one.
+        source: the recording.
+        map: of keypoints; None: that of the recording, if it has one.
         settings: parameters by dotted name (``{"readout_time": 0.03}``), or a params file.
 
     Returns:
-        a pyarrow.Table; docs/integrations.md has its columns. Refused frames have a reason and no
+        a pyarrow.Table; docs/recordings.md has its columns. Refused frames have a reason and no
         pose.
 
     Raises:
         ValueError: for a recording, map or settings that cannot be used.
-        ImportError: without pyarrow, or fsspec for a URL (``pip install 'rs_localizer[table]'``).
+        ImportError: without pyarrow (``pip install 'rs_localizer[table]'``).
     """
     config = _config(map, settings)
     if config.is_rig:
         raise ValueError("a table is of one camera: leave the setting cameras out")
-    rows = FrameTable(source)
-    with open_bag(source) as bag:
+    with open_bag(Path(source)) as bag:
         topics, localizer = prepare(bag, config)
         compiled_elsewhere(f"replay {config.solver}", _warm_up, config)
         localizer.warm_up()
+        rows = FrameTable(source, localizer)
         for frame in replay(bag, topics, localizer):
             if frame.result or frame.result.reason not in NO_FRAMES:
                 rows.add(frame.stamp_ns, frame.result)
@@ -268,7 +256,9 @@ def _warm_up(config: NodeConfig) -> None:
     FrameLocalizer(config).warm_up()
 
 
-def _config(map_file: Location | None, settings: Mapping[str, Any] | Location | None) -> NodeConfig:
+def _config(
+    map_file: Path | str | None, settings: Mapping[str, Any] | Path | str | None
+) -> NodeConfig:
     if settings is None:
         values: dict[str, Any] = {}
     elif isinstance(settings, Mapping):
@@ -277,8 +267,7 @@ def _config(map_file: Location | None, settings: Mapping[str, Any] | Location | 
             if (fault := unknown(name)) is not None:
                 raise ValueError(f"settings: {fault}")
     else:
-        with local_copy(settings) as file:
-            values = load_params_file(file)
+        values = load_params_file(Path(settings))
     if map_file is not None:
         values["map_file"] = str(map_file)
     return build(values)

@@ -75,7 +75,6 @@ class Input:
     lasting: bool = False  # one message is enough
     # Of what comes with every image, and only its stamp is new: what the localizer has of it.
     held: Callable[[FrameLocalizer], Any] | None = None
-    help: str | None = None  # of its option in commands
     also: tuple[str, ...] = ()  # other types with the same names of fields; none may be installed
 
     @property
@@ -86,7 +85,7 @@ class Input:
     @property
     def option(self) -> str:
         """The option of commands that names its topic in a recording."""
-        return f"--{self.topic.replace('_', '-')}"
+        return f"-r {self.topic}:=TOPIC"
 
     def take(self, localizer: FrameLocalizer, message: Any) -> Results:
         """Read and use a message at once; the results of frames that are complete with it."""
@@ -125,7 +124,6 @@ _ROWS = (
         said="a map",
         latched=True,
         lasting=True,
-        help="the map of the keypoints",
     ),
     Input(
         topics.IMU,
@@ -135,7 +133,6 @@ _ROWS = (
         read=read_imu,
         use=lambda localizer, reading: localizer.imu.add(reading),
         refused=Reason.BAD_IMU,
-        help="of the IMU, if there are several",
     ),
     Input(
         topics.CORRESPONDENCES,
@@ -153,7 +150,6 @@ _ROWS = (
         use=lambda localizer, message: localizer.localize_keypoints(message),
         refused=Reason.BAD_KEYPOINTS,
         needs=topics.MAP_POINTS,
-        help="instead of correspondences",
     ),
     Input(
         topics.DETECTIONS,
@@ -162,7 +158,6 @@ _ROWS = (
         Role.FRAMES,
         use=lambda localizer, message: localizer.localize_detections(message),
         refused=Reason.BAD_DETECTIONS,
-        help="tags of apriltag_ros or isaac_ros_apriltag, with -p marker_map:=FILE",
         also=(ISAAC_TYPE,),
     ),
 )

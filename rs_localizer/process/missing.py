@@ -18,18 +18,13 @@ _EXTRAS = {
     "av": "video",
     "dask": "fleet",
     "distributed": "fleet",
-    "fsspec": "table",
-    "h5py": "hloc",
     "pyarrow": "table",
     "pycolmap": "mapping",
-    "rerun": "view",
     "telemetry_parser": "video",
-    "zarr": "zarr",
 }
 _PIP = {
     "PIL": "Pillow",
     "cv2": "opencv-python-headless",
-    "rerun": "rerun-sdk",
     "telemetry_parser": "telemetry-parser",
     "yaml": "PyYAML",
 }

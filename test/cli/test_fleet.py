@@ -3,6 +3,8 @@
 """Many recordings by one command: the bytes of one process, and nothing in the way."""
 
 import csv
+import dataclasses
+import fcntl
 import filecmp
 import os
 import shutil
@@ -15,9 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.cli import batch as fleet
+from rs_localizer.cli import replay
 from rs_localizer.cli.main import main
-from rs_localizer.offline.fleet.task import Outcome, Task, perform
+from rs_localizer.offline.fleet import Outcome, Task, perform, perform_all, tasks_of
 
 pytest.importorskip("distributed", reason="needs Dask")
 
@@ -41,10 +43,6 @@ def rows(out: Path) -> dict[str, dict[str, str]]:
         return {row["folder"]: row for row in csv.DictReader(file)}
 
 
-def states(out: Path) -> dict[str, str]:
-    return {name: row["state"] for name, row in rows(out).items()}
-
-
 def differing(one: filecmp.dircmp[str]) -> list[str]:
     """Names of all that is not the same, to the last byte, in two trees."""
     _, other, unreadable = filecmp.cmpfiles(one.left, one.right, one.common_files, shallow=False)
@@ -58,13 +56,11 @@ def test_two_workers_write_the_bytes_of_one_process(recordings, tmp_path, capsys
     said = capsys.readouterr()
     failed = f"rs_localizer replay: 1 of 3 recordings failed; {out}/summary.csv says why\n"
     assert said.err == failed
-    assert "3 recordings: 2 done, 1 failed\n" in said.out
     table = rows(out)
-    assert states(out) == {"a_flight": "done", "b_flight": "done", "notes": "failed"}
+    assert list(table) == ["a_flight", "b_flight", "notes"]
     assert table["a_flight"]["frames"] == table["a_flight"]["localized"] == "7"
     assert table["notes"]["reason"].startswith(f"{recordings[2]} cannot be read as a recording")
-    assert (out / "summary.png").read_bytes().startswith(b"\x89PNG")
-    assert "# replay: 3 recordings: 2 done, 1 failed\n" in (out / "summary.md").read_text()
+    assert table["a_flight"]["reason"] == ""
     # In a process of its own: what other tests have compiled in this one may round differently.
     replay = ["replay", recordings[0], *SHUTTER, "--out", str(tmp_path / "alone")]
     subprocess.run([sys.executable, "-m", "rs_localizer", *replay], check=True, capture_output=True)
@@ -81,7 +77,7 @@ def test_two_workers_write_the_bytes_of_one_process(recordings, tmp_path, capsys
 def instead(monkeypatch: pytest.MonkeyPatch, work: Callable[[Task], Outcome] | None) -> None:
     """Work in this process, without the time that a worker's start takes; None: nobody works."""
     monkeypatch.setattr(
-        fleet, "perform_all", lambda tasks, where: (work(task) for task in tasks if work)
+        replay, "perform_all", lambda tasks, *_: ((task, work(task)) for task in tasks if work)
     )
 
 
@@ -91,63 +87,62 @@ def test_results_of_other_settings_are_in_the_way(recordings, tmp_path, monkeypa
     words = ["replay", *recordings, "--out", str(out), *SHUTTER]
     (out / "a_flight").mkdir(parents=True)
     (out / "a_flight" / "mine").write_text("")
-    marker = '{"identity": "another", "command": "COMMAND", "figures": {}}'
-    # As ``replay out/*/ --out out --overwrite`` would replace what it reads.
-    for text in ("no marker", marker.replace("COMMAND", "detect")):
+    for text in ("no marker", '{"identity": "another", "figures": {}}'):
         (out / "a_flight" / "fleet.json").write_text(text)
-        assert main([*words, "--overwrite"]) == 1
-        assert f"{out}/a_flight exists and is no result of replay" in capsys.readouterr().err
-    (out / "a_flight" / "fleet.json").write_text(marker.replace("COMMAND", "replay"))
-    assert main(words) == 1
-    assert "a_flight is a result of other settings, another recording or another version; " in (
-        capsys.readouterr().err
-    )
-    assert main([*words, "--overwrite"]) == 0
+        assert main(words) == 1
+        assert f"{out}/a_flight exists and is no result of this" in capsys.readouterr().err
+    assert main([*words, "--overwrite"]) == 1
     assert (out / "a_flight" / "mine").exists()  # until there is a better one
-    assert states(out)["b_flight"] == "not done"
-    with fleet.only_one(out):
+    assert rows(out)["b_flight"]["reason"] == "not done"
+    with (out / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
         assert main([*words, "--overwrite"]) == 1
     assert f"another command is writing into {out}; wait" in capsys.readouterr().err
 
 
-def test_without_dask_one_sentence_says_what_to_install(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(fleet.importlib.util, "find_spec", lambda name: None)
-    assert main(["replay", "a", "b", "--out", str(tmp_path / "out")]) == 1
+def test_what_goes_wrong_is_one_line(recordings, tmp_path, monkeypatch, capsys):
+    words = ["replay", *recordings[:2], "--out"]
+    assert main([*words, "s3://bucket/poses"]) == 2
+    assert "--out: must be a path of this machine, got s3://bucket/poses" in capsys.readouterr().err
+    assert main([*words, str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9"]) == 1
+    assert "no Dask scheduler answers at tcp://127.0.0.1:9" in capsys.readouterr().err
+    assert set(rows(tmp_path / "out")) == {"a_flight", "b_flight"}
+    assert main(["replay", "a", "b"]) == 2
+    monkeypatch.setattr(replay.importlib.util, "find_spec", lambda name: None)
+    assert main(["replay", "a", "b", "--out", str(tmp_path / "other")]) == 1
     assert capsys.readouterr().err.endswith("pip install 'rs_localizer[fleet]'\n")
+    assert not (tmp_path / "other").exists()
+
+
+def test_workers_that_cannot_do_it_say_why(tmp_path):
+    (task,) = tasks_of([tmp_path / "bag"], tmp_path, _fail, "settings")
+    assert "has another rs_localizer" in perform(dataclasses.replace(task, program="x")).reason
+    elsewhere = dataclasses.replace(task, folder=tmp_path / "no" / "bag")
+    assert f"does not see {tmp_path}/no" in perform(elsewhere).reason
+    assert perform(task).reason == f"ZeroDivisionError: of {tmp_path}/bag"
     assert list(tmp_path.iterdir()) == []
+    (tmp_path / "a").mkdir()
+    places = [tmp_path / "a" / "bag.mcap", tmp_path / "bag.mcap", tmp_path / "bag.mcap"]
+    names = [task.folder.name for task in tasks_of(places, tmp_path, _fail, "")]
+    assert names == ["a_bag", f"{tmp_path.name}_bag"]
 
 
-def test_maps_are_found_from_any_directory(recordings, tmp_path, monkeypatch):
-    """A worker of a scheduler has a working directory of its own."""
-    seen: list[Path] = []
-
-    def elsewhere(task: Task) -> Outcome:
-        seen.append(task.arguments.map)
-        return Outcome(task.name, None, "not tried")
-
-    instead(monkeypatch, elsewhere)
-    monkeypatch.chdir(tmp_path)
-    words = [recordings[0], "--workers", "1", "-p", "map_file:=map.npz", "--out", "out"]
-    assert main(["replay", *words]) == 1
-    assert seen == [tmp_path / "map.npz"]
+def _fail(recording: Path, out: Path) -> dict[str, float]:
+    out.mkdir()
+    raise ZeroDivisionError(f"of {out}")
 
 
-def test_evaluate_finds_the_truth_of_each_by_its_name(recordings, tmp_path, monkeypatch):
-    """The estimates are the truth itself; one of them has none to be compared with."""
-    instead(monkeypatch, perform)
-    truths, estimates, out = (tmp_path / name for name in ("truths", "estimates", "out"))
-    truths.mkdir()
-    for name in ("one", "two"):
-        shutil.copytree(recordings[0], estimates / name)
-    (truths / "one").symlink_to(recordings[0])
-    words = ["evaluate", *map(str, estimates.iterdir()), "--truths", str(truths)]
-    assert main([*words, "--out", str(out), "--plot", "pictures"]) == 1
-    found = rows(out)
-    assert found["one"]["position (m) median"] == "0"
-    assert (out / "one" / "pictures" / "errors.png").is_file()
-    assert "poses compared\n" in (out / "one" / "log.txt").read_text()
-    assert "there is no truth of" in found["two"]["reason"]
-    assert not (out / "two").exists()
+def test_a_recording_that_kills_its_workers_does_not_stop_the_others(tmp_path):
+    def work(recording: Path, out: Path) -> dict[str, float | int | str]:
+        if recording.name == "deadly":
+            os.kill(os.getpid(), signal.SIGKILL)
+        out.mkdir()
+        return {"frames": 1}
+
+    tasks = tasks_of([tmp_path / name for name in ("good", "deadly")], tmp_path, work, "")
+    outcomes = {task.recording.name: outcome for task, outcome in perform_all(tasks, None, 1)}
+    assert outcomes["good"].figures == {"frames": 1}
+    assert outcomes["deadly"].reason.startswith("lost: ")
 
 
 def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(
@@ -169,13 +164,11 @@ def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(
     os.killpg(running.pid, signal.SIGINT)
     _, errors = running.communicate(timeout=60)
     assert (running.returncode, errors) == (130, "rs_localizer replay: interrupted\n")
-    found = states(out)
-    done = {name for name, state in found.items() if state == "done"}
+    done = {name for name, row in rows(out).items() if not row["reason"]}
     assert {"0"} <= done
     assert {path.name for path in out.iterdir() if path.is_dir()} == done
     assert all((out / name / "fleet.json").is_file() for name in done)
-    assert set(found.values()) <= {"done", "not done"}
     instead(monkeypatch, perform)
     assert main(words) == 0
     assert f"{len(done)} of 3 recordings have been done before\n" in capsys.readouterr().out
-    assert set(states(out).values()) == {"done"}
+    assert {row["reason"] for row in rows(out).values()} == {""}

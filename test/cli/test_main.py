@@ -20,7 +20,7 @@ import pytest
 
 import rs_localizer
 from rs_localizer.cli import UsageError
-from rs_localizer.cli.main import COMMANDS, main
+from rs_localizer.cli.main import COMMANDS, main, parse
 from rs_localizer.cli.map import ACTIONS
 from rs_localizer.core.simd.jit import cache_directory
 from rs_localizer.io.atomic_files import atomic_files
@@ -62,9 +62,7 @@ def test_every_command_has_help_and_takes_its_example(name, capsys):
     assert f"usage: rs_localizer {name}" in text
     assert COMMANDS[name].example in text
     module = importlib.import_module(COMMANDS[name].module)
-    parser = argparse.ArgumentParser()
-    module.add_arguments(parser)
-    parser.parse_args(COMMANDS[name].example.split()[2:])
+    parse(name, module, COMMANDS[name].example.split()[1 + len(name.split()) :])
 
 
 def test_help_waits_for_nothing_that_only_work_needs():
@@ -88,19 +86,23 @@ for words in {[*([name] for name in COMMANDS), *actions]}:
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["fly"], "invalid choice: 'fly'; choose from demo, replay"),
-        (["repaly"], "invalid choice: 'repaly'; did you mean replay?"),
+        (["fly"], "there is no command 'fly'; choose from demo, replay"),
+        (["repaly"], "there is no command 'repaly'; did you mean replay?"),
+        (["replay", "bag", "--smoth"], "unrecognized arguments: --smoth; did you mean --smooth?"),
+        (["replay", "bag", "--out=s3://b/c"], "must be a path of this machine, got s3://b/c"),
+        (["-q"], "rs_localizer: give a COMMAND"),
         (["replay"], "the following arguments are required: RECORDING"),
         (["replay", "bag", "-p", "sead:=1"], "'sead' is not a setting"),
         (["replay", "a", "b"], "many recordings need --out DIR"),
         (["calibrate", "x", "--out", "x.txt"], "x.txt"),
-        (["evaluate", "a"], "give EST and TRUTH"),
+        (["evaluate", "a"], "the following arguments are required: TRUTH"),
     ],
 )
 def test_wrong_usage(words, text, capsys):
     assert main(words) == 2
     captured = capsys.readouterr()
     assert text in captured.err
+    assert captured.err.count("\n") == 1
     assert captured.out == ""
 
 
@@ -172,8 +174,8 @@ def test_a_signal_while_the_workplace_is_removed(tmp_path, monkeypatch, command)
     ("result", "told"),
     [
         (
-            {"residual (px)": math.nan, "poses": 3},
-            {"result": {"residual (px)": None, "poses": 3}, "next": "rs_localizer evaluate"},
+            {"residual_px": math.nan, "poses": 3},
+            {"result": {"residual_px": None, "poses": 3}, "next": "rs_localizer evaluate"},
         ),
         (None, {"text": ["a line", "next: rs_localizer evaluate"]}),
     ],
@@ -184,8 +186,9 @@ def test_what_a_command_prints_as_json(result, told, command, capsys):
         return result
 
     command.run = run
-    assert main(["replay", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"command": "replay", **told}
+    for words in (["replay", "--json"], ["--json", "replay"]):
+        assert main(words) == 0
+        assert json.loads(capsys.readouterr().out) == {"command": "replay", **told}
 
 
 @pytest.mark.parametrize(

@@ -42,12 +42,12 @@ def test_a_recording_of_everything(tmp_path, capsys):
                 bag.write("/cam/map_points", message, frame.stamp_ns - 1)
     words = ["replay", str(tmp_path / "all"), *SHUTTER]
     assert main(words) == 1
-    assert "choose with --correspondences or --keypoints" in capsys.readouterr().err
+    assert "choose with -r correspondences:=TOPIC or -r keypoints:=TOPIC" in capsys.readouterr().err
     found = {}
     for name, given in {
-        "clouds": ["--correspondences", "/correspondences"],
-        "ids": ["--keypoints", "/ids", "--map-points", "/cam/map_points"],
-        "descriptors": ["--keypoints", "/cam/keypoints"],
+        "clouds": ["-r", "correspondences:=/correspondences"],
+        "ids": ["-r", "keypoints:=/ids", "-r", "map_points:=/cam/map_points"],
+        "descriptors": ["-r", "keypoints:=cam/keypoints"],
     }.items():
         assert main([*words, *given, "--out", str(tmp_path / name)]) == 0
         found[name] = read_tum(tmp_path / name / "poses.txt").positions

@@ -22,7 +22,6 @@ from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum
 from rs_localizer.io.video import Video, VideoError, split_jpegs
-from rs_localizer.offline.hloc import HlocError, open_h5, read_queries
 
 COLMAP = Path(__file__).parent / "maps" / "colmap"
 IMU = "sensor_msgs/msg/Imu"
@@ -82,32 +81,6 @@ def test_a_view_in_the_place_of_descriptors(tmp_path):
     tables.close()
     with pytest.raises(MapError, match="of 0 kinds"):
         read_map_file(tmp_path / "model", "map")
-
-
-def test_a_query_that_is_no_camera(tmp_path):
-    (tmp_path / "queries.txt").write_text("image.jpg what is this\n")
-    with pytest.raises(HlocError, match="line 1: expected NAME MODEL"):
-        read_queries(tmp_path / "queries.txt")
-
-
-def test_damaged_hdf5(tmp_path):
-    h5py = pytest.importorskip("h5py")
-    path = tmp_path / "a.h5"
-    with h5py.File(path, "w") as file:
-        for number in range(50):
-            file[f"a{number}.jpg/b.jpg/matches0"] = np.arange(9)
-    whole = path.read_bytes()
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        data = bytearray(whole)
-        start = int(rng.integers(100, len(data) - 64))
-        data[start : start + 64] = rng.integers(0, 256, 64, np.uint8).tobytes()
-        path.write_bytes(data)
-        try:
-            with open_h5(path) as matches:
-                matches.matches(f"a{start % 50}.jpg", "b.jpg")
-        except HlocError:
-            pass
 
 
 def test_recordings_with_types_of_their_own(tmp_path):

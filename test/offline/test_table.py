@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The table of frames: one row a frame, the same bytes whoever makes it, from and to anywhere."""
+"""The table of frames: one row a frame, the same bytes whoever makes it."""
 
 from __future__ import annotations
 
@@ -16,15 +16,11 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip(  # of today, which NumPy 1.26 cannot import
     "pyarrow", reason="needs pyarrow (rs_localizer[table])", exc_type=ImportError
 )
-pytest.importorskip("fsspec", reason="needs fsspec (rs_localizer[table])")
-
-import fsspec
 
 import rs_localizer as rsl
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES
-from rs_localizer.io.remote import RemoteError, fingerprint, local_copy
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.offline.table import COLUMNS, read_parquet, schema
 
@@ -90,26 +86,21 @@ def test_rows_say_what_the_messages_say(flights: list[Path], tmp_path: Path) -> 
         assert (row["points"], row["map_frame"]) == (100, "map")
 
 
-def test_a_result_goes_to_a_url(
-    flights: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    files, url = fsspec.filesystem("memory"), "memory://results/poses"
-    words = ["replay", str(flights[1]), *SHUTTER, "--out"]
-    assert main([*words, url]) == 0
-    assert f"written to {url}: " in capsys.readouterr().out
-    assert main([*words, str(tmp_path / "poses")]) == 0
-    here = {str(path.relative_to(tmp_path)): path.read_bytes()
-            for path in tmp_path.rglob("*") if path.is_file()}  # fmt: skip
-    there = {path.removeprefix("/results/"): files.cat(path) for path in files.find("/results")}
-    assert there.keys() == here.keys()
-    assert there["poses/poses.txt"] == here["poses/poses.txt"]
-    assert main([*words, url]) == 1
-    assert f"{url} cannot be written: something is there already" in capsys.readouterr().err
-    # What fails leaves nothing.
-    assert main(["replay", str(tmp_path / "none"), "--out", "memory://results/none"]) == 1
-    assert not files.exists("/results/none")
-    assert main([*words, "memory://results/more", "--scheduler", "tcp://head:8786"]) == 2
-    files.rm("/results", recursive=True)
+def test_what_is_there_is_not_replaced(flights: list[Path], tmp_path: Path, capsys) -> None:
+    """Once said after the replay, whose poses were then gone; a table replaced any file."""
+    notes, out = tmp_path / "notes.txt", tmp_path / "out"
+    notes.write_text("mine")
+    for place, text in (
+        (notes, "notes.txt is no earlier result of --parquet"),
+        (notes / "a.parquet", "a.parquet cannot be written: Not a directory"),
+    ):
+        words = [str(flights[1]), "--out", str(out), "--parquet", str(place), "--overwrite"]
+        assert main(["replay", *words, *SHUTTER]) == 1
+        told = capsys.readouterr()
+        assert text in told.err
+        assert "frames per second" not in told.out
+        assert not out.exists()
+    assert notes.read_text() == "mine"
 
 
 def test_smoothed_rows_are_those_of_the_smoothed_motion(
@@ -150,58 +141,6 @@ def test_the_same_bytes_from_one_process_and_from_dask(flights: list[Path], tmp_
     assert one.read_bytes().startswith(b"PAR1")
     assert read_parquet(one).num_rows > 3 * 5
     assert two.read_bytes() == one.read_bytes()
-
-
-@pytest.fixture
-def bucket(flights: list[Path]) -> str:
-    url = "memory://bucket/monday"
-    fsspec.filesystem("memory").put(str(flights[1]), f"{url}/flight", recursive=True)
-    return url
-
-
-def test_recordings_and_tables_elsewhere(
-    flights: list[Path], bucket: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["replay", f"{bucket}/flight", *SHUTTER, "--out", str(tmp_path / "out")]
-    assert main([*words, "--parquet", f"{bucket}/frames.parquet"]) == 0
-    assert f"written to {bucket}/frames.parquet: " in capsys.readouterr().out
-    with local_copy(f"{bucket}/frames.parquet") as copy:
-        table = read_parquet(copy)
-    assert set(table["recording"].to_pylist()) == {f"{bucket}/flight"}
-    assert not copy.exists()
-    here = rsl.localize_recording(flights[1], settings=SETTINGS)
-    assert table.drop(["recording"]).equals(here.drop(["recording"]))
-    assert rsl.localize_recording(f"{bucket}/flight", settings=SETTINGS).equals(table)
-    # A settings file, and a single file of the recording.
-    file = next(flights[1].glob("*.mcap"))
-    fsspec.filesystem("memory").put(str(file), f"{bucket}/alone.mcap")
-    settings = tmp_path / "settings.yaml"
-    settings.write_text("/**:\n  ros__parameters: {readout_time: 0.03}\n")
-    alone = rsl.localize_recording(f"{bucket}/alone.mcap", settings=settings)
-    assert alone.drop(["recording"]).equals(here.drop(["recording"]))
-
-
-def test_a_change_elsewhere_is_noticed(bucket: str) -> None:
-    before = fingerprint(f"{bucket}/flight")
-    assert fingerprint(f"{bucket}/flight") == before
-    fsspec.filesystem("memory").pipe_file(f"{bucket}/flight/more", b"x")
-    assert fingerprint(f"{bucket}/flight") != before
-
-
-@pytest.mark.parametrize(
-    ("url", "text"),
-    [
-        ("memory://nowhere/flight", "memory://nowhere/flight cannot be read: it does not exist"),
-        ("nonsense://host/flight", "nonsense://host/flight cannot be read: Protocol not known"),
-    ],
-)
-def test_what_cannot_be_fetched_is_one_line(
-    url: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(RemoteError, match=text):
-        rsl.localize_recording(url)
-    assert main(["replay", url, "--out", str(tmp_path / "out")]) == 1
-    assert text in capsys.readouterr().err
 
 
 def test_wrong_settings_are_named(flights: list[Path]) -> None:

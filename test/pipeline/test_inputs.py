@@ -82,11 +82,11 @@ def test_topics_are_found_by_name_then_by_type():
 def test_what_is_not_there_or_not_clear_is_said():
     with pytest.raises(BagError, match="CameraInfo for the camera_info"):
         find_topics(bag(correspondences=CLOUD))
-    with pytest.raises(BagError, match="choose with --correspondences or --keypoints"):
+    with pytest.raises(BagError, match="choose with -r correspondences:=TOPIC or -r keyp"):
         find_topics(bag(correspondences=CLOUD, keypoints=CLOUD, camera_info=INFO))
     with pytest.raises(BagError, match="/camera_info is of type sensor_msgs"):
         find_topics(bag(camera_info=INFO, a=CLOUD), {"correspondences": "/camera_info"})
-    with pytest.raises(BagError, match="choose one with --correspondences"):
+    with pytest.raises(BagError, match="choose one with -r correspondences:=TOPIC"):
         find_topics(bag(camera_info=INFO, a=CLOUD, b=CLOUD))
 
 

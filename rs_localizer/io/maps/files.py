@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from rs_localizer.io.maps.colmap import read_colmap
 from rs_localizer.io.maps.landmarks import Map, MapError, make_map
-from rs_localizer.io.remote import Location, local_copy
 
 SUFFIX = ".npz"
 _ARRAYS = ("points", "ids", "descriptors", "covariances", "error_modes")
@@ -118,11 +117,11 @@ def _size(file: IO[bytes], name: str) -> tuple[int, int, int]:
     return file.tell(), math.prod(shape), kind.itemsize  # Python integers do not overflow
 
 
-def read_map_file(path: Location, frame: str, database: Path | None = None) -> Map:
+def read_map_file(path: Path | str, frame: str, database: Path | None = None) -> Map:
     """Read a map: a folder of COLMAP or a NumPy archive (.npz).
 
     Args:
-        path: of the file or folder, or its URL.
+        path: of the file or folder.
         frame: in which its points are given; files do not say.
         database: COLMAP's, where it is not near the model.
 
@@ -130,16 +129,16 @@ def read_map_file(path: Location, frame: str, database: Path | None = None) -> M
         MapError: for anything that is no map, naming the file and what was found.
         OSError: for a file that is not there or cannot be read.
     """
-    with local_copy(path) as file:
-        file.stat()  # what does not exist is said to be so
-        try:
-            if file.is_dir():
-                return read_colmap(file, frame, database)
-            if database is not None:
-                raise MapError("it is not a folder of COLMAP, which alone has a database")
-            return read_npz(file, frame)
-        except MapError as error:
-            raise MapError(f"{path}: {error}") from error
+    file = Path(path)
+    file.stat()  # what does not exist is said to be so
+    try:
+        if file.is_dir():
+            return read_colmap(file, frame, database)
+        if database is not None:
+            raise MapError("it is not a folder of COLMAP, which alone has a database")
+        return read_npz(file, frame)
+    except MapError as error:
+        raise MapError(f"{path}: {error}") from error
 
 
 def write_map_file(path: Path | str, landmarks: Map) -> None:

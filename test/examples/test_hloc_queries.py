@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What hloc has matched becomes poses; its files are made here, by a small projector."""
 
+import importlib
 import json
-import shutil
-import struct
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,9 +13,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.cli.main import main
-
 h5py = pytest.importorskip("h5py")
+pytest.importorskip("pycolmap")
+hloc_queries = importlib.import_module("hloc_queries")
 
 WIDTH, HEIGHT, FOCAL, READOUT = 640, 480, 500.0, 0.03
 LENS = f"SIMPLE_PINHOLE {WIDTH} {HEIGHT} {FOCAL} 320 240"  # COLMAP: the corner of the image is 0, 0
@@ -117,15 +116,11 @@ def make(folder: Path, motions: dict[str, Pose], old: bool = False) -> SimpleNam
     return SimpleNamespace(folder=folder, sfm=sfm, seen=correspondences, results=results)
 
 
-def localize(files: Any, *words: str, **paths: Path) -> int:
+def localize(files: Any, readout: float = READOUT) -> None:
     folder = files.folder
-    chosen = {
-        "reference-sfm": files.sfm, "queries": folder / "queries.txt",
-        "retrieval": folder / "pairs.txt", "features": folder / "features.h5",
-        "matches": folder / "m.h5", "results": files.results,
-    } | {name.replace("_", "-"): path for name, path in paths.items()}  # fmt: skip
-    given = [word for name, path in chosen.items() for word in (f"--{name}", str(path))]
-    return main(["localize-hloc", *given, *words])
+    names = ("queries.txt", "pairs.txt", "features.h5", "m.h5")
+    places = [files.sfm, *(folder / name for name in names), files.results]
+    hloc_queries.main(*map(str, places), str(readout))
 
 
 def read(path: Path) -> dict[str, tuple[Any, Any]]:
@@ -159,7 +154,8 @@ def motions(count: int) -> dict[str, Pose]:
 
 def global_shutter(files: Any, name: str) -> tuple[Any, Any]:
     """The pose that hloc itself would give."""
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     camera = pycolmap.Camera(
         model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, 320.0, 240.0]
     )
@@ -171,11 +167,10 @@ def global_shutter(files: Any, name: str) -> tuple[Any, Any]:
     return matrix[:, :3], matrix[:, 3]
 
 
-def test_moving_queries_lose_half_of_the_error(tmp_path, capsys):
+def test_moving_queries_lose_half_of_the_error(tmp_path):
     truth = motions(6)
     files = make(tmp_path, truth)
-    assert localize(files, "-p", f"readout_time:={READOUT}") == 0
-    assert "poses.txt, poses_motion.json: 6 of 6 queries localized" in capsys.readouterr().out
+    localize(files)
     found = read(files.results)
     told = json.loads((tmp_path / "poses_motion.json").read_text())
     assert set(found) == {f"{k}.jpg" for k in range(6)}
@@ -184,77 +179,27 @@ def test_moving_queries_lose_half_of_the_error(tmp_path, capsys):
         ours.append(errors(found[Path(name).name], pose.at(0.0)))
         theirs.append(errors(global_shutter(files, name), pose.at(0.0)))
         motion = told["queries"][name]
-        deviations = np.sqrt(np.diag(motion["twist_covariance"]))
-        off = np.concatenate([motion["linear_velocity"] - pose.linear,
-                              motion["angular_velocity"] - pose.angular])  # fmt: skip
-        assert np.all(np.abs(off) < 5.0 * deviations)
-        assert np.all(np.abs(off) < np.repeat([0.6, 0.15], 3))
+        off = np.concatenate([motion["angular_velocity_rad_per_s"] - pose.angular,
+                              motion["linear_velocity_m_per_s"] - pose.linear])  # fmt: skip
+        assert np.all(np.abs(off) < 5.0 * np.array(motion["twist_deviations"]))
+        assert np.all(np.abs(off) < np.repeat([0.15, 0.6], 3))
     assert np.all(np.median(ours, axis=0) < 0.5 * np.median(theirs, axis=0))
 
 
-def test_rows_names_and_older_files(tmp_path, capsys):
+def test_older_files_and_bad_ones(tmp_path):
     truth = motions(2)
     new, old = make(tmp_path / "new", truth), make(tmp_path / "old", truth, old=True)
-    words = ["-p", f"readout_time:={READOUT}", "--prepend-camera-name", "--row", "first"]
-    assert localize(new, *words) == localize(old, *words) == 0
+    localize(new)
+    localize(old)
     assert new.results.read_text() == old.results.read_text()
-    found = read(new.results)
-    for name, pose in truth.items():
-        assert np.all(errors(found[name.removeprefix("query/")], pose.at(-0.5)) < [0.03, 0.3])
-    # A result is not overwritten.
-    assert localize(new, *words) == 1
-    assert "poses.txt exists already" in capsys.readouterr().err
-    # Without a readout time there are poses, and no velocities.
-    other = tmp_path / "other.txt"
-    assert localize(new, results=other) == 0
-    assert "no velocities: readout_time is 0" in capsys.readouterr().out
-    told = json.loads((tmp_path / "other_motion.json").read_text())
-    assert all(query["angular_velocity"] is None for query in told["queries"].values())
-
-
-def test_bad_files_are_told_of_in_one_line(tmp_path, capsys):
-    files = make(tmp_path, motions(1))
-    name, h5 = "query/cam0/0.jpg", tmp_path / "bad.h5"
-    bad, broken = tmp_path / "bad", tmp_path / "broken"
-    broken.mkdir()
-
-    def refused(said: str, **paths: Path) -> None:
-        assert localize(files, **paths) == 1
-        error = capsys.readouterr().err
-        assert said in error
-        assert error.count("\n") == 1 or "localize:" in error
-        assert not files.results.exists()
-        assert not (tmp_path / "poses_motion.json").exists()
-
-    bad.write_bytes((tmp_path / "features.h5").read_bytes()[:500])
-    refused("bad cannot be read as HDF5", features=bad)
-    with h5py.File(h5, "w") as file:
-        file.create_group(f"{name}/keypoints")
-    refused(f"bad.h5 has no keypoints of {name}", features=h5)
-    refused("has no matches of query/cam0/0.jpg and db/0.jpg", matches=h5)
-    with h5py.File(h5, "w") as file:
-        file[f"{name}/keypoints"] = np.zeros((5, 2))
-    refused("but query/cam0/0.jpg has 5: are features and matches", features=h5)
-    for index, said in (
-        (9999, "keypoint 9999 of db/0.jpg, which has"), (-7, "db/0.jpg are of keypoint -7"),
-    ):  # fmt: skip
-        shutil.copy(tmp_path / "m.h5", h5)
-        with h5py.File(h5, "a") as file:
-            file["query-cam0-0.jpg/db-0.jpg/matches0"][3] = index
-        refused(said, matches=h5)
-    for option, text, said in (
-        ("retrieval", f"{name}\n", "bad, line 1: expected QUERY IMAGE"),
-        ("retrieval", f"{name} db/7.jpg\n", "is in the model: db/7.jpg is not one of db/0.jpg"),
-        ("retrieval", "other.jpg db/0.jpg\n", "most often: no image of the model is paired with"),
-        ("queries", f"{name} FOV 640 480 500 320 240 1\n", "model must be one of SIMPLE_PINHOLE"),
-        ("queries", "# nothing\n", "bad has no query"),
-    ):
-        bad.write_text(text)
-        refused(said, **{option: bad})
-    refused("has neither images.bin nor images.txt", reference_sfm=broken)
-    (broken / "images.txt").write_text("1 0 0 0 1 0 0\n\n")
-    refused("expected ID QW QX", reference_sfm=broken)
-    (broken / "images.bin").write_bytes(struct.pack("<Q", 1) + bytes(70))
-    refused("images.bin is truncated or damaged", reference_sfm=broken)
-    assert localize(files, "-p", "readout:=1") == 2
-    assert localize(files, "--row", "third") == 2
+    for change, text in ((9999, "other features or model"), (None, "no matches of query/cam0/0")):
+        with h5py.File(new.folder / "m.h5", "a") as file:
+            if change is None:
+                del file["query-cam0-0.jpg/db-0.jpg"]
+            else:
+                file["query-cam0-0.jpg/db-0.jpg/matches0"][3] = change
+        with pytest.raises(ValueError, match=text):
+            localize(new)
+    (new.folder / "queries.txt").write_text("query/cam0/0.jpg FOV 640 480 500 320 240 1")
+    with pytest.raises(ValueError, match="must be one of SIMPLE_PINHOLE"):
+        localize(new)

@@ -1,0 +1,253 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Options of a command: a dataclass, whose fields, types and texts make its parser.
+
+The class of a command derives from those of options that several commands share; the docstring of
+each is the title of its group in the help.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import math
+import re
+import types
+import typing
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+T = TypeVar("T")
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+
+
+class UsageError(ValueError):
+    """Wrong arguments, among them those that argparse cannot see by itself."""
+
+
+def argument(help: str, metavar: str, default: Any = MISSING) -> Any:  # noqa: A002
+    """A field that is given by its place; a list takes one or more.
+
+    Args:
+        help: what it is.
+        metavar: its name in the help.
+        default: makes it optional.
+    """
+    about = {"help": help, "metavar": metavar, "positional": True}
+    return field(metadata=about) if default is MISSING else field(default=default, metadata=about)
+
+
+def option(
+    help: str,  # noqa: A002
+    metavar: str = "",
+    default: Any = None,
+    *,
+    flag: str = "",
+    choices: Sequence[str] = (),
+    limits: tuple[float, float] = (-math.inf, math.inf),
+    above: bool = False,
+    required: bool = False,
+) -> Any:
+    """A field that is given by ``--its-name``.
+
+    Args:
+        help: what it does; a default that is no None, False or empty list is added.
+        metavar: of its value.
+        default: ``list`` for one that may be repeated; of a switch, False.
+        flag: another name, such as ``-p``.
+        choices: of a text.
+        limits: least and largest number.
+        above: the least itself is refused.
+        required: there is no default.
+    """
+    about = {"help": help, "metavar": metavar, "flag": flag, "choices": tuple(choices)}
+    about |= {"limits": limits, "above": above, "required": required, "positional": False}
+    if default is list:
+        return field(default_factory=list, metadata=about)
+    return field(default=default, metadata=about)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """settings of the localizer."""
+
+    params: Path | None = option("a ROS 2 params file, such as calibrate writes", "FILE")
+    assignments: list[str] = option(
+        "one setting, as after --ros-args; may be repeated", "NAME:=VALUE", list, flag="-p"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """topics of the recording (found by name and type)."""
+
+    remaps: list[str] = option(
+        "another topic of an input: -r imu:=/imu/data; may be repeated",
+        "INPUT:=TOPIC",
+        list,
+        flag="-r",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overwrite:
+    """results."""
+
+    overwrite: bool = option("replace an earlier result", default=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Many:
+    """many recordings (needs Dask: pip install 'rs_localizer[fleet]')."""
+
+    workers: int | None = option(
+        "processes of this machine (default: one for each core)", "N", limits=(1, math.inf)
+    )
+    scheduler: str | None = option(
+        "instead: the workers of a Dask scheduler, such as tcp://host:8786, which see these files",
+        "ADDRESS",
+    )
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong by a :class:`UsageError`, with the option that may be meant."""
+
+    def __init__(self, **words: Any) -> None:
+        words |= {"allow_abbrev": False}
+        words.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(**words)
+
+    def error(self, message: str) -> NoReturn:
+        unknown = re.match(r"unrecognized arguments: (-\S+)", message)
+        if unknown:
+            known = [name for action in self._actions for name in action.option_strings]
+            close = difflib.get_close_matches(unknown[1].partition("=")[0], known, n=1)
+            message += f"; did you mean {close[0]}?" if close else ""
+        raise UsageError(message)
+
+
+def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
+    """Add an argument for each field of a dataclass of options."""
+    hints = typing.get_type_hints(kind)
+    groups: dict[type[Any], argparse._ActionsContainer] = {kind: parser}
+    # Bases come last in the help: what is the command's own is looked for first.
+    for owner in kind.__mro__[:-1]:
+        if owner is not kind:
+            groups[owner] = parser.add_argument_group(
+                " ".join((owner.__doc__ or "").split()).rstrip(".")
+            )
+        for item in fields(kind):
+            if item.name in vars(owner).get("__annotations__", {}):
+                _add(groups[owner], item.name, hints[item.name], item)
+
+
+def _add(group: argparse._ActionsContainer, name: str, hint: Any, item: Any) -> None:
+    about = item.metadata
+    one, many = _element(hint)
+    words: dict[str, Any] = {"help": about["help"].replace("%", "%%")}
+    if one is bool:
+        words["action"] = "store_true"
+    else:
+        words["metavar"] = about["metavar"] or None
+        limits, above = about.get("limits", (-math.inf, math.inf)), about.get("above", False)
+        words["type"] = {
+            float: number(*limits, above=above), int: integer(*limits), Path: path, str: str
+        }.get(one, one)  # fmt: skip
+        if about.get("choices"):
+            words["choices"] = about["choices"]
+        if isinstance(many, int):
+            words["nargs"] = many
+            words["metavar"] = tuple(about["metavar"].split())
+    if about["positional"]:
+        if many is list:
+            words["nargs"] = "+"
+        elif item.default is not MISSING:
+            words |= {"nargs": "?", "default": item.default}
+        group.add_argument(name, **words)
+        return
+    flag = about["flag"] or f"--{name.replace('_', '-')}"
+    if many is list:
+        words |= {"action": "append", "default": []}
+    elif one is not bool:
+        words |= {"default": item.default, "required": about["required"]}
+        if item.default is not None:
+            words["help"] += f" (default: {item.default})"
+    group.add_argument(flag, dest=name, **words)
+
+
+def _element(hint: Any) -> tuple[Any, Any]:
+    """Type of one value, and how many there are: None for one, ``list``, or a number."""
+    if isinstance(hint, types.UnionType):
+        hint = next(part for part in hint.__args__ if part is not type(None))
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin is list:
+        return parts[0], list
+    if origin is tuple:
+        return parts[0], len(parts)
+    return hint, None
+
+
+def read(kind: type[T], namespace: argparse.Namespace) -> T:
+    """The options that a parser has found."""
+    hints = typing.get_type_hints(kind)
+    given = {}
+    for item in fields(kind):  # type: ignore[arg-type]
+        value = getattr(namespace, item.name)
+        several = isinstance(value, list) and isinstance(_element(hints[item.name])[1], int)
+        given[item.name] = tuple(value) if several else value
+    return kind(**given)
+
+
+def path(text: str) -> Path:
+    """A place on this machine; a URL is none."""
+    if _URL.match(text):
+        raise argparse.ArgumentTypeError(
+            f"must be a path of this machine, got {text}: mount it, or copy it here"
+        )
+    return Path(text)
+
+
+def number(
+    minimum: float = -math.inf, maximum: float = math.inf, *, above: bool = False
+) -> Callable[[str], float]:
+    """A finite number from ``minimum`` to ``maximum``, for ``add_argument(type=...)``.
+
+    Args:
+        above: the minimum itself is refused.
+    """
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise argparse.ArgumentTypeError(f"must be a number, got {text!r}")
+        if not minimum <= value <= maximum or (above and value == minimum):
+            raise argparse.ArgumentTypeError(f"{_range(minimum, maximum, above)}, got {text}")
+        return value
+
+    return parse
+
+
+def integer(minimum: float = -math.inf, maximum: float = math.inf) -> Callable[[str], int]:
+    """A whole number from ``minimum`` to ``maximum``, for ``add_argument(type=...)``."""
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"must be a whole number, got {text!r}") from None
+        if not minimum <= value <= maximum:
+            raise argparse.ArgumentTypeError(f"{_range(minimum, maximum, False)}, got {text}")
+        return value
+
+    return parse
+
+
+def _range(minimum: float, maximum: float, above: bool) -> str:
+    if math.isfinite(maximum):
+        return f"must lie between {minimum:g} and {maximum:g}"
+    return f"must be more than {minimum:g}" if above else f"must be {minimum:g} or more"

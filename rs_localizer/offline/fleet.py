@@ -1,0 +1,279 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Many recordings by Dask: each a task of its own, whichever process or machine does it."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import functools
+import hashlib
+import io
+import json
+import logging
+import os
+import pickle
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import uuid
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from rs_localizer.core.simd.jit import cache_directory
+from rs_localizer.io.atomic_files import write_errors
+
+Figures = dict[str, float | int | str]
+"""What the summary says of a recording, by identifiers with their units."""
+
+MARKER, LOG = "fleet.json", "log.txt"
+"""In each complete result: what it is of, written last; and what the command would have said."""
+
+_PACKAGE = Path(__file__).parents[1]
+_WARM = (
+    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
+    "warm, argument = pickle.load(sys.stdin.buffer); warm(argument)"
+)
+# How often a recording may take its worker with it until it counts as failed.
+_DEATHS = 3
+# Scheduler that answers nothing for so long is none, s.
+_CONNECT_TIMEOUT = 5.0
+# What is printed can be told apart only while one task of a process prints.
+_PRINTING = threading.Lock()
+
+
+class ClusterError(ValueError):
+    """No workers; the message says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One recording, and all that its result depends on."""
+
+    work: Callable[[Path, Path], Figures]  # of a recording, and the folder to create
+    recording: Path  # absolute, as the folder: workers are elsewhere
+    folder: Path
+    identity: str
+    program: str  # of who asks
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a task."""
+
+    figures: Figures | None  # None: it failed
+    reason: str = ""  # why, in one line
+
+
+@functools.cache
+def program() -> str:
+    """Digest of the sources of this package, its version among them."""
+    digest = hashlib.sha256()
+    for file in sorted(_PACKAGE.rglob("*.py")):
+        digest.update(file.relative_to(_PACKAGE).as_posix().encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def tasks_of(
+    recordings: Sequence[Path],
+    out: Path,
+    work: Callable[[Path, Path], Figures],
+    settings: str,
+    inputs: Sequence[Path] = (),
+) -> list[Task]:
+    """A task for each recording, with a folder of its own below ``out``.
+
+    Args:
+        recordings: what is localized; one that stands twice is done once.
+        out: of all results.
+        work: a function that can be pickled.
+        settings: all that a result depends on beside the files, as text.
+        inputs: other files that are read.
+    """
+    places = list(dict.fromkeys(Path(os.path.abspath(place)) for place in recordings))
+    known = [_fingerprint(Path(file).absolute()) for file in inputs]
+    made = []
+    for place, name in zip(places, _names(places), strict=True):
+        said = json.dumps([program(), settings, _fingerprint(place), known])
+        identity = hashlib.sha256(said.encode()).hexdigest()
+        made.append(Task(work, place, out / name, identity, program()))
+    return made
+
+
+def _fingerprint(place: Path) -> list[tuple[str, int, int]]:
+    """Name, size and time of change (ns) of each file: reading all of a recording takes long."""
+    files = sorted(place.rglob("*")) if place.is_dir() else [place]
+    about = [(file, file.stat()) for file in files if file.is_file()]
+    return [(str(file), stat.st_size, stat.st_mtime_ns) for file, stat in about]
+
+
+def _names(places: Sequence[Path]) -> list[str]:
+    """A name for each recording: its own, with its folder's or a number where others have it."""
+    own = [place.name if place.is_dir() else place.stem for place in places]
+    counts = Counter(own)
+    names: list[str] = []
+    for place, name in zip(places, own, strict=True):
+        wanted = name if counts[name] == 1 else f"{place.parent.name}_{name}"
+        number, free = 2, wanted
+        while free in names:
+            number, free = number + 1, f"{wanted}_{number}"
+        names.append(free)
+    return names
+
+
+def finished(task: Task) -> Figures | None:
+    """The figures of a complete result of just this task; None: there is none."""
+    try:
+        content = json.loads((task.folder / MARKER).read_text(encoding="utf-8"))
+        return dict(content["figures"]) if content["identity"] == task.identity else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def perform(task: Task) -> Outcome:
+    """Do a task, unless it has been done: its folder is there afterwards, whole, or not at all.
+
+    Whatever goes wrong with the recording is an outcome, not an exception.
+    """
+    here = socket.gethostname()
+    if program() != task.program:
+        return Outcome(None, f"the worker on {here} has another rs_localizer: install the same")
+    if not task.folder.parent.is_dir():
+        return Outcome(None, f"the worker on {here} does not see {task.folder.parent}")
+    if (figures := finished(task)) is not None:
+        return Outcome(figures)
+    # A folder of its own: a worker that is taken for lost may still be at it.
+    partial = task.folder.with_name(f".unfinished-{uuid.uuid4().hex}")
+    inner = partial / task.folder.name  # under its final name, which some files repeat
+    said = io.StringIO()
+    try:
+        with write_errors(partial):
+            partial.mkdir()
+        with _PRINTING, contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            figures = task.work(task.recording, inner)
+        about = {"recording": str(task.recording), "identity": task.identity, "figures": figures}
+        with write_errors(inner):
+            text = said.getvalue().replace(str(inner), task.folder.name)
+            (inner / LOG).write_text(text, encoding="utf-8")
+            (inner / MARKER).write_text(json.dumps(about, indent=1, default=str), encoding="utf-8")
+            if task.folder.exists() and finished(task) is None:  # of other settings
+                task.folder.rename(partial / "replaced")
+            if finished(task) is None:  # else another worker, taken for lost, has done it
+                inner.rename(task.folder)
+    except Exception as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        kind = "" if isinstance(error, (ValueError, OSError)) else f"{type(error).__name__}: "
+        return Outcome(None, (kind + text).replace(str(inner), str(task.folder)))
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return Outcome(figures)
+
+
+def perform_all(
+    tasks: Sequence[Task], scheduler: str | None, workers: int | None
+) -> Iterator[tuple[Task, Outcome]]:
+    """The outcome of each task, as they come; close the iterator to stop all.
+
+    Args:
+        tasks: what is not done yet.
+        scheduler: address of one that runs; None: processes of this machine.
+        workers: so many of them; None: one for each core.
+
+    Raises:
+        ClusterError: when no scheduler answers.
+        ImportError: without Dask.
+    """
+    from distributed import Client, as_completed
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
+    with contextlib.ExitStack() as stack:
+        where: Any = scheduler
+        if scheduler is None:
+            cores = len(os.sched_getaffinity(0))
+            where = stack.enter_context(_local(max(1, min(len(tasks), workers or cores))))
+        try:
+            client = stack.enter_context(Client(where, timeout=_CONNECT_TIMEOUT))
+        except (OSError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise ClusterError(f"no Dask scheduler answers at {scheduler}: {reason}") from error
+        # Not by what they are: a result that has been removed would be taken as done.
+        futures = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
+        for future in as_completed(list(futures)):
+            try:
+                outcome = future.result()
+            except Exception as error:  # with its worker, or the scheduler: Dask says which
+                outcome = Outcome(None, f"lost: {' '.join(str(error).split())[:200]}")
+            yield futures[future], outcome
+
+
+@contextlib.contextmanager
+def _local(workers: int) -> Iterator[Any]:
+    """A cluster of processes with one thread each."""
+    import dask
+    from distributed import LocalCluster
+
+    settings = {
+        "distributed.scheduler.allowed-failures": _DEATHS - 1,
+        # A worker that dies takes no task along but the one that it is at.
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.worker.preload": [__name__],
+        "distributed.worker.profile.enabled": False,
+    }
+    # Of worker processes that were killed, Python's clean-up would tell on the screen.
+    quiet = "ignore:resource_tracker:UserWarning"
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), quiet]))
+    with dask.config.set(settings):
+        cluster = LocalCluster(
+            n_workers=workers, threads_per_worker=1, memory_limit=0,
+            dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL + 1,
+        )  # fmt: skip
+        try:
+            yield cluster
+        except BaseException:
+            # One that is asked to end goes on with its recording for seconds.
+            for nanny in cluster.workers.values():
+                with contextlib.suppress(AttributeError, ProcessLookupError, TypeError):
+                    os.kill(nanny.process.pid, signal.SIGKILL)
+            raise
+        finally:
+            with contextlib.suppress(Exception):
+                cluster.close(timeout=5)
+
+
+def dask_setup(worker: Any) -> None:
+    """Leave Ctrl-C, which a terminal sends to all processes, to the one that started them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def compiled_elsewhere(kernels: str, warm: Callable[[Any], None], argument: Any) -> None:
+    """Compile in another process, unless this machine has compiled it before.
+
+    A process that has compiled kernels itself rounds differently than those that load them.
+
+    Args:
+        kernels: names what ``warm(argument)`` compiles.
+        warm: a function that another process can import.
+        argument: can be pickled.
+    """
+    said = f"{program()} {kernels} {numba.__version__} {sys.implementation.cache_tag}"
+    done = cache_directory() / "fleet" / hashlib.sha256(said.encode()).hexdigest()[:16]
+    if done.exists():
+        return
+    given = pickle.dumps(sys.path) + pickle.dumps((warm, argument))
+    with contextlib.suppress(OSError):  # nothing can be kept there: each compiles for itself
+        done.parent.mkdir(parents=True, exist_ok=True)
+        with done.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                words = [sys.executable, "-c", _WARM]
+                if not subprocess.run(words, input=given, capture_output=True).returncode:
+                    done.touch()
