@@ -143,6 +143,7 @@ COMPILED = {"kernel", "inlined", "error_model"}
 INSTEAD_OF_KERNELS = {"solvers/r6p.py: solve_batch"}
 # What is called with keywords: declarations, and the library's own entrance for cameras and rigs.
 BY_KEYWORDS = {
+    "cli/options.py: option",
     "solvers/minimal.py: solve_minimal",
     "localizer.py: localize",
     "localizer.py: find",

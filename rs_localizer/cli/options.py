@@ -62,7 +62,8 @@ def option(
         above: the least itself is refused.
         required: there is no default.
     """
-    about = {"help": help, "metavar": metavar, "flag": flag, "choices": tuple(choices)}
+    about: dict[str, Any] = {"help": help, "metavar": metavar, "flag": flag}
+    about |= {"choices": tuple(choices)}
     about |= {"limits": limits, "above": above, "required": required, "positional": False}
     if default is list:
         return field(default_factory=list, metadata=about)
