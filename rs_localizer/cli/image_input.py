@@ -315,6 +315,8 @@ def opened(
         if value is not None:
             raise UsageError(f"--{name} is for videos and folders; a bag has its own times")
     with open_bag(path) as bag:
+        if bag.fault is not None:
+            print(f"warning: {bag.fault}")
         camera = None if args.calibration is None else read_calibration(args.calibration)
         yield of_bag(bag, camera, args, calibrated)
 

@@ -20,6 +20,8 @@ from typing import Any, Self
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
+    MessageDefinition,
+    MessageDefinitionFormat,
     Qos,
     QosDurability,
     QosHistory,
@@ -30,15 +32,15 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
+from rs_localizer.io.containers import METADATA, ZSTD, data_files, magic, storage
 from rs_localizer.io.detections import DEFINITIONS
 from rs_localizer.io.topics import TF_STATIC
 from rs_localizer.io.yaml_text import load_yaml
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
-SUFFIXES = (".mcap", ".db3", ".bag")
-"""Of files that are recordings."""
 # Whoever plays a recording offers its topics as it says; on /tf_static everybody listens for what
 # was said before.
 _NO_LIMIT = QosTime(2**31 - 1, 10**9 - 1)
@@ -70,6 +72,7 @@ class _BoundedZstd:
     def __init__(self, module: Any) -> None:
         self._module = module
         self.compress = module.compress
+        self.ZstdDecompressor = module.ZstdDecompressor
 
     def decompress(self, data: bytes) -> bytes:
         return _unpacked(self._module.ZstdDecompressor(), data)
@@ -109,8 +112,37 @@ def _bound_decompression() -> None:
     }
 
 
+def _read_other_definitions() -> None:
+    """Have rosbags take ROS 1's definitions in an MCAP, and pass over those that are not of ROS."""
+    mcap = vars(importlib.import_module("rosbags.rosbag2.storage_mcap"))
+    own = mcap["get_msgdef"]
+
+    def get_msgdef(schema: Any) -> MessageDefinition:
+        if schema is not None and schema.encoding == "ros1msg":
+            return MessageDefinition(MessageDefinitionFormat.MSG, schema.data)
+        try:
+            found: MessageDefinition = own(schema)
+            return found
+        except KeyError:  # of JSON, Protobuf ...
+            return MessageDefinition(MessageDefinitionFormat.NONE, "")
+
+    mcap["get_msgdef"] = get_msgdef
+
+
 with contextlib.suppress(KeyError, AttributeError):  # of versions that are made otherwise
     _bound_decompression()
+    _read_other_definitions()
+
+
+def _zstd() -> Any:
+    """The module, with limits, that rosbags unpacks with."""
+    return vars(importlib.import_module("rosbags.rosbag2.reader"))["zstd"]
+
+
+def _unpack_file(packed: Path, out: Path) -> None:
+    """Write what a file of Zstandard holds, within limits."""
+    with packed.open("rb") as data, _zstd().open(data, "rb") as file, out.open("wb") as target:
+        shutil.copyfileobj(file, target)
 
 
 @lru_cache(maxsize=1)
@@ -130,14 +162,34 @@ def make_message(type_name: str, **fields: Any) -> Any:
     return typestore().types[type_name](**fields)
 
 
+_ROS1 = "ros1"
+_ENCODINGS = ("cdr", _ROS1, "")
+
+
+def _encoding(connection: Any) -> str:
+    return str(getattr(connection.ext, "serialization_format", _ROS1))
+
+
 class BagReader:
     """An open recording (see :func:`open_bag`)."""
 
-    def __init__(self, path: Path, reader: AnyReader) -> None:
+    def __init__(self, path: Path, reader: AnyReader, fault: str | None = None) -> None:
         self.path = path
+        self.fault = fault  # what is to be said of the file: that it was cut off
         self._reader = reader
+        self._connections = [c for c in reader.connections if _encoding(c) in _ENCODINGS]
+        others = {_encoding(c) for c in reader.connections} - set(_ENCODINGS)
+        if others and not self._connections:
+            raise BagError(
+                f"{path} has no messages of ROS: they are {', '.join(sorted(others))}, as of "
+                f"{reader.connections[0].msgtype}; record or convert them as ROS 2 messages (cdr)"
+            )
+        kinds: dict[str, set[str]] = {}
+        for connection in self._connections:
+            kinds.setdefault(connection.topic, set()).add(normalize_msgtype(connection.msgtype))
         self.topics: dict[str, str] = {
-            name: info.msgtype or "several types" for name, info in reader.topics.items()
+            name: next(iter(types)) if len(types) == 1 else "several types"
+            for name, types in sorted(kinds.items())
         }
 
     def count(self, topics: Collection[str]) -> int:
@@ -157,28 +209,34 @@ class BagReader:
                 f"{self.path} has no topic {', '.join(missing)}; it has "
                 f"{', '.join(sorted(self.topics))}"
             )
-        wanted = [c for c in self._reader.connections if c.topic in topics]
+        wanted = [c for c in self._connections if c.topic in topics]
         if not wanted:
             return
         with _explained(self.path):
-            self._check_types({connection.msgtype for connection in wanted})
+            self._check_types({c.msgtype for c in wanted if _encoding(c) != _ROS1})
             for connection, stamp_ns, data in self._reader.messages(connections=wanted):
-                message = self._reader.deserialize(data, connection.msgtype)
-                if not self._reader.is2:
-                    message = _as_ros2(message, connection.msgtype)
-                yield connection.topic, stamp_ns, message
+                if data[: len(ZSTD)] == ZSTD and self._reader.is2:  # of a file without metadata
+                    data = _unpacked(_zstd().ZstdDecompressor(), data)
+                kind = normalize_msgtype(connection.msgtype)
+                if _encoding(connection) == _ROS1:
+                    old = self._reader.typestore.deserialize_ros1(data, kind)
+                    yield connection.topic, stamp_ns, _as_ros2(old, kind)
+                else:
+                    yield connection.topic, stamp_ns, self._reader.deserialize(data, kind)
 
     def _check_types(self, names: Collection[str]) -> None:
         """Refuse types that a recording describes otherwise than ROS: fields would be missed."""
         own, standard = self._reader.typestore.fielddefs, typestore().fielddefs
-        for name in (set(names) & set(standard)) - set(DEFINITIONS) if self._reader.is2 else ():
+        for name in (set(names) & set(standard)) - set(DEFINITIONS):
             if _fields_of(name, own) != _fields_of(name, standard):
                 raise BagError(f"{self.path} describes {name} otherwise than ROS 2 Jazzy does")
 
 
 @contextlib.contextmanager
 def open_bag(path: Path | str) -> Iterator[BagReader]:
-    """Open a rosbag2 directory, ``.mcap``, ``.db3`` or ``.bag``.
+    """Open a rosbag2 directory, a file of one, or a ROS 1 bag.
+
+    What a file is, its first bytes say (:mod:`rs_localizer.io.containers`).
 
     Raises:
         BagError: when there is no such recording, or it is damaged or empty.
@@ -186,9 +244,9 @@ def open_bag(path: Path | str) -> Iterator[BagReader]:
     path = Path(path)
     with contextlib.ExitStack() as stack:
         with _explained(path):
-            file = _storage(path)
-            reader = stack.enter_context(AnyReader([file], default_typestore=typestore()))
-            bag = BagReader(path, reader)
+            opened = stack.enter_context(storage(path, _listed(path), _unpack_file))
+            reader = stack.enter_context(AnyReader(opened.paths, default_typestore=typestore()))
+            bag = BagReader(path, reader, opened.fault)
             if bag.count(bag.topics) == 0:
                 raise BagError(f"{path} is an empty recording: it holds no message")
         yield bag
@@ -206,37 +264,34 @@ def _fields_of(name: str, defined: Mapping[str, Any]) -> Any:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path looks like a recording, and not like a video or a folder of images."""
+    """Whether a path is a recording by what it holds, and no video or folder of images."""
     if path.is_dir():
-        holds = {file.suffix for file in path.iterdir()}
-        return (path / "metadata.yaml").exists() or bool(holds & set(SUFFIXES))
-    return path.suffix in SUFFIXES
+        return (path / METADATA).exists() or bool(data_files(path))
+    return bool(magic(path))
 
 
-def _storage(path: Path) -> Path:
-    """What rosbags opens for this path."""
+def _listed(path: Path) -> list[Path] | None:
+    """The files that a folder's metadata lists; None: there is none that can be used.
+
+    A recorder that was killed leaves its data without it, or an empty one.
+    """
     if not path.exists():
         raise BagError(f"{path} does not exist")
     if not path.is_dir():
-        if path.suffix not in SUFFIXES:
-            raise BagError(
-                f"{path} is not a recording: expected a rosbag2 directory or a file ending in "
-                f"{', '.join(SUFFIXES)}"
-            )
         if path.stat().st_size == 0:
             raise BagError(f"{path} is an empty file")
-        return path
-    if (path / "metadata.yaml").exists():
-        load_yaml((path / "metadata.yaml").read_text(encoding="utf-8"))  # with limits
-        return path
-    # A recorder that was killed leaves its data without metadata.yaml.
-    files = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES)
-    if len(files) != 1:
-        raise BagError(
-            f"{path} is not a recording: the directory has no metadata.yaml and "
-            f"{len(files)} files ending in {', '.join(SUFFIXES)}"
-        )
-    return files[0]
+        if not magic(path):
+            raise BagError(
+                f"{path} is not a recording: expected a rosbag2 folder, or a file that is an MCAP, "
+                "a database of rosbag2 or a ROS 1 bag by its first bytes"
+            )
+        return None
+    if not (path / METADATA).is_file():
+        return None
+    tree = load_yaml((path / METADATA).read_text(encoding="utf-8"))  # with limits
+    about = tree.get("rosbag2_bagfile_information") if isinstance(tree, dict) else None
+    names = about.get("relative_file_paths") if isinstance(about, dict) else None
+    return [path / Path(str(name)).name for name in names] if isinstance(names, list) else None
 
 
 @contextlib.contextmanager
@@ -253,7 +308,7 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def _as_ros2(message: Any, type_name: str) -> Any:
-    """A ROS 1 message with the field names of ROS 2 (``header.seq`` stays as an extra)."""
+    """A message of ROS 1 with the field names of ROS 2 (``header.seq`` stays as an extra)."""
     if type_name != "sensor_msgs/msg/CameraInfo":
         return message
     # ROS 2 spells D, K, R and P in lower case.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.camera import Camera, DistortionModel, Roi
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.messages import MessageError, frame_id
 
 
@@ -71,26 +72,69 @@ def read_camera_info(message: Any) -> Calibration:
             f"binning of {binning[0]} x {binning[1]} leaves nothing of an image of "
             f"{width} x {height}"
         )
-    return Calibration(
-        frame=frame,
-        width=width,
-        height=height,
-        K=K,
-        D=D,
-        distortion_model=_distortion_model(str(message.distortion_model), D),
-        binning=binning,
-        roi=_roi(message.roi, width, height),
-    )
+    model, D = _lens(str(message.distortion_model), D)
+    roi = _roi(message.roi, width, height)
+    found = Calibration(frame, width, height, K, D, model, binning, roi)
+    if binning != (1, 1) or roi is not None:
+        _check_binned(K, (width, height), found)
+    return found
 
 
-def _distortion_model(name: str, D: tuple[float, ...]) -> str:
-    if not name and not any(D):
-        return DistortionModel.PLUMB_BOB.value  # drivers of ideal and simulated cameras say nothing
+# What drivers call the models besides.
+_NAMES = {
+    "fisheye": "equidistant", "kannala_brandt": "equidistant", "kannala_brandt4": "equidistant",
+    "plumb bob": "plumb_bob", "radtan": "plumb_bob", "brown_conrady": "plumb_bob",
+    "rational": "rational_polynomial",
+}  # fmt: skip
+_RATIONAL = 8  # coefficients of OpenCV's models and more
+
+
+def _lens(said: str, D: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
+    """The model and its coefficients, where what is said can mean one lens only.
+
+    Drivers of ideal and simulated cameras name no model; others fill D with zeros, or write
+    OpenCV's coefficients, which mean the same in all lengths, under the name of the shortest.
+    """
+    used = max((k + 1 for k, value in enumerate(D) if value != 0.0), default=0)
+    name = _NAMES.get(said.lower(), said.lower())
+    if name in ("", "none", "pinhole", "plumb_bob"):
+        if used > 5 and len(D) >= _RATIONAL:
+            name = "rational_polynomial"
+        elif name == "plumb_bob" or used == 0 or len(D) >= 5:
+            name = "plumb_bob"
+        else:
+            raise MessageError(
+                f"distortion_model is {said!r}, and {len(D)} coefficients may be of plumb_bob or "
+                "of equidistant: name it"
+            )
     if name not in tuple(DistortionModel):
         raise MessageError(
-            f"distortion_model must be one of {', '.join(DistortionModel)}; found {name!r}"
+            f"distortion_model must be one of {', '.join(DistortionModel)}; found {said!r}"
         )
-    return name
+    counts = DistortionModel(name).law.counts
+    fitting = [count for count in counts if used <= count < len(D)]
+    return name, D if len(D) in counts or not fitting else D[: max(fitting)]
+
+
+# Principal points lie so near the middle, as a share of the image.
+_CENTRAL = 0.2
+
+
+def _check_binned(K: tuple[float, ...], size: tuple[int, int], image: Calibration) -> None:
+    """Refuse a K of the delivered image beside a binning or a region, which would count twice."""
+    camera = image.camera(0.0, ScanDirection.TOP_TO_BOTTOM)
+    centre = np.array([K[2], K[5]])
+
+    def central(extent: tuple[int, int]) -> bool:
+        return bool(np.all(np.abs(centre / extent - 0.5) < _CENTRAL))
+
+    if camera.size != size and central(camera.size) and not central(size):
+        raise MessageError(
+            f"K is of the delivered image of {camera.size[0]}x{camera.size[1]}: its principal "
+            f"point ({K[2]:g}, {K[5]:g}) lies in the middle of that, not of the {size[0]}x{size[1]}"
+            " of the message; give width and height of that image without binning and region, or a "
+            "K of all pixels"
+        )
 
 
 def _roi(roi: Any, width: int, height: int) -> Roi | None:
@@ -104,6 +148,7 @@ def _roi(roi: Any, width: int, height: int) -> Roi | None:
     ):
         raise MessageError(
             f"the region of interest, {region.width} x {region.height} at ({region.x_offset}, "
-            f"{region.y_offset}), does not lie in the image of {width} x {height}"
+            f"{region.y_offset}), does not lie in the image of {width} x {height}: width and "
+            "height are those of all pixels"
         )
     return region

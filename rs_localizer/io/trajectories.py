@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.bags import SUFFIXES, BagError, BagReader, open_bag
+from rs_localizer.io.bags import BagError, BagReader, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
 
 # Files round quaternions to four digits or more; what is further from 1 is no rotation.
@@ -234,7 +234,7 @@ def read_motions(
             not line.startswith("#") for line in twists.read_text(encoding="utf-8").splitlines()
         )
         return Motions(read_tum(path / POSES_FILE), read_twists(twists) if has_twists else None)
-    if path.is_file() and path.suffix not in SUFFIXES:
+    if path.is_file() and not is_bag(path):
         return Motions(read_tum(path), None)
     with open_bag(path) as bag:
         pose_topic = _topic(bag, _POSE, pose_topic, "--pose-topic", required=True)

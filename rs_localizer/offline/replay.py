@@ -366,6 +366,10 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
         topic, _, message = item
         return topic == topics.frames and localizer.awaits_imu(stamp_ns(message), LOOK_AHEAD)
 
+    for name, topic in topics.of.items():  # which recorders may write last
+        if name.endswith(CAMERA_INFO):
+            first = next((message for _, _, message in bag.messages((topic,))), None)
+            list(_each(inputs[topic].take(localizer, first)) if first is not None else ())
     messages = imu_first(bag.messages(topics.names), topics.of.get(IMU), awaits)
     last: Item | None = None
     for last in messages:

@@ -2,16 +2,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of all three kinds are written and read back; bad ones are refused by name."""
 
+import contextlib
+import sqlite3
+import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from rs_localizer.io.bags import STORAGES, BagError, BagWriter, make_message, open_bag
+from rs_localizer.io.bags import (
+    STORAGES,
+    BagError,
+    BagWriter,
+    is_bag,
+    make_message,
+    open_bag,
+    typestore,
+)
 from rs_localizer.io.messages import make_header
+from rs_localizer.io.recording import make_image
 
 
 def point(seconds: int, x: float) -> Any:
@@ -97,9 +110,10 @@ def test_nothing_is_overwritten(tmp_path):
     ("name", "content", "expected"),
     [
         ("absent", None, "absent does not exist"),
-        ("notes.txt", b"hello", r"notes.txt is not a recording: expected .*\.mcap, \.db3, \.bag"),
+        ("notes.txt", b"hello", r"notes.txt is not a recording: expected a rosbag2 folder, or a"),
         ("zero.mcap", b"", "zero.mcap is an empty file"),
-        ("wrong.mcap", b"hello" * 99, "wrong.mcap cannot be read as a recording: .*magic"),
+        ("wrong.mcap", b"hello" * 99, "wrong.mcap is not a recording"),
+        ("short.mcap", b"\x89MCAP0\r\n", "short.mcap is an empty recording"),
     ],
 )
 def test_what_is_no_recording_is_refused(tmp_path, name, content, expected):
@@ -109,13 +123,125 @@ def test_what_is_no_recording_is_refused(tmp_path, name, content, expected):
         pass
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-def test_truncated_recording(tmp_path, storage):
-    with BagWriter(tmp_path / "bag", storage) as bag:
+def cut(bag: Path, share: float) -> Path:
+    """The file of a recording, of which the end is missing."""
+    (data,) = (file for file in bag.iterdir() if file.name != "metadata.yaml")
+    content = data.read_bytes()
+    data.write_bytes(content[: int(share * len(content))])
+    return data
+
+
+def test_a_truncated_database(tmp_path):
+    with BagWriter(tmp_path / "bag", "sqlite3") as bag:
         for index in range(500):
             bag.write("/points", point(index, 1.0), index)
-    (data,) = (file for file in (tmp_path / "bag").iterdir() if file.name != "metadata.yaml")
-    content = data.read_bytes()
-    data.write_bytes(content[: int(0.6 * len(content))])
+    cut(tmp_path / "bag", 0.6)
     with pytest.raises(BagError, match="bag cannot be read"), open_bag(tmp_path / "bag") as opened:
         list(opened.messages(["/points"]))
+
+
+def test_of_a_cut_mcap_all_whole_chunks_are_read(tmp_path):
+    """Chunks of 1 MB; within one, messages are in no order."""
+    with BagWriter(tmp_path / "bag", "mcap") as bag:
+        for index in range(40):
+            image = np.full(100_000, index, np.uint8)
+            bag.write("/images", make_image(index, "png", image.tobytes()), index ^ 1)
+    data = cut(tmp_path / "bag", 0.7)
+    for path in (tmp_path / "bag", data):  # with its metadata, and without
+        with open_bag(path) as opened:
+            read = list(opened.messages(["/images"]))
+            assert opened.fault.startswith(f"{data.name} is cut off: the ")
+        assert len(read) in (20, 22, 24, 26)
+        assert [stamp for _, stamp, _ in read] == list(range(len(read)))
+        assert all(set(message.data) == {stamp ^ 1} for _, stamp, message in read)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
+def test_packed_files_without_metadata(tmp_path, storage, mode):
+    """What a recorder packs, as a folder without metadata and as its file, whatever its name."""
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=STORAGES[storage])
+    writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    kind = "geometry_msgs/msg/PointStamped"
+    with writer:
+        connection = writer.add_connection("/points", kind, typestore=typestore())
+        writer.write(connection, 5, typestore().serialize_cdr(point(3, 3.0), kind))
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    (data,) = (tmp_path / "bag").iterdir()
+    odd = tmp_path / "download"
+    odd.write_bytes(data.read_bytes())
+    for path in (tmp_path / "bag", data, odd):
+        assert is_bag(path)
+        with open_bag(path) as bag:
+            ((topic, stamp, message),) = bag.messages(["/points"])
+        assert (topic, stamp, message.point.x) == ("/points", 5, 3.0)
+
+
+def test_parts_of_a_split_recording(tmp_path):
+    """Without metadata, or with metadata of files that were renamed; the tenth after the ninth."""
+    (tmp_path / "bag").mkdir()
+    for part in range(11):
+        with BagWriter(tmp_path / f"part{part}") as bag:
+            bag.write("/points", point(part, float(part)), part)
+        (data,) = (file for file in (tmp_path / f"part{part}").glob("*.mcap"))
+        data.rename(tmp_path / "bag" / f"rec_{part}.mcap")
+    (tmp_path / "bag" / "0001.jpg").write_bytes(b"none")
+    (tmp_path / "part0" / "metadata.yaml").rename(tmp_path / "bag" / "metadata.yaml")
+    for _ in range(2):
+        with open_bag(tmp_path / "bag") as bag:
+            assert [stamp for _, stamp, _ in bag.messages(["/points"])] == list(range(11))
+        (tmp_path / "bag" / "metadata.yaml").unlink(missing_ok=True)
+
+
+def mcap(
+    path: Path, profile: str, encoding: str, schema: tuple[str, str, str], data: bytes
+) -> None:
+    """An MCAP of one message, without an index."""
+
+    def text(word: str) -> bytes:
+        return struct.pack("<I", len(word.encode())) + word.encode()
+
+    name, kind, definition = schema
+    records = (
+        (1, text(profile) + text("test")),
+        (3, struct.pack("<H", 1) + text(name) + text(kind) + text(definition)),
+        (4, struct.pack("<HH", 1, 1) + text("/points") + text(encoding) + struct.pack("<I", 0)),
+        (5, struct.pack("<HIQQ", 1, 0, 7, 7) + data),
+        (15, bytes(4)),
+        (2, bytes(20)),
+    )
+    whole = b"".join(struct.pack("<BQ", code, len(part)) + part for code, part in records)
+    path.write_bytes(b"\x89MCAP0\r\n" + whole + b"\x89MCAP0\r\n")
+
+
+@pytest.mark.parametrize("profile", ["ros1", ""])
+def test_ros1_in_an_mcap(tmp_path, profile):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    stamp = store.types["builtin_interfaces/msg/Time"](sec=5, nanosec=6)
+    header = store.types["std_msgs/msg/Header"](seq=9, stamp=stamp, frame_id="cam")
+    kind = "geometry_msgs/msg/PointStamped"
+    old = store.types[kind](header, store.types["geometry_msgs/msg/Point"](1.0, 2.0, 3.0))
+    schema = "geometry_msgs/PointStamped", "ros1msg", store.generate_msgdef(kind)[0]
+    data = bytes(store.serialize_ros1(old, kind))
+    mcap(tmp_path / "old.mcap", profile, "ros1", schema, data)
+    with open_bag(tmp_path / "old.mcap") as bag:
+        assert bag.topics == {"/points": kind}
+        ((_, stamp_ns, found),) = bag.messages(["/points"])
+    assert (stamp_ns, found.header.stamp.nanosec, found.header.frame_id) == (7, 6, "cam")
+    assert found.point.z == 3.0
+
+
+def test_messages_of_others_are_named(tmp_path):
+    schema = "foxglove.CompressedImage", "jsonschema", "{}"
+    mcap(tmp_path / "fox.mcap", "", "json", schema, b"{}")
+    said = r"fox.mcap has no messages of ROS: they are json, as of foxglove.CompressedImage; record"
+    with pytest.raises(BagError, match=said), open_bag(tmp_path / "fox.mcap"):
+        pass
+
+
+def test_databases_of_others_are_no_recordings(tmp_path):
+    with contextlib.closing(sqlite3.connect(tmp_path / "database.db")) as tables:
+        tables.execute("CREATE TABLE images (id)")
+        tables.commit()
+    assert not is_bag(tmp_path / "database.db")
+    assert not is_bag(tmp_path)

@@ -65,3 +65,53 @@ def test_binning_and_region(make_camera_info):
 def test_what_is_no_calibration_is_said(make_camera_info, changes, text):
     with pytest.raises(MessageError, match=text):
         read_camera_info(make_camera_info(**changes)).camera(0.0, "top_to_bottom")
+
+
+EIGHT = [0.1, -0.2, 0.01, 0.02, 0.3, 0.4, 0.5, 0.6]
+
+
+@pytest.mark.parametrize(
+    ("said", "D", "model", "kept"),
+    [
+        ("plumb_bob", [*EIGHT[:5], 0.0, 0.0, 0.0], "plumb_bob", EIGHT[:5]),  # of Orbbec
+        ("plumb_bob", [0.0] * 8, "plumb_bob", [0.0] * 5),
+        ("plumb_bob", EIGHT, "rational_polynomial", EIGHT),
+        ("plumb_bob", [*EIGHT[:5], *[0.0] * 9], "plumb_bob", EIGHT[:5]),
+        ("fisheye", EIGHT[:4], "equidistant", EIGHT[:4]),
+        ("equidistant", [*EIGHT[:4], 0.0], "equidistant", EIGHT[:4]),
+        ("", EIGHT[:5], "plumb_bob", EIGHT[:5]),
+        ("", EIGHT, "rational_polynomial", EIGHT),
+        ("Plumb Bob", EIGHT[:5], "plumb_bob", EIGHT[:5]),
+        ("none", [], "plumb_bob", []),
+    ],
+)
+def test_where_one_lens_only_can_be_meant(make_camera_info, said, D, model, kept):
+    camera = read_camera_info(make_camera_info(distortion_model=said, d=np.array(D))).camera(
+        0.0, "top_to_bottom"
+    )
+    assert (camera.distortion_model, camera.D.tolist()) == (model, kept)
+
+
+def test_where_two_lenses_can_be_meant(make_camera_info):
+    message = make_camera_info(distortion_model="", d=np.array(EIGHT[:4]))
+    with pytest.raises(MessageError, match="4 coefficients may be of plumb_bob or of equidistant"):
+        read_camera_info(message)
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"binning_x": 2, "binning_y": 2},
+        {"roi": roi(0, 0, 640, 480)},
+        {"roi": roi(640, 480, 640, 480)},
+    ],
+)
+def test_a_K_of_the_delivered_image_is_named(make_camera_info, told):
+    """Of a sensor of 1280x960; its binning, or its region, would count twice."""
+    sensor = {"width": 1280, "height": 960} | told
+    with pytest.raises(
+        MessageError, match=r"K is of the delivered image of 640x480: its principal"
+    ):
+        read_camera_info(make_camera_info(**sensor))
+    K = np.array([1000.0, 0.0, 639.5, 0.0, 1020.0, 479.5, 0.0, 0.0, 1.0])
+    assert tuple(K) == read_camera_info(make_camera_info(k=K, **sensor)).K
