@@ -273,23 +273,6 @@ class OrientationCovariance(StrEnum):
     ROLL_PITCH_YAW = "roll_pitch_yaw"
 
 
-class ShutterDepth(StrEnum):
-    """By which depth the shutter is taken out of images."""
-
-    NONE = "none"  # there are no such images
-    FAR = "far"
-    PLANE = "plane"
-    MAP = "map"
-
-
-class Px4Odometry(StrEnum):
-    """Axes of the world in which PX4 gets its external vision, if it does."""
-
-    NONE = "none"
-    FRD = "frd"
-    NED = "ned"
-
-
 class MatchBy(StrEnum):
     """What keypoints and landmarks are compared by."""
 
@@ -475,19 +458,6 @@ class NodeConfig(LocalizerConfig):
         "What covariances of poses are about; fixed_axes: rotations about those of the map, as "
         "REP-103 has it; roll_pitch_yaw: these angles, as robot_localization reads them",
     )
-    px4_odometry: str = setting(
-        Px4Odometry.NONE,
-        "External vision of PX4 on ~/vehicle_odometry; frd: the map has z up; ned: it has x east, "
-        "y north, z up; needs px4_msgs and base_frame",
-        fixed=True,
-    )
-    image_rect_shutter: str = setting(
-        ShutterDepth.NONE,
-        "Images as a global shutter would have taken them on ~/image_rect_shutter, from image or "
-        "image/compressed; far: the turn is undone; plane: by the plane of the frame's inliers; "
-        "map: by what lies between them",
-        fixed=True,
-    )
     transform_tolerance: float = setting(
         0.2,
         "How long to wait for a transform that is not there yet, and how far map_to_odom is "
@@ -537,14 +507,6 @@ class NodeConfig(LocalizerConfig):
         for name in ("odom_frame", "map_frame"):
             if not getattr(self, name):
                 raise ValueError(f"{name} must not be empty")
-        if self.px4_odometry != Px4Odometry.NONE and not self.base_frame:
-            raise ValueError(
-                f"px4_odometry {self.px4_odometry} needs base_frame, a body with x forward, y left "
-                "and z up: PX4 would take the camera's axes for its own"
-            )
-        fixed = self.orientation_covariance == OrientationCovariance.FIXED_AXES
-        if self.px4_odometry != Px4Odometry.NONE and not fixed:
-            raise ValueError("px4_odometry needs orientation_covariance fixed_axes")
         if self.base_frame == self.odom_frame:
             raise ValueError(f"base_frame and odom_frame are both {self.odom_frame!r}")
 
@@ -575,8 +537,8 @@ class NodeConfig(LocalizerConfig):
                     f"{name}.scan_direction must be one of {', '.join(ScanDirection)}; "
                     f"got {camera.scan_direction!r}"
                 )
-        for name in ("estimate_readout_time", "marker_map", "image_rect_shutter"):
-            if getattr(self, name) not in (False, "", ShutterDepth.NONE):
+        for name in ("estimate_readout_time", "marker_map"):
+            if getattr(self, name) not in (False, ""):
                 raise ValueError(f"{name} is for one camera: leave it out with cameras")
 
 

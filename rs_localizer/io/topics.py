@@ -12,7 +12,7 @@ DETECTIONS = "detections"  # tags of apriltag_ros
 MAP_POINTS = "map_points"
 CAMERA_INFO = "camera_info"
 IMU = "imu"
-# Inputs of the detectors, and of the localizer's image_rect_shutter.
+# Inputs of the detectors.
 IMAGE = "image"
 COMPRESSED_IMAGE = "image/compressed"
 # Outputs, below the name of their node.
@@ -22,8 +22,6 @@ POSE_WITH_COVARIANCE = "pose_with_covariance"
 TWIST_WITH_COVARIANCE = "twist_with_covariance"
 ODOMETRY = "odometry"
 INLIERS = "inliers"
-IMAGE_RECT_SHUTTER = "image_rect_shutter"
-VEHICLE_ODOMETRY = "vehicle_odometry"
 DEBUG_IMAGE = "debug_image"
 COMPRESSED_DEBUG_IMAGE = "debug_image/compressed"
 # Of everybody.

@@ -6,6 +6,7 @@ The flight is the independent simulator's; laws of motion and the truth judge, i
 who listen.
 """
 
+import runpy
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +27,6 @@ from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.offline.replay import TF_TYPE, find_topics, find_transforms, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.published import broadcast
-from rs_localizer.pipeline.px4 import Jumps, vehicle_odometry
 from rs_localizer.settings import build, load_params_file
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -98,11 +98,6 @@ def frames(flight) -> list[Localized]:
     return replayed(flight, NodeConfig(readout_time=0.03, base_frame="base_link"))[0]
 
 
-def test_a_flight_is_no_jump(frames):
-    jumps = Jumps(NodeConfig)
-    assert [jumps.add(frame) for frame in frames] == [0] * LENGTH
-
-
 def squared(errors: Array, covariances: Array) -> float:
     """Mean squared error in standard deviations, per component."""
     each = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
@@ -144,7 +139,10 @@ def vars_of(vector: SimpleNamespace) -> tuple[float, float, float]:
 
 
 def test_px4_gets_the_same_in_its_axes(flight, frames):
-    fields = [vehicle_odometry(frame, "ned", 0, frame.stamp_ns) for frame in frames][SETTLED]
+    odometry = [messages(frame, make_message)["odometry"] for frame in frames]
+    px4 = runpy.run_path(str(CONFIG.parent / "examples" / "px4_odometry.py"))
+    assert not any(map(px4["jumps"], odometry, odometry[1:]))
+    fields = [px4["vehicle_odometry"](message, "ned", 0, 0) for message in odometry[SETTLED]]
 
     def column(name: str) -> Array:
         return np.array([item[name] for item in fields], dtype=float)

@@ -21,11 +21,10 @@ from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
-from rs_localizer.io.outputs import Localized, Pose, Twist
+from rs_localizer.io.outputs import Localized
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.px4 import Jumps
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import simulate_frames
 from rs_localizer.simulation.scene import room
@@ -295,72 +294,3 @@ def test_no_more_than_max_points_are_used_and_that_is_said_once():
         assert isinstance(result, Localized)
         assert len(result.estimate.inliers) == 500
     assert notices == ["3000 points have come; max_points of them, 500, are used"]
-
-
-PERIOD = 1 / 30
-
-
-def frame(
-    seconds: float, position: Any = (0.0, 0.0, 0.0), turn: Any = (0.0, 0.0, 0.0), **others: Any
-) -> Localized:
-    """1 cm and 0.5 deg; 0.1 m/s and 1 deg/s where it has a twist."""
-    unused: Any = None
-    pose = Pose(
-        np.array(position),
-        Rotation.from_rotvec(turn).as_matrix(),
-        np.diag([1e-4] * 3 + [7.6e-5] * 3),
-    )
-    stamp = round((100.0 + seconds) * 1e9)
-    given = {"map_frame": "map", "twist": None} | others
-    return Localized(stamp, stamp, body_frame="base", pose=pose, inliers=unused, dropped=0,
-                     estimate=unused, **given)  # fmt: skip
-
-
-def twist(linear: Any = (0.0, 0.0, 0.0), angular: Any = (0.0, 0.0, 0.0)) -> Twist:
-    return Twist(np.array(linear), np.array(angular), np.diag([1e-2] * 3 + [3e-4] * 3))
-
-
-@pytest.fixture
-def jumps() -> Jumps:
-    return Jumps(NodeConfig)
-
-
-def test_a_flight_that_goes_on_has_none(jumps):
-    velocity, rate = np.array([5.0, 0.0, 0.0]), np.array([0.0, 0.0, 2.0])
-    position, rng = np.zeros(3), np.random.default_rng(0)
-    for index in range(60):
-        turn = rate * index * PERIOD
-        noise = rng.normal(size=6) * [*[0.01] * 3, *[8.7e-3] * 3]
-        seen = Rotation.from_rotvec(noise[3:]) * Rotation.from_rotvec(turn)
-        moving = {"twist": twist(velocity, rate)}
-        made = frame(index * PERIOD, position + noise[:3], seen.as_rotvec(), **moving)
-        assert jumps.add(made) == 0
-        position = position + Rotation.from_rotvec(turn).apply(velocity) * PERIOD
-
-
-@pytest.mark.parametrize(
-    ("frames", "counts"),
-    [
-        # A step that nobody makes, or turn; it stays there.
-        (
-            [frame(k * PERIOD, (0.0, 0.3 * min(k, 1), 0.0), twist=twist()) for k in range(3)],
-            [0, 1, 1],
-        ),
-        ([frame(k * PERIOD, turn=(0.3 * k, 0.0, 0.0), twist=twist()) for k in range(2)], [0, 1]),
-        # After a gap a camera may be elsewhere.
-        ([frame(k, (0.3 * k, 0.0, 0.0), twist=twist()) for k in (0.0, 1.0)], [0, 0]),
-        # Without a twist it may be moving: 3 m/s, 6 rad/s.
-        (
-            [frame(0.0), frame(PERIOD, (0.1, 0.0, 0.0), (0.2, 0.0, 0.0)),
-             frame(2 * PERIOD, (2.0, 0.0, 0.0))],
-            [0, 0, 1],
-        ),
-        # Another map, and a clock that goes back.
-        (
-            [frame(1.0), frame(1.0 + PERIOD, map_frame="other"), frame(0.0, map_frame="other")],
-            [0, 1, 2],
-        ),
-    ],
-)  # fmt: skip
-def test_jumps_are_counted(jumps, frames, counts):
-    assert [jumps.add(each) for each in frames] == counts

@@ -12,16 +12,14 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
-from rs_localizer.config import ImuUse, NodeConfig, Px4Odometry, ShutterDepth
+from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
-from rs_localizer.io.topics import VEHICLE_ODOMETRY
 from rs_localizer.pipeline.compiling import compile_in_child, give_back_compiler, is_compiled
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import Input, Results, Role
-from rs_localizer.pipeline.px4 import TYPE, Jumps, vehicle_odometry
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.pipeline.rigs import RigLocalizer, frame_localizer, inputs_of
 from rs_localizer.ros.localizer import transforms
@@ -33,7 +31,6 @@ from rs_localizer.ros.localizer.health import (
     of_interest,
     tell,
 )
-from rs_localizer.ros.localizer.shutter import ShutterOutput
 from rs_localizer.ros.localizer.transforms import Broadcaster
 from rs_localizer.ros.node.conversion import create_output, installed, make_message, message_class
 from rs_localizer.ros.node.health import Health
@@ -235,45 +232,6 @@ _ODD = (
 )  # fmt: skip
 
 
-def check_px4(config: NodeConfig) -> None:
-    """Raise ``ValueError`` if PX4's output is asked for and px4_msgs is not installed."""
-    if config.px4_odometry == Px4Odometry.NONE:
-        return
-    try:
-        message_class(TYPE)
-    except ImportError as error:
-        raise ValueError(
-            f"px4_odometry {config.px4_odometry} needs the package px4_msgs, which cannot be "
-            f"imported ({error}): build it in your workspace, of PX4's release"
-        ) from error
-
-
-class Px4Output:
-    """Publishes frames as PX4's messages on ``~/vehicle_odometry``; needs px4_msgs.
-
-    Args:
-        node: creates the publisher, and has the clock of the stamps.
-        frames: has the settings that hold now.
-    """
-
-    def __init__(self, node: LifecycleNode, frames: FrameLocalizer) -> None:
-        self._node = node
-        self._world = frames.config.px4_odometry
-        self._jumps = Jumps(lambda: frames.config)
-        self._publisher = create_output(node, message_class(TYPE), f"~/{VEHICLE_ODOMETRY}")
-
-    def publish(self, frame: Localized) -> None:
-        """Publish a frame; jumps are counted whether anybody listens or not."""
-        resets = self._jumps.add(frame)
-        if self._publisher.get_subscription_count():
-            now_ns = self._node.get_clock().now().nanoseconds
-            fields = vehicle_odometry(frame, self._world, resets, now_ns)
-            self._publisher.publish(make_message(TYPE, **fields))
-
-    def close(self) -> None:
-        self._node.destroy_lifecycle_publisher(self._publisher)
-
-
 class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     """Localizes; see :class:`rs_localizer.ros.node.managed.ManagedNode`."""
 
@@ -283,7 +241,6 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def __init__(self, **options: Any) -> None:
         self._localizer: FrameLocalizer | None = None  # the worker's: here only to be read
         self._feed: Feed | None = None
-        self._shutter: ShutterOutput | None = None
         self._undo = contextlib.ExitStack()  # of what :meth:`open` has made
         super().__init__(NODE_NAME, NodeConfig, tell, **options)
         self._broadcaster = Broadcaster(self, self.refusals)
@@ -310,7 +267,6 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def check(self, config: NodeConfig) -> None:
         frame_localizer(config)
         transforms.check(config)
-        check_px4(config)
 
     def open(self, config: NodeConfig) -> None:
         frames = frame_localizer(config, self.refusals.notice, self._broadcaster.tf)
@@ -323,14 +279,6 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         outputs = Outputs(self)
         publish = [outputs.publish]
         self._undo.callback(outputs.close)
-        if config.px4_odometry != Px4Odometry.NONE:
-            px4 = Px4Output(self, frames)
-            publish.append(px4.publish)
-            self._undo.callback(px4.close)
-        if config.image_rect_shutter != ShutterDepth.NONE:
-            self._shutter = ShutterOutput(self, frames)
-            publish.append(self._shutter.add)
-            self._undo.callback(self._shutter.close)
         publish.append(lambda frame: self._broadcaster.publish(frame, frames.config))
 
         def publish_all(frame: Localized) -> None:
@@ -345,13 +293,12 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         self._undo.callback(self.destroy_service, reset)
 
     def close(self) -> None:
-        self._feed = self._localizer = self._shutter = None
+        self._feed = self._localizer = None
         self._undo.close()
 
     def begin(self, config: NodeConfig) -> None:
         assert self._feed is not None
-        images = {} if self._shutter is None else self._shutter.topics()
-        topics = self.listen(self._feed.topics(config) | images)
+        topics = self.listen(self._feed.topics(config))
         if config.readout_time == 0.0 and not config.is_rig:
             until = " until it is estimated" if config.estimate_readout_time else ""
             self.warn(
