@@ -1,11 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The frames of a recording and their transforms: tf2 without ROS.
+"""Rigid transforms, and the frames of a recording: what tf2 answers, without ROS.
 
-Follows ``tf2::BufferCore`` of Jazzy, step by step and operation by operation, so that a replay
-gives what the node gives: quaternions are composed and not matrices, a rotation goes through a
-matrix where it is stored and where it is looked up, and between two samples positions are
-interpolated linearly and rotations by slerp.
+Between two samples positions are interpolated linearly and rotations by slerp, as tf2 does; both
+agree to rounding.
 """
 
 from __future__ import annotations
@@ -20,89 +18,6 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.messages import Make, make_header, make_quaternion, make_vector
 from rs_localizer.io.messages import stamp_ns as stamp_of
-
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]  # x y z w
-
-
-def plus(a: Vector, b: Vector) -> Vector:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def conjugate(q: Quaternion) -> Quaternion:
-    return -q[0], -q[1], -q[2], q[3]
-
-
-def times(p: Quaternion, q: Quaternion) -> Quaternion:
-    return (
-        p[3] * q[0] + p[0] * q[3] + p[1] * q[2] - p[2] * q[1],
-        p[3] * q[1] + p[1] * q[3] + p[2] * q[0] - p[0] * q[2],
-        p[3] * q[2] + p[2] * q[3] + p[0] * q[1] - p[1] * q[0],
-        p[3] * q[3] - p[0] * q[0] - p[1] * q[1] - p[2] * q[2],
-    )
-
-
-def rotate(q: Quaternion, v: Vector) -> Vector:
-    turned = (
-        q[3] * v[0] + q[1] * v[2] - q[2] * v[1],
-        q[3] * v[1] + q[2] * v[0] - q[0] * v[2],
-        q[3] * v[2] + q[0] * v[1] - q[1] * v[0],
-        -q[0] * v[0] - q[1] * v[1] - q[2] * v[2],
-    )
-    return times(turned, conjugate(q))[:3]
-
-
-def _dot(p: Quaternion, q: Quaternion) -> float:
-    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3]
-
-
-def slerp(p: Quaternion, q: Quaternion, ratio: float) -> Quaternion:
-    cosine = _dot(p, q)
-    if cosine < 0.0:  # the same rotation, nearer
-        q = (-q[0], -q[1], -q[2], -q[3])
-    cosine = min(abs(cosine) / math.sqrt(_dot(p, p) * _dot(q, q)), 1.0)
-    angle = math.acos(cosine) * 2.0 / 2.0
-    if angle == 0.0:
-        return p
-    scale = 1.0 / math.sin(angle)
-    s, t = math.sin((1.0 - ratio) * angle), math.sin(ratio * angle)
-    return (
-        (p[0] * s + q[0] * t) * scale,
-        (p[1] * s + q[1] * t) * scale,
-        (p[2] * s + q[2] * t) * scale,
-        (p[3] * s + q[3] * t) * scale,
-    )
-
-
-def through_matrix(q: Quaternion) -> Quaternion:
-    """The quaternion of a quaternion's matrix, as tf2's Transform holds rotations."""
-    x, y, z, w = q
-    s = 2.0 / _dot(q, q)
-    xs, ys, zs = x * s, y * s, z * s
-    wx, wy, wz = w * xs, w * ys, w * zs
-    xx, xy, xz = x * xs, x * ys, x * zs
-    yy, yz, zz = y * ys, y * zs, z * zs
-    m = (
-        (1.0 - (yy + zz), xy - wz, xz + wy),
-        (xy + wz, 1.0 - (xx + zz), yz - wx),
-        (xz - wy, yz + wx, 1.0 - (xx + yy)),
-    )
-    trace = m[0][0] + m[1][1] + m[2][2]
-    if trace > 0.0:
-        s = math.sqrt(trace + 1.0)
-        w, s = s * 0.5, 0.5 / s
-        return (m[2][1] - m[1][2]) * s, (m[0][2] - m[2][0]) * s, (m[1][0] - m[0][1]) * s, w
-    i = 1 if m[0][0] < m[1][1] else 0
-    if m[i][i] < m[2][2]:
-        i = 2
-    j, k = (i + 1) % 3, (i + 2) % 3
-    s = math.sqrt(m[i][i] - m[j][j] - m[k][k] + 1.0)
-    result = [0.0, 0.0, 0.0, 0.0]
-    result[i], s = s * 0.5, 0.5 / s
-    result[3] = (m[k][j] - m[j][k]) * s
-    result[j] = (m[j][i] + m[i][j]) * s
-    result[k] = (m[k][i] + m[i][k]) * s
-    return result[0], result[1], result[2], result[3]
 
 
 # How far the squared norm of a quaternion may be from one; tf2 ignores those that are farther.
@@ -204,60 +119,41 @@ def make_transform(
     )
 
 
-# Longer chains are loops.
-_MOST_LINKS = 1000
-_NOWHERE: tuple[Vector, Quaternion] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-
-
-@dataclass(frozen=True, slots=True)
-class _Link:
-    """A frame in its parent."""
-
-    parent: str
-    translation: Vector
-    rotation: Quaternion
-
-
 @dataclass(slots=True)
 class _Track:
-    """A frame in its parent over time: one link for ever, or samples in the order of time."""
+    """A frame in its parent over time: for ever, or samples in the order of time."""
 
-    static: _Link | None = None
-    stamps: list[int] = field(default_factory=list)  # ns
-    links: list[_Link] = field(default_factory=list)
+    stamps: list[int] = field(default_factory=list)  # ns; none: the only link holds for ever
+    links: list[tuple[str, Transform]] = field(default_factory=list)  # parent, parent_from_child
 
-    def add(self, stamp: int, link: _Link) -> None:
-        self.static = None
+    def add(self, stamp: int, parent: str, link: Transform) -> None:
         index = bisect_right(self.stamps, stamp)
         self.stamps.insert(index, stamp)
-        self.links.insert(index, link)
+        self.links.insert(index, (parent, link))
 
-    def at(self, stamp: int | None) -> _Link:
-        if self.static is not None:
-            return self.static
-        if stamp is None or stamp == self.stamps[-1]:
+    def at(self, stamp: int | None) -> tuple[str, Transform]:
+        """Parent and transform at a time; None: the latest."""
+        if not self.stamps or stamp is None or stamp == self.stamps[-1]:
             return self.links[-1]
-        if stamp == self.stamps[0]:
-            return self.links[0]
         index = bisect_right(self.stamps, stamp)
         if not 0 < index < len(self.stamps):
             raise TransformError(
                 f"is known from {self.stamps[0] * 1e-9:.3f} s to {self.stamps[-1] * 1e-9:.3f} s, "
                 f"not at {stamp * 1e-9:.3f} s"
             )
-        older, newer = self.links[index - 1], self.links[index]
-        if older.parent != newer.parent:
-            return older
+        (parent, older), (other, newer) = self.links[index - 1 : index + 1]
         before, after = self.stamps[index - 1 : index + 1]
-        ratio = float(stamp - before) / float(after - before)
-        rest = 1.0 - ratio
-        a, b = older.translation, newer.translation
-        between = (
-            rest * a[0] + ratio * b[0],
-            rest * a[1] + ratio * b[1],
-            rest * a[2] + ratio * b[2],
-        )
-        return _Link(older.parent, between, slerp(older.rotation, newer.rotation, ratio))
+        if parent != other or stamp == before:
+            return parent, older
+        return parent, _between(older, newer, (stamp - before) / (after - before))
+
+
+def _between(older: Transform, newer: Transform, ratio: float) -> Transform:
+    from scipy.spatial.transform import Rotation, Slerp  # late: live, tf2 does this
+
+    both = Rotation.from_matrix(np.stack([older.rotation, newer.rotation]))
+    rotation = Slerp([0.0, 1.0], both)(ratio).as_matrix()
+    return Transform(rotation, (1.0 - ratio) * older.translation + ratio * newer.translation)
 
 
 class TransformTree:
@@ -275,44 +171,35 @@ class TransformTree:
         for stamped in message.transforms:
             parent = stamped.header.frame_id.removeprefix("/")
             child = stamped.child_frame_id.removeprefix("/")
-            t, q = stamped.transform.translation, stamped.transform.rotation
-            translation, rotation = (t.x, t.y, t.z), (q.x, q.y, q.z, q.w)
             try:
-                from_numbers(translation, rotation)
+                link = read_transform(stamped.transform)
             except TransformError:
                 continue
             if not parent or not child or parent == child:
                 continue
-            link = _Link(parent, translation, through_matrix(rotation))
             self._parents.add(parent)
             if static:
-                self._tracks[child] = _Track(static=link)
-            else:
-                self._tracks.setdefault(child, _Track()).add(stamp_of(stamped), link)
+                self._tracks[child] = _Track(links=[(parent, link)])
+                continue
+            track = self._tracks.get(child)
+            if track is None or not track.stamps:  # the first, or one that was static
+                track = self._tracks[child] = _Track()
+            track.add(stamp_of(stamped), parent, link)
 
     def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
         """``target_from_source`` at a time; None: the latest that all its links have."""
         target, source = target.removeprefix("/"), source.removeprefix("/")
         if target == source:
-            return from_numbers((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+            return Transform(np.eye(3), np.zeros(3))
         if stamp_ns is None:
             stamp_ns = self._latest(target, source)
         self._check(target, source)
-        to_source, top, gap = self._climb(source, target, stamp=stamp_ns)
-        translation, rotation = _compose(to_source)
-        if top != target:
-            to_target, met, other_gap = self._climb(target, top, source, stamp=stamp_ns)
-            if met == source:  # the source lies above the target: its own way up does not count
-                translation, rotation = _NOWHERE
-            elif met != top:
-                raise other_gap or gap or _unconnected(target, source)
-            top_translation, top_rotation = _compose(to_target)
-            back = conjugate(top_rotation)
-            x, y, z = top_translation
-            inverse = rotate(back, (-x, -y, -z))
-            translation = plus(rotate(back, translation), inverse)
-            rotation = times(back, rotation)
-        return from_numbers(translation, through_matrix(rotation))
+        of_source, gap = self._above(source, stamp_ns)
+        of_target, other_gap = self._above(target, stamp_ns)
+        meeting = next((name for name in of_source if name in of_target), None)
+        if meeting is None:
+            raise other_gap or gap or _unconnected(target, source)
+        return of_target[meeting].inverse() @ of_source[meeting]
 
     def moves(self, target: str, source: str) -> bool:
         """Whether a link between the two frames comes with a time."""
@@ -322,12 +209,12 @@ class TransformTree:
     def _latest(self, target: str, source: str) -> int | None:
         """The last time (ns) at which all links are known; None: they are all static."""
         self._check(target, source)
-        chains = [self._frames_above(name) for name in (target, source)]
-        meeting = next((name for name in chains[0] if name in chains[1]), None)
+        ways = [list(self._above(name, None)[0]) for name in (target, source)]
+        meeting = next((name for name in ways[0] if name in ways[1]), None)
         if meeting is None:
             raise _unconnected(target, source)
-        tracks = [self._tracks[name] for chain in chains for name in chain[: chain.index(meeting)]]
-        return min((t.stamps[-1] for t in tracks if t.static is None), default=None)
+        tracks = [self._tracks[name] for way in ways for name in way[: way.index(meeting)]]
+        return min((track.stamps[-1] for track in tracks if track.stamps), default=None)
 
     def _check(self, *names: str) -> None:
         for name in names:
@@ -335,43 +222,23 @@ class TransformTree:
                 frames = ", ".join(sorted(self._parents | set(self._tracks))) or "none"
                 raise TransformError(f"frame {name!r} does not exist; there are {frames}")
 
-    def _frames_above(self, name: str) -> list[str]:
-        """A frame and all that it hangs on, by the latest links."""
-        names = [name]
+    def _above(
+        self, name: str, stamp_ns: int | None
+    ) -> tuple[dict[str, Transform], TransformError | None]:
+        """A frame in itself and in all that it hangs on, up to the root or a gap, and that gap."""
+        here = Transform(np.eye(3), np.zeros(3))
+        found = {name: here}
         while name in self._tracks:
-            name = self._tracks[name].at(None).parent
-            names.append(name)
-            if len(names) > _MOST_LINKS:
-                raise TransformError(f"the frames above {names[0]!r} are a loop")
-        return names
-
-    def _climb(
-        self, name: str, *ends: str, stamp: int | None
-    ) -> tuple[list[_Link], str, TransformError | None]:
-        """Links from a frame up to one of the ends, the root, or where the time is not known.
-
-        With them, the frame that was reached, and why it was not the root.
-        """
-        links: list[_Link] = []
-        while name in self._tracks and name not in ends:
             try:
-                link = self._tracks[name].at(stamp)
+                parent, link = self._tracks[name].at(stamp_ns)
             except TransformError as error:
-                return links, name, TransformError(f"frame {name!r} {error}")
-            links.append(link)
-            name = link.parent
-            if len(links) > _MOST_LINKS:
-                raise TransformError("the frames are a loop")
-        return links, name, None
+                return found, TransformError(f"frame {name!r} {error}")
+            if parent in found:
+                raise TransformError(f"the frames above {name!r} are a loop")
+            name, here = parent, link @ here
+            found[name] = here
+        return found, None
 
 
 def _unconnected(target: str, source: str) -> TransformError:
     return TransformError(f"frames {target!r} and {source!r} are not connected")
-
-
-def _compose(links: list[_Link]) -> tuple[Vector, Quaternion]:
-    translation, rotation = _NOWHERE
-    for link in links:
-        translation = plus(rotate(link.rotation, translation), link.translation)
-        rotation = times(link.rotation, rotation)
-    return translation, rotation

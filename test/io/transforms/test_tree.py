@@ -81,10 +81,8 @@ def test_the_same_as_tf2(tree, target, source, stamp_ns, text):
     x, y, z, *quaternion = map(float.fromhex, text.split())
     expected = from_numbers((x, y, z), tuple(quaternion))
     found = tree.lookup(target, source, stamp_ns)
-    # Between samples there are sines, which each C library rounds in its own way.
-    tolerance = 1e-15 if stamp_ns == 1_012_345_678 else 0.0
-    assert np.allclose(found.translation, expected.translation, rtol=0.0, atol=tolerance)
-    assert np.allclose(found.rotation, expected.rotation, rtol=0.0, atol=tolerance)
+    assert np.allclose(found.translation, expected.translation, rtol=0.0, atol=1e-14)
+    assert np.allclose(found.rotation, expected.rotation, rtol=0.0, atol=1e-14)
 
 
 def test_what_moves(tree):
