@@ -51,17 +51,6 @@ def setting(
     return field(default=default, metadata=metadata)
 
 
-def bond_setting() -> Any:
-    """Of every node."""
-    return setting(
-        0.0,
-        "Time between heartbeats for nav2's lifecycle manager, in s; 0: none; needs the package "
-        "bond",
-        (0.0, 2.0),
-        read_only=True,
-    )
-
-
 def check(config: Any, prefix: str = "") -> None:
     """Raise ``ValueError`` for the first setting whose type, range or choice is wrong."""
     for item in fields(config):
@@ -489,7 +478,6 @@ class NodeConfig(LocalizerConfig):
         (0.0, 0.0, -1.0), "Direction in which things fall in the map, of any length: imu.gravity"
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
-    bond_heartbeat_period: float = bond_setting()
     # Of each of the cameras, by its name.
     of_cameras: Mapping[str, CameraSettings] = field(default_factory=dict)
 
@@ -581,7 +569,6 @@ class DetectorConfig:
         (-10.0, 10.0),
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
-    bond_heartbeat_period: float = bond_setting()
 
     def __post_init__(self) -> None:
         check(self)
@@ -612,7 +599,6 @@ class FeatureConfig:
         read_only=True,
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
-    bond_heartbeat_period: float = bond_setting()
 
     def __post_init__(self) -> None:
         check(self)

@@ -19,7 +19,6 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.io.messages import Make, make_header, make_quaternion, make_vector
 from rs_localizer.io.messages import stamp_ns as stamp_of
 
-
 # How far the squared norm of a quaternion may be from one; tf2 ignores those that are farther.
 _NORM_TOLERANCE = 1e-2
 

@@ -71,8 +71,6 @@ def test_launch_files_exist(page, line):
     code += (pages.ROOT / "rs_localizer" / "ros" / "launching.py").read_text()
     known = {*settings(), *settings(DetectorConfig), *settings(FeatureConfig), *INPUTS}
     known |= set(re.findall(r"\"(\w+)\"", code))
-    if file == "two_cameras.launch.py":  # which puts these names together
-        known |= {"left", "right", "left_params_file", "right_params_file"}
     given = {word.partition(":=")[0] for word in arguments if not word.startswith("--")}
     assert given <= known, page
 

@@ -30,15 +30,13 @@ from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.node.conversion import create_output, make_message
 from rs_localizer.ros.node.health import (
-    SOME,
     Health,
     Level,
     State,
+    counts,
     hindrance,
-    milliseconds,
     one_line,
     out_of_service,
-    refused,
 )
 from rs_localizer.ros.node.inputs import Silence, Topic
 from rs_localizer.ros.node.managed import ManagedNode
@@ -58,20 +56,8 @@ class Sight:
 
 def values_of(summary: Summary[Sight]) -> dict[str, str]:
     """What a node says in numbers."""
-    values = {
-        "Images in (Hz)": f"{summary.rate_in:.1f}",
-        "Images done (Hz)": f"{summary.rate_out:.1f}",
-        **milliseconds("Latency", summary.latency),
-    }
-    if summary.last is not None:
-        values |= summary.last.values
-    values |= {
-        "Images received": str(sum(summary.received.values())),
-        "Images done": str(summary.answered),
-        "Images replaced": str(summary.replaced),
-        "Images refused": str(summary.refused),
-    }
-    return values | refused(summary)
+    values = counts(summary, "Images", "Images done")
+    return values if summary.last is None else values | summary.last.values
 
 
 def judge(
@@ -82,9 +68,9 @@ def judge(
     if causes or not silence:
         message = "; ".join([f"{State.WAITING} images", *causes])
         return Health(Level.WARN, State.WAITING, message, subject="images")
-    message = hindrance(summary, "images", "looked at")
-    if sum(summary.recently_refused.values()) > SOME * summary.recently_received:
-        message += f": {', '.join(sorted(summary.recently_refused))}"
+    message = hindrance(summary, "images")
+    if "refused" in message:
+        message += f": {', '.join(sorted(summary.recent_reasons))}"
     if message := message or one_line(oddities):
         return Health(Level.WARN, State.DETECTING, message)
     last = summary.last

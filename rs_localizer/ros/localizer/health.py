@@ -16,11 +16,10 @@ from rs_localizer.ros.node.health import (
     Health,
     Level,
     State,
+    counts,
     hindrance,
-    milliseconds,
     one_line,
     out_of_service,
-    refused,
 )
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.statistics import Summary
@@ -171,7 +170,7 @@ def _judge(condition: Condition, summary: Summary[Answer]) -> Health:
         what = " and ".join(said(name) for name in condition.missing)
         causes = [f"{it.topic}: {it.cause}" for it in condition.silence.values() if it.cause]
         for reason in (input_named(name).refused for name in condition.missing):
-            if count := summary.refusals.get(reason):
+            if count := summary.reasons.get(reason):
                 causes.append(f"{count} cannot be used: see {reason} in the log")
         if any(item.mismatch for item in condition.silence.values()):
             level = Level.ERROR
@@ -205,24 +204,19 @@ def _judge_frames(summary: Summary[Answer], oddities: Mapping[str, str]) -> Heal
             message = "no frame has been localized yet"
             return Health(Level.WARN, State.WAITING, message, subject="frames")
         message = f"the last {summary.refused_since_answer} frames gave no pose"
-        if reasons := summary.recently_refused:
+        if reasons := summary.recent_reasons:
             message += f", mostly for {max(reasons, key=lambda reason: reasons[reason])}"
         message = "; ".join(filter(None, [message, one_line(oddities)]))
         return Health(Level.ERROR, State.LOST, message)
     state = State.TRACKING if last.tracked else State.LOCALIZED
-    if message := hindrance(summary, "frames", "localized") or one_line(oddities):
+    if message := hindrance(summary, "frames") or one_line(oddities):
         return Health(Level.WARN, state, message)
     message = f"{state} with {last.inliers} of {last.points} points"
     return Health(Level.OK, state, message)
 
 
 def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
-    values = {
-        "Frames in (Hz)": f"{summary.rate_in:.1f}",
-        "Poses out (Hz)": f"{summary.rate_out:.1f}",
-        **milliseconds("Latency", summary.latency),
-        **milliseconds("Delay of the stamp", summary.delay),
-    }
+    values = counts(summary, "Frames", "Poses out")
     if summary.last is not None:
         values |= {
             "Points": str(summary.last.points),
@@ -245,17 +239,6 @@ def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
     values |= condition.of_rig
     if condition.imu is not None:
         values |= imu_values(condition.imu)
-    values |= {
-        "Frames received": str(sum(summary.received.values())),
-        "Poses published": str(summary.answered),
-        "Frames replaced": str(summary.replaced),
-        "Frames refused": str(summary.refused),
-    }
-    if summary.recently_missing:
-        values["Frames missing by their stamps, recently"] = str(summary.recently_missing)
-    if summary.dropped:
-        values["Frames dropped"] = str(summary.dropped)
-    values |= refused(summary)
     values |= {f"Topic {item.topic}": _heard(item) for item in condition.silence.values()}
     return values | {f"Odd: {name}": text for name, text in condition.oddities.items()}
 

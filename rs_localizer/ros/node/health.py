@@ -12,7 +12,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from rs_localizer.io.topics import DIAGNOSTICS
-from rs_localizer.ros.node.statistics import WINDOW, Percentiles, Summary
+from rs_localizer.ros.node.statistics import WINDOW, Event, Summary
 
 SOME = 0.05
 """Share of the messages that may be refused, replaced or lost before it is worth a warning."""
@@ -86,42 +86,39 @@ def one_line(oddities: Mapping[str, str]) -> str:
     return "; ".join(f"{name}: {text}" for name, text in oddities.items())
 
 
-def hindrance(summary: Summary[Any], what: str, worked_on: str) -> str:
-    """Why some of the last messages have no result; empty where nearly all have one.
-
-    Args:
-        summary: of a node that works.
-        what: the messages are.
-        worked_on: is done with them.
-    """
-    worth_it = SOME * summary.recently_received
-    lately = f"in the last {WINDOW:.0f} s"
-    if (bad := sum(summary.recently_refused.values())) > worth_it:
-        return f"{bad} {what} were refused {lately}"
-    if summary.recently_replaced > worth_it:
-        return f"{summary.recently_replaced} {what} came while another was {worked_on} {lately}"
-    if summary.recently_missing > worth_it:
-        sent = summary.recently_received + summary.recently_missing
+def hindrance(summary: Summary[Any], what: str) -> str:
+    """Why some of the last messages have no result; empty where nearly all have one."""
+    lately, lost = summary.lately, summary.recently_missing
+    came = lately.get(Event.RECEIVED, 0)
+    for event, text in ((Event.REFUSED, "were refused"), (Event.REPLACED, "came too fast")):
+        if (bad := lately.get(event, 0)) > SOME * came:
+            return f"{bad} {what} {text} in the last {WINDOW:.0f} s"
+    if lost > SOME * came:
         return (
-            f"messages are lost: by their stamps, {summary.recently_missing} of {sent} have not "
-            f"come {lately} (is the publisher best effort, or the machine too slow?)"
+            f"messages are lost: by their stamps, {lost} of {came + lost} have not come in the "
+            f"last {WINDOW:.0f} s (is the publisher best effort, or the machine too slow?)"
         )
     return ""
 
 
-def milliseconds(name: str, value: Percentiles | None) -> dict[str, str]:
-    """Median and 95th percentile as values of a diagnosis; nothing where they are unknown."""
-    if value is None:
-        return {}
-    return {
-        f"{name} p50 (ms)": f"{1e3 * value[0]:.2f}",
-        f"{name} p95 (ms)": f"{1e3 * value[1]:.2f}",
+def counts(summary: Summary[Any], what: str, done: str) -> dict[str, str]:
+    """Rates, latency and totals as values of a diagnosis; what is zero and rare is left out."""
+    values = {
+        f"{what} in (Hz)": f"{summary.rate_in:.1f}",
+        f"{done} (Hz)": f"{summary.rate_out:.1f}",
     }
-
-
-def refused(summary: Summary[Any]) -> dict[str, str]:
-    """How often which reason, as values of a diagnosis."""
-    return {f"Refused: {reason}": str(n) for reason, n in sorted(summary.refusals.items())}
+    for name, value in (("Latency", summary.latency), ("Delay of the stamp", summary.delay)):
+        if value is not None:
+            values[f"{name} p50 (ms)"], values[f"{name} p95 (ms)"] = (
+                f"{1e3 * seconds:.2f}" for seconds in value
+            )
+    for event in Event:
+        count = summary.total.get(event, 0)
+        if count or event is not Event.DROPPED:
+            values[f"{what} {event}"] = str(count)
+    if summary.recently_missing:
+        values[f"{what} missing by their stamps, recently"] = str(summary.recently_missing)
+    return values | {f"Refused: {reason}": str(n) for reason, n in sorted(summary.reasons.items())}
 
 
 _PERIOD = 1.0  # s

@@ -11,7 +11,6 @@ import gc
 import os
 import sys
 import traceback
-import uuid
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
@@ -20,7 +19,6 @@ import rclpy
 from lifecycle_msgs.msg import State as Label
 from lifecycle_msgs.msg import Transition
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
@@ -28,7 +26,6 @@ from rclpy.task import Future
 
 from rs_localizer.process.stopping import StopRequest
 from rs_localizer.ros.node import parameters
-from rs_localizer.ros.node.conversion import installed, make_message
 from rs_localizer.ros.node.health import Diagnostics, Health
 from rs_localizer.ros.node.inputs import Inputs, Silence, Topic
 from rs_localizer.ros.node.refusals import Refusals, describe
@@ -45,55 +42,6 @@ def _failure(function: Callable[[], None]) -> str:
     except Exception:
         return traceback.format_exc()
     return ""
-
-
-_BOND = "bond/msg/Status"
-# What nav2's own nodes use, s.
-_BOND_TIMEOUT = 4.0
-
-
-class Bond:
-    """Heartbeats for nav2's lifecycle manager, which takes a node for dead when they end.
-
-    The protocol is that of ros/bond_core: both sides say that they are there, by the node's name;
-    the one that ends says so, and the other confirms it.
-
-    Args:
-        node: whose name it has.
-        period: s between heartbeats, by the machine's own clock.
-    """
-
-    def __init__(self, node: Any, period: float) -> None:
-        self._node, self._period, self._instance = node, period, str(uuid.uuid4())
-        self._publisher = node.create_publisher(installed(_BOND), "bond", 5)
-        self._subscription = node.create_subscription(installed(_BOND), "bond", self._take, 5)
-        clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(period, lambda: self._send(True), clock=clock)
-
-    def _take(self, status: Any) -> None:
-        ours = (status.id, status.instance_id) == (self._node.get_name(), self._instance)
-        if status.id == self._node.get_name() and not ours and not status.active:
-            self._timer.cancel()
-            self._send(False)
-
-    def _send(self, active: bool) -> None:
-        self._publisher.publish(
-            make_message(
-                _BOND,
-                id=self._node.get_name(),
-                instance_id=self._instance,
-                active=active,
-                heartbeat_timeout=_BOND_TIMEOUT,
-                heartbeat_period=self._period,
-            )
-        )
-
-    def close(self) -> None:
-        """End it, and say so."""
-        self._node.destroy_timer(self._timer)
-        self._node.destroy_subscription(self._subscription)
-        self._send(False)
-        self._node.destroy_publisher(self._publisher)
 
 
 Result = TypeVar("Result")
@@ -143,11 +91,7 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
         self.worker: Worker[State, Result] | None = None
         # From activating to deactivating.
         self._inputs: Inputs | None = None
-        self._bond: Bond | None = None
         config = parameters.declare(self, kind)
-        self._bond_period: float = config.bond_heartbeat_period
-        if self._bond_period and installed(_BOND) is None:
-            raise ValueError("bond_heartbeat_period needs the package bond: ros-$ROS_DISTRO-bond")
         if self.checked_at_start:
             self.check(config)
         for text in parameters.unknown_names(self, kind):
@@ -306,8 +250,6 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
             self._end()
             super().on_deactivate(state)
             return TransitionCallbackReturn.FAILURE
-        if self._bond_period:
-            self._bond = Bond(self, self._bond_period)
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -329,9 +271,6 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
         super().destroy_node()
 
     def _end(self) -> None:
-        if self._bond is not None:
-            self._bond.close()
-            self._bond = None
         self.listen({})
         if self.worker is not None:
             self.worker.pause()

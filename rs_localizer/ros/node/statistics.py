@@ -5,8 +5,9 @@
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -51,29 +52,34 @@ Kept = TypeVar("Kept")
 WINDOW = 5.0
 """What "now" means, in s."""
 
-# Frames that are remembered; a window of faster cameras is shorter.
-_MOST_FRAMES = 2048
+# Events that are remembered; a window of faster cameras is shorter.
+_MOST_EVENTS = 8192
 # A header's stamp that is older (s), or in the future, was made by another clock.
 _OLDEST_STAMP = 10.0
 
 Percentiles = tuple[float, float]  # s, the median and the 95th
 
 
+class Event(StrEnum):
+    """What becomes of a frame."""
+
+    RECEIVED = "received"
+    ANSWERED = "answered"
+    REFUSED = "refused"
+    REPLACED = "replaced"  # by a newer one, before it was looked at
+    DROPPED = "dropped"  # because the node was deactivated
+
+
 @dataclass(frozen=True, slots=True)
 class Summary(Generic[Kept]):
     """How things are now."""
 
-    received: dict[str, int]  # frames since the start, by topic
-    answered: int
-    replaced: int
-    dropped: int  # because the node was deactivated
-    refused: int
-    refusals: dict[str, int]  # also of messages that are no frames, by reason
+    total: Mapping[Event, int]  # frames since the start
+    lately: Mapping[Event, int]  # in the window
+    reasons: dict[str, int]  # of refusals since the start, also of messages that are no frames
+    recent_reasons: Mapping[str, int]  # of frames
     rate_in: float  # Hz
     rate_out: float  # Hz
-    recently_received: int  # in the window
-    recently_replaced: int
-    recently_refused: dict[str, int]  # frames, by reason
     recently_missing: int  # sent and not received, by the gaps between the stamps
     refused_since_answer: int  # frames in a row
     busy: float | None  # s for which the worker has had the same frame
@@ -99,41 +105,32 @@ class Statistics(Generic[Result, Kept]):
         ros_time: Callable[[], int] = time.time_ns,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._refusals = refusals
-        self._tell = tell
-        self._ros_time = ros_time
-        self._clock = clock
+        self._refusals, self._tell = refusals, tell
+        self._ros_time, self._clock = ros_time, clock
         self._lock = threading.Lock()
-        self._received: Counter[str] = Counter()
-        self._answered = self._replaced = self._refused = self._dropped = self._in_a_row = 0
+        self._total: Counter[Event] = Counter()
+        self._in_a_row = 0
         self._last: Kept | None = None
         self._started: float | None = None
-        # Times of what happened, and what is told of each answer.
-        self._in: deque[float] = deque(maxlen=_MOST_FRAMES)
-        self._stamps: dict[str, deque[tuple[float, int]]] = {}
-        self._refused_at: deque[tuple[float, str]] = deque(maxlen=_MOST_FRAMES)
-        self._replaced_at: deque[float] = deque(maxlen=_MOST_FRAMES)
-        self._out: deque[tuple[float, float, float]] = deque(maxlen=_MOST_FRAMES)
+        # When what happened, with a stamp (topic, ns), a reason, or latency and delay in s.
+        self._events: deque[tuple[float, Event, Any]] = deque(maxlen=_MOST_EVENTS)
+
+    def _add(self, event: Event, what: Any = None, count: int = 1) -> None:
+        self._total[event] += count
+        self._events.append((self._clock(), event, what))
 
     def received(self, topic: str, message: Any) -> None:
         """A frame has come: a message with a header."""
         with self._lock:
-            now = self._clock()
-            self._received[topic] += 1
-            self._in.append(now)
-            stamps = self._stamps.setdefault(topic, deque(maxlen=_MOST_FRAMES))
-            stamps.append((now, stamp_ns(message)))
+            self._add(Event.RECEIVED, (topic, stamp_ns(message)))
 
     def replaced(self) -> None:
-        """A frame gave way to a newer one before it was looked at."""
         with self._lock:
-            self._replaced += 1
-            self._replaced_at.append(self._clock())
+            self._add(Event.REPLACED)
 
     def dropped(self, count: int) -> None:
-        """The node was deactivated before these frames were answered."""
         with self._lock:
-            self._dropped += count
+            self._add(Event.DROPPED, count=count)
 
     def started(self) -> None:
         """The worker has taken a frame."""
@@ -144,50 +141,47 @@ class Statistics(Generic[Result, Kept]):
 
     def refused(self, refusal: Refusal) -> None:
         with self._lock:
-            self._refused += 1
+            self._add(Event.REFUSED, refusal.reason)
             self._in_a_row += 1
-            self._refused_at.append((self._clock(), refusal.reason))
         self._refusals.add(refusal.reason, refusal.detail)
 
     def answered(self, result: Result, received: float) -> None:
         """A result was published of a frame that had been received at this time of the clock."""
-        input_stamp_ns, summary = self._tell(result)
-        now = self._clock()
+        input_stamp_ns, kept = self._tell(result)
         delay = (self._ros_time() - input_stamp_ns) * 1e-9
         with self._lock:
-            self._answered += 1
+            self._add(Event.ANSWERED, (self._clock() - received, delay))
             self._in_a_row = 0
-            self._out.append((now, now - received, delay))
-            self._last = summary
+            self._last = kept
 
     def summary(self) -> Summary[Kept]:
         """How things are now."""
         with self._lock:
-            since = self._clock() - WINDOW
-            out = [item for item in self._out if item[0] >= since]
-            started = self._started
-            return Summary(
-                received=dict(self._received),
-                answered=self._answered,
-                replaced=self._replaced,
-                dropped=self._dropped,
-                refused=self._refused,
-                refusals=dict(self._refusals.counts),
-                rate_in=_rate([when for when in self._in if when >= since]),
-                rate_out=_rate([when for when, _, _ in out]),
-                recently_received=sum(when >= since for when in self._in),
-                recently_replaced=sum(when >= since for when in self._replaced_at),
-                recently_refused=Counter(r for when, r in self._refused_at if when >= since),
-                recently_missing=sum(
-                    missing([stamp for when, stamp in stamps if when >= since])
-                    for stamps in self._stamps.values()
-                ),
-                refused_since_answer=self._in_a_row,
-                busy=None if started is None else self._clock() - started,
-                latency=_percentiles([latency for _, latency, _ in out]),
-                delay=_percentiles([d for _, _, d in out if 0.0 <= d <= _OLDEST_STAMP]),
-                last=self._last,
-            )
+            now, started = self._clock(), self._started
+            recent = [item for item in self._events if item[0] >= now - WINDOW]
+            total, last, in_a_row = Counter(self._total), self._last, self._in_a_row
+
+        def of(event: Event) -> list[tuple[float, Any]]:
+            return [(when, what) for when, each, what in recent if each is event]
+
+        came, out = of(Event.RECEIVED), of(Event.ANSWERED)
+        topics = {topic for _, (topic, _) in came}
+        return Summary(
+            total=total,
+            lately=Counter(event for _, event, _ in recent),
+            reasons=dict(self._refusals.counts),
+            recent_reasons=Counter(reason for _, reason in of(Event.REFUSED)),
+            rate_in=_rate([when for when, _ in came]),
+            rate_out=_rate([when for when, _ in out]),
+            recently_missing=sum(
+                missing([stamp for _, (topic, stamp) in came if topic == one]) for one in topics
+            ),
+            refused_since_answer=in_a_row,
+            busy=None if started is None else now - started,
+            latency=_percentiles([latency for _, (latency, _) in out]),
+            delay=_percentiles([d for _, (_, d) in out if 0.0 <= d <= _OLDEST_STAMP]),
+            last=last,
+        )
 
 
 def _rate(times: list[float]) -> float:

@@ -111,7 +111,7 @@ def test_numbers_of_a_working_node(world):
         "Lens error (px)": "0.00",
         "Iterations": "64",
         "Frames received": "100",
-        "Poses published": "100",
+        "Frames answered": "100",
         "Frames replaced": "0",
         "Frames refused": "0",
         "Topic /camera_info": "messages arrive, best effort",
@@ -122,7 +122,7 @@ def test_numbers_of_a_working_node(world):
     values = world.diagnose().values
     assert values["Poses out (Hz)"] == "0.0"
     assert "Latency p50 (ms)" not in values
-    assert values["Poses published"] == "100"
+    assert values["Frames answered"] == "100"
 
 
 def test_numbers_of_a_rig_and_of_the_readout_time_that_the_motion_shows(world):

@@ -102,7 +102,7 @@ def test_the_newest_frame_wins_and_what_it_replaced_is_counted(fake):
     fake.wait(fake.done)
     assert fake.published == ["one old", "four old"]
     summary = fake.statistics.summary()
-    assert (summary.received, summary.replaced) == ({"frames": 4}, 2)
+    assert summary.total == {"received": 4, "answered": 2, "replaced": 2}
 
 
 def test_topics_do_not_replace_each_other(fake):
@@ -153,7 +153,7 @@ def test_errors_and_refusals_are_told_and_it_goes_on(fake):
     assert fake.published == ["light old"]
     assert fake.refusals.counts == {"internal_error": 1, "dark": 1}
     summary = fake.statistics.summary()
-    assert summary.refused == 2
+    assert summary.total["refused"] == 2
     assert fake.errors[0].startswith("ValueError('no such setting') in fail, ")
 
 
@@ -166,7 +166,7 @@ def test_nothing_is_published_after_a_pause(fake):
     fake.go_on.release(2)
     fake.wait(fake.done)
     assert fake.published == ["three old"]
-    assert fake.statistics.summary().dropped == 2  # none is lost unseen
+    assert fake.statistics.summary().total["dropped"] == 2  # none is lost unseen
 
 
 def test_a_late_mounting_keeps_no_other_frame_waiting(fake):
@@ -183,7 +183,7 @@ def test_a_late_mounting_keeps_no_other_frame_waiting(fake):
     fake.wait(fake.done)
     fake.wait(fake.done)
     assert fake.published == ["next old", "late 1", "late 2"]
-    assert fake.statistics.summary().refused == 0
+    assert fake.statistics.summary().total["refused"] == 0
 
 
 def test_a_mounting_that_does_not_come_is_a_refusal(fake):
@@ -205,7 +205,7 @@ def test_a_frame_that_waits_for_its_mounting_is_dropped_by_a_pause(fake):
     deadline = time.monotonic() + PATIENCE
     fake.worker.pause()
     fake.mounted = {"late"}
-    while not fake.statistics.summary().dropped:
+    while not fake.statistics.summary().total["dropped"]:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     assert fake.published == []
