@@ -442,6 +442,20 @@ class NodeConfig(LocalizerConfig):
         "Transform to publish: map_to_camera: the body (base_frame if set) in the map; "
         "map_to_odom: REP-105, needs odometry on TF",
     )
+    tf_rate: float = setting(
+        20.0,
+        "Rate of map_to_odom on TF, in Hz, the last correction held between and without frames; 0: "
+        "once a frame",
+        (0.0, 1000.0),
+    )
+    hold: float = setting(
+        0.0,
+        "How long the last correction is held where no frame gives a pose, in s; 0: for ever",
+        (0.0, 1e6),
+    )
+    two_d_mode: bool = setting(
+        False, "Of map_to_odom, z, roll and pitch are zero, for robots on a floor"
+    )
     orientation_covariance: str = setting(
         OrientationCovariance.FIXED_AXES,
         "What covariances of poses are about; fixed_axes: rotations about those of the map, as "

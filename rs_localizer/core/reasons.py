@@ -84,6 +84,7 @@ class Notice(StrEnum):
     REPEATED_MARKERS = "repeated_markers"
     # Of nodes.
     NOT_BROADCAST = "not_broadcast"
+    MAP_JUMPED = "map_jumped"
     INCOMPATIBLE_PUBLISHER = "incompatible_publisher"
     NO_POSE = "no_pose"
     NO_IMAGES = "no_images"

@@ -29,6 +29,7 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences, select_inliers
 from rs_localizer.io.outputs import Localized, Pose, Twist
 from rs_localizer.io.transforms import NotYetError, Transform, TransformError, Transforms
+from rs_localizer.pipeline.map_to_odom import corrected
 from rs_localizer.pipeline.pose_at_time import (
     backwards,
     either,
@@ -249,6 +250,12 @@ class Broadcast:
     parent_from_child: Transform
 
 
+def check_time(frame: Localized) -> None:
+    """Raise ``TransformError`` for a frame that says nothing of its time."""
+    if frame.input_stamp_ns == 0:
+        raise TransformError("header.stamp of the input is zero: the pose has no time for TF")
+
+
 def broadcast(frame: Localized, config: NodeConfig, transforms: Transforms) -> Broadcast | None:
     """The transform to publish of a frame; None when ``publish_tf`` is ``none``.
 
@@ -257,15 +264,14 @@ def broadcast(frame: Localized, config: NodeConfig, transforms: Transforms) -> B
     """
     if config.publish_tf == PublishTf.NONE:
         return None
-    if frame.input_stamp_ns == 0:
-        raise TransformError("header.stamp of the input is zero: the pose has no time for TF")
+    check_time(frame)
     map_from_body = Transform(frame.pose.rotation, frame.pose.position)
     if config.publish_tf == PublishTf.MAP_TO_CAMERA:
         return Broadcast(frame.stamp_ns, frame.map_frame, frame.body_frame, map_from_body)
-    body_from_odom = transforms.lookup(frame.body_frame, config.odom_frame, frame.stamp_ns)
+    odom_from_body = transforms.lookup(config.odom_frame, frame.body_frame, frame.stamp_ns)
     return Broadcast(
         frame.stamp_ns + round(config.transform_tolerance * 1e9),
         frame.map_frame,
         config.odom_frame,
-        map_from_body @ body_from_odom,
+        corrected(map_from_body, odom_from_body, two_d=config.two_d_mode),
     )

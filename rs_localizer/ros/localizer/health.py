@@ -11,6 +11,7 @@ import numpy as np
 from rs_localizer.io.outputs import CameraShare, Localized
 from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.inputs import Role, input_named, said
+from rs_localizer.pipeline.map_to_odom import Holding
 from rs_localizer.pipeline.refusal import IMU_REASONS
 from rs_localizer.ros.node.health import (
     Health,
@@ -121,6 +122,7 @@ class Condition:
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
     readout: MeasuredReadout | None = None  # as the camera's motion shows it
     imu: ImuState | None = None  # None: there is none
+    holding: Holding | None = None  # the correction of odometry; None: none is sent
     of_rig: Mapping[str, str] = field(default_factory=dict)  # of its cameras, by readable names
 
 
@@ -178,7 +180,7 @@ def _judge(condition: Condition, summary: Summary[Answer]) -> Health:
         return Health(level, State.WAITING, message, subject=what)
     if silent is not None:
         return silent
-    return _judge_frames(summary, condition.oddities)
+    return _judge_frames(summary, condition)
 
 
 def _silent_frames(condition: Condition) -> Health | None:
@@ -197,8 +199,8 @@ def _silent_frames(condition: Condition) -> Health | None:
     return Health(level, State.WAITING, message, subject="frames")
 
 
-def _judge_frames(summary: Summary[Answer], oddities: Mapping[str, str]) -> Health:
-    last = summary.last
+def _judge_frames(summary: Summary[Answer], condition: Condition) -> Health:
+    last, oddities = summary.last, condition.oddities
     if last is None or summary.refused_since_answer >= _LOST:
         if summary.refused_since_answer == 0:
             message = "no frame has been localized yet"
@@ -206,7 +208,8 @@ def _judge_frames(summary: Summary[Answer], oddities: Mapping[str, str]) -> Heal
         message = f"the last {summary.refused_since_answer} frames gave no pose"
         if reasons := summary.recent_reasons:
             message += f", mostly for {max(reasons, key=lambda reason: reasons[reason])}"
-        message = "; ".join(filter(None, [message, one_line(oddities)]))
+        held = "" if condition.holding is None else str(condition.holding)
+        message = "; ".join(filter(None, [message, held, one_line(oddities)]))
         return Health(Level.ERROR, State.LOST, message)
     state = State.TRACKING if last.tracked else State.LOCALIZED
     if message := hindrance(summary, "frames") or one_line(oddities):
@@ -236,6 +239,8 @@ def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
     if condition.readout is not None:
         readout, deviation = 1e3 * condition.readout.readout_time, 1e3 * condition.readout.deviation
         values["Readout time seen (ms)"] = f"{readout:.2f} +- {deviation:.2f}"
+    if condition.holding is not None:
+        values["Correction of odometry"] = str(condition.holding)
     values |= condition.of_rig
     if condition.imu is not None:
         values |= imu_values(condition.imu)

@@ -338,6 +338,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
             | (rig.faults if rig else {}),
             readout=watch.measured if watch else None,
             imu=imu,
+            holding=self._broadcaster.holding,
             of_rig=rig.values if rig else {},
         )
         health = diagnose(condition, self.statistics.summary())
@@ -346,5 +347,6 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         assert self._feed is not None  # as long as the service is there
         self._feed.reset()
+        self._broadcaster.forget()
         response.success, response.message = True, "the previous pose and twist are forgotten"
         return response

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-from rclpy.clock import JumpThreshold
+from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.subscription import Subscription
@@ -35,7 +35,8 @@ from rs_localizer.io.transforms import (
     make_transform,
     read_transform,
 )
-from rs_localizer.pipeline.published import Broadcast, broadcast
+from rs_localizer.pipeline.map_to_odom import Holding, MapToOdom
+from rs_localizer.pipeline.published import Broadcast, broadcast, check_time
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.ros.node.refusals import Refusals
@@ -149,7 +150,16 @@ class Tf:
         Raises:
             TransformError: when it is not known at all.
         """
-        return stamp_of(self._ask(target, source, None)) != 0
+        return self.latest(target, source)[0] != 0
+
+    def latest(self, target: str, source: str) -> tuple[int, Transform]:
+        """Stamp (ns) of the newest ``target_from_source``, and that; 0: it is static.
+
+        Raises:
+            TransformError: when it is not known at all.
+        """
+        found = self._ask(target, source, None)
+        return stamp_of(found), read_transform(found.transform)
 
     def _ask(self, target: str, source: str, stamp_ns: int | None) -> Any:
         """The geometry_msgs/TransformStamped that tf2 has now."""
@@ -220,6 +230,8 @@ def _text(error: Exception) -> str:
 
 # Frames that wait for odometry, which mostly comes later than they do.
 _MOST_PENDING = 100
+# Odometry that goes back by more (ns) has started over.
+_RESTART = 500_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,12 +246,16 @@ class _Pending:
 class Broadcaster:
     """TF's side of the outputs.
 
+    ``map_to_odom`` never stops: with each frame there is a new correction of odometry, and that is
+    sent ``tf_rate`` times a second, as long as odometry comes, stamped ``transform_tolerance``
+    ahead of it, so that whoever asks for a time that odometry knows has an answer.
+
     :meth:`publish` may be called from any thread; transforms are heard in one of their own, and all
     else belongs to the executor's.
 
     Args:
         node: sends, and listens for the odometry.
-        refusals: told of what was not sent, and of errors that nobody foresaw.
+        refusals: told of what was not sent, of jumps, and of errors that nobody foresaw.
     """
 
     def __init__(self, node: Node, refusals: Refusals) -> None:
@@ -247,8 +263,14 @@ class Broadcaster:
         self._node = node
         self._refusals = refusals
         self._broadcaster: Any = None
+        self._timer: Any = None
+        self._config: NodeConfig | None = None
+        self._sending = threading.Lock()  # of the next three
         self._pending: deque[_Pending] = deque(maxlen=_MOST_PENDING)
-        self._sending = threading.Lock()
+        self._correction, self._map_frame = MapToOdom(), ""
+        self._sent_ns = 0  # the newest stamp of map -> odom
+        self._holding: Holding | None = None
+        self._body = ""  # frame of the body whose correction is held
         self._own: set[tuple[str, str]] = set()  # parents and children that we have sent
         self._parents: dict[str, str] = {}  # that others have sent, by child
         self._sent = 0.0  # when, time.monotonic()
@@ -263,12 +285,23 @@ class Broadcaster:
         self.tf.configure(config)
         if config.publish_tf != PublishTf.NONE and self._broadcaster is None:
             self._broadcaster = import_tf2_ros(needed(config)).TransformBroadcaster(self._node)
+        self._stop_timer()
+        self._config = config
+        if config.publish_tf == PublishTf.MAP_TO_ODOM and config.tf_rate > 0.0:
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            self._timer = self._node.create_timer(1.0 / config.tf_rate, self._tick, clock=clock)
+
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+            self._timer = None
 
     def forget(self) -> None:
         """Send nothing of the frames so far."""
         with self._sending:
             self._pending.clear()
-            self._failed = None
+            self._correction.forget()
+            self._failed = self._holding = None
 
     def fault(self) -> dict[str, str]:
         """For the diagnostics: why nothing has been sent lately, if something should have been."""
@@ -278,8 +311,14 @@ class Broadcaster:
             return {}
         return {Notice.NOT_BROADCAST: failed[1]}
 
+    @property
+    def holding(self) -> Holding | None:
+        """How the correction of odometry stands; None: none is sent."""
+        return self._holding
+
     def close(self) -> None:
         self.forget()
+        self._stop_timer()
         self.tf.close()
         if self._broadcaster is not None:
             self._node.destroy_publisher(self._broadcaster.pub_tf)
@@ -311,22 +350,71 @@ class Broadcaster:
             self._pending.clear()
             for item in waiting:
                 try:
-                    self._send(broadcast(item.frame, item.config, self.tf))
+                    self._take(item.frame, item.config)
                 except NotYetError as error:
                     if time.monotonic() < item.deadline:
                         self._pending.append(item)
                     else:
-                        self._say(item, error)
+                        self._say(item.config, error)
                 except TransformError as error:
-                    self._say(item, error)
+                    self._say(item.config, error)
 
-    def _say(self, item: _Pending, error: TransformError) -> None:
-        text = f"publish_tf {item.config.publish_tf}: {error}"
+    def _take(self, frame: Localized, config: NodeConfig) -> None:
+        if config.publish_tf != PublishTf.MAP_TO_ODOM:
+            if (item := broadcast(frame, config, self.tf)) is not None:
+                self._send(item)
+            return
+        check_time(frame)
+        body_in_odom = self.tf.lookup(config.odom_frame, frame.body_frame, frame.stamp_ns)
+        last = self._correction.stamp_ns
+        if frame.map_frame != self._map_frame or (last is not None and frame.stamp_ns < last):
+            self._correction.forget()
+            self._map_frame = frame.map_frame
+        first = self._correction.stamp_ns is None
+        if jump := self._correction.take(frame, body_in_odom, two_d=config.two_d_mode):
+            self._refusals.notice(Notice.MAP_JUMPED, jump)
+        if first:  # nobody shall have to wait for the time that it is stamped ahead
+            self._sent_ns = 0
+            self._send_correction(frame.stamp_ns, config)
+        self._hold(frame.body_frame, config)
+
+    def _tick(self) -> None:
+        config = self._config
+        if config is None or config.publish_tf != PublishTf.MAP_TO_ODOM:
+            return
+        with self._sending:
+            try:
+                self._hold(self._body, config)
+            except TransformError as error:
+                self._say(config, error)
+
+    def _hold(self, body_frame: str, config: NodeConfig) -> None:
+        """Send what is held ahead of the newest odometry, if that is new."""
+        self._body = body_frame
+        if self._correction.stamp_ns is None:
+            return
+        newest_ns, body_in_odom = self.tf.latest(config.odom_frame, body_frame)
+        newest_ns = newest_ns or self._node.get_clock().now().nanoseconds
+        self._holding = self._correction.holding(newest_ns, body_in_odom)
+        ahead_ns = newest_ns + round(config.transform_tolerance * 1e9)
+        if ahead_ns < self._sent_ns - _RESTART:
+            self._sent_ns = 0
+        if ahead_ns > self._sent_ns:
+            self._send_correction(ahead_ns, config, newest_ns)
+
+    def _send_correction(self, stamp_ns: int, config: NodeConfig, now_ns: int = 0) -> None:
+        held = self._correction.held(now_ns or stamp_ns, config.hold)
+        if held is not None:
+            self._send(Broadcast(stamp_ns, self._map_frame, config.odom_frame, held))
+            self._sent_ns = stamp_ns
+
+    def _say(self, config: NodeConfig, error: TransformError) -> None:
+        text = f"publish_tf {config.publish_tf}: {error}"
         self._failed = time.monotonic(), text
         self._refusals.notice(Notice.NOT_BROADCAST, text)
 
-    def _send(self, item: Broadcast | None) -> None:
-        if item is None or self._broadcaster is None:
+    def _send(self, item: Broadcast) -> None:
+        if self._broadcaster is None:
             return
         other = self._parents.get(item.child, item.parent)
         if other != item.parent:

@@ -21,7 +21,7 @@ from rs_localizer.ros.localizer.transforms import Broadcaster, check
 from .robot import tf2_ros
 
 Notes = list[tuple[str, str]]
-HALF_TURN = (0.0, 0.0, 1.0, 0.0)
+HALF_TURN, NO_TURN = (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.fixture
@@ -121,16 +121,18 @@ def test_map_to_odom(made, robot, peer):
     # Odometry comes later than the frame: nothing waits, and it is sent when it has come.
     node.publish(frame(7 * second, x=10.0), node.config)
     robot.send("odom", "base_link", 3.0, 8 * second)
+    # At once for the frame, and ahead of the newest odometry.
+    heard(robot, peer, "map", "odom", 7 * second)
+    heard(robot, peer, "map", "odom", 8_400_000_000)
     sent = heard(robot, peer, "map", "odom")
-    assert sent.header.stamp.sec == 7
-    assert sent.header.stamp.nanosec == 500_000_000
+    assert (sent.header.stamp.sec, sent.header.stamp.nanosec) == (8, 500_000_000)
     # base_link is at 2.5 in odom, turned by half a turn, and at 10 in the map.
     assert sent.transform.translation.x == pytest.approx(12.5)
     assert sent.transform.rotation.z == pytest.approx(1.0)
     assert not node.notes
     # REP-105: with odometry, the map has the base where the localizer has found it.
-    node.publish(frame(7_800_000_000, x=11.0), node.config)
-    base = heard(robot, peer, "map", "base_link", 7_800_000_000)
+    base = heard(robot, peer, "map", "base_link", 7 * second)
+    assert base.transform.translation.x == pytest.approx(10.0)
     assert base.transform.rotation.w == pytest.approx(1.0)
 
 
@@ -152,6 +154,33 @@ def test_odometry_that_does_not_come(made, robot, peer):
     peer.spin_until(lambda: False, 0.1)
     with pytest.raises(Exception, match="does not exist"):
         robot.buffer.lookup_transform("map", "base_link", Time())
+
+
+def test_the_correction_never_stops(made, robot, peer):
+    node = made(publish_tf="map_to_odom", transform_tolerance=0.2, hold=3.0)
+    for tenth in range(50, 61):
+        robot.send("odom", "base_link", 0.1 * tenth, tenth * 10**8, NO_TURN)
+    known(node, peer, "odom", "base_link", 6 * 10**9)
+    node.publish(frame(5_500_000_000, x=5.5), node.config)
+    # No frame comes any more, odometry does.
+    for tenth in range(61, 80):
+        robot.send("odom", "base_link", 0.1 * tenth, tenth * 10**8, NO_TURN)
+        base = heard(robot, peer, "map", "base_link", tenth * 10**8 - 5 * 10**7)
+        assert base.transform.translation.x == pytest.approx(0.1 * tenth - 0.05)
+    known(node, peer, "odom", "base_link", 7_900_000_000)
+    peer.spin_until(lambda: node.broadcaster.holding.seconds > 2.35)
+    assert str(node.broadcaster.holding).startswith("holding for 2.4 s, ")
+    # A frame that contradicts it beyond all drift is told; it counts all the same.
+    node.publish(frame(7_800_000_000, x=97.8), node.config)
+    ((_, text),) = [note for note in node.notes if note[0] == "map_jumped"]
+    assert "jumps by 9e+03 cm" in text
+    # After hold it ends.
+    for tenth in range(80, 115):
+        robot.send("odom", "base_link", 0.1 * tenth, tenth * 10**8, NO_TURN)
+    known(node, peer, "odom", "base_link", 11_400_000_000)
+    peer.spin_until(lambda: False, 0.3)
+    with pytest.raises(Exception, match="future"):
+        robot.buffer.lookup_transform("map", "base_link", Time(nanoseconds=11_300_000_000))
 
 
 def test_map_to_camera(made, robot, peer):
