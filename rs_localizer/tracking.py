@@ -128,6 +128,7 @@ class Tracker:
         # Then, logarithm of the odds for a global shutter, beside those of any.
         self.of_rest = 0.0
         self._track: _Track | None = None
+        self._given: tuple[int, Prior] | None = None
         self._last_ns, self._too_close = 0, 0
         self._aid: GyroscopeAid | None = None
         if inertial is not None:
@@ -137,7 +138,7 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget all frames so far."""
-        self._track = None
+        self._track = self._given = None
         if self._aid is not None:
             self._aid.reset()
 
@@ -175,14 +176,22 @@ class Tracker:
                 "of a millisecond"
             )
 
+    def expect(self, time_ns: int, prior: Prior) -> None:
+        """Have the frame of this time found near a motion that others know.
+
+        Frames that the ones before predict are not: theirs is known better.
+        """
+        self._given = time_ns, prior
+
     def prediction(self, time_ns: int, span: float | None = None) -> Prior | None:
-        """What the last frames say of the motion at a time; None when there is no track.
+        """What the last frames, or others, say of the motion at a time; None: nobody does.
 
         ``span``: s, of the row times of the frame; None: as of the last one.
         """
         track = self._track
         if track is None or not self._follows(time_ns):
-            return None
+            given = self._given
+            return given[1] if given is not None and given[0] == time_ns else None
         dt = (time_ns - track.time_ns) * 1e-9
         readout_time = track.estimate.span if span is None else span
         acceleration = self.localizer.config.acceleration

@@ -34,6 +34,8 @@ class Reason(StrEnum):
     NO_MATCHES = "no_matches"
     BAD_IMU = "bad_imu"
     NO_TRANSFORM = "no_transform"
+    REPEATED_STAMP = "repeated_stamp"
+    LATE_FRAME = "late_frame"
     # Images that cannot be searched.
     BAD_IMAGE = "bad_image"
     NO_TIME = "no_time"
@@ -71,6 +73,9 @@ class Notice(StrEnum):
     COARSE_COORDINATES = "coarse_coordinates"
     PIXELS_OUTSIDE = "pixels_outside"
     TOO_MANY_POINTS = "too_many_points"
+    MAP_SCALE = "map_scale"
+    PRIOR_REFUSED = "prior_refused"
+    DOUBTFUL = "doubtful"
     READOUT_TIME = "readout_time"
     LENS = "lens"
     EXTRINSICS = "extrinsics"
@@ -85,6 +90,7 @@ class Notice(StrEnum):
     # Of nodes.
     NOT_BROADCAST = "not_broadcast"
     MAP_JUMPED = "map_jumped"
+    TWO_PUBLISHERS = "two_publishers"
     INCOMPATIBLE_PUBLISHER = "incompatible_publisher"
     NO_POSE = "no_pose"
     NO_IMAGES = "no_images"

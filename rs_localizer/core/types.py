@@ -61,6 +61,8 @@ class Estimate(Motion):
     lens: LensError | None = None
     of_lens: LensError | None = None  # what the frame says of that; None: not asked
     span: float = 0.0  # s of a readout, as which row times count; 0: unknown
+    # Probability that the pose lies outside its region or the map is another one; NaN: not judged
+    integrity: float = math.nan
 
     @property
     def covariance(self) -> Array:

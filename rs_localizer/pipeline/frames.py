@@ -35,11 +35,13 @@ from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms import Transforms, TransformTree
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher, MatchError
+from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
 from rs_localizer.pipeline.imu import ImuInput, inertial_settings
 from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch, Watched
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
+from rs_localizer.pipeline.stream import Stream
 from rs_localizer.pipeline.tags import Tags, read_tags
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Memory, Tracker
@@ -152,6 +154,8 @@ def oddities_of_map(landmarks: Map, previous: Map | None) -> dict[Notice, str]:
     return notices
 
 
+# From this chance on of a wrong pose or map, it is more probable than not.
+_DOUBTFUL = 0.5
 # Coordinates in single precision shall tell millimetres, in m: they do as far as 8 km.
 _FINE = 0.00097
 # Trackers of features may find a point somewhat outside, in px.
@@ -248,7 +252,8 @@ class FrameLocalizer:
         self.readout_watch = ReadoutWatch(notice)
         self._landmarks = Landmarks(notice)
         self._tags: Tags | None = None
-        self._last: tuple[int, str] | None = None  # stamp and map frame of the frame before
+        self._stream = Stream(notice, self._forget_motion)
+        self._pose_prior = PosePrior(notice)
         self._calibration: Calibration | None = None
         self._too_many = False  # whether clouds above max_points have been noticed
         self._settings = config  # a readout time that is estimated takes the place of theirs
@@ -305,7 +310,7 @@ class FrameLocalizer:
 
     def reset(self) -> None:
         """Forget the previous frames."""
-        self._last = None
+        self._stream.reset()
         self._forget_motion()
 
     def _forget_motion(self) -> None:
@@ -360,6 +365,22 @@ class FrameLocalizer:
         """Match keypoints with this map from the next frame on."""
         self._landmarks.use(landmarks)
 
+    def give_pose(self, given: GivenPose) -> None:
+        """Find the next frame near this pose; one that a user gives ends the track."""
+        self._pose_prior.take(given)
+        if not given.lasts:
+            self._forget_motion()
+
+    def _expect(self, time_ns: int, map_frame: str) -> None:
+        """Tell the tracker what others know of the pose at a time, if it knows nothing itself."""
+        if self._calibration is None or self._tracker.prediction(time_ns) is not None:
+            return
+        prior = self._pose_prior.prior(
+            time_ns, map_frame, self._calibration.frame, self._config, self.transforms
+        )
+        if prior is not None:
+            self._tracker.expect(time_ns, prior)
+
     def localize(self, message: Any) -> Localized | Refusal:
         """Localize one sensor_msgs/PointCloud2 of correspondences; never raises for bad ones."""
         cloud = read_or_refuse(read_correspondences, message, Reason.BAD_CLOUD)
@@ -367,7 +388,9 @@ class FrameLocalizer:
 
     def localize_cloud(self, cloud: Correspondences) -> Localized | Refusal:
         """Localize correspondences, however they came."""
-        self._follow(cloud.stamp_ns, cloud.frame)
+        refusal = self._stream.follow(cloud.stamp_ns, cloud.frame)
+        if refusal is not None:
+            return refusal
         result = self._localize(cloud)
         if result:
             self._landmarks.lacking = False  # who sends correspondences needs none
@@ -383,12 +406,17 @@ class FrameLocalizer:
         if isinstance(keypoints, Refusal):
             return keypoints
         if self.map is not None:
-            self._follow(keypoints.stamp_ns, self.map.frame)
+            refusal = self._stream.follow(keypoints.stamp_ns, self.map.frame)
+            if refusal is not None:
+                return refusal
         by = self._landmarks.how(keypoints, self.config.matching)
         if isinstance(by, Refusal):
             return by
         if by == MatchBy.DESCRIPTOR and self._config.matching.gate > 0.0:
-            prior = self._tracker.prediction(self._middle_row_ns(keypoints.stamp_ns))
+            time_ns = self._middle_row_ns(keypoints.stamp_ns)
+            if self.map is not None:
+                self._expect(time_ns, self.map.frame)
+            prior = self._tracker.prediction(time_ns)
             result = None if prior is None else self._localize_by_map(keypoints, prior)
             # Without its mounting a pose is none the worse.
             if result or (result is not None and result.reason is Reason.NO_TRANSFORM):
@@ -420,6 +448,7 @@ class FrameLocalizer:
         tracker.trusts_readout_time = watch.trusted
         tracker.readout_time_deviation = deviation
         tracker.localizer.error_modes = self._landmarks.error_modes
+        self._expect(time_ns, cloud.frame)
         matches = (cloud.points, cloud.pixels, cloud.scores)
         result = self.imu.track(tracker, config, time_ns, frame, self.transforms, matches)
         adopted = watch.add(Watched(time_ns, cloud, result, config, camera))
@@ -430,6 +459,11 @@ class FrameLocalizer:
             return Refusal(Reason.SCAN_AXIS, wrong_axis)
         if not result:
             return Refusal(result.reason, result.detail)
+        self._stream.pace(time_ns, result, config)
+        self._pose_prior.judge(result)
+        if result.integrity > _DOUBTFUL:
+            text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
+            self._notice(Notice.DOUBTFUL, text)
         if result.lens is not None and not watch.axis_in_doubt:
             self._notice(Notice.LENS, lens_is_off(result.lens))
         readout = ReadoutKnown(
@@ -451,21 +485,3 @@ class FrameLocalizer:
     def mounted(self, localized: Localized) -> Localized | Refusal:
         """The result of ``base_frame``, from that of the camera."""
         return of_body(localized, self.config, self.transforms)
-
-    def _follow(self, stamp_ns: int, frame: str) -> None:
-        """Start afresh where this frame cannot follow the last one."""
-        last, self._last = self._last, (stamp_ns, frame)
-        last_ns, last_frame = last or self._last
-        notices: dict[Notice, str] = {}
-        if stamp_ns < last_ns:
-            notices[Notice.TIME_WENT_BACK] = (
-                f"the stamp {stamp_ns * 1e-9:.3f} s lies {(last_ns - stamp_ns) * 1e-9:.3f} s "
-                "before the last one"
-            )
-        if frame != last_frame:
-            notices[Notice.MAP_CHANGED] = (
-                f"the points are in frame {frame!r}, the last ones were in {last_frame!r}"
-            )
-        for name, text in notices.items():
-            self._forget_motion()
-            self._notice(name, f"{text}; the previous frames are forgotten")

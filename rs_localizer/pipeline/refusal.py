@@ -157,6 +157,14 @@ REASONS: dict[str, Meaning] = {
     Reason.INTERNAL_ERROR: Meaning(
         "a fault of this program, which continues with the next frame", "please report the message"
     ),
+    Reason.REPEATED_STAMP: Meaning(
+        "a frame with this stamp has come already",
+        "does a second node, or a recording, publish on this topic; does the driver stamp anew?",
+    ),
+    Reason.LATE_FRAME: Meaning(
+        "a newer frame came before it; from half a second on, the previous frames are forgotten",
+        "nothing, if it is rare; otherwise, do two senders use this topic?",
+    ),
     Reason.NO_TRANSFORM: Meaning(
         "TF has no transform from the camera to base_frame",
         "record /tf and /tf_static, too; a robot_state_publisher has to run",

@@ -249,7 +249,9 @@ class RigLocalizer(FrameLocalizer):
                 f"the points of {images[0].camera} are in frame {reference.frame!r}, others in "
                 f"{', '.join(map(repr, sorted(others)))}: cameras of a rig see one map",
             )
-        self._follow(images[0].start_ns, reference.frame)
+        refusal = self._stream.follow(images[0].start_ns, reference.frame)
+        if refusal is not None:
+            return refusal
         refusal = self._mount(images)
         images = [image for image in images if image.camera in self._mounts]
         if not images:

@@ -127,7 +127,7 @@ class ImageNode(
 
     lack = Notice.NO_IMAGES
     output: ClassVar[str]  # topic of the clouds
-    odd: ClassVar[tuple[Notice, ...]] = ()  # notices that the diagnostics repeat
+    odd: ClassVar[tuple[Notice, ...]] = (Notice.TWO_PUBLISHERS,)  # that the diagnostics repeat
 
     def __init__(
         self,
@@ -278,7 +278,7 @@ def _image_topics(worker: Worker[Work[Settings, Result], Result]) -> dict[str, T
 
         return take
 
-    return {name: Topic(kind, images(name)) for name, kind in _IMAGES.items()}
+    return {name: Topic(kind, images(name), single=True) for name, kind in _IMAGES.items()}
 
 
 _JPEG_QUALITY = 85

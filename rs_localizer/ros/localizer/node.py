@@ -17,8 +17,10 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
+from rs_localizer.io.topics import GIVEN_POSES
 from rs_localizer.pipeline.compiling import compile_in_child, give_back_compiler, is_compiled
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.given_pose import read_given_pose
 from rs_localizer.pipeline.inputs import Input, Results, Role
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.pipeline.rigs import RigLocalizer, frame_localizer, inputs_of
@@ -82,11 +84,17 @@ class Feed:
             Role.STATE: self._state_topic,
             Role.SAMPLES: self._samples_topic,
         }
-        return {
+        found = {
             name: make[item.role](item)
             for name, item in inputs_of(config).items()
             if not item.also or installed(*item.types)  # of packages that most do not have
         }
+        if not config.is_rig:
+            found |= {
+                name: Topic(message_class(kind), self._take_pose)
+                for name, kind in GIVEN_POSES.items()
+            }
+        return found
 
     def take_config(self, config: NodeConfig) -> None:
         """Use these settings from the next frame on."""
@@ -108,7 +116,17 @@ class Feed:
             need = Need(_lacks_samples, self._frames.config.imu.wait)
             self._worker.process(item.topic, message, localize, need)
 
-        return Topic(installed(*item.types), take)
+        return Topic(installed(*item.types), take, single=True)
+
+    def _take_pose(self, message: Any) -> None:
+        """What others know of the pose."""
+        try:
+            given = read_given_pose(message)
+        except MessageError as error:
+            self._refusals.notice(Notice.PRIOR_REFUSED, str(error))
+            return
+        kind = "filter's pose" if given.lasts else "given pose"
+        self._worker.update(kind, lambda frames: frames.give_pose(given))
 
     def _samples_topic(self, item: Input) -> Topic:
         """A topic whose messages are all used here; frames wait for them."""
@@ -228,7 +246,7 @@ class Outputs:
 # Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
 _ODD = (
     "map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "no_images",
-    "lens", "clock", "bad_imu",
+    "lens", "clock", "bad_imu", "map_scale", "map_jumped", "two_publishers", "doubtful",
 )  # fmt: skip
 
 

@@ -125,6 +125,11 @@ def offered(node: Node, topic: str) -> list[Policies]:
     return [policies(info.qos_profile) for info in node.get_publishers_info_by_topic(topic)]
 
 
+def node_of(publisher: Any) -> str:
+    """Full name of the node of a TopicEndpointInfo."""
+    return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+
+
 def best(wished: Policies, offers: Sequence[Policies]) -> Policies:
     """What is wished, and where that is ``BEST_AVAILABLE``, the most that all of them offer.
 
@@ -188,6 +193,7 @@ class Topic:
     qos: Mapping[str, Any] = field(default_factory=lambda: SENSOR_DATA)
     lasting: bool = False  # one message is enough
     raw: bool = False  # whether the callback takes serialized messages
+    single: bool = False  # whether two publishers would contradict each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,7 +263,12 @@ class Inputs:
         """Listen anew to topics whose publishers offer more, or less, than they are heard with."""
         changed = []
         for name, subscription in self._subscriptions.items():
-            offers = offered(self._node, subscription.topic_name)
+            publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)
+            if self._topics[name].single and len(publishers) > 1:
+                names = " and ".join(sorted(map(node_of, publishers)))
+                text = f"{names} publish on {subscription.topic_name}: their frames come in turns"
+                self._refusals.notice(Notice.TWO_PUBLISHERS, text)
+            offers = [policies(each.qos_profile) for each in publishers]
             present = policies(subscription.qos_profile)
             if offers and best(self._wished[name], offers) != present:
                 changed.append(name)
@@ -321,7 +332,7 @@ class Inputs:
         unfit = []
         publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)
         for publisher in publishers:
-            where = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+            where = node_of(publisher)
             if publisher.topic_type != wanted:
                 unfit.append(f"{where} publishes {publisher.topic_type}, not {wanted}")
                 continue

@@ -1,0 +1,168 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A pose that others know, as a prior of frames that no frame before predicts.
+
+A user's click in RViz, a filter's pose: where no track is, the frame is looked for near it, within
+its covariance, before it is searched for everywhere. Points that disagree count more. While there
+is a track it says nothing: a filter's pose has our own in it.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.config import NodeConfig
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.reasons import Notice
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.io.messages import MessageError, stamp_ns
+from rs_localizer.io.transforms import Transform, TransformError, Transforms, from_numbers
+from rs_localizer.pipeline.refusal import Notify
+
+# What a variance of zero means: RViz leaves those of z, roll and pitch so. m, rad.
+_UNSAID = (0.1, 0.05)
+# Nobody knows a pose better beforehand than it is worth: m, rad.
+_LEAST = (0.01, 0.005)
+_OLDEST = 10.0  # s
+# Squared distance of six numbers from what was given that one pose in ten thousand has.
+_FAR = 27.9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GivenPose:
+    """A pose and its covariance, as it came."""
+
+    stamp_ns: int  # 0: of now
+    frame: str  # of the map
+    body: str  # frame of the body; empty: base_frame, or the camera
+    pose: Transform  # map_from_body
+    covariance: Array  # (6,6) x y z, rotations about the axes of the map
+
+    @property
+    def lasts(self) -> bool:
+        """Whether it is of a filter, which says more and more."""
+        return bool(self.body)
+
+
+def read_given_pose(message: Any) -> GivenPose:
+    """Read a PoseWithCovarianceStamped, or an Odometry.
+
+    Raises:
+        MessageError: for numbers that are no pose or no covariance.
+    """
+    at, q = message.pose.pose.position, message.pose.pose.orientation
+    covariance = np.array(message.pose.covariance, float).reshape(6, 6)
+    try:
+        pose = from_numbers((at.x, at.y, at.z), (q.x, q.y, q.z, q.w))
+    except TransformError as error:
+        raise MessageError(f"the given pose is none: {error}") from error
+    if not np.isfinite(covariance).all() or (covariance.diagonal() < 0.0).any():
+        raise MessageError("the covariance of the given pose is none: see its diagonal")
+    return GivenPose(
+        stamp_ns(message),
+        message.header.frame_id.removeprefix("/"),
+        getattr(message, "child_frame_id", "").removeprefix("/"),
+        pose,
+        0.5 * (covariance + covariance.T),
+    )
+
+
+class PosePrior:
+    """Keeps what was given until a frame has been found by it, or it is too old.
+
+    Args:
+        notice: told why it is not used.
+    """
+
+    def __init__(self, notice: Notify) -> None:
+        self._notice = notice
+        self._given: GivenPose | None = None
+        self._expected: Prior | None = None
+
+    def take(self, given: GivenPose) -> None:
+        self._given = given
+
+    def prior(
+        self,
+        time_ns: int,
+        map_frame: str,
+        camera_frame: str,
+        config: NodeConfig,
+        transforms: Transforms,
+    ) -> Prior | None:
+        """What it says of the camera's motion at a time; None: nothing."""
+        self._expected = None
+        given = self._given
+        if given is None:
+            return None
+        seconds = abs(time_ns - given.stamp_ns) * 1e-9 if given.stamp_ns else 0.0
+        body = given.body or config.base_frame or camera_frame
+        try:
+            if given.frame != map_frame:
+                raise TransformError(f"it is in {given.frame!r}, the points are in {map_frame!r}")
+            if seconds > _OLDEST:
+                raise TransformError(f"it is {seconds:.0f} s older, or newer, than the frame")
+            body_from_camera = (
+                Transform(np.eye(3), np.zeros(3))
+                if body == camera_frame
+                else transforms.lookup(body, camera_frame, None)
+            )
+        except TransformError as error:
+            self._notice(Notice.PRIOR_REFUSED, f"the given pose is not used: {error}")
+            self._given = None
+            return None
+        self._expected = _of_camera(given, body_from_camera, seconds, config)
+        return self._expected
+
+    def judge(self, result: Estimate) -> None:
+        """Be done with it, now that a frame has a pose."""
+        given, expected = self._given, self._expected
+        if given is None or expected is None:
+            return
+        assert expected.motion is not None
+        assert expected.covariance is not None
+        turn = so3.log(np.ascontiguousarray(expected.motion.rotation @ result.rotation.T))
+        centre = -expected.motion.rotation.T @ expected.motion.translation
+        off = np.concatenate([turn, expected.motion.rotation @ (result.position - centre)])
+        spread = expected.covariance[:6, :6] + result.covariance[:6, :6]
+        if off @ np.linalg.solve(spread, off) > _FAR:
+            self._notice(
+                Notice.PRIOR_REFUSED,
+                f"the points disagree with the given pose, by {np.linalg.norm(off[3:]):.2f} m and "
+                f"{np.degrees(np.linalg.norm(turn)):.0f} degrees",
+            )
+        self._expected = None
+        if not given.lasts:
+            self._given = None
+
+
+def _of_camera(
+    given: GivenPose, body_from_camera: Transform, seconds: float, config: NodeConfig
+) -> Prior:
+    """The prior of a camera that may have moved for so long since then, as cameras do."""
+    camera = given.pose @ body_from_camera
+    least = np.repeat(_LEAST, 3)
+    variances = given.covariance.diagonal()
+    unsaid = np.where(variances > 0.0, least, np.repeat(_UNSAID, 3)) ** 2
+    pace = [config.velocity_prior.linear, config.velocity_prior.angular]
+    moved = np.repeat(np.square(np.multiply(pace, seconds)), 3)
+    covariance = given.covariance + np.diag(unsaid + moved)
+    # Turn and place of the camera in its own axes, by those of the body about the map's.
+    back = camera.rotation.T
+    lever = camera.translation - given.pose.translation
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, 3:] = back
+    jacobian[3:, :3] = back
+    jacobian[3:, 3:] = -back @ so3.hat(lever)
+    whole = np.zeros((12, 12))
+    whole[:6, :6] = jacobian @ covariance @ jacobian.T
+    readout = config.readout_time
+    for i, deviation in ((6, config.velocity_prior.angular), (9, config.velocity_prior.linear)):
+        variance = (deviation * readout) ** 2 if deviation > 0.0 else np.inf
+        whole[i : i + 3, i : i + 3][np.diag_indices(3)] = variance
+    motion = Motion(back, -back @ camera.translation, np.zeros(3), np.zeros(3))
+    return Prior(motion=motion, covariance=whole)

@@ -1,0 +1,67 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Stamps out of order, and poses that no camera can have."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rs_localizer.config import NodeConfig
+from rs_localizer.pipeline.stream import Stream
+
+SECOND = 10**9
+
+
+class Heard:
+    """A stream, and what it told."""
+
+    def __init__(self) -> None:
+        self.notices: list[str] = []
+        self.forgotten = 0
+        self.stream = Stream(lambda name, _: self.notices.append(name), self._forget)
+
+    def _forget(self) -> None:
+        self.forgotten += 1
+
+    def reason(self, seconds: float, frame: str = "map") -> Any:
+        refusal = self.stream.follow(round(seconds * SECOND), frame)
+        return None if refusal is None else refusal.reason
+
+
+def test_stamps_out_of_order():
+    heard = Heard()
+    assert [heard.reason(s) for s in (5.0, 5.1, 5.1, 5.05, 5.2, 4.71)] == [
+        None, None, "repeated_stamp", "late_frame", None, "late_frame",
+    ]  # fmt: skip
+    assert (heard.forgotten, heard.notices) == (0, [])
+    # Half a second and more is a recording that starts over.
+    assert heard.reason(4.7) is None
+    assert (heard.forgotten, heard.notices) == (1, ["time_went_back"])
+    assert heard.reason(4.7, "other") is None
+    assert (heard.forgotten, heard.notices[1:]) == (2, ["map_changed"])
+    heard.stream.reset()
+    assert heard.reason(4.7, "other") is None
+
+
+def test_no_stamp_is_no_time():
+    heard = Heard()
+    assert [heard.reason(0.0) for _ in range(3)] == [None] * 3
+    assert heard.forgotten == 0
+
+
+@pytest.mark.parametrize(
+    ("unit", "speed", "noise", "told"),
+    [(1.0, 1.5, 0.01, False), (1000.0, 0.2, 0.01, True), (1000.0, 0.0, 0.01, False),
+     (1.0, 40.0, 0.01, False), (1.0, 0.0, 30.0, False)],
+)  # fmt: skip
+def test_a_map_in_millimetres_is_named(unit, speed, noise, told):
+    rng = np.random.default_rng(0)
+    heard = Heard()
+    for i in range(90):
+        place = np.array([speed * i / 30.0, 0.0, 2.0]) + rng.normal(0.0, noise, 3)
+        covariance = np.diag(np.full(12, (unit * noise) ** 2))
+        estimate: Any = SimpleNamespace(position=unit * place, covariance=covariance)
+        heard.stream.pace(i * SECOND // 30, estimate, NodeConfig())
+    assert ("map_scale" in heard.notices) == told
