@@ -24,11 +24,11 @@ by_rosdoc2 = "confpy_succeeded" in globals()  # which runs this file inside its 
 PAGES = {
     "Start": "concepts install camera cameras/index",
     "Use": "node reasons detector features imu rigs recordings calibration mapping map_build maps "
-    "simulation viewing integrations library policy",
+    "simulation viewing integrations examples library policy",
     "Understand": "solvers estimator honesty benchmarks architecture api",
 }
 OTHERS = (
-    *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README"),
+    *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README", "examples/README"),
     *("QUALITY_DECLARATION", "CHANGELOG", "docs/adr/0001-compiled-kernels"),
 )
 if not by_rosdoc2:

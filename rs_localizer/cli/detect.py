@@ -44,7 +44,8 @@ if WORKING:
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.rigs import make_mounts, read_camchain
     from rs_localizer.io.topics import TF_STATIC
-    from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
+    from rs_localizer.offline import detect as offline
+    from rs_localizer.offline.detect import Extraction, Recorded, record, record_features
     from rs_localizer.offline.fleet import Figures
     from rs_localizer.offline.image_sources import Carried, Shot
     from rs_localizer.pipeline.images import FrameDetector
@@ -108,7 +109,7 @@ def detect_one(args: argparse.Namespace) -> Figures:
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
 
     def look(
-        shots: Shots, bag: BagWriter, options: Options, bar: Any
+        shots: Shots, bag: BagWriter, options: offline.Options, bar: Any
     ) -> tuple[Recorded, Counter[str], tuple[float, float]]:
         notices: Counter[str] = Counter()
         detector = FrameDetector(config, lambda _, text: notices.update([text]), marker_map)
@@ -144,7 +145,7 @@ def detect_one(args: argparse.Namespace) -> Figures:
 
 def _look(
     args: argparse.Namespace,
-    look: Callable[[Shots, BagWriter, Options, Any], Seen],
+    look: Callable[[Shots, BagWriter, offline.Options, Any], Seen],
     of_map: Mapping[str, float] | None = None,
 ) -> list[tuple[str, Seen, ImageClock | None]]:
     """Record what ``look`` finds in the images of each camera of a rig, or of one without a name.
@@ -170,7 +171,7 @@ def _look(
                     if name not in ("", settings.cameras[0]):  # what goes along is of the first
                         shots = (shot for shot in shots if not isinstance(shot, Carried))
                     direction = settings.of_cameras.get(name, settings).scan_direction
-                    options = Options(args.with_images, direction, name)
+                    options = offline.Options(args.with_images, direction, name)
                     seen.append((name, look(shots, bag, options, bar), source.clock))
         write_shutter(args, out, of_map)
     return seen
@@ -220,7 +221,7 @@ def detect_features(args: argparse.Namespace) -> None:
         config = FeatureConfig(features=args.features, max_keypoints=args.max_keypoints)
     extractor, images = FrameExtractor(config), 0
 
-    def look(shots: Shots, bag: BagWriter, options: Options, bar: Any) -> Extraction:
+    def look(shots: Shots, bag: BagWriter, options: offline.Options, bar: Any) -> Extraction:
         return record_features(shots, extractor, bag, options, bar.update)
 
     for name, extraction, clock in _look(args, look):

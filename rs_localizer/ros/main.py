@@ -88,6 +88,26 @@ def feature_detector(args: list[str] | None = None) -> int:
     return _run("feature_detector", args)
 
 
+def example_matcher(args: list[str] | None = None) -> int:
+    """Run the matcher of the bundled recording likewise."""
+    words = sys.argv[1:] if args is None else args
+    if not {*_HELP}.isdisjoint(words):
+        sys.stdout.write(
+            "usage: ros2 run rs_localizer example_matcher\n\nPublishes the matches of the bundled "
+            "webcam recording, and prints the poses of a localizer.\n"
+        )
+        return 0
+    with StopRequest() as stop:
+        try:
+            with stop.at_once():
+                from rs_localizer.ros import example_matcher as node
+        except ImportError as error:
+            sys.stderr.write(f"example_matcher: {explain(error)}\n")
+            return 1
+    node.run(args)
+    return 0
+
+
 def _run(name: str, args: list[str] | None) -> int:
     limit_threads()
     with StopRequest() as stop:

@@ -1,0 +1,25 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Pose and velocity of one image, from points of a map and where the image shows them."""
+
+import numpy as np
+from projector import HEIGHT, READOUT, WIDTH, K, Moving, matches, scene
+
+import rs_localizer as rsl
+
+moving = Moving()
+points, pixels = matches(moving, scene(150), seconds=0.0)  # (n,3) m, (n,2) raw pixels
+
+camera = rsl.Camera(WIDTH, HEIGHT, K, readout_time=READOUT, scan_direction="top_to_bottom")
+result = rsl.Localizer(camera).localize(points, pixels)
+
+if result:  # a Failure is false, and str() of it says why
+    state = rsl.camera_state(result, camera)  # at the middle row, in the map, SI units
+    deviations = np.sqrt(np.diag(result.covariance))
+    print("inliers", result.inliers.sum(), "of", len(points))
+    print("position (m)", state.position.round(4), "+-", deviations[3:6].round(4))
+    print("turn rate (rad/s)", state.angular_velocity.round(3), "true", moving.turn)
+    print("velocity (m/s)", state.linear_velocity_in_map.round(3), "true", moving.velocity)
+    print("pose at the first row", *result.at(-0.5))
+else:
+    print("no pose:", result)
