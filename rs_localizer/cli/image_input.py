@@ -353,7 +353,7 @@ def of_files(
         return Source(from_video(path, camera, clock), None, clock)
     files = image_files(path)
     if rate is None and not have_times(files):
-        raise UsageError("the names of the files are not times in ns: give --rate")
+        raise UsageError("the names of the files are not times: give --rate")
     clock = ImageClock(rate, start_ns)
     return Source(from_files(files, camera, clock), len(files), clock)
 

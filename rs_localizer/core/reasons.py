@@ -87,6 +87,7 @@ class Notice(StrEnum):
     # Of markers in images.
     UNKNOWN_MARKERS = "unknown_markers"
     REPEATED_MARKERS = "repeated_markers"
+    OTHER_BOARD = "other_board"
     # Of nodes.
     NOT_BROADCAST = "not_broadcast"
     MAP_JUMPED = "map_jumped"

@@ -161,6 +161,8 @@ def _choose(cameras: Mapping[str, T], name: str | None) -> T:
     return cameras[name]
 
 
+# Values of a JSON file: PhotonVision's hold all corners that were seen.
+_MOST_JSON = 1_000_000
 # OpenCV writes "%YAML:1.0" where YAML has "%YAML 1.0", and a tag of its own before matrices, which
 # are plain mappings of rows, cols, dt and data.
 _DIRECTIVE = re.compile(r"\A%YAML[: ][0-9.]+\s*\n")
@@ -177,7 +179,7 @@ def _load_tree(text: str) -> Any:
             tree = json.loads(text)
         except (ValueError, RecursionError):
             return load_yaml(text)  # flow style, and its message if that fails, too
-        check_tree(tree)
+        check_tree(tree, _MOST_JSON)
         return tree
     return load_yaml(_TAG.sub("", _DIRECTIVE.sub("", text)))
 

@@ -73,6 +73,9 @@ _STILL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _FRAME_HEADERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 ALONE = {0x01, *range(0xD0, 0xD8)}
 """Markers of JPEG that stand alone; all others are followed by their length."""
+# Of pixels with 16 bits: so many tell the range, and these percentiles of them bound it.
+_LOOKED_AT, _RANGE = 100_000, (0.1, 99.9)
+_LEVELS = 64  # of eight bits, that an image needs
 # Raw rows: a camera's note that the picture should be shown upright turns the shutter, too.
 _AS_IT_IS = cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
 
@@ -246,8 +249,17 @@ def _gray(raw: NDArray[Any], encoding: _Encoding) -> Gray:
 
 
 def _eight_bits(image: NDArray[Any]) -> Gray:
-    """The upper eight bits of those that the image uses: sensors fill 10 or 12 of 16."""
+    """Eight bits of sixteen: the upper ones that the image uses, as sensors fill 10 or 12.
+
+    Where those have few values, as of a thermal image, or beside a pixel that is always bright,
+    all between nearly the darkest and nearly the brightest one; none is spread over several.
+    """
     if image.dtype.itemsize == 1:
         return np.ascontiguousarray(image, np.uint8)
+    step = max(1, math.isqrt(image.size // _LOOKED_AT))
+    low, high = np.percentile(image[::step, ::step], _RANGE)
     unused = max(0, int(image.max()).bit_length() - 8)
-    return np.ascontiguousarray(image >> unused, np.uint8)
+    if not _LEVELS <= high - low < _LEVELS << unused:
+        return np.ascontiguousarray(image >> unused, np.uint8)
+    scaled = (image.astype(np.float32) - low) * (255.0 / max(255.0, high - low))
+    return np.asarray(np.clip(scaled, 0.0, 255.0), np.uint8)

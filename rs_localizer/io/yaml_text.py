@@ -11,12 +11,11 @@ import yaml
 
 # A file may name a part of itself again; counted at every place, so that few lines do not stand
 # for a thousand million values, or for endlessly many.
-_MOST_VALUES = 100_000
-_DEEPEST = 50
+_MOST_VALUES, _DEEPEST = 100_000, 50
+# libyaml reads 5 MB a second, PyYAML alone a tenth of that.
+_MOST_CHARACTERS = 2_000_000
 # Of numbers; those of base 60 ("1:0:0 ...", YAML 1.1) take time that grows with its square.
 _LONGEST_NUMBER = 100
-# PyYAML reads half a megabyte a second.
-_MOST_CHARACTERS = 4_000_000
 
 
 class YamlError(ValueError):
@@ -34,28 +33,13 @@ def file_faults(path: Path, fault: type[ValueError], kind: str = "YAML") -> Iter
         raise fault(f"{path} is not a {kind} file: {' '.join(str(error).split())}") from error
 
 
-class _Loader(yaml.SafeLoader):
-    """PyYAML's, with limits on what takes much more time or memory than its text does."""
-
-    def __init__(self, stream: str) -> None:
-        super().__init__(stream)
-        self.sizes: dict[int, int] = {}  # of mappings, by identity
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """PyYAML's, without what takes much more time or memory than its text does."""
 
     def flatten_mapping(self, node: Any) -> None:
-        """Put what ``<<`` names into a mapping: copies, of copies where these merge, too.
-
-        PyYAML since 6.0.4 leaves out what is named twice. Other readers of the same file do not, so
-        every copy counts.
-        """
-        merges = [value for key, value in node.value if key.tag == "tag:yaml.org,2002:merge"]
-        size = len(node.value) - len(merges)
-        super().flatten_mapping(node)
-        for value in merges:
-            named = value.value if isinstance(value, yaml.SequenceNode) else [value]
-            size += sum(self.sizes[id(mapping)] for mapping in named)
-        self.sizes[id(node)] = max(size, self.sizes.get(id(node), 0))
-        if size > _MOST_VALUES:
-            raise YamlError(f"it holds more than {_MOST_VALUES} values")
+        """Merges (``<<``) are copies, of copies where these merge, too."""
+        if any(key.tag == "tag:yaml.org,2002:merge" for key, _ in node.value):
+            raise YamlError("it merges mappings (<<), which parameters of ROS do not either")
 
     def construct_scalar(self, node: Any) -> Any:
         is_number = node.tag.rpartition(":")[2] in ("int", "float", "timestamp")
@@ -72,6 +56,8 @@ def load_yaml(text: str) -> Any:
     """
     if len(text) > _MOST_CHARACTERS:
         raise YamlError(f"it has {len(text)} characters, more than {_MOST_CHARACTERS}")
+    if text.count(",") + text.count("\n") > 2 * _MOST_VALUES:  # before they are made
+        raise YamlError(f"it holds more than {_MOST_VALUES} values")
     try:
         tree = yaml.load(text, _Loader)
     except RecursionError:
@@ -84,7 +70,7 @@ def load_yaml(text: str) -> Any:
     return tree
 
 
-def check_tree(tree: Any) -> None:
+def check_tree(tree: Any, most: int = _MOST_VALUES) -> None:
     """Refuse, with a YamlError, what is larger or deeper than anything that people write."""
     waiting, count = [(tree, 0)], 0
     while waiting:
@@ -92,8 +78,8 @@ def check_tree(tree: Any) -> None:
         count += 1
         if depth > _DEEPEST:
             raise YamlError(f"it nests deeper than {_DEEPEST}, or holds itself")
-        if count > _MOST_VALUES:
-            raise YamlError(f"it holds more than {_MOST_VALUES} values")
+        if count > most:
+            raise YamlError(f"it holds more than {most} values")
         if isinstance(value, dict):
             waiting += [(item, depth + 1) for item in value.values()]
         elif isinstance(value, list | set | tuple):

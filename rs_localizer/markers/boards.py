@@ -4,6 +4,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -187,6 +188,70 @@ def find_charuco(
             rows.append(corner)
             pixels.append(refined)
     return np.array(rows, np.int64), np.array(pixels, np.float64).reshape(-1, 2)
+
+
+# Thickness of a plane, as a share of its smaller extent.
+_FLAT = 0.02
+# How far markers are from where a homography has them, in their sides: of a right board (also by a
+# fisheye lens), and of one whose markers are a square away.
+_FITS, _MISFITS = 0.1, 0.25
+_LEAST_MARKERS = 3
+
+
+def flat_misfit(points: Array, pixels: Array) -> float:
+    """How far markers of one plane are from where a homography has them, in their sides.
+
+    No calibration is needed. NaN: the points are not of one plane; infinite: corners go the other
+    way round, as of a mirrored map.
+
+    Args:
+        points: (4m,3) of their corners.
+        pixels: (4m,2)
+    """
+    centred = points - points.mean(axis=0)
+    _, extents, axes = np.linalg.svd(centred, full_matrices=False)
+    if extents[2] > _FLAT * extents[1]:
+        return np.nan
+    quads = pixels.reshape(-1, 4, 2)
+    x, y = np.moveaxis(quads, -1, 0)
+    if np.any(np.sum(x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y, axis=1) <= 0.0):
+        return np.inf
+    flat = centred @ axes[:2].T
+    homography, _ = cv2.findHomography(flat, pixels)
+    if homography is None:
+        return np.inf
+    mapped = cv2.perspectiveTransform(flat[None], homography)[0]
+    side = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).mean()
+    return float(np.sqrt(np.mean(np.sum((mapped - pixels) ** 2, axis=1))) / side)
+
+
+def charuco_fault(board: Charuco, ids: NDArray[np.int64], quads: Array) -> str | None:
+    """What the board is instead, where its markers (m,) do not lie as it says: (m,4,2) px.
+
+    The other layout or exchanged sizes put each marker one square or more beside its place.
+    """
+    if len(ids) < _LEAST_MARKERS:
+        return None
+
+    def misfit(of: Charuco) -> float:
+        rows = ids - of.first_id
+        if rows.max() >= len(of.cells):
+            return np.inf
+        corners = np.array([marker.corners for marker in of.markers])[rows]
+        return flat_misfit(corners.reshape(-1, 3), quads.reshape(-1, 2))
+
+    flat = replace(board, shape=None)
+    if not misfit(flat) > _MISFITS:
+        return None
+    turned = replace(flat, columns=board.rows, rows=board.columns)
+    for other in (replace(flat, legacy=not board.legacy), turned,
+                  replace(turned, legacy=not board.legacy)):  # fmt: skip
+        if misfit(other) < _FITS:
+            said = (
+                f"columns: {other.columns}, rows: {other.rows}, legacy: {str(other.legacy).lower()}"
+            )
+            return f"the images show {board.name} with {said}; it is not used as the map has it"
+    return None
 
 
 def _black_on_white(image: Gray, board: Chessboard | CircleGrid) -> Gray:

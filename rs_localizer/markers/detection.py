@@ -6,7 +6,8 @@ The node and the offline command run this one class, so the same images give the
 """
 
 import time
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -14,12 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.markers.boards import find_charuco, find_chessboard, find_circles
+from rs_localizer.markers.boards import (
+    charuco_fault,
+    find_charuco,
+    find_chessboard,
+    find_circles,
+)
 from rs_localizer.markers.dictionaries import DictionaryError, Gray, MarkerFinder
 from rs_localizer.markers.edges import refine
 from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.prints import Board, Charuco, Chessboard
+from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid
 
 IntArray = NDArray[np.int64]
 
@@ -53,6 +59,7 @@ class Detections:
     boards: tuple[tuple[str, Array], ...]  # names and pixels (k,2) of those that were seen
     unknown: tuple[str, ...]  # markers that are not in the map
     repeated: tuple[str, ...]  # markers that the image shows more than once: not used
+    faults: tuple[str, ...] = ()  # boards that are not as the map has them: not used
 
 
 class MarkerDetector:
@@ -118,6 +125,7 @@ class MarkerDetector:
         ]
         parts = [self._corners(item) for item in observations]
         boards = []
+        self._faults: list[str] = []
         for row, board in self._boards:
             looking = time.perf_counter()
             rows, pixels = self._board(image, board, observations, stamp_ns)
@@ -143,6 +151,7 @@ class MarkerDetector:
             repeated=tuple(
                 f"{item.family.name} {i}" for item in observations for i in _twice(item.ids)
             ),
+            faults=tuple(self._faults),
         )
         self.seconds += time.perf_counter() - started
         return detections
@@ -186,6 +195,9 @@ class MarkerDetector:
             last = board.first_id + len(board.cells)
             own = item.mapped & (item.ids >= board.first_id) & (item.ids < last)
             own &= item.exact.all(axis=1)
+            if fault := charuco_fault(board, item.ids[own], item.quads[own]):
+                self._faults.append(fault)
+                return np.empty(0, np.int64), np.empty((0, 2))
             return find_charuco(image, board, item.ids[own], item.quads[own])
         if not 0 <= stamp_ns - self._last_board_ns <= _LONGEST_LOSS_NS:
             self._last_board = None
@@ -264,8 +276,11 @@ _LEAST_CORNERS = 12
 _MOST_IDS = 6
 
 
-def recognized(image: Gray) -> list[str]:
-    """The markers, by family, and the chessboard that an image shows; most certain first.
+def recognized(image: Gray, boards: Iterable[Board] = ()) -> list[str]:
+    """The markers, by family, and the board that an image shows; most certain first.
+
+    A board is named after it was found: a chessboard of any size, and each of ``boards`` with
+    columns and rows exchanged.
 
     Takes seconds in a large image: all families are tried. Of several that read the same
     quadrilateral, that with the most bits counts, for it is the least likely to be chance.
@@ -286,9 +301,14 @@ def recognized(image: Gray) -> list[str]:
             listed = ", ".join(map(str, sorted(named)[:_MOST_IDS]))
             more = ", ..." if len(named) > _MOST_IDS else ""
             said.append(f"{_smallest(finder.family, max(named)).name} {listed}{more}")
-    board = chessboard_size(image)
-    if board is not None:
-        said.append(f"a chessboard of {board[0]}x{board[1]} inner corners")
+    size = chessboard_size(image)
+    if size is not None and find_chessboard(image, Chessboard(*size, 1.0)) is not None:
+        said.append(f"a chessboard of {size[0]}x{size[1]} inner corners")
+    for board in boards:
+        if isinstance(board, CircleGrid) and board.columns != board.rows:
+            turned = replace(board, columns=board.rows, rows=board.columns, shape=None)
+            if find_circles(image, turned) is not None:
+                said.append(f"the {turned.name}: its columns and rows are exchanged")
     return said
 
 

@@ -37,7 +37,7 @@ def pattern(family: Family, id_: int) -> NDArray[np.bool_]:
     if not 0 <= id_ < family.count:
         raise ValueError(f"{family.name} has the ids 0 to {family.count - 1}, found {id_}")
     inside = np.rot90(_bits(family, id_), _turns(family))
-    return np.pad(inside, 1).astype(bool)
+    return np.pad(inside, family.border).astype(bool)
 
 
 class MarkerFinder:
@@ -58,10 +58,10 @@ class MarkerFinder:
         self._ids = np.arange(family.count) if ids is None else np.array(sorted(ids), np.int64)
         dictionary = _dictionary(family) if ids is None else _part(family, self._ids)
         if hasattr(_aruco, "ArucoDetector"):
-            parameters = _configured(_aruco.DetectorParameters())
+            parameters = _configured(_aruco.DetectorParameters(), family)
             self._find = _aruco.ArucoDetector(dictionary, parameters).detectMarkers
         else:
-            parameters = _configured(_aruco.DetectorParameters_create())
+            parameters = _configured(_aruco.DetectorParameters_create(), family)
             self._find = lambda image: _aruco.detectMarkers(
                 image, dictionary, parameters=parameters
             )
@@ -79,7 +79,8 @@ class MarkerFinder:
         return own_ids, np.roll(quads, -self._turns, axis=1)
 
 
-def _configured(parameters: Any) -> Any:
+def _configured(parameters: Any, family: Family) -> Any:
+    parameters.markerBorderBits = family.border
     # Of OpenCV's own refinements, the AprilTag one is off by 0.46 px along x and y, and the
     # sub-pixel search moves the corners of a blurred marker inward by 0.1 to 0.4 px.
     parameters.cornerRefinementMethod = _aruco.CORNER_REFINE_NONE

@@ -4,7 +4,7 @@
 
 import difflib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, slots=True)
@@ -13,19 +13,23 @@ class Family:
 
     name: str
     kind: str  # families of one kind share their patterns: 4x4_50 is the start of 4x4_100
-    bits: int  # cells along a side inside the black border of one cell
+    bits: int  # cells along a side inside the black border
     count: int  # ids are 0 to count - 1
     first: int  # pattern of id 0, upright: row by row from the top left, 1 is white
+    border: int = 1  # cells
 
     @property
     def cells(self) -> int:
         """Cells along a side, with the border: what a marker's size spans."""
-        return self.bits + 2
+        return self.bits + 2 * self.border
 
     @property
     def constant(self) -> str:
         """Name of the dictionary in ``cv2.aruco``."""
-        return f"DICT_{self.name.upper()}"
+        return f"DICT_{self.name.removesuffix(_WIDE).upper()}"
+
+
+_WIDE = "_border2"
 
 
 def _table() -> dict[str, Family]:
@@ -45,6 +49,8 @@ def _table() -> dict[str, Family]:
         ("apriltag_36h11", 6, 587, 0xD5D628584),
     ):
         rows.append(Family(name, name, bits, count, first))
+    wide = rows[-1].name + _WIDE  # of Kalibr's AprilGrid
+    rows.append(replace(rows[-1], name=wide, kind=wide, border=2))
     return {family.name: family for family in rows}
 
 

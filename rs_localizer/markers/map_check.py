@@ -41,37 +41,6 @@ def other_units(marker_map: MarkerMap) -> Iterator[str]:
             )
 
 
-def flat_misfit(points: Array, pixels: Array) -> float:
-    """How far markers of one plane are from where a homography has them, in their sides.
-
-    No calibration is needed. NaN: the points are not of one plane; infinite: corners go the other
-    way round, as of a mirrored map.
-
-    Args:
-        points: (4m,3) of their corners.
-        pixels: (4m,2)
-    """
-    centred = points - points.mean(axis=0)
-    _, extents, axes = np.linalg.svd(centred, full_matrices=False)
-    if extents[2] > _FLAT * extents[1]:
-        return np.nan
-    quads = pixels.reshape(-1, 4, 2)
-    x, y = np.moveaxis(quads, -1, 0)
-    if np.any(np.sum(x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y, axis=1) <= 0.0):
-        return np.inf
-    flat = centred @ axes[:2].T
-    homography, _ = cv2.findHomography(flat, pixels)
-    if homography is None:
-        return np.inf
-    mapped = cv2.perspectiveTransform(flat[None], homography)[0]
-    side = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).mean()
-    return rms(mapped - pixels) / float(side)
-
-
-# Thickness of a plane, as a share of its smaller extent.
-_FLAT = 0.02
-
-
 def whole_markers(detections: Detections, end: int) -> dict[int, IntArray]:
     """Rows of the detections for each single marker of which all four corners were found."""
     place = {int(id_): row for row, id_ in enumerate(detections.ids) if id_ < end}

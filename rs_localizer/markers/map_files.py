@@ -20,7 +20,7 @@ import yaml
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.yaml_text import file_faults, load_yaml
-from rs_localizer.markers.families import family
+from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation
 from rs_localizer.markers.poses import rotation_of_quaternion as _rotation
@@ -57,11 +57,47 @@ def read_marker_map(path: Path | str) -> MarkerMap:
 
 def _map(tree: Any) -> MarkerMap:
     entry = Entry(tree, "the map")
+    if _KALIBR in entry:
+        return _kalibr_target(entry)
     markers = [_marker(item) for item in entry.entries("markers", "marker")]
     boards = [_board(item) for item in entry.entries("boards", "board")]
     frame = entry.take("map_frame", str)
     entry.finish()
     return MarkerMap(tuple(markers), tuple(boards), frame)
+
+
+_KALIBR = "target_type"
+
+
+def _kalibr_target(entry: Entry) -> MarkerMap:
+    """A target file of Kalibr; of an AprilGrid in its frame, the lower left corner of tag 0."""
+    kind = entry.take(_KALIBR, str)
+    if kind == "aprilgrid":
+        columns, rows = entry.take("tagCols", int), entry.take("tagRows", int)
+        size, gap = entry.number("tagSize"), entry.number("tagSpacing")
+        name = FAMILIES["apriltag_36h11_border2"].name
+        places = [
+            (c * (1.0 + gap) + 0.5, r * (1.0 + gap) + 0.5)
+            for r in range(rows)
+            for c in range(columns)
+        ]
+        with entry.named():
+            return MarkerMap(tuple(
+                Marker.at(name, k, size, Pose(np.array([size * x, size * y, 0.0])))
+                for k, (x, y) in enumerate(places)
+            ))  # fmt: skip
+    if kind not in ("checkerboard", "circlegrid"):
+        raise EntryError(f"target_type must be aprilgrid, checkerboard or circlegrid, not {kind!r}")
+    columns, rows = entry.take("targetCols", int), entry.take("targetRows", int)
+    with entry.named():
+        if kind == "circlegrid":
+            asymmetric = entry.take("asymmetricGrid", bool, False)
+            spacing = entry.number("spacingMeters")
+            return MarkerMap(boards=(CircleGrid(columns, rows, spacing, asymmetric),))
+        square, other = entry.number("rowSpacingMeters"), entry.number("colSpacingMeters")
+        if square != other:
+            raise ValueError(f"squares must be as high as wide, found {square:g} and {other:g} m")
+        return MarkerMap(boards=(Chessboard(columns, rows, square),))
 
 
 def _marker(entry: Entry) -> Marker:

@@ -137,6 +137,7 @@ class _Tally:
     def __init__(self, marker_map: MarkerMap, found: Extraction) -> None:
         self._map, self._found = marker_map, found
         self._others: Counter[str] = Counter()
+        self._faults: Counter[str] = Counter()
         self._residuals: list[float] = []
         self._empty: list[Image] = []  # some that show nothing
         self._empties = 0
@@ -145,6 +146,7 @@ class _Tally:
     def add(self, camera: Camera, detected: Detected) -> None:
         detections = detected.detections
         self._others.update(detections.unknown)
+        self._faults.update(detections.faults)
         if len(detections.ids):
             self._found.counts.append(len(detections.ids))
             self._residuals.append(static_residual(camera, detected))
@@ -166,6 +168,8 @@ class _Tally:
         text = f"shows anything of the map ({wanted})"
         if self._found.refused:
             text += f"; {'; '.join(self._found.refused.values())}"
+        if self._faults:
+            return f"{text}; {self._faults.most_common(1)[0][0]}"
         if self._others:
             names = ", ".join(name for name, _ in self._others.most_common(5))
             return f"{text}; they show {names}, which the map does not have"
@@ -178,7 +182,9 @@ class _Tally:
 
     def instead(self) -> list[str]:
         """What images that show nothing of the map show otherwise."""
-        names = Counter(name for image in self._empty for name in recognized(image.pixels))
+        names = Counter(
+            name for image in self._empty for name in recognized(image.pixels, self._map.boards)
+        )
         # What one of several shows may be chance.
         return [name for name, count in names.most_common(4) if 2 * count >= len(self._empty)]
 

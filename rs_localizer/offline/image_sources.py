@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where images come from, offline: a video, a folder of files, a bag."""
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,8 +34,10 @@ _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".mjpeg", ".mjpg", ".m4v", "
 LENSES = tuple(f"lens{k}" for k in range(1, 10))
 """Names of the cameras that filmed into one file, in the order of their streams."""
 
-# Names of image files that are a time in ns, as EuRoC's and TUM-VI's: from 1973 (before, a name
-# may be a time of today in us) to what a stamp of ROS can hold.
+# Names of image files that are a time since 1970, of 2001 to 2038: by the number of their digits
+# in s (with a fraction, as TUM's), ms, us, or, as EuRoC's, in ns, which may also be of 1973 on.
+_UNITS = {10: 10**9, 13: 10**6, 16: 10**3, 18: 1, 19: 1}
+_TIME = re.compile(r"([1-9]\d*)(?:[._](\d{1,9}))?")
 _EARLIEST_NS, _LATEST_NS = 10**17, 2**31 * 10**9
 
 
@@ -106,7 +109,8 @@ def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> I
     """JPEG and PNG files; their names are times in ns, or they follow each other at a rate."""
     timed = have_times(files)
     for file in files:
-        now = clock.absolute(int(file.stem)) if timed else clock.relative(None)
+        own = name_time(file) if timed else None
+        now = clock.relative(None) if own is None else clock.absolute(own)
         assert now is not None  # a clock without a rate has refused
         name = "png" if file.suffix.lower() == ".png" else "jpeg"
         compressed = _compressed(now, CAMERA_FRAME, file.read_bytes(), name)
@@ -125,6 +129,8 @@ def image_files(folder: Path) -> list[Path]:
     files = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
     if not files:
         raise SourceError(f"{folder} has no images: no file ends in {', '.join(SUFFIXES)}")
+    if have_times(files):
+        return sorted(files, key=lambda file: name_time(file) or 0)
     if all(file.stem.isdecimal() for file in files):
         return sorted(files, key=lambda file: int(file.stem))
     return sorted(files)
@@ -145,10 +151,20 @@ def image_topics(bag: BagReader) -> list[str]:
     return sorted(topic for topic, kind in bag.topics.items() if kind in IMAGE_TYPES)
 
 
+def name_time(file: Path) -> int | None:
+    """The time, ns, that the name of an image file is; None: it is none."""
+    match = _TIME.fullmatch(file.stem)
+    unit = None if match is None else _UNITS.get(len(match[1]))
+    if match is None or unit is None or (match[2] and unit != _UNITS[10]):
+        return None
+    time = int(match[1]) * unit + int((match[2] or "0").ljust(9, "0"))
+    return time if _EARLIEST_NS <= time < _LATEST_NS else None
+
+
 def have_times(files: list[Path]) -> bool:
-    """Whether the names of image files are times in ns."""
-    names = [file.stem for file in files]
-    return all(n.isdecimal() and _EARLIEST_NS <= int(n) < _LATEST_NS for n in names)
+    """Whether the names of image files are times, each of one image."""
+    times = [name_time(file) for file in files]
+    return None not in times and len(set(times)) == len(times)
 
 
 def find_topic(bag: BagReader, types: tuple[str, ...], given: str | None, option: str) -> str:

@@ -105,4 +105,6 @@ class FrameDetector:
             if markers:
                 shown = ", ".join(markers[:8]) + (", ..." if len(markers) > 8 else "")
                 self._notice(name, f"the image shows {shown}, {text}")
+        for fault in detections.faults:
+            self._notice(Notice.OTHER_BOARD, fault)
         return Detected(image, detections, self.map, self._row)

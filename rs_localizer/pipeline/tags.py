@@ -12,8 +12,8 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.detections import TagDetections, read_detections
+from rs_localizer.markers.boards import flat_misfit
 from rs_localizer.markers.detection import Detections
-from rs_localizer.markers.map_check import flat_misfit
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse

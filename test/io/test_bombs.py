@@ -129,5 +129,5 @@ def test_metadata_that_merges_for_ever(tmp_path):
     merges = "".join(f"k{n}: &a{n} {{<<: [*a{n - 1}, *a{n - 1}]}}\n" for n in range(1, 40))
     with (tmp_path / "bag" / "metadata.yaml").open("a") as file:
         file.write(f"\nk0: &a0 {{x: 1}}\n{merges}")
-    with pytest.raises(BagError, match="more than 100000 values"), open_bag(tmp_path / "bag"):
+    with pytest.raises(BagError, match="it merges mappings"), open_bag(tmp_path / "bag"):
         pass

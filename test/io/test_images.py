@@ -77,6 +77,17 @@ def test_sixteen_bits(encoding, big, bits, shift):
     np.testing.assert_allclose(found.pixels, values >> shift, atol=1)
 
 
+def test_sixteen_bits_keep_their_contrast():
+    """A thermal image of 200 values around 7000, with a pixel that is always bright."""
+    values = 6900 + 2 * np.arange(100 * 100).reshape(100, 100) // 100
+    rows = values.astype("<u2")
+    rows[3, 4] = 65535
+    found = read_image(image("mono16", [row.tobytes() for row in rows], 100)).pixels
+    assert found[-1, 0] - int(found[0, 0]) > 190
+    assert np.all(np.diff(found[10:90, 0].astype(int)) >= 0)
+    assert found[3, 4] == 255
+
+
 @pytest.mark.parametrize(
     ("order", "bits"), [("rggb", 8), ("bggr", 8), ("gbrg", 8), ("grbg", 8), ("rggb", 16)]
 )

@@ -30,13 +30,14 @@ def test_what_people_write():
         ("a: [1", "expected ',' or ']'"),
         ("a: &x {b: *x}", "nests deeper than 50, or holds itself"),
         ("[" * 60 + "]" * 60, "nests deeper than 50"),
-        ("[" * 5000, "nests deeper than 50|expected"),
+        ("[" * 5000, "nests deeper than 50|expected|nesting depth"),
         (LAUGHS, "more than 100000 values"),
         ("2026-99-99", "month must be in 1..12"),
         ("9" * 5000, "a number of 5000 characters"),
         (":".join(["1"] * 200_000), "a number of 399999 characters"),
-        (MERGES, "more than 100000 values"),
+        (MERGES, "it merges mappings"),
         ("a" * 5_000_000, "5000000 characters"),
+        ("a: [" + "1, " * 400_000 + "1]", "more than 100000 values"),
         ("!!python/object/apply:os.system [ls]", "could not determine a constructor"),
     ],
 )
@@ -44,4 +45,4 @@ def test_traps(text, fault):
     started = time.process_time()
     with pytest.raises(YamlError, match=fault):
         load_yaml(text)
-    assert time.process_time() - started < 20.0
+    assert time.process_time() - started < 5.0

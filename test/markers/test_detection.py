@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Corners of rendered markers and boards: where they are, their order, and which are left out."""
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -12,6 +13,7 @@ from rs_localizer.markers.detection import MarkerDetector, recognized
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.edges import refine
 from rs_localizer.markers.families import FAMILIES, Family, family
+from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Charuco, Chessboard, CircleGrid, Marker
@@ -24,7 +26,7 @@ SIZE = 0.1
 def printed(one: Family) -> Any:
     """Cells of id 0 as its authors print it, from its code and not by OpenCV."""
     bits = [one.first >> k & 1 for k in reversed(range(one.bits**2))]
-    return np.pad(np.array(bits, bool).reshape(one.bits, one.bits), 1)
+    return np.pad(np.array(bits, bool).reshape(one.bits, one.bits), one.border)
 
 
 def available() -> list[str]:
@@ -220,6 +222,58 @@ def test_charuco_corners_are_those_of_opencvs_board(rows, legacy):
     found = detector.detect(render([(cells, outline)], pose))
     assert 3 <= len(found.ids) < 3 * (rows - 1)
     np.testing.assert_allclose(found.pixels, project(board.points[found.ids], pose), atol=0.15)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize("told", ["layout", "exchanged", "both"])
+def test_a_charuco_board_that_is_another_one_is_named(legacy, told):
+    """Its corners would be a square off in every second row, or anywhere."""
+    if not hasattr(cv2.aruco.CharucoBoard, "setLegacyPattern"):
+        return
+    true = Charuco(6, 4, 0.03, 0.02, family("6x6_250"), legacy=legacy)
+    wrong = Charuco(4, 6, 0.03, 0.02, true.family, legacy=legacy)
+    if told != "exchanged":
+        wrong = replace(true if told == "layout" else wrong, legacy=not legacy)
+    image = render([(charuco_cells(true), rectangle(0.18, 0.12))], look(8.0, distance=0.3))
+    found = MarkerDetector(MarkerMap(boards=(wrong,))).detect(image)
+    assert len(found.ids) == 0
+    (said,) = found.faults
+    assert f"columns: 6, rows: 4, legacy: {str(legacy).lower()}; it is not used" in said
+    assert MarkerDetector(MarkerMap(boards=(true,))).detect(image).faults == ()
+
+
+KALIBR = "target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.05\ntagSpacing: 0.3\n"
+
+
+def test_an_aprilgrid_of_kalibr(tmp_path):
+    """Its tags have borders of two cells, and black squares between their corners."""
+    (tmp_path / "target.yaml").write_text(KALIBR)
+    target = read_marker_map(tmp_path / "target.yaml")
+    # The lower left corner of tag 0 is the origin, x is right, y up.
+    np.testing.assert_allclose(target.markers[0].corners[3], 0.0, atol=1e-12)
+    np.testing.assert_allclose(target.markers[5].corners[1], [0.18, 0.115, 0.0], atol=1e-12)
+    cells = np.ones((29, 42), bool)  # of 5 mm: tags of 10, and 3 between them
+    for i, j in np.ndindex(4, 3):
+        cells[13 * j : 13 * j + 3, 13 * i : 13 * i + 3] = False
+    for marker in target.markers:
+        i, j = marker.id % 3, 1 - marker.id // 3
+        place = slice(13 * j + 3, 13 * j + 13), slice(13 * i + 3, 13 * i + 13)
+        cells[place] = pattern(marker.family, marker.id)
+    rotation, translation = look(5.0, distance=0.3)
+    seen = rotation, translation - rotation @ [0.09, 0.0575, 0.0]
+    image = render([(cells, rectangle(0.21, 0.145))], (rotation, translation), noise=1.0)
+    found = MarkerDetector(target).detect(image)
+    assert len(found.ids) >= 22
+    np.testing.assert_allclose(found.pixels, project(found.points, seen), atol=0.5)
+    (said,) = recognized(image)  # and no chessboard
+    assert said.startswith("apriltag_36h11_border2 ")
+
+
+def test_exchanged_columns_and_rows_are_tried():
+    true = CircleGrid(4, 5, 0.03, asymmetric=True)
+    image = render([(drawn(true), rectangle(*true.extent))], look(distance=0.5))
+    said = recognized(image, (replace(true, columns=5, rows=4),))
+    assert said == ["the asymmetric circle grid 4x5: its columns and rows are exchanged"]
 
 
 @pytest.mark.parametrize("name", ["5x5_250", "apriltag_36h11"])

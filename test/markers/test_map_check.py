@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.markers.boards import flat_misfit
 from rs_localizer.markers.detection import Detections
 from rs_localizer.markers.families import family
-from rs_localizer.markers.map_check import Fit, LeaveOneOut, flat_misfit, other_units, still_fit
+from rs_localizer.markers.map_check import Fit, LeaveOneOut, other_units, still_fit
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Charuco, Marker

@@ -22,7 +22,7 @@ if WORKING:
     from rs_localizer.io.maps.colmap import read_model, write_model
     from rs_localizer.io.maps.landmarks import MapError
     from rs_localizer.mapping.global_shutter import GlobalShutterModel, Shutter, undo_shutter
-    from rs_localizer.offline.image_sources import have_times
+    from rs_localizer.offline.image_sources import have_times, name_time
     from rs_localizer.offline.rectified import map_depths, motion_between, rectified
     from rs_localizer.settings import build
 
@@ -115,10 +115,10 @@ def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:
     if rate is None:
         if not have_times([Path(name) for name in names]):
             raise UsageError(
-                f"the names of the images are not times in ns (such as {names[0]}): give --rate, "
+                f"the names of the images are not times (such as {names[0]}): give --rate, "
                 "the images per second of the numbers in them (1e9 for ns since a video's start)"
             )
-        return {name: int(Path(name).stem) for name in names}
+        return {name: name_time(Path(name)) or 0 for name in names}
     stamps = {}
     for name in names:
         numbers = _NUMBER.findall(Path(name).stem)
