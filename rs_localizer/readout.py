@@ -21,6 +21,16 @@ from rs_localizer import data
 
 _TABLE = "readout_times/table.csv"
 _COLUMNS = ("name", "mode", "median_ms", "low_ms", "high_ms", "number", "source")
+# Of which nobody has published a readout time that names its mode.
+COMMON = (
+    "Logitech C920", "Logitech C270", "Logitech Brio", "Intel RealSense D435", "Luxonis OAK-D",
+    "Stereolabs ZED 2", "Microsoft Azure Kinect", "Raspberry Pi Camera 3",
+    "Raspberry Pi HQ Camera", "Orbbec Gemini 2",
+)  # fmt: skip
+MEASURE = (
+    "measure it: film a printed chessboard for 20 s, the camera moving as it will, and run "
+    "rs_localizer calibrate VIDEO --board 9x6 --square 0.025 --out camera.yaml"
+)
 _QUARTILE = 0.6745  # of a normal distribution, in standard deviations
 # Of the interval between images: who writes this much has rather an upper bound than a measurement.
 _UPPER_BOUND = 0.95
@@ -74,11 +84,14 @@ def find_readout(name: str, mode: str = "") -> list[Known]:
     table = known_cameras()
     named = [entry for entry in table if _has(entry.name, name)]
     if not named:
+        common = next((one for one in COMMON if _has(one, name)), None)
+        if common is not None:
+            raise ValueError(f"no readout time of {common} in its modes is known; {MEASURE}")
         names = {entry.name.lower(): entry.name for entry in table}
         near = difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.5)
         hint = f"; there are {', '.join(names[one] for one in near)}" if near else ""
         raise ValueError(
-            f"nothing is known of a camera {name!r}{hint}; rs_localizer calibrate measures it"
+            f"nothing is known of a camera {name!r}{hint} (all: rs_localizer readout); {MEASURE}"
         )
     matching = [entry for entry in named if _has(entry.mode, mode)]
     if not matching:

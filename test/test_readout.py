@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 
 from rs_localizer import data
+from rs_localizer.cli.main import main
 from rs_localizer.readout import (
+    COMMON,
     StampAt,
     as_json,
     as_rows,
@@ -31,6 +33,21 @@ def test_every_row_of_the_table_makes_sense():
         assert known.number >= (3 if known.source == "gyroflow" else 1)
         assert known.name
         assert known.mode
+
+
+def test_of_common_cameras_the_command_that_measures_is_told(capsys):
+    table = {entry.name.lower() for entry in known_cameras()}
+    assert len(COMMON) == 10
+    for name in COMMON:
+        assert name.lower() not in table
+        with pytest.raises(ValueError, match=f"of {name} .* rs_localizer calibrate VIDEO --board"):
+            find_readout(name)
+    assert main(["readout"]) == 0
+    said = capsys.readouterr().out
+    assert all(entry.name in said for entry in known_cameras())
+    assert "Not known of Logitech C920" in said
+    assert main(["readout", "nobody's camera"]) == 1
+    assert "rs_localizer calibrate VIDEO --board 9x6" in capsys.readouterr().err
 
 
 def test_a_camera_is_found_by_words_and_all_of_its_modes_are_told():

@@ -119,6 +119,13 @@ def _other_frames(estimate: Trajectory, truth: Trajectory, tolerance_ns: int) ->
     estimated = Rotation.from_quat(estimate.quaternions[rows])
     true = Rotation.from_quat(truth.quaternions[true_rows])
     before = float(np.degrees(np.median((true.inv() * estimated).magnitude())))
+    shifted = Rotation.from_quat(truth.quaternions[true_rows][:, [1, 2, 3, 0]])
+    after = float(np.degrees(np.median((shifted.inv() * estimated).magnitude())))
+    if before > _ANOTHER_FRAME and after < _EXPLAINED * before:
+        return (
+            f"are quaternions of TRUTH given w first? Read so, orientations differ by {after:.3f} "
+            f"deg and not {before:.3f} (TUM's lines are t x y z qx qy qz qw)"
+        )
     for whose, between in (
         ("body (base_frame, optical axes)", true.inv() * estimated),
         ("map", estimated * true.inv()),

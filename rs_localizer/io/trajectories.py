@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectory files: TUM poses ``t x y z qx qy qz qw`` and twists ``t wx wy wz vx vy vz``.
 
+Truths of others are read, too: EuRoC's CSV (ns, position, quaternion w x y z, more), lines in any
+order, and NaN where a tracker has lost its target.
+
 Times are seconds in the files and integer nanoseconds here: a float of today's date in seconds
 is 240 ns coarse. Files that end in ``.gz`` are compressed text.
 """
@@ -74,7 +77,7 @@ def read_tum(path: Path | str) -> Trajectory:
     """Read a TUM file.
 
     Raises:
-        TrajectoryError: for a missing, empty or malformed file, unsorted or repeated times.
+        TrajectoryError: for a missing, empty or malformed file, or a time of two poses.
     """
     path = Path(path)
     stamps_ns, values = _read_table(path, ("x", "y", "z", "qx", "qy", "qz", "qw"))
@@ -146,32 +149,45 @@ def _open(path: Path, mode: Literal["r", "w"]) -> TextIO:
 
 
 def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64], Array]:
-    """Times in ns and the other columns; comments and empty lines are skipped."""
-    stamps: list[int] = []
-    rows: list[list[float]] = []
+    """Times in ns and the other columns; comments, headings and empty lines are skipped."""
+    rows: dict[int, list[float]] = {}
     for number, line in _lines(path):
-        words = line.split()
+        words = line.replace(",", " ").split()
         try:
-            if len(words) != 1 + len(columns):
+            stamp_ns = _stamp(words[0])
+            values = [float(word) for word in words[1 : len(columns) + 1]]
+            of_euroc = "," in line and words[0] == str(stamp_ns) and columns[-1] == "qw"
+            more = len(words) - 1 - len(columns)
+            if more < 0 or (more and not of_euroc):
                 raise ValueError
-            stamp_ns, row = parse_stamp(words[0]), [float(word) for word in words[1:]]
-            if not np.all(np.isfinite(row)):
+            if of_euroc:
+                values = [*values[:3], *values[4:7], values[3]]  # EuRoC's: w x y z
+            if np.isnan(values).all():  # a tracker that has lost its target
+                continue
+            if not np.isfinite(values).all():
                 raise ValueError
         except (ValueError, InvalidOperation):
+            if not rows and "," in line and not line[0].isdigit():
+                continue  # the heading
             raise TrajectoryError(
-                f"{path}, line {number}: expected the finite numbers t {' '.join(columns)}, "
-                f"found {line[:80]!r}"
+                f"{path}, line {number}: expected the finite numbers t {' '.join(columns)} (or, "
+                f"with commas, EuRoC's: ns, then the quaternion as w x y z), found {line[:80]!r}"
             ) from None
-        if stamps and stamp_ns <= stamps[-1]:
-            fault = "repeats" if stamp_ns == stamps[-1] else "lies before"
+        if rows.setdefault(stamp_ns, values) != values:
             raise TrajectoryError(
-                f"{path}, line {number}: the time {words[0]} {fault} the time of the line before"
+                f"{path}, line {number}: the time {words[0]} was there before, with other values"
             )
-        stamps.append(stamp_ns)
-        rows.append(row)
     if not rows:
         raise TrajectoryError(f"{path} holds no line of numbers")
-    return np.array(stamps, dtype=np.int64), np.array(rows)
+    stamps = sorted(rows)
+    return np.array(stamps, dtype=np.int64), np.array([rows[stamp] for stamp in stamps])
+
+
+def _stamp(word: str) -> int:
+    """Nanoseconds of a time in s, or of a whole number that can only be ns, as EuRoC's."""
+    if word.isdecimal() and _LATEST < int(word) < 2**63:
+        return int(word)
+    return parse_stamp(word)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:

@@ -114,3 +114,15 @@ def test_frames_that_differ_are_named_with_their_turn(files, capsys, whose):
     assert f"warning: the poses are given in different frames of the {whose}" in said
     assert "a turn of 120.00 deg about (-0.577, 0.577, -0.577)" in said
     assert "explains all but 0.000 deg of 120.000 deg" in said
+
+
+def test_quaternions_with_w_first_are_named(files, capsys):
+    """Their norm is 1, too, and no turn of a frame explains them."""
+    first = TRUTH.quaternions[:, [3, 0, 1, 2]]
+    write_tum(files / "truth.txt", Trajectory(STAMPS, TRUTH.positions, first))
+    assert evaluate(files) == 0
+    said = capsys.readouterr().out
+    assert (
+        "warning: are quaternions of TRUTH given w first? Read so, orientations differ by 2.0"
+        in said
+    )
