@@ -25,9 +25,9 @@ from benchmarks.independent.cameras import Camera, Scan
 from benchmarks.independent.motions import IntArray, Moving, hand
 from benchmarks.independent.rigs import Mounted, Scene, Views, views
 from benchmarks.independent.rotations import Array, exponential, logarithm
-from rs_localizer.trajectory.calibration import calibrate
-from rs_localizer.trajectory.observe import Observed
-from rs_localizer.trajectory.rig import Recording, calibrate_rig
+from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.calibration import calibrate
+from rs_localizer.tools.rig import Recording, calibrate_rig
 
 _RATE, _POINTS = 30.0, 76  # Hz; of each camera
 _PHASE, _OFFSET = 0.0071, 0.0123  # s, of the second camera's images, and of its clock

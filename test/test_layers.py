@@ -29,9 +29,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "markers": {"core", "io"},
     "features": {"core", "config", "io"},
     "pipeline": {*METHOD, "io", "features", "markers", "matching", "trajectory"},
-    "mapping": {
-        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings")
-    },
     "offline": {
         *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings")
     },
@@ -40,13 +37,15 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "evaluation": {
         *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
-        *("mapping", "data", "simulation"),
+        *("data", "simulation"),
     },
 }
+# What makes a camera or a map known: nothing but the commands imports it.
+MAY_IMPORT["tools"] = {*MAY_IMPORT}
 EVERYTHING = {*MAY_IMPORT, "__init__"}
 MAY_IMPORT |= {
     "__init__": {*METHOD, "io", "offline"},
-    "ros": EVERYTHING,
+    "ros": EVERYTHING - {"tools"},
     "cli": {*EVERYTHING, "ros"},
     "__main__": {"process", "cli"},
 }

@@ -22,9 +22,9 @@ from rs_localizer.simulation.frames import frame_stamps, simulate_frames
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import RecordedMotion
-from rs_localizer.trajectory import verdict
-from rs_localizer.trajectory.calibration import Calibration, calibrate
-from rs_localizer.trajectory.observe import Observed
+from rs_localizer.tools import verdict
+from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.calibration import Calibration, calibrate
 
 _SPECIFICATION = "our issue"
 _RATE = 30.0  # Hz

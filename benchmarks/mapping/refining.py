@@ -18,11 +18,16 @@ from benchmarks.mapping.rooms import (
     walls,
 )
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.mapping.adjustment import MapProblem, apply_similarity
-from rs_localizer.mapping.gauge import through
-from rs_localizer.mapping.observations import MapObservations, RigCamera, Start
-from rs_localizer.mapping.refine import MapFreedom, Preparation, RefinedMap, refine
-from rs_localizer.trajectory.model import Freedom, start_state
+from rs_localizer.tools.adjust.variables import Freedom, start_state
+from rs_localizer.tools.mapping.gauge import through
+from rs_localizer.tools.mapping.observations import MapObservations, RigCamera, Start
+from rs_localizer.tools.mapping.refine import (
+    MapFreedom,
+    Preparation,
+    RefinedMap,
+    apply_similarity,
+    refine,
+)
 
 _NOISE, _OFF = 0.3, 0.02  # px, m
 _READOUT = 0.03
@@ -106,11 +111,10 @@ def _least(seen: MapObservations, found: RefinedMap, freedom: MapFreedom) -> Arr
         linear_acceleration=freedom.linear_acceleration,
     )  # fmt: skip
     state = start_state(found.camera, observed, found.spline, found.readout_time)
-    (camera,) = prepared.problem([observed], state, free).cameras
-    errors = [sights.errors for sights in camera.look(state)[1]]
-    fitting = replace(observed, pixels=observed.pixels + np.concatenate(errors))
-    motion = prepared.problem([fitting], state, free)
-    problem = MapProblem(motion, state, prepared.deviations, False)
+    problem = prepared.problem([observed], state, free)
+    (sights,) = problem.sights(state)
+    fitting = replace(observed, pixels=observed.pixels + sights.errors)
+    problem = prepared.problem([fitting], state, free)
     return apply_similarity(
         problem, state, _NOISE, np.ones(len(found.points), np.bool_)
     ).covariances

@@ -12,8 +12,8 @@ import numpy as np
 from benchmarks.independent import cameras
 from benchmarks.independent.rotations import Array, exponential
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping.observations import MapObservations, Start
-from rs_localizer.mapping.unknown_markers import Spotted
+from rs_localizer.tools.mapping.observations import MapObservations, Start
+from rs_localizer.tools.mapping.unknown_markers import Spotted
 
 _HALF = 2.5  # m, of the room
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])

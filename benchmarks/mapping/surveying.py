@@ -23,8 +23,6 @@ from benchmarks.mapping.rooms import (
     ring,
 )
 from rs_localizer.core.arrays import Array
-from rs_localizer.mapping.survey import Survey, survey, survey_rig
-from rs_localizer.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.families import Family, family
 from rs_localizer.simulation.planes import TexturedPlane
@@ -32,9 +30,11 @@ from rs_localizer.simulation.renderer import Renderer
 from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.simulation.true_motion import TrueState
 from rs_localizer.simulation.walls import PAPER_AND_INK, printed
-from rs_localizer.trajectory.fit import Fit
-from rs_localizer.trajectory.model import Extrinsics, Mounting
-from rs_localizer.trajectory.problem import LIMIT
+from rs_localizer.tools.adjust.fit import Fit
+from rs_localizer.tools.adjust.problem import LIMIT
+from rs_localizer.tools.adjust.variables import Extrinsics, Mounting
+from rs_localizer.tools.mapping.survey import Survey, survey, survey_rig
+from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
 
 _CELL_TEXELS = 24
 _GREY_NOISE = 2.0

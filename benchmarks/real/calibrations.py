@@ -23,10 +23,10 @@ import numpy as np
 from benchmarks.real.clips import Clip, opencv_lens
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.trajectory import verdict
-from rs_localizer.trajectory.calibration import calibrate
-from rs_localizer.trajectory.first_lens import first_lens, reprojection_error
-from rs_localizer.trajectory.observe import Observed
+from rs_localizer.tools import verdict
+from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.calibration import calibrate
+from rs_localizer.tools.first_lens import first_lens, reprojection_error
 
 Result = dict[str, Any]
 PARTS = ("whole", "1/2", "2/2", "1/3", "2/3", "3/3")

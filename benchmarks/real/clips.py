@@ -18,10 +18,10 @@ from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.io.video import Video
 from rs_localizer.markers.boards import find_chessboard
 from rs_localizer.markers.prints import Chessboard
-from rs_localizer.trajectory import verdict
-from rs_localizer.trajectory.calibration import calibrate
-from rs_localizer.trajectory.first_lens import first_lens
-from rs_localizer.trajectory.observe import Observed
+from rs_localizer.tools import verdict
+from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.calibration import calibrate
+from rs_localizer.tools.first_lens import first_lens
 
 INDEX = "index.csv"
 # Of a video whose readout time is not found: that of an ordinary phone, s, give or take.

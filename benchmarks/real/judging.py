@@ -24,13 +24,13 @@ from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.state import ANGULAR, POSE, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
+from rs_localizer.tools.adjust.fit import fit
+from rs_localizer.tools.adjust.observe import Observed, collect
+from rs_localizer.tools.adjust.problem import LIMIT, Problem, View
+from rs_localizer.tools.calibration import calibrate, within
+from rs_localizer.tools.first_lens import first_lens
 from rs_localizer.tracking import Memory, Tracker
-from rs_localizer.trajectory.calibration import calibrate, within
-from rs_localizer.trajectory.first_lens import first_lens
-from rs_localizer.trajectory.fit import fit
-from rs_localizer.trajectory.observe import Observed, collect
 from rs_localizer.trajectory.online_readout import REVERSED
-from rs_localizer.trajectory.problem import LIMIT, Problem
 
 Pose = Estimate | GlobalPose
 Poses = Sequence[Pose | Failure | None]
@@ -227,7 +227,7 @@ def _shutter_gain(clip: Clip) -> dict[str, float]:
     for sign in (1.0, 0.0, -1.0):
         start = replace(found.fit.state, readout_time=sign * found.readout_time)
         state = fit(camera, known, start, held, found.fit.deviation).state
-        squared = Problem(camera, unseen, state, held).errors(state)
+        squared = Problem([View(camera, unseen, held)], state).errors(state)
         # Corners that are wrong say nothing of the shutter.
         squared = np.minimum(squared, (LIMIT * found.fit.deviation) ** 2)
         counts = np.bincount(unseen.frames, minlength=len(parts[1]))

@@ -40,6 +40,7 @@ if WORKING:
     from rs_localizer.io.calibration import kalibr_fields, read_calibration, write_calibration
     from rs_localizer.io.camera_info import read_camera_info
     from rs_localizer.io.images import Image
+    from rs_localizer.io.imu import ImuRecording
     from rs_localizer.io.maps.files import read_map_file
     from rs_localizer.io.rigs import (
         RigParts,
@@ -65,13 +66,13 @@ if WORKING:
     from rs_localizer.pipeline.images import FrameDetector
     from rs_localizer.readout import Known, as_json, as_rows, measured
     from rs_localizer.settings import write_parameters
-    from rs_localizer.trajectory import verdict
-    from rs_localizer.trajectory.calibration import Calibration, calibrate
-    from rs_localizer.trajectory.first_lens import first_lens
-    from rs_localizer.trajectory.imu import ImuRecording, MountFound
-    from rs_localizer.trajectory.lens import LensErrors
-    from rs_localizer.trajectory.observe import Observed, in_order
-    from rs_localizer.trajectory.rig import Mounted, Recording, calibrate_rig
+    from rs_localizer.tools import verdict
+    from rs_localizer.tools.adjust.lens import LensErrors
+    from rs_localizer.tools.adjust.observe import Observed, in_order
+    from rs_localizer.tools.calibration import Calibration, calibrate
+    from rs_localizer.tools.first_lens import first_lens
+    from rs_localizer.tools.imu import MountFound
+    from rs_localizer.tools.rig import Mounted, Recording, calibrate_rig
 
 # A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
 _MOST_TURN, _SIGMAS = 1.0, 4.0
@@ -308,7 +309,7 @@ def _calibrated(
     for line in imu_lines(found, source.imu, config):
         print(line)
     if args.plots is not None:
-        from rs_localizer.evaluation.calibration_plots import save_plots
+        from rs_localizer.tools.calibration_plots import save_plots
 
         save_plots(camera, found, args.plots)
     return found

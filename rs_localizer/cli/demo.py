@@ -39,21 +39,21 @@ if WORKING:
         clip_stamps,
         draw_clip,
     )
-    from rs_localizer.evaluation.map_pictures import localized_picture
-    from rs_localizer.evaluation.room_mapping import Piece, Room, without_refinement
     from rs_localizer.io.bags import BagWriter
     from rs_localizer.io.maps.files import write_npz
     from rs_localizer.io.recording import make_camera_info, write_frame
     from rs_localizer.io.topics import KEYPOINTS
     from rs_localizer.io.trajectories import Motions, Trajectory, Twists, read_tum
     from rs_localizer.io.video import Image
-    from rs_localizer.mapping.colmap import Effort, require
     from rs_localizer.process.missing import explain
     from rs_localizer.settings import build, load_params_file
     from rs_localizer.simulation.frames import frame_stamps, middle_stamp, simulate_frames
     from rs_localizer.simulation.recording import write_simulated, write_truth
     from rs_localizer.simulation.scene import room
     from rs_localizer.simulation.true_motion import RecordedMotion
+    from rs_localizer.tools.mapping.colmap import Effort, require
+    from rs_localizer.tools.mapping.pictures import localized_picture
+    from rs_localizer.tools.room_mapping import Piece, Room, without_refinement
 
     _WALK, _FLIGHT = Piece(28.0, 11.8, 15.0), Piece(40.0, 8.0, 10.0)  # of the room
     _EFFORT = Effort(adjusted=60)

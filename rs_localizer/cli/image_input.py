@@ -26,6 +26,7 @@ if WORKING:
 
     from rs_localizer.core.camera import Camera
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
+    from rs_localizer.io.imu import ImuRecording
     from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_telemetry
     from rs_localizer.io.video import count_lenses, has_times
     from rs_localizer.offline.image_sources import (
@@ -42,7 +43,6 @@ if WORKING:
         image_files,
         with_telemetry,
     )
-    from rs_localizer.trajectory.imu import ImuRecording
 
 # Readout times and focal lengths that differ by less are called the same: what a file says counts
 # rows its own way, and is of no single camera.

@@ -67,11 +67,11 @@ if WORKING:
         prepare,
         replay,
     )
-    from rs_localizer.offline.smoothed import smooth_frames
     from rs_localizer.offline.table import FrameTable, read_parquet, schema, write_parquet
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.pipeline.rigs import frame_localizer
-    from rs_localizer.trajectory.warm_up import warm_up
+    from rs_localizer.tools.smoothed import smooth_frames
+    from rs_localizer.tools.warm_up import warm_up
 
 if TYPE_CHECKING:  # an extra
     from pyarrow import Table

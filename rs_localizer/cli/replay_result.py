@@ -33,7 +33,6 @@ if WORKING:
     from rs_localizer.io.transforms import TransformError, make_transform
     from rs_localizer.offline.fleet import LOG, MARKER, Figures
     from rs_localizer.offline.replay import TF_TYPE
-    from rs_localizer.offline.smoothed import SmoothedFrames
     from rs_localizer.offline.table import FrameTable
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.pipeline.imu import ImuState
@@ -41,6 +40,7 @@ if WORKING:
     from rs_localizer.pipeline.refusal import Refusal, explained
     from rs_localizer.settings import NODE_NAME
     from rs_localizer.solvers.table import find_solver
+    from rs_localizer.tools.smoothed import SmoothedFrames
 
 POSES, TWISTS = "poses.txt", "twists.txt"
 _UNKNOWN_TWIST = (np.nan,) * 6

@@ -25,8 +25,8 @@ if WORKING:
     from rs_localizer.io.video import count_lenses
     from rs_localizer.offline.image_sources import LENSES
     from rs_localizer.offline.recordings import camera_topics, optical_frame, transform_between
-    from rs_localizer.trajectory.model import Extrinsics, Mounting
-    from rs_localizer.trajectory.rig import DETERMINED
+    from rs_localizer.tools.adjust.variables import Extrinsics, Mounting
+    from rs_localizer.tools.rig import DETERMINED
 
 
 @dataclass(frozen=True, slots=True, eq=False)

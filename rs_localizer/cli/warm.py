@@ -19,7 +19,7 @@ if WORKING:
     from rs_localizer.markers import detection
     from rs_localizer.pipeline.compiling import note_compiled
     from rs_localizer.pipeline.frames import FrameLocalizer
-    from rs_localizer.trajectory import warm_up as trajectory
+    from rs_localizer.tools import warm_up as trajectory
 
 # Any that is known: with it, frames are tracked, too.
 _READOUT_TIME = 0.03

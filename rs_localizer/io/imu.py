@@ -8,11 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.messages import MessageError, frame_id, make_header, make_vector, stamp_ns
 
 Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuRecording:
+    """What a gyroscope measured while the camera ran."""
+
+    stamps_ns: IntArray  # (k,)
+    angular_velocities: Array  # (k,3) rad/s, in its own axes
+    camera_from_imu: Array | None = None  # (3,3) as others say: checked, not believed
+
 
 # Gyroscopes end at 70 rad/s (4000 deg/s), accelerometers of robots at some hundred g: beyond these
 # a message counts in other units.

@@ -13,7 +13,7 @@ from rs_localizer.config import Matching
 from rs_localizer.io.bags import BagReader
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.clouds import Correspondences, read_correspondences, read_keypoints, read_map
-from rs_localizer.io.imu import read_imu
+from rs_localizer.io.imu import ImuRecording, read_imu
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS
@@ -22,7 +22,6 @@ from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.offline.image_sources import IMAGE_TYPES, INFO_TYPE, SourceError, find_topic
 from rs_localizer.offline.replay import TF_TYPE, Topics, as_tf2, tf_topics
 from rs_localizer.pipeline.inputs import IMU_TYPE
-from rs_localizer.trajectory.imu import ImuRecording
 
 
 class RecordingError(ValueError):

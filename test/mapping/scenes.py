@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping.observations import Adjusted, MapObservations, Start
-from rs_localizer.mapping.unknown_markers import Spotted
-from rs_localizer.trajectory.model import Extrinsics, Mounting
+from rs_localizer.tools.adjust.variables import Extrinsics, Mounting
+from rs_localizer.tools.mapping.observations import Adjusted, MapObservations, Start
+from rs_localizer.tools.mapping.unknown_markers import Spotted
 
 READOUT = 0.03
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])

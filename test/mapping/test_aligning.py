@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.cli.map.align import Wishes, alignment, moved, moved_markers
 from rs_localizer.core import so3
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.mapping.gauge import Similarity, through
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
+from rs_localizer.tools.mapping.gauge import Similarity, through
 
 TURN = so3.exp(np.array([0.4, -0.7, 0.2]))
 

@@ -7,18 +7,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping import MappingError
-from rs_localizer.mapping.anchors import (
+from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.tools.mapping import MappingError
+from rs_localizer.tools.mapping.anchors import (
     Anchors,
     Distance,
     PointSight,
     marker_constraints,
     placement,
 )
-from rs_localizer.mapping.gauge import Similarity
-from rs_localizer.mapping.observations import MapObservations, Start
-from rs_localizer.mapping.triangulation import Triangulated
-from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.tools.mapping.gauge import Similarity
+from rs_localizer.tools.mapping.observations import MapObservations, Start
+from rs_localizer.tools.mapping.triangulation import Triangulated
 
 WALL = MarkerMap(wall("4x4_50", (3, 2), 0.2, 0.1))
 TO_MAP = Similarity(

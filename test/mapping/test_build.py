@@ -18,20 +18,20 @@ from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.evaluation.room_mapping import Piece, Room, without_refinement
 from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.mapping import MappingError
-from rs_localizer.mapping.anchors import Anchors
-from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_fit
-from rs_localizer.mapping.colmap import SPARSE, Effort
-from rs_localizer.mapping.gauge import through
-from rs_localizer.mapping.report import written
-from rs_localizer.mapping.views import View
 from rs_localizer.simulation.frames import middle_stamp
 from rs_localizer.simulation.renderer import Renderer
 from rs_localizer.simulation.settings import ImageSettings
+from rs_localizer.tools.mapping import MappingError
+from rs_localizer.tools.mapping.anchors import Anchors
+from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map, check_fit
+from rs_localizer.tools.mapping.colmap import SPARSE, Effort
+from rs_localizer.tools.mapping.gauge import through
+from rs_localizer.tools.mapping.report import written
+from rs_localizer.tools.mapping.views import View
+from rs_localizer.tools.room_mapping import Piece, Room, without_refinement
 
 pytest.importorskip("pycolmap")
 

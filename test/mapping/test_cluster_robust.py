@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scenes import camera, ring, spot
 
-from rs_localizer.mapping.survey import Survey, survey
-from rs_localizer.mapping.unknown_markers import every_marker
 from rs_localizer.markers.families import family
-from rs_localizer.trajectory.cluster_robust import pull_at_landmarks
+from rs_localizer.tools.adjust.cluster_robust import pull_at_landmarks
+from rs_localizer.tools.mapping.survey import Survey, survey
+from rs_localizer.tools.mapping.unknown_markers import every_marker
 
 RATE, LANDMARKS, SECONDS = 30, 60, 10
 

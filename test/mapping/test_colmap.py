@@ -13,9 +13,9 @@ import pytest
 
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.io.calibration import colmap_camera, colmap_parameters
-from rs_localizer.mapping import MappingError, colmap
-from rs_localizer.mapping.colmap import Effort, build_structure, image_name, pairs_of
 from rs_localizer.simulation.walls import collage
+from rs_localizer.tools.mapping import MappingError, colmap
+from rs_localizer.tools.mapping.colmap import Effort, build_structure, image_name, pairs_of
 
 K = np.array([[260.0, 0.0, 161.0], [0.0, 255.0, 118.0], [0.0, 0.0, 1.0]])
 
@@ -84,7 +84,8 @@ def test_pycolmap_stays_out_of_this_process():
     """OpenCV is in it; both together abort on some machines."""
     pytest.importorskip("pycolmap")
     code = (
-        "import sys, cv2, rs_localizer.mapping.build, rs_localizer.mapping.colmap as c\n"
+        "import sys, cv2, rs_localizer.tools.mapping.build\n"
+        "import rs_localizer.tools.mapping.colmap as c\n"
         "c.require()\nassert 'pycolmap' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -6,7 +6,7 @@ import numpy as np
 from scenes import SQUARE
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.mapping.gauge import of_the_shape
+from rs_localizer.tools.mapping.gauge import of_the_shape
 
 COUNT = 4
 

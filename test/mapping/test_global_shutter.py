@@ -12,7 +12,7 @@ from scenes import READOUT, camera, hand, walk
 
 from rs_localizer.cli.main import main
 from rs_localizer.io.maps.colmap import ModelImage, Points, read_images, read_model, write_model
-from rs_localizer.mapping.gauge import through
+from rs_localizer.tools.mapping.gauge import through
 
 pytest.importorskip("pycolmap")
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import projector
 import pytest
+from dense import normal_of
 from scenes import (
     BACK,
     CENTRE,
@@ -25,12 +26,18 @@ from scipy.stats import chi2
 
 from rs_localizer.core import so3
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.mapping.adjustment import MapNormal, MapProblem, MapStep, Reduced
-from rs_localizer.mapping.gauge import through
-from rs_localizer.mapping.observations import MapObservations, RigCamera, Start
-from rs_localizer.mapping.refine import MapFreedom, Preparation, RefinedMap, refine, refine_rig
-from rs_localizer.trajectory.model import Freedom, State
-from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
+from rs_localizer.tools.adjust.problem import Problem
+from rs_localizer.tools.adjust.system import Factored
+from rs_localizer.tools.adjust.variables import Freedom, State
+from rs_localizer.tools.mapping.gauge import through
+from rs_localizer.tools.mapping.observations import MapObservations, RigCamera, Start
+from rs_localizer.tools.mapping.refine import (
+    MapFreedom,
+    Preparation,
+    RefinedMap,
+    refine,
+    refine_rig,
+)
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
 
@@ -41,81 +48,39 @@ def errors(found: RefinedMap, truth: Walk) -> np.ndarray:
     return np.linalg.norm(through(ours, true)(ours) - true, axis=1)
 
 
-def dense(normal: MapNormal) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and slope of motion, shared numbers and landmarks, from the rows themselves."""
-    rows, motion = normal.rows, normal.motion.whole
-    controls, shared = motion.band.shape[1], len(motion.corner)
-    size, count = controls + shared, len(rows.precisions)
-    matrix = np.zeros((size + 3 * count,) * 2)
-    slope = np.zeros(size + 3 * count)
-    for d in range(len(motion.band)):
-        k = np.arange(controls - d)
-        matrix[k + d, k] = motion.band[d, : controls - d]
-    matrix[controls:size, :controls] = motion.cross.T
-    matrix[controls:size, controls:size] = np.tril(motion.corner)
-    matrix = np.tril(matrix) + np.tril(matrix, -1).T
-    matrix[:size, :size] += normal.held @ normal.held.T
-    slope[:controls], slope[controls:size] = motion.slope, motion.border_slope
-    slope[:size] += normal.held @ normal.held_error
-    for landmark in range(count):
-        at = slice(size + 3 * landmark, size + 3 * landmark + 3)
-        matrix[at, at] += rows.precisions[landmark] * np.eye(3)
-        slope[at] += rows.precisions[landmark] * rows.offsets[landmark]
-        for n in rows.order[rows.starts[landmark] : rows.starts[landmark + 1]]:
-            first = CONTROL * int(rows.first[n])
-            columns = [*range(first, first + LOCAL), *range(controls, size)]
-            by_rest, by_own = rows.values[n, :, : len(columns)], rows.values[n, :, -4:-1]
-            matrix[at, at] += by_own.T @ by_own
-            matrix[columns, at] += by_rest.T @ by_own
-            matrix[at, columns] += by_own.T @ by_rest
-            slope[at] += by_own.T @ rows.values[n, :, -1]
-    return matrix, slope
-
-
-def small_problem() -> tuple[MapProblem, State]:
+def small_problem() -> tuple[Problem, State]:
     rng = np.random.default_rng(0)
     scene = walk(rng, np.array([0.0, 0.03, 0.06, 1.0, 2.0]), points=120, count=25)
     prepared = Preparation([RigCamera(camera())], scene.seen, scene.start, MapFreedom())
     seen = prepared.observations()
     state = prepared.state(seen)
     free = Freedom(lens=True, angular_velocity=2.0, linear_velocity=1.0)
-    motion = prepared.problem(seen, state, free)
-    problem = MapProblem(motion, state, prepared.deviations, floating=True)
-    return problem, state
+    return prepared.problem(seen, state, free), state
 
 
-def test_the_elimination_solves_the_dense_system():
+def test_step_and_covariances_are_those_of_the_dense_system():
     problem, state = small_problem()
-    normal = problem.normal(state, 5.0)[1]
-    matrix, slope = dense(normal)
-    step = Reduced(normal).step()
+    matrix, slope = normal_of(problem.groups, problem.terms(state, 5.0))
+    inverse, factored = np.linalg.inv(matrix), Factored(problem.system(state, 5.0))
     expected = -np.linalg.solve(matrix, slope)
-    found = np.concatenate([step[0], step[1], step[2].ravel()])
+    found = factored.step()
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
-
-
-def test_covariances_are_those_of_the_dense_system():
-    problem, state = small_problem()
-    normal = problem.normal(state, 5.0)[1]
-    inverse = np.linalg.inv(dense(normal)[0])
-    of_landmarks, shared = Reduced(normal).covariances()
-    size = normal.motion.whole.band.shape[1] + problem.motion.border
+    of_landmarks, shared = factored.block_covariances()
+    motion, kept = problem.groups.motion, problem.groups.kept
     for k, covariance in enumerate(of_landmarks):
-        at = slice(size + 3 * k, size + 3 * k + 3)
+        at = slice(kept + 3 * k, kept + 3 * k + 3)
         np.testing.assert_allclose(covariance, inverse[at, at], rtol=1e-5, atol=1e-12)
-    at = slice(size - problem.motion.border, size)
+    at = slice(motion, kept)
     np.testing.assert_allclose(shared, inverse[at, at], rtol=1e-5, atol=1e-12)
 
 
 def test_modes_are_the_errors_of_the_motion_that_move_landmarks_most():
     """By dense algebra: whitened, and the largest of landmarks in their own deviations."""
     problem, state = small_problem()
-    normal = problem.normal(state, 5.0)[1]
-    matrix = dense(normal)[0]
-    size = normal.motion.whole.band.shape[1] + problem.motion.border
+    matrix, size = normal_of(problem.groups, problem.terms(state, 5.0))[0], problem.groups.kept
     of_motion, crossed, own = matrix[:size, :size], matrix[:size, size:], matrix[size:, size:]
     reduced = of_motion - crossed @ np.linalg.solve(own, crossed.T)
-    modes = Reduced(normal).modes(normal, 12)
+    modes = Factored(problem.system(state, 5.0)).modes(12)
     np.testing.assert_allclose(modes.T @ reduced @ modes, np.eye(12), atol=1e-5)
     moves = np.linalg.solve(own, crossed.T @ modes)
     expected = eigh(of_motion, reduced, eigvals_only=True)[:-13:-1] - 1.0
@@ -125,26 +90,12 @@ def test_modes_are_the_errors_of_the_motion_that_move_landmarks_most():
 def test_the_slope_is_the_derivative_of_the_cost():
     rng = np.random.default_rng(2)
     problem, state = small_problem()
-    cost, normal = problem.normal(state, 5.0)
-    slope = dense(normal)[1]
-    controls, shared = len(normal.motion.whole.slope), problem.motion.border
+    slope = normal_of(problem.groups, problem.terms(state, 5.0))[1]
     direction = rng.normal(size=len(slope)) * 1e-6
-    costs = []
-    for sign in (-1.0, 1.0):
-        step = sign * direction
-        moved = problem.moved(
-            state,
-            normal,
-            MapStep(
-                step[:controls],
-                step[controls : controls + shared],
-                step[controls + shared :].reshape(-1, 3),
-            ),
-        )
-        costs.append(problem.normal(moved, 5.0)[0])
+    costs = [problem.system(problem.moved(state, s * direction), 5.0).cost for s in (-1.0, 1.0)]
     # Half the cost; noise moves with the flow, whose own derivative is left out.
     assert 0.25 * (costs[1] - costs[0]) == pytest.approx(slope @ direction, rel=0.02)
-    assert cost > 0.0
+    assert costs[0] > 0.0
 
 
 @pytest.fixture(scope="module")

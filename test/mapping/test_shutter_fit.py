@@ -9,9 +9,9 @@ import pytest
 from scenes import READOUT, camera, walk
 
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.mapping.observations import MapFreedom
-from rs_localizer.mapping.refine import RefinedMap, refine
-from rs_localizer.mapping.shutter_fit import ShutterFit, fit_shutter, likely_axes
+from rs_localizer.tools.mapping.observations import MapFreedom
+from rs_localizer.tools.mapping.refine import RefinedMap, refine
+from rs_localizer.tools.mapping.shutter_fit import ShutterFit, fit_shutter, likely_axes
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
 # The wrong axis first.

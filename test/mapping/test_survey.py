@@ -23,11 +23,11 @@ from scenes import (
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.io.transforms import Transform
-from rs_localizer.mapping.survey import Survey, survey, survey_rig
-from rs_localizer.mapping.unknown_markers import Chained, Filmed, Spotted, chain, every_marker
 from rs_localizer.markers.families import family
 from rs_localizer.markers.map_check import other_units
 from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.tools.mapping.survey import Survey, survey, survey_rig
+from rs_localizer.tools.mapping.unknown_markers import Chained, Filmed, Spotted, chain, every_marker
 
 SIZE = 0.15
 STAMPS = np.arange(0.0, 3.0, 1.0 / 30.0)
@@ -142,7 +142,7 @@ def turned_over(chained: Chained, marker: int) -> Chained:
 @pytest.mark.parametrize("origin", [0, 2])
 def test_a_marker_that_was_turned_over_is_turned_back(spotted, poses, origin, monkeypatch):
     monkeypatch.setattr(
-        "rs_localizer.mapping.survey.chain", lambda *given: turned_over(chain(*given), 2)
+        "rs_localizer.tools.mapping.survey.chain", lambda *given: turned_over(chain(*given), 2)
     )
     # All of it would turn it back on the way.
     found = survey(camera(), spotted[:40], MARKERS, origin=origin)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping.triangulation import Sights, moves, triangulate
+from rs_localizer.tools.mapping.triangulation import Sights, moves, triangulate
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, K, np.array([-0.1, 0.02, 0.001, -0.001]))

@@ -21,10 +21,10 @@ from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.trajectories import Motions, read_motions
-from rs_localizer.offline import smoothed
 from rs_localizer.offline.replay import find_topics, find_transforms, replay
-from rs_localizer.offline.smoothed import smooth_frames
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.tools import smoothed
+from rs_localizer.tools.smoothed import smooth_frames
 
 CONFIG = NodeConfig(readout_time=0.03)
 SECOND = 10**9

@@ -4,17 +4,17 @@
 
 import numpy as np
 import projector
+from dense import normal_of
 from scipy.linalg import toeplitz
 from scipy.spatial.transform import Rotation
-from test_fit import as_dense, guess, make_camera, observe
+from test_fit import guess, make_camera, observe
 
-from rs_localizer.trajectory.fit import fit
-from rs_localizer.trajectory.model import Freedom, start_state
-from rs_localizer.trajectory.normal_kernels import Normal, add_accelerations
-from rs_localizer.trajectory.problem import Problem
-from rs_localizer.trajectory.sight_kernels import Curve
-from rs_localizer.trajectory.smoothing import told
-from rs_localizer.trajectory.spline import Layout, Spline
+from rs_localizer.tools.adjust.fit import fit
+from rs_localizer.tools.adjust.motion import acceleration_rows
+from rs_localizer.tools.adjust.problem import Problem, View
+from rs_localizer.tools.adjust.spline import Layout, Spline
+from rs_localizer.tools.adjust.variables import Freedom, start_state
+from rs_localizer.tools.smoothing import told
 
 SPACING, ANGULAR, LINEAR, FADING = 0.04, 3.0, 2.0, 0.1
 
@@ -24,19 +24,6 @@ def two_stretches() -> Spline:
     motion = projector.Motion.random(np.random.default_rng(0))
     layout = Layout.over(np.array([[0.0, 4 * SPACING], [1.0, 1.0 + 2 * SPACING]]), SPACING)
     return Spline(layout, *motion.pose(layout.control_times()))
-
-
-def prior_alone(spline: Spline, freedom: Freedom) -> tuple[float, Normal]:
-    """Its cost, and its normal equations with nothing else in them."""
-    count, empty = 6 * len(spline.positions), np.zeros((0, 0))
-    normal = Normal(
-        np.zeros((24, count)), np.zeros((count, 0)), empty, np.zeros(count), np.zeros(0),
-        np.zeros(0, int), empty, empty, np.zeros(0), np.zeros(0),
-    )  # fmt: skip
-    spacing = spline.layout.spacing
-    curve = Curve(spline.rotations, spline.positions, *spline.steps(), spacing)
-    cost = add_accelerations(curve, spline.layout.firsts, freedom.accelerations(spacing), normal)
-    return cost, normal
 
 
 def by_hand(spline: Spline, fading: float) -> float:
@@ -59,14 +46,9 @@ def test_the_prior_is_that_of_accelerations_that_fade():
     spline = two_stretches()
     for fading in (0.0, FADING):
         freedom = Freedom(angular_acceleration=ANGULAR, linear_acceleration=LINEAR, fading=fading)
-        cost, normal = prior_alone(spline, freedom)
-        np.testing.assert_allclose(cost, by_hand(spline, fading), rtol=1e-9)
-        for k in range(len(normal.slope)):
-            step = np.zeros(len(normal.slope))
-            step[k] = 1e-6
-            more, less = (by_hand(spline.moved(sign * step), fading) for sign in (1.0, -1.0))
-            slope = (more - less) / 4e-6  # the slope is of half the cost
-            np.testing.assert_allclose(normal.slope[k], slope, rtol=1e-5, atol=1e-4)
+        rows = acceleration_rows(spline, freedom.accelerations(SPACING))
+        np.testing.assert_allclose(rows.cost, by_hand(spline, fading), rtol=1e-9)
+        np.testing.assert_allclose(rows.cost, np.sum(rows.errors**2), rtol=1e-12)
 
 
 def test_the_keypoints_tell_as_many_numbers_as_the_trace_says():
@@ -77,9 +59,11 @@ def test_the_keypoints_tell_as_many_numbers_as_the_trace_says():
     start = start_state(camera, seen, guess(rng, motion, frames), 0.03)
     freedom = Freedom(False, angular_acceleration=8.0, linear_acceleration=4.0, fading=FADING)
     found = fit(camera, seen, start, freedom, 0.5)
-    problem = Problem(camera, seen, found.state, freedom)
-    prior = as_dense(prior_alone(found.state.spline, freedom)[1])
-    share = np.linalg.solve(as_dense(problem.normal(found.state, found.deviation)[1]), prior)
+    problem = Problem([View(camera, seen, freedom)], found.state)
+    expected = freedom.accelerations(found.state.spline.layout.spacing)
+    prior, _ = normal_of(problem.groups, [acceleration_rows(found.state.spline, expected)])
+    whole, _ = normal_of(problem.groups, problem.terms(found.state, found.deviation))
+    share = np.linalg.solve(whole, prior)
     parts = np.tile(np.repeat([0, 1], 3), len(found.state.spline.positions))
     count = 3 * (len(found.state.spline.positions) - 2)
     # The prior has no terms between turns and places: the trace falls apart into theirs.

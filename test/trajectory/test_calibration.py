@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.trajectory import verdict
-from rs_localizer.trajectory.calibration import Calibration, calibrate, discrepancy, examine
-from rs_localizer.trajectory.first_lens import first_lens
-from rs_localizer.trajectory.observe import Observed
+from rs_localizer.tools import verdict
+from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.calibration import Calibration, calibrate, discrepancy, examine
+from rs_localizer.tools.first_lens import first_lens
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 

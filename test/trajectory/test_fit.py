@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator: its normal equations against differences, its results against an own projector."""
+"""The estimator against an own projector."""
 
 from dataclasses import replace
 
@@ -10,12 +10,9 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
-from rs_localizer.trajectory.banded import Factored
-from rs_localizer.trajectory.fit import fit
-from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
-from rs_localizer.trajectory.normal_kernels import Normal
-from rs_localizer.trajectory.problem import Problem
-from rs_localizer.trajectory.spline import Layout, Spline, first_spline
+from rs_localizer.tools.adjust.fit import fit
+from rs_localizer.tools.adjust.spline import Spline, first_spline
+from rs_localizer.tools.adjust.variables import Freedom, Observations, start_state
 
 READOUT = 0.03
 
@@ -51,88 +48,6 @@ def guess(
     rotations = rotations @ so3.exp_many(rng.normal(0.0, 0.003, (len(times), 3)))
     positions = positions + rng.normal(0.0, 0.01, positions.shape)
     return first_spline(times, rotations, positions, spacing, 0.03)
-
-
-def small_problem(
-    rng: np.random.Generator, direction: str = "top_to_bottom", distortion: str = "plumb_bob"
-) -> tuple[Problem, State]:
-    """Everything free, and errors of zero."""
-    camera = make_camera(scan_direction=direction)
-    if distortion == "equidistant":
-        camera = replace(camera, D=np.array([0.01, -0.02, 0.003, 0.001]),
-                         distortion_model=distortion)  # fmt: skip
-    motion, landmarks = projector.Motion.random(rng), projector.room(rng, 6)
-    layout = Layout.over(np.array([[0.0, 0.1]]), 0.04)
-    spline = Spline(layout, *motion.pose(layout.control_times()))
-    count = 40
-    pixels = rng.uniform(0.0, 400.0, (count, 2))
-    seen = Observations(
-        times=rng.choice([0.02, 0.05, 0.08], count),
-        row_times=camera.row_time(pixels),
-        pixels=pixels,
-        landmarks=landmarks,
-        points=rng.integers(0, 6, count),
-        frames=np.zeros(count, int),
-        trusted=np.ones(count, bool),
-    )
-    state = start_state(camera, seen, spline, READOUT)
-    # Weak: its errors are not zero, and second derivatives would count.
-    freedom = Freedom(True, True, (0.3, 1.0), 0.01, 0.0, 1e4, 1e4)
-    _, parts = Problem(camera, seen, state, freedom).look(state)
-    exact = replace(seen, pixels=pixels + np.concatenate([part.errors for part in parts]))
-    return Problem(camera, exact, state, freedom), state
-
-
-def as_dense(normal: Normal) -> np.ndarray:
-    """The whole symmetric matrix of normal equations."""
-    controls, border = normal.cross.shape
-    dense = np.zeros((controls + border, controls + border))
-    for d in range(len(normal.band)):
-        k = np.arange(controls - d)
-        dense[k + d, k] = normal.band[d, : controls - d]
-    dense[controls:, :controls] = normal.cross.T
-    dense[controls:, controls:] = normal.corner
-    return np.tril(dense) + np.tril(dense, -1).T
-
-
-@pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
-@pytest.mark.parametrize("distortion", ["plumb_bob", "equidistant"])
-def test_the_normal_matrix_is_the_derivative_of_the_slope(direction, distortion):
-    problem, state = small_problem(np.random.default_rng(0), direction, distortion)
-    _, normal = problem.normal(state, 1.0)
-    controls, border = len(normal.slope), problem.border
-    dense = as_dense(normal)
-    for k in range(controls + border):
-        h = 1e-6 / np.sqrt(dense[k, k] + 1e-12) * 30.0
-        slopes = []
-        for sign in (-1.0, 1.0):
-            step = np.zeros(controls + border)
-            step[k] = sign * h
-            moved = problem.moved(state, normal, (step[:controls], step[controls:]))
-            found = problem.normal(moved, 1.0)[1]
-            slopes.append(np.concatenate([found.slope, found.border_slope]))
-        numeric = (slopes[1] - slopes[0]) / (2.0 * h)
-        scale = np.sqrt(dense[k, k] * np.diag(dense))
-        np.testing.assert_allclose(numeric / scale, dense[k] / scale, atol=2e-4)
-
-
-def test_steps_and_covariances_are_those_of_the_dense_system():
-    problem, state = small_problem(np.random.default_rng(1))
-    _, normal = problem.normal(state, 1.0)
-    normal.slope[:] = np.random.default_rng(2).normal(size=len(normal.slope))
-    controls, dense = len(normal.slope), as_dense(normal)
-    inverse = np.linalg.inv(dense)
-    factored = Factored(normal)
-    inner, border = factored.step()
-    expected = -inverse @ np.concatenate([normal.slope, normal.border_slope])
-    np.testing.assert_allclose(np.concatenate([inner, border]), expected, rtol=1e-5, atol=1e-8)
-    np.testing.assert_allclose(
-        factored.border_covariance(), inverse[controls:, controls:], rtol=1e-5, atol=1e-9
-    )
-    first = np.arange(controls // 6 - 3)
-    for k, covariance in zip(first, factored.local_covariances(first), strict=True):
-        at = slice(6 * k, 6 * k + 24)
-        np.testing.assert_allclose(covariance, inverse[at, at], rtol=1e-5, atol=1e-9)
 
 
 def test_truth_without_noise():

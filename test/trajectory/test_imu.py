@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A gyroscope beside the camera: derivatives, what is found of it, and what is refused."""
-
-from dataclasses import replace
+"""A gyroscope beside the camera: what is found of it, and what is refused."""
 
 import numpy as np
 import projector
@@ -10,13 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.trajectory.calibration import calibrate
-from rs_localizer.trajectory.gyro import MOUNT, GyroMount, GyroSamples, first_mount
-from rs_localizer.trajectory.gyro_terms import GyroTerms
-from rs_localizer.trajectory.imu import ImuRecording
-from rs_localizer.trajectory.model import State
-from rs_localizer.trajectory.observe import Observed
-from rs_localizer.trajectory.spline import Layout, Spline
+from rs_localizer.io.imu import ImuRecording
+from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.adjust.spline import Layout, Spline
+from rs_localizer.tools.adjust.variables import GyroSamples
+from rs_localizer.tools.calibration import calibrate
+from rs_localizer.tools.imu import first_mount
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 CAMERA_FROM_IMU = Rotation.from_rotvec([0.3, -1.2, 0.7]).as_matrix()
@@ -35,33 +32,6 @@ def gyroscope(
 def spline_of(motion: projector.Motion, seconds: float, spacing: float) -> Spline:
     layout = Layout.over(np.array([[0.0, seconds]]), spacing)
     return Spline(layout, *motion.pose(layout.control_times()))
-
-
-def test_derivatives_are_those_of_the_errors():
-    rng = np.random.default_rng(0)
-    motion = projector.Motion.random(rng)
-    mount = GyroMount(CAMERA_FROM_IMU, BIAS, 0.003, rng.normal(0.0, 0.05, 6))
-    state = State(spline_of(motion, 0.3, 0.05), 0.0, np.zeros(0), np.zeros((0, 3)), np.zeros(0),
-                  mount)  # fmt: skip
-    samples = GyroSamples(np.linspace(0.05, 0.25, 7), rng.normal(size=(7, 3)), 1.0)
-    terms = GyroTerms(samples, state, 0)
-    turns, h = terms.look(state), 1e-6
-
-    def errors(step: np.ndarray, controls: np.ndarray) -> np.ndarray:
-        moved = replace(state, spline=state.spline.moved(controls), mount=mount.moved(step))
-        return terms.look(moved).errors
-
-    count = 6 * len(state.spline.positions)
-    for k in range(MOUNT):
-        step = h * np.eye(MOUNT)[k]
-        numeric = (errors(step, np.zeros(count)) - errors(-step, np.zeros(count))) / (2 * h)
-        np.testing.assert_allclose(turns.by_mount[:, :, k], numeric, atol=1e-6)
-    for k in range(24):
-        for sample, first in enumerate(turns.first):
-            step = np.zeros(count)
-            step[6 * first + k] = h
-            numeric = (errors(np.zeros(MOUNT), step) - errors(np.zeros(MOUNT), -step)) / (2 * h)
-            np.testing.assert_allclose(turns.by_controls[sample, :, k], numeric[sample], atol=1e-5)
 
 
 def test_offset_rotation_and_bias_are_found():

@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.trajectory.calibration import calibrate
-from rs_localizer.trajectory.observe import Observed
-from rs_localizer.trajectory.rig import Recording, calibrate_rig
+from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.calibration import calibrate
+from rs_localizer.tools.rig import Recording, calibrate_rig
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 # The second camera looks back, 10 cm beside the first, its shutter runs up, its images come 7 ms

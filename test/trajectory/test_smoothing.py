@@ -12,9 +12,9 @@ from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
 from rs_localizer.localizer import Localizer
+from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.smoothing import Smoothed, smooth
 from rs_localizer.tracking import Tracker
-from rs_localizer.trajectory.observe import Observed
-from rs_localizer.trajectory.smoothing import Smoothed, smooth
 
 READOUT = 0.03
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.trajectory.spline import Layout, Spline
+from rs_localizer.tools.adjust.spline import Layout, Spline
 
 H = 1e-6
 

@@ -15,10 +15,10 @@ import projector
 from numba.core.dispatcher import Dispatcher
 from rs_localizer.core.camera import Camera
 from rs_localizer.localizer import Localizer
-from rs_localizer.trajectory.calibration import calibrate, likelihood
-from rs_localizer.trajectory.observe import Observed, localize_each
-from rs_localizer.trajectory.smoothing import smooth
-from rs_localizer.trajectory.warm_up import warm_up
+from rs_localizer.tools.calibration import calibrate, likelihood
+from rs_localizer.tools.adjust.observe import Observed, localize_each
+from rs_localizer.tools.smoothing import smooth
+from rs_localizer.tools.warm_up import warm_up
 
 def compiled():
     return {(found.py_func.__module__, found.py_func.__name__, str(signature))

@@ -11,7 +11,7 @@ from functools import partial
 from rs_localizer.cli import WORKING, LateParser, add_common
 
 if WORKING:
-    from rs_localizer.mapping.observations import ReadoutCheck
+    from rs_localizer.tools.mapping.observations import ReadoutCheck
 
 # Each module offers ``add_arguments(parser)`` and ``run(arguments)``.
 ACTIONS = {

@@ -18,10 +18,10 @@ if WORKING:
     from scipy.spatial.transform import Rotation
 
     from rs_localizer.io.maps.landmarks import Map
-    from rs_localizer.mapping.gauge import Similarity, upright
     from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.markers.poses import Pose
     from rs_localizer.markers.prints import Marker
+    from rs_localizer.tools.mapping.gauge import Similarity, upright
 
 _LEAST_FLOOR = 3  # points make a plane
 # A floor whose points lie within this part of their extent of a line has no direction.

@@ -34,15 +34,15 @@ if WORKING:
     from rs_localizer.io.maps.files import write_npz
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
     from rs_localizer.io.trajectories import Trajectory, write_tum
-    from rs_localizer.mapping.anchors import Anchors, Distance, PointSight
-    from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_features
-    from rs_localizer.mapping.colmap import Effort, require
-    from rs_localizer.mapping.report import advice, rows, written
-    from rs_localizer.mapping.views import Looker, View
     from rs_localizer.offline.detect import Cameras
     from rs_localizer.offline.image_sources import Carried
     from rs_localizer.pipeline.refusal import Refusal
     from rs_localizer.settings import build, write_parameters
+    from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
+    from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map, check_features
+    from rs_localizer.tools.mapping.colmap import Effort, require
+    from rs_localizer.tools.mapping.report import advice, rows, written
+    from rs_localizer.tools.mapping.views import Looker, View
 
 # After so many, images without features are refused: two seconds of a usual video.
 _EARLY_VIEWS = 30
@@ -234,7 +234,7 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
     if looked.camera is None:
         write_calibration(out / CAMERA, replace(built.camera, readout_time=0.0))
-    from rs_localizer.evaluation.map_pictures import save_pictures
+    from rs_localizer.tools.mapping.pictures import save_pictures
 
     save_pictures(built, out)
     (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")

@@ -31,10 +31,10 @@ if WORKING:
     from rs_localizer.io.calibration import read_calibration, write_calibration
     from rs_localizer.io.clouds import Correspondences
     from rs_localizer.io.maps.landmarks import Map
-    from rs_localizer.mapping.observations import RecordedMap, RigCamera, from_recordings
-    from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine_rig
     from rs_localizer.offline.recordings import read_recording
     from rs_localizer.offline.replay import find_topics
+    from rs_localizer.tools.mapping.observations import RecordedMap, RigCamera, from_recordings
+    from rs_localizer.tools.mapping.refine import MapFreedom, RefinedMap, refine_rig
 
 _GIVEN, _ESTIMATED, _GLOBAL = "given", "estimated", "global"
 _HOLD = 0.001

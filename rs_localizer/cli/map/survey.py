@@ -29,13 +29,13 @@ if WORKING:
     from rs_localizer.core.arrays import Array
     from rs_localizer.io.camera_info import Calibration, read_camera_info
     from rs_localizer.io.images import Image
-    from rs_localizer.mapping.survey import MISFIT, Survey, survey_rig
-    from rs_localizer.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
     from rs_localizer.markers.map_check import other_units
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.markers.prints import Marker
     from rs_localizer.offline.image_sources import Carried
+    from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey_rig
+    from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
 
 _LISTED = 12
 _SHAPE, _ORIGIN = "shape", "origin"

@@ -1,0 +1,129 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How much less is known because errors of keypoints that follow each other are correlated.
+
+The corners of a marker, or the features of a surface, look nearly the same from image to image, and
+so do their errors: a hundred of them say less than a hundred independent ones. Errors of a second
+are taken together (cluster-robust covariance: Liang and Zeger, *Longitudinal data analysis using
+generalized linear models*, Biometrika 1986), by what they pull at all that is estimated. As one
+factor: a recording has too few seconds to tell one for each number.
+
+Of independent errors, what a second pulls has the expectation ``tr B - tr B^2``, where ``B`` is the
+share of all information that comes from it: what was estimated fits its own errors, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.tools.adjust.fit import Fit, steepness
+from rs_localizer.tools.adjust.problem import Problem
+from rs_localizer.tools.adjust.system import Rows
+
+SECONDS = 1.0
+"""Errors farther apart than this are taken for independent."""
+# As if so many numbers had been found known as well as independent errors let them: what few
+# seconds say is chance.
+_DOUBT = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Pull:
+    """What errors pull at what is estimated, in its own covariance, all seconds together."""
+
+    measured: float
+    expected: float  # of independent errors of the noise that the covariance stands for
+
+    def inflation(self, independent: float) -> float:
+        """Of the covariance, if it would be so large for independent errors."""
+        share = (self.measured + _DOUBT * independent) / (self.expected + _DOUBT)
+        return max(share, independent)
+
+
+def cluster_robust(problem: Problem, fitted: Fit) -> Fit:
+    """The estimate with covariances as large as its own errors show.
+
+    Args:
+        problem: whose minimum it is, with the same freedom and without delays of images.
+    """
+    of_errors = steepness(fitted.squared_errors[fitted.inliers], fitted.deviation) ** 2
+    pull = _pull(problem, fitted)
+    inflation = Pull(of_errors * pull.measured, pull.expected).inflation(fitted.inflation)
+    return replace(
+        fitted,
+        border_covariance=fitted.border_covariance * (inflation / fitted.inflation),
+        inflation=inflation,
+    )
+
+
+def _pull(problem: Problem, fitted: Fit) -> Pull:
+    """In units in which the border has covariance 1, the controls following it."""
+    factored = fitted.factored
+    covariance = factored.border_covariance()
+    unit = np.zeros((problem.groups.kept, problem.border))
+    unit[problem.groups.motion :] = np.eye(problem.border)
+    following = factored.kept(unit) @ np.linalg.inv(np.linalg.cholesky(covariance)).T
+    total, expected = 0.0, 0.0
+    every = problem.keypoint_rows(fitted.state, fitted.deviation)
+    for rows, view in zip(every, problem.views, strict=True):
+        for first, end in _seconds(view.observations.times):
+            own = _times(rows, slice(first, end), following)
+            total += float(np.sum((own.T @ rows.errors[first:end].ravel()) ** 2))
+            share = own.T @ own if own.shape[0] > own.shape[1] else own @ own.T
+            expected += float(np.trace(share) - np.sum(share**2))
+    return Pull(total, expected)
+
+
+def _times(rows: Rows, part: slice, by: Array) -> Array:
+    """Rows (m,k) of a part times what all unknowns are by others (N,k)."""
+    others, first = rows.others[part], rows.first[part]
+    run = rows.values.shape[2] - others.shape[1]
+    values = rows.values[part]
+    columns = np.concatenate([first[:, None] + np.arange(run), others], axis=1)
+    values = np.where((columns >= 0)[:, None], values, 0.0)
+    numbers, width = values.shape[1], values.shape[2]
+    sparse = csr_array(
+        (
+            values.ravel(),
+            np.repeat(np.maximum(columns, 0), numbers, axis=0).ravel(),
+            width * np.arange(numbers * len(values) + 1),
+        ),
+        shape=(numbers * len(values), len(by)),
+    )
+    return np.asarray(sparse @ by)
+
+
+def _seconds(times: Array) -> list[tuple[int, int]]:
+    """First and end of the keypoints of each second, at rising times (n,)."""
+    starts = np.flatnonzero(np.diff(np.floor(times / SECONDS), prepend=-np.inf))
+    return list(zip(starts.tolist(), [*starts[1:].tolist(), len(times)], strict=True))
+
+
+def pull_at_landmarks(rows: Array, landmarks: IntArray, times: Array, held: Array) -> Pull:
+    """What errors pull at landmarks, the motion taken for given.
+
+    Args:
+        rows: (n,2,4) whitened derivatives by the landmark, and the error.
+        landmarks: (n,) numbers of the landmarks.
+        times: (n,) s.
+        held: (p,) 1/m^2, of what is known of the landmarks beforehand.
+    """
+    seconds = np.floor(times / SECONDS)
+    order = np.lexsort((seconds, landmarks))
+    own, errors = rows[order, :, :3], rows[order, :, 3]
+    of, at = landmarks[order], seconds[order]
+    starts = np.flatnonzero((np.diff(of, prepend=-1) != 0) | (np.diff(at, prepend=-np.inf) != 0))
+    information = np.add.reduceat(np.einsum("nri,nrj->nij", own, own), starts)
+    pulls = np.add.reduceat(np.einsum("nri,nr->ni", own, errors), starts)
+    every = held[:, None, None] * np.eye(3)
+    np.add.at(every, of[starts], information)
+    inverse = np.linalg.inv(every[of[starts]])
+    shares = inverse @ information
+    return Pull(
+        float(np.einsum("ki,kij,kj->", pulls, inverse, pulls)),
+        float(np.einsum("kii->", shares) - np.einsum("kij,kji->", shares, shares)),
+    )

@@ -1,0 +1,351 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras on one motion: which unknowns they have, the cost, and its least."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.tools.adjust.bodies import Pieces, paper_covariance
+from rs_localizer.tools.adjust.gyro import Gyroscope
+from rs_localizer.tools.adjust.keypoints import LIMIT, Columns, Curve, Free, Keypoints, Sights
+from rs_localizer.tools.adjust.lens import lens_prior
+from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
+from rs_localizer.tools.adjust.priors import Floating, block_rows, known, lens_term, mount_term
+from rs_localizer.tools.adjust.spline_kernels import CONTROL
+from rs_localizer.tools.adjust.system import (
+    Factored,
+    Groups,
+    Quadratic,
+    Rows,
+    System,
+    Undetermined,
+)
+from rs_localizer.tools.adjust.variables import EXTRINSICS, MOUNT, Freedom, Observations, State
+
+# Errors beyond so many standard deviations do not count for the scale of the noise.
+_SCALE_LIMIT = 4.0
+# Median of a squared error in two dimensions, in variances.
+_MEDIAN = 2.0 * np.log(2.0)
+_LOOSE_BODY = 100.0  # m, rad
+_STEPS, _MOST_DAMPINGS = 20, 6
+# A step that brings less than this, or than this part of the cost, is the last one.
+_LEAST_GAIN, _LEAST_SHARE = 0.02, 1e-6
+_FIRST_DAMPING = 1e-8
+# The rounds end when the noise settles to this part of it.
+_ROUNDS, _SETTLED = 8, 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What one camera sees, and what of it is free."""
+
+    camera: Camera
+    observations: Observations
+    freedom: Freedom
+
+    def subset(self, chosen: BoolArray) -> View:
+        """With the chosen keypoints (n,)."""
+        return replace(self, observations=self.observations.subset(chosen))
+
+
+class Problem:
+    """The cost of one motion that cameras see; borders and keypoints stand in their order.
+
+    Args:
+        views: of the cameras, of which the first has what is expected of the motion.
+        start: first guess.
+        noises: (k,) px, of each camera's keypoints; they keep their ratios (None: all alike).
+        one_map: the free landmarks are the same of all; they come last in the border, once.
+        deviations: (p,) m, of landmarks that are all free and the same of all, and eliminated,
+            about where they are observed to be; None: what the views' freedom says.
+        floating: nothing holds the whole but its start.
+    """
+
+    def __init__(
+        self, views: Sequence[View], start: State, noises: Array | None = None,
+        one_map: bool = False, deviations: Array | None = None, floating: bool = False,
+    ) -> None:  # fmt: skip
+        self.views, self._one_map, self.deviations = list(views), one_map, deviations
+        self.freedom, self.camera = self.views[0].freedom, self.views[0].camera
+        noises = np.ones(len(self.views)) if noises is None else noises
+        self.noises, self.ratios = noises, noises / noises[0]
+        self._lens_priors = [lens_prior(v.camera, v.freedom.lens_deviations) for v in self.views]
+        every = deviations is not None
+        self.pieces = [_pieces(v.observations, v.freedom, every) for v in self.views]
+        self.lens_count = len(start.lens)
+        self._columns(start)
+        self.keypoints = [
+            Keypoints(
+                v.camera, v.observations, pieces,
+                Free(
+                    v.freedom.readout_time, v.freedom.lens, v.freedom.mounting is not None,
+                    v.freedom.stamps > 0.0,
+                ),
+            )
+            for v, pieces in zip(self.views, self.pieces, strict=True)
+        ]  # fmt: skip
+        self.floating = Floating(start.spline) if floating else None
+        self._shapes = [
+            _shape_information(v, pieces) for v, pieces in zip(self.views, self.pieces, strict=True)
+        ]
+        self._last: tuple[State, Curve, list[State]] | None = None
+
+    def _columns(self, start: State) -> None:
+        """Number all unknowns: controls, each camera's border, landmarks of all, gyroscope."""
+        controls = CONTROL * len(start.spline.positions)
+        self.at: list[dict[str, int]] = []
+        column, eliminated = controls, 0
+        for view, pieces, own in zip(self.views, self.pieces, (start, *start.others), strict=True):
+            free, at = view.freedom, dict[str, int]()
+            for name, size in (
+                ("readout", int(free.readout_time)),
+                ("lens", len(own.lens) if free.lens else 0),
+                ("mount", EXTRINSICS if free.mounting is not None else 0),
+                ("points", 0 if self._one_map or self.deviations is not None else pieces.columns),
+            ):
+                if size:
+                    at[name] = column
+                    column += size
+            self.at.append(at)
+        if self._one_map and self.pieces[0].columns:
+            for at in self.at:
+                at["points"] = column
+            column += self.pieces[0].columns
+        self.gyro: Gyroscope | None = None
+        gyro = self.views[0].observations.gyro
+        if gyro is not None and start.mount is not None:
+            self.gyro = Gyroscope(gyro, start)
+            self.at[0]["gyro"] = column
+            column += MOUNT
+        width = 1
+        if self.deviations is not None:
+            width, eliminated = 3, len(self.deviations)
+            for at in self.at:
+                at["points"] = column
+        else:
+            for at, view, own in zip(self.at, self.views, (start, *start.others), strict=True):
+                if view.freedom.stamps > 0.0:
+                    at["delays"] = column + eliminated
+                    eliminated += len(own.delays)
+        self.groups = Groups(controls, column - controls, eliminated, width)
+
+    @property
+    def border(self) -> int:
+        """Unknowns that many keypoints share."""
+        return self.groups.border
+
+    def place(self, name: str, view: int = 0) -> int:
+        """Where a camera's numbers begin in the border."""
+        return self.at[view][name] - self.groups.motion
+
+    def states(self, state: State) -> list[State]:
+        """Those of the cameras, of one spline."""
+        return self._look(state)[1]
+
+    def _look(self, state: State) -> tuple[Curve, list[State]]:
+        if self._last is None or self._last[0] is not state:
+            spline = state.spline
+            curve = Curve(
+                spline.rotations, spline.positions, *spline.steps(), float(spline.layout.spacing)
+            )
+            others = [replace(other, spline=spline) for other in state.others]
+            self._last = state, curve, [state, *others]
+        return self._last[1:]
+
+    def sights(self, state: State) -> list[Sights]:
+        """The keypoints of each camera, on the spline."""
+        curve, states = self._look(state)
+        return [of.look(curve, own) for of, own in zip(self.keypoints, states, strict=True)]
+
+    def keypoint_rows(self, state: State, deviation: float) -> list[Rows]:
+        """Of each camera, at a standard deviation of the noise (px)."""
+        curve, states = self._look(state)
+        rows = []
+        for keypoints, own, at, ratio in zip(
+            self.keypoints, states, self.at, self.ratios, strict=True
+        ):
+            sizes = {"readout": 1, "lens": len(own.lens), "mount": EXTRINSICS}
+            shared = [(at[name], size) for name, size in sizes.items() if name in at]
+            columns = Columns(shared, at.get("points", -1), at.get("delays", -1))
+            rows.append(keypoints.rows(curve, own, columns, deviation * float(ratio)))
+        return rows
+
+    def system(self, state: State, deviation: float) -> System:
+        """Cost and normal equations at a standard deviation of the noise (px)."""
+        return System(self.groups, self.terms(state, deviation))
+
+    def terms(self, state: State, deviation: float) -> list[Rows | Quadratic]:
+        """All that is measured and known."""
+        terms: list[Rows | Quadratic] = [*self.keypoint_rows(state, deviation)]
+        terms += self._expected_motion(state)
+        for k, own in enumerate(self.states(state)):
+            terms += self._known(k, own)
+        if self.deviations is not None:
+            offsets = state.landmarks - self.views[0].observations.landmarks
+            terms.append(block_rows(offsets, self.deviations, self.groups.kept))
+        if self.floating is not None:
+            terms.append(self.floating.rows(state.spline))
+        if self.gyro is not None:
+            terms += self.gyro.terms(state, self.at[0]["gyro"])
+        return terms
+
+    def _expected_motion(self, state: State) -> list[Rows]:
+        freedom, spline = self.freedom, state.spline
+        rows = [acceleration_rows(spline, freedom.accelerations(spline.layout.spacing))]
+        if len(spline.layout.alone()) and freedom.angular_velocity < math.inf:
+            rows.append(rest_rows(spline, freedom.angular_velocity, freedom.linear_velocity))
+        return rows
+
+    def _known(self, k: int, own: State) -> list[Rows | Quadratic]:
+        """What is known of a camera's unknowns beforehand."""
+        terms: list[Rows | Quadratic] = []
+        view, at, pieces = self.views[k], self.at[k], self.pieces[k]
+        freedom = view.freedom
+        if "lens" in at:
+            terms.append(lens_term(own.lens, self._lens_priors[k], at["lens"]))
+        if freedom.mounting is not None:
+            terms.append(mount_term(own.extrinsics, freedom.mounting, at["mount"]))
+        if "points" in at and self.deviations is None and not (k and self._one_map):
+            if pieces.rigid:  # a body none of whose landmarks fits stays where it is
+                information = np.full(pieces.columns, _LOOSE_BODY**-2)
+                offset = np.zeros(pieces.columns)
+            else:
+                free = pieces.slots >= 0
+                offset = (own.landmarks - view.observations.landmarks)[free].ravel()
+                information = np.full(pieces.columns, max(freedom.landmarks, 1e-12) ** -2)
+            shape = self._shapes[k]
+            matrix = np.diag(information) if shape is None else shape
+            terms.append(known(offset, matrix, at["points"]))
+        if "delays" in at:
+            deviations = np.full(len(own.delays), freedom.stamps)
+            terms.append(block_rows(own.delays[:, None], deviations, at["delays"]))
+        return terms
+
+    def moved(self, state: State, step: Array) -> State:
+        """The state after a step of all unknowns."""
+        spline = state.spline.moved(step[: self.groups.motion])
+        states = enumerate(self.states(state))
+        first, *others = (self._camera_moved(k, own, step) for k, own in states)
+        if self.gyro is not None and state.mount is not None:
+            at = self.at[0]["gyro"]
+            first = replace(first, mount=state.mount.moved(step[at : at + MOUNT]))
+        return replace(first, spline=spline, others=tuple(others))
+
+    def _camera_moved(self, k: int, own: State, step: Array) -> State:
+        at, pieces = self.at[k], self.pieces[k]
+        changed: dict[str, object] = {}
+        if "readout" in at:
+            changed["readout_time"] = own.readout_time + float(step[at["readout"]])
+        if "lens" in at:
+            changed["lens"] = own.lens + step[at["lens"] : at["lens"] + len(own.lens)]
+        if "mount" in at:
+            changed["extrinsics"] = own.extrinsics.moved(step[at["mount"] :][:EXTRINSICS])
+        if "points" in at:
+            own_step = step[at["points"] :][: pieces.columns]
+            changed["landmarks"] = pieces.moved(own.landmarks, own_step)
+        if "delays" in at:
+            changed["delays"] = own.delays + step[at["delays"] :][: len(own.delays)]
+        return replace(own, **changed)  # type: ignore[arg-type]
+
+    def errors(self, state: State) -> Array:
+        """Squared whitened errors (n,), px^2 of the first camera."""
+        curve, states = self._look(state)
+        parts = zip(self.keypoints, states, self.ratios, strict=True)
+        return np.concatenate([of.squared_errors(curve, own) / r**2 for of, own, r in parts])
+
+    def noise(self, state: State, deviation: float) -> float:
+        """Standard deviation of the noise (px), from errors that the last one lets count."""
+        return max(noise_of(self.errors(state), deviation), self.freedom.least_noise)
+
+    def of(self, views: Sequence[View], start: State) -> Problem:
+        """The same of other views of the cameras."""
+        floating = self.floating is not None
+        return Problem(views, start, self.noises, self._one_map, self.deviations, floating)
+
+    def trusted(self, start: State) -> Problem:
+        """The same with the trusted keypoints only."""
+        return self.of([view.subset(view.observations.trusted) for view in self.views], start)
+
+    def images(self, inliers: BoolArray) -> int:
+        """How many images of all cameras have some of these keypoints (n,)."""
+        frames = [view.observations.frames for view in self.views]
+        parts = np.split(inliers, np.cumsum([len(own) for own in frames])[:-1])
+        return sum(len(np.unique(of[own])) for of, own in zip(frames, parts, strict=True))
+
+
+def minimise(problem: Problem, state: State, deviation: float, steps: int = _STEPS) -> State:
+    """The state of least cost near to this one, by Levenberg and Marquardt, after so many steps."""
+    system = problem.system(state, deviation)
+    damping = _FIRST_DAMPING
+    for _ in range(steps):
+        for _ in range(_MOST_DAMPINGS):
+            cost = math.inf
+            try:
+                trial = problem.moved(state, Factored(system, damping).step())
+                following = problem.system(trial, deviation)
+                cost = following.cost
+            except Undetermined:  # far from the minimum, rounding may cost definiteness
+                pass
+            if cost < system.cost + _LEAST_GAIN:  # NaN compares false
+                break
+            damping = max(100.0 * damping, 1e-4)
+        else:
+            return state
+        gain = system.cost - cost
+        state, system, damping = trial, following, 0.1 * damping
+        if gain < max(_LEAST_GAIN, _LEAST_SHARE * cost):
+            break
+    return state
+
+
+def settle(problem: Problem, state: State, deviation: float) -> tuple[State, float]:
+    """State and noise (px) when neither changes any more."""
+    for _ in range(_ROUNDS):
+        state = minimise(problem, state, deviation)
+        before, deviation = deviation, problem.noise(state, deviation)
+        if abs(deviation - before) < _SETTLED * deviation:
+            break
+    return state, deviation
+
+
+def noise_of(squared: Array, deviation: float) -> float:
+    """Standard deviation of the noise, from squared errors (n,) that are not far off the last one.
+
+    Raises:
+        Undetermined: when there are none.
+    """
+    near = squared[squared < (_SCALE_LIMIT * deviation) ** 2]
+    if len(near) == 0:
+        raise Undetermined("no keypoint agrees with the motion of the frames")
+    return float(np.sqrt(np.median(near) / _MEDIAN))
+
+
+def _pieces(observations: Observations, freedom: Freedom, every: bool) -> Pieces:
+    """What is free of the map: all of it, bodies, or the landmarks that are seen."""
+    if every:
+        return Pieces(np.arange(len(observations.landmarks)), rigid=False)
+    if observations.bodies is not None:
+        return Pieces(observations.bodies, rigid=True)
+    slots = np.full(len(observations.landmarks), -1)
+    if freedom.landmarks > 0.0:
+        landmarks = np.unique(observations.points)
+        slots[landmarks] = np.arange(len(landmarks))
+    return Pieces(slots, rigid=False)
+
+
+def _shape_information(view: View, pieces: Pieces) -> Array | None:
+    """Of the shape of a flat print; None: it is none."""
+    if not (view.freedom.paper and pieces.count and not pieces.rigid):
+        return None
+    landmarks = view.observations.landmarks[pieces.slots >= 0]
+    return np.asarray(np.linalg.inv(paper_covariance(landmarks, view.freedom.landmarks)))
+
+
+__all__ = ["LIMIT", "Problem", "Undetermined", "View", "minimise", "noise_of", "settle"]

@@ -1,0 +1,583 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The readout time of a recording: value, honest deviation, direction, and what is odd about it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.io.imu import ImuRecording
+from rs_localizer.tools.adjust.bodies import is_flat
+from rs_localizer.tools.adjust.fit import Fit, cheaper, cost_at, fit, image_speeds
+from rs_localizer.tools.adjust.lens import LensErrors, lens_difference, lens_errors
+from rs_localizer.tools.adjust.observe import Observed, Posed, collect, in_order, localize_each
+from rs_localizer.tools.adjust.spline import LONGEST_SPACING, Spline, first_spline, refined
+from rs_localizer.tools.adjust.system import Undetermined
+from rs_localizer.tools.adjust.variables import (
+    DELAY,
+    MOUNT,
+    Freedom,
+    Observations,
+    State,
+    start_state,
+)
+from rs_localizer.tools.first_lens import as_fisheye
+from rs_localizer.tools.imu import MountFound, NoMount, gyro_samples, mount_of, with_gyro
+
+
+def likelihood(camera: Camera, result: Calibration, count: int = 9) -> tuple[Array, Array]:
+    """Readout times (count,) within four deviations, and what they cost more than the best."""
+    observations = within(result.posed.observations, result.fit.state.spline)
+    values = result.readout_time + np.linspace(-4.0, 4.0, count) * result.formal_deviation
+    costs = np.array([cost_at(camera, observations, result.fit, float(value)) for value in values])
+    return values, costs - result.fit.cost
+
+
+class Residuals(NamedTuple):
+    """Of the keypoints that fit."""
+
+    row_times: Array  # (n,)
+    speeds: Array  # (n,) px/s, in the image
+    squared_errors: Array  # (n,) px^2
+
+
+def without_readout(camera: Camera, result: Calibration) -> tuple[Residuals, Residuals]:
+    """What a global shutter would leave, and what the readout time leaves."""
+    observations = within(result.posed.observations, result.fit.state.spline).subset(
+        result.fit.inliers
+    )
+    observations = replace(observations, trusted=np.ones_like(observations.trusted))
+    held = replace(result.fit.freedom, readout_time=False)
+    both = []
+    for value in (0.0, result.readout_time):
+        start = replace(result.fit.state, readout_time=value)
+        both.append(fit(camera, observations, start, held).squared_errors)
+    speeds = image_speeds(camera, observations, result.fit.state)
+    before, after = (Residuals(observations.row_times, speeds, errors) for errors in both)
+    return before, after
+
+
+# A camera's own clock keeps its stamps within this (s) of even intervals.
+_MOST_JITTER = 5e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stamps:
+    """Images of a camera that should run evenly."""
+
+    interval: float  # s
+    jitter: float  # s rms, of the stamps about even intervals
+    missing: int  # images
+
+    @property
+    def irregular(self) -> bool:
+        return self.jitter > _MOST_JITTER
+
+
+def examine(times: Array) -> Stamps:
+    """Even intervals nearest to the stamps (f,), s, sorted.
+
+    The number of intervals is counted from stamp to stamp, so that images may be missing.
+    """
+    steps = np.diff(times)
+    interval = float(np.median(steps))
+    for _ in range(3):
+        counts = np.maximum(np.round(steps / interval), 1.0)
+        number = np.concatenate([[0.0], np.cumsum(counts)])
+        rate = np.polyfit(number, times, 1)
+        interval = float(rate[0])
+    even = np.polyval(rate, number)
+    off = times - even
+    jitter = float(np.sqrt(np.mean((off - np.median(off)) ** 2)))
+    return Stamps(interval, jitter, int(number[-1]) + 1 - len(times))
+
+
+# Parts of the recording that are calibrated on their own: three at least, for two that agree may do
+# so by chance, and more of a longer one.
+_BLOCK_SECONDS, _LEAST_BLOCKS, _MOST_BLOCKS = 3.0, 3, 8
+# Blocks that would differ this much by chance once in a hundred recordings disagree.
+_DISAGREEMENT = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """A part of the recording on its own."""
+
+    start: float  # s
+    end: float  # s
+    readout_time: float  # s
+    deviation: float  # s
+    camera: Camera  # with the lens of this part
+    landmarks: Array  # (p,3) m, with the shape that this part finds
+    delay: float = math.nan  # s, of the gyroscope where there is one
+    delay_deviation: float = math.nan  # s
+
+
+def blocks_of(
+    camera: Camera, observations: Observations, whole: Fit, count: int | None = None
+) -> tuple[Block, ...]:
+    """Equal parts of the recording, each with a lens and a shape of the map of its own.
+
+    Args:
+        camera: whose lens the whole was started from.
+        count: of the parts; None: as many as the recording is long enough for.
+    """
+    first, last = observations.times.min(), observations.times.max()
+    if count is None:
+        count = int(np.clip((last - first) / _BLOCK_SECONDS, _LEAST_BLOCKS, _MOST_BLOCKS))
+    blocks: list[Block] = []
+    for start, end in pairwise(np.linspace(first, last + 1e-6, count + 1)):
+        # Not only what fits the whole: a part that differs would be left out of its own estimate.
+        part = observations.subset((observations.times >= start) & (observations.times < end))
+        state = cut(whole.state, start, end)
+        if state is None or not np.any(part.trusted):
+            continue
+        try:
+            own = fit(camera, part, state, whole.freedom)
+        except ValueError:  # undetermined, or a lens that no camera has
+            continue
+        value, deviation = own.state.readout_time, own.readout_time_deviation
+        delay = _delay(own)
+        shape = own.state.landmarks
+        blocks.append(Block(float(start), float(end), value, deviation, own.camera, shape, *delay))
+    return tuple(blocks)
+
+
+def _delay(own: Fit) -> tuple[float, float]:
+    """Delay of the gyroscope and its deviation, s; NaN without one."""
+    if own.state.mount is None:
+        return math.nan, math.nan
+    at = DELAY - MOUNT
+    return own.state.mount.delay, math.sqrt(float(own.border_covariance[at, at]))
+
+
+def cut(state: State, start: float, end: float) -> State | None:
+    """The state with the motion between two times only."""
+    layout = state.spline.layout
+    intervals = np.column_stack([layout.starts, layout.ends])
+    margin = max(abs(one.readout_time) for one in (state, *state.others))
+    kept = np.clip(intervals, start - margin, end + margin)
+    kept = kept[kept[:, 1] - kept[:, 0] > layout.spacing]
+    if len(kept) == 0:
+        return None
+    return replace(state, spline=refined(state.spline, layout.spacing, kept))
+
+
+def disagreement(values: Array, deviations: Array) -> float:
+    """By how much deviations (b,) are too small (Birge's ratio), at least 1."""
+    if len(values) < 2:
+        return 1.0
+    weights = deviations**-2.0
+    total = float(np.sum(weights))
+    mean = np.sum(weights * values) / total
+    squared = float(np.sum(weights * (values - mean) ** 2))
+    freedoms = len(values) - 1
+    if chdtrc(freedoms, squared) > _DISAGREEMENT:
+        return 1.0
+    # What the blocks disagree in is not their noise: none of them is better than the others.
+    scatter = np.std(values, ddof=1) / math.sqrt(len(values))
+    return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))
+
+
+def discrepancy(value: float, values: Array, deviations: Array) -> float:
+    """By how much the whole's value differs from the mean of its parts (b,), beyond its noise.
+
+    Corners that are off in all images of a part alike bend its lens and shape. The shorter it is,
+    the more of the shutter is taken for those: then the whole lies beside all of its parts.
+    """
+    if len(values) == 0:
+        return 0.0
+    weights = deviations**-2.0
+    mean = weights @ values / weights.sum()
+    return math.sqrt(max(float((value - mean) ** 2 - 1.0 / weights.sum()), 0.0))
+
+
+_LEAST_IMAGES = 20
+# Where a plain lens leaves out more than this part of the keypoints, a fisheye is tried, and taken
+# if most of these fit by it: 0.88 of a fisheye's rim (rendered). Of nine real boards before plain
+# lenses seven lose up to 1 %, one 6 % (0.02 of which a fisheye fits), and 54 % where a hand bends
+# the sheet (0.44).
+_LEFT_OUT, _MOST_OF_THEM = 0.05, 0.7
+# Keypoints of all images together: each image keeps its part. A fisheye of 285 images with 352
+# corners each took minutes longer, for a lens and a readout time that errors of the corners limit.
+_MOST_SIGHTS = 40_000
+# A board: few landmarks, seen often. Each is where it should be to about this part of its size (a
+# quarter of a millimetre of an A4 sheet), beside what bends all of it.
+_MOST_BOARD_POINTS, _LEAST_SIGHTS, _BOARD_SHARE = 400, 30, 1e-3
+_GIVEN_LENS = (0.02, 0.1)  # deviations of a given one, see Freedom.lens_deviations
+# Parts that differ by this share of the value beyond chance, and by more than a value may be off:
+# the camera may turn its picture.
+_STABILISED = 0.1
+_HALVES_SIGMAS = 3.0
+# Images that were not taken at their even stamps may be missing others between them: the mean
+# interval, and with it the readout time, is off by about this part of what they are off.
+_INTERVAL_SHARE = 0.5
+# A readout time is determined to this part of the interval between images, 1.7 ms at 30 Hz: by the
+# estimate itself a slow motion, which makes it too long, would make it better known. Nor do slow
+# cameras have slow sensors.
+_DETERMINED_SHARE, _LONGEST_INTERVAL = 0.05, 1.0 / 30.0
+# So many parts have to determine it by themselves, or the recording has to be so long (s).
+_LEAST_TELLING, _LONG = 3, 9.0
+# A global shutter has 0 within so many deviations, and these within this (s): the fastest rolling
+# shutters take 4 ms.
+_GLOBAL_SIGMAS, _GLOBAL = 3.0, 2e-3
+# Standard deviations of the images' own times, by the interval, to begin with.
+_FIRST_JITTERS = (0.1, 0.3)
+# Less than this does no harm, and may be a motion that the knots do not follow.
+_LEAST_JITTER = 0.03
+_LEAST_STAMPS = 1e-5  # s
+# The prior of the accelerations is so many times their median, and at least this.
+_ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """What a recording says of its camera."""
+
+    readout_time: float  # s; negative: against the scan direction that was given
+    deviation: float  # s, with what blocks and halves disagree in, and doubts of the stamps
+    formal_deviation: float  # s, of the noise alone
+    blocks: tuple[Block, ...]
+    halves: tuple[Block, ...]
+    inflation: float  # of the deviation, because the blocks disagree; 1: they do not
+    reversed_cost: float  # by how much the reversed direction costs more, noise variances
+    stamps: Stamps
+    own_stamps: bool  # the images' own, not those of a rate
+    fit: Fit
+    posed: Posed
+    images: int  # that show the map
+    lens: LensErrors  # standard deviations of the lens that was found
+    mount: MountFound | None = None  # of the IMU, where there is one
+    no_mount: str = ""  # why there is none
+
+    @property
+    def jitter(self) -> float:
+        """By how much (s rms) images were exposed beside their stamps; 0: they were not."""
+        return self.fit.freedom.stamps
+
+    @property
+    def odds(self) -> float:
+        """Decimal logarithm of the odds for the direction of the sign."""
+        return 0.5 * self.reversed_cost / self.inflation**2 / math.log(10.0)
+
+    @property
+    def limit(self) -> float:
+        """Deviation (s) from which on a readout time is not determined."""
+        return _DETERMINED_SHARE * min(self.stamps.interval, _LONGEST_INTERVAL)
+
+    @property
+    def seconds(self) -> float:
+        """How long the images with a pose last."""
+        return float(np.ptp(self.posed.times))
+
+    @property
+    def telling(self) -> int:
+        """How many blocks determine it by themselves."""
+        return sum(block.deviation < self.limit for block in self.blocks)
+
+    @property
+    def long_enough(self) -> bool:
+        """Whether parts of it can speak against the whole."""
+        return self.telling >= _LEAST_TELLING or self.seconds >= _LONG
+
+    @property
+    def determined(self) -> bool:
+        """Whether the motion determines the readout time."""
+        return self.deviation < self.limit and self.long_enough
+
+    @property
+    def near_zero(self) -> bool:
+        """Whether 0 lies within the error."""
+        return abs(self.readout_time) < _GLOBAL_SIGMAS * self.deviation
+
+    @property
+    def global_shutter(self) -> bool:
+        """Whether nothing else than a global shutter is left."""
+        sure = _GLOBAL_SIGMAS * self.deviation < _GLOBAL and self.inflation == 1.0
+        return self.determined and self.near_zero and sure and self.own_stamps
+
+    @property
+    def too_fast(self) -> bool:
+        """Whether it is a readout that no sensor has, by stamps that a file was given."""
+        slowest = abs(self.readout_time) + _GLOBAL_SIGMAS * self.deviation
+        return not (self.near_zero or self.own_stamps) and slowest < _GLOBAL
+
+    @property
+    def held(self) -> int:
+        """Landmarks that are seen often enough to have a shape estimated, but are too many."""
+        observations = self.posed.observations
+        often = len(observations.points) >= _LEAST_SIGHTS * len(observations.landmarks)
+        return len(observations.landmarks) if often and self.fit.freedom.landmarks == 0.0 else 0
+
+    @property
+    def shape_deviation(self) -> float:
+        """Of the estimated landmarks (m, rms): by the noise, and half of the halves' difference."""
+        count = 3 * len(np.unique(self.posed.observations.points))
+        first = 1 + len(self.fit.state.lens)
+        variances = np.diag(self.fit.border_covariance)[first : first + count]
+        apart = 0.0
+        if len(self.halves) == 2:
+            one, other = (half.landmarks - half.landmarks.mean(axis=0) for half in self.halves)
+            turn = Rotation.align_vectors(one, other)[0]
+            apart = float(np.mean(np.sum((one - turn.apply(other)) ** 2, axis=1)))
+        return math.sqrt(3.0 * self.inflation**2 * float(np.mean(variances)) + 0.25 * apart)
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation of the blocks' values, s."""
+        values = [block.readout_time for block in self.blocks]
+        return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+    @property
+    def stabilised(self) -> bool:
+        """Whether the parts disagree as those of a camera that turns its picture do."""
+        least = max(_STABILISED * abs(self.readout_time), self.limit)
+        apart, noise = _apart(self.halves)
+        by_halves = apart > max(_HALVES_SIGMAS * noise, 2.0 * least)
+        return bool((self.inflation > 1.0 and self.scatter > least) or by_halves)
+
+
+def _apart(halves: tuple[Block, ...]) -> tuple[float, float]:
+    """By how much the readout times of two halves differ, and the deviation of that (s)."""
+    if len(halves) < 2:
+        return 0.0, math.inf
+    one, other = halves
+    noise = math.hypot(one.deviation, other.deviation)
+    return abs(one.readout_time - other.readout_time), noise
+
+
+def calibrate(
+    camera: Camera,
+    images: list[Observed],
+    *,
+    intrinsics: bool = False,
+    imu: ImuRecording | None = None,
+    own_stamps: bool = True,
+    done: Callable[[], object] = lambda: None,
+) -> Calibration:
+    """Readout time, and lens, of a camera from a recording in which it moves.
+
+    Args:
+        camera: its lens, and the axis and assumed direction of its scan; not its readout time.
+        images: with at least a dozen correspondences each; those that show nothing say when the
+            camera took images.
+        intrinsics: the lens is to be found, also whether it is a fisheye, which a first lens, from
+            images that move, does not tell; otherwise it is known to a percent or two.
+        imu: how it goes with the camera is to be found; its turns then help to find all else.
+        own_stamps: stamps are the camera's; otherwise those of a file, which are the images' own
+            only where they are uneven.
+        done: called after each image.
+
+    Raises:
+        ValueError: when the recording determines nothing, saying what was found.
+    """
+    taken = np.unique([image.stamp_ns for image in images])
+    images = _thinned(in_order(images))
+    if len(images) < _LEAST_IMAGES:
+        raise ValueError(f"{len(images)} images show the map, at least {_LEAST_IMAGES} are needed")
+    stamps = examine((taken - taken[0]) * 1e-9)
+    posed, fitted = _fitted(camera, images, stamps.interval, intrinsics, done)
+    every, fits = sum(len(image.points) for image in images), np.count_nonzero(fitted.inliers)
+    plain = fitted.camera.distortion_model == DistortionModel.PLUMB_BOB
+    if intrinsics and plain and fits < (1.0 - _LEFT_OUT) * every:
+        seen = within(posed.observations, fitted.state.spline).subset(fitted.inliers)
+        with suppress(ValueError):
+            alike = as_fisheye(fitted.camera, seen.pixels)
+            fisheye = replace(camera, K=alike.K, D=alike.D, distortion_model=alike.distortion_model)
+            other = _fitted(fisheye, images, stamps.interval, intrinsics, lambda: None)
+            if np.count_nonzero(other[1].inliers) > fits + _MOST_OF_THEM * (every - fits):
+                camera, (posed, fitted) = fisheye, other
+    observations, no_mount = within(posed.observations, fitted.state.spline), ""
+    if imu is not None:
+        try:
+            samples = gyro_samples(imu, posed.start_ns)
+            observations, fitted = with_gyro(
+                camera, observations, fitted, samples, imu.camera_from_imu
+            )
+        except (NoMount, Undetermined) as error:
+            no_mount = str(error)
+    judged = _judged(camera, posed, observations, stamps, fitted, len(images))
+    return replace(judged, no_mount=no_mount, own_stamps=own_stamps or stamps.irregular)
+
+
+def _fitted(
+    camera: Camera, images: list[Observed], interval: float, intrinsics: bool,
+    done: Callable[[], object],
+) -> tuple[Posed, Fit]:  # fmt: skip
+    """Images with their own poses, and one motion through them with all that is free."""
+    results = localize_each(camera, images, done)
+    localized = sum(map(bool, results))
+    if localized < _LEAST_IMAGES:
+        failures = [str(result) for result in results if not result]
+        raise ValueError(
+            f"{localized} of {len(images)} images have a pose, at least {_LEAST_IMAGES} are "
+            f"needed; of the last one without, {failures[-1]}"
+        )
+    posed = collect(camera, images, results)
+    try:
+        return posed, _best(camera, posed, interval, _freedom(posed.observations, intrinsics))
+    except Undetermined as error:
+        raise ValueError(str(error)) from error
+
+
+def _thinned(images: list[Observed]) -> list[Observed]:
+    """Images with no more keypoints in all than are worth their time, others in each image."""
+    every = sum(len(image.points) for image in images) / _MOST_SIGHTS
+    if every <= 1.0:
+        return images
+    kept = (np.floor(np.arange(k / len(images), len(image.points), every)).astype(np.int64)
+            for k, image in enumerate(images))  # fmt: skip
+    return [
+        replace(image, points=image.points[rows], pixels=image.pixels[rows])
+        for image, rows in zip(images, kept, strict=True)
+    ]
+
+
+def _freedom(observations: Observations, intrinsics: bool) -> Freedom:
+    landmarks, sights = observations.landmarks, len(observations.points)
+    often = len(landmarks) <= min(_MOST_BOARD_POINTS, sights / _LEAST_SIGHTS)
+    size = float(np.linalg.norm(np.ptp(landmarks, axis=0)))
+    return Freedom(
+        lens=True,
+        lens_deviations=None if intrinsics else _GIVEN_LENS,
+        landmarks=_BOARD_SHARE * size if often else 0.0,
+        paper=often and is_flat(landmarks),
+    )
+
+
+def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fit:
+    """Readout time first, then all that is free, then the images' times and finer knots."""
+    spacing = min(LONGEST_SPACING, interval)
+    spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, 0.5 * interval)
+    observations = within(posed.observations, spline)
+    plain = fit(camera, observations, start_state(camera, observations, spline), Freedom())
+    fitted = fit(camera, observations, plain.state, _calm(plain.state, freedom), plain.deviation)
+    with suppress(Undetermined):  # a richer model that cannot be determined is no candidate
+        other = _unsteady(camera, observations, fitted, interval, freedom)
+        unsteady = other.freedom.stamps > _LEAST_JITTER * interval
+        if unsteady and cheaper(other, fitted, len(other.state.delays)):
+            fitted = other
+    with suppress(Undetermined):
+        state = replace(fitted.state, spline=refined(fitted.state.spline, 0.5 * spacing))
+        finer = fit(camera, observations, state, fitted.freedom, fitted.deviation)
+        added = 6 * (len(finer.state.spline.positions) - len(fitted.state.spline.positions))
+        if cheaper(finer, fitted, added):
+            fitted = finer
+    return fitted
+
+
+def _unsteady(
+    camera: Camera, observations: Observations, fitted: Fit, interval: float, freedom: Freedom
+) -> Fit:
+    """With a time of its own for each image, from tight to loose to what they turn out to be."""
+    own, other = _calm(fitted.state, freedom), fitted
+    for share in _FIRST_JITTERS:
+        own = replace(own, stamps=share * interval)
+        other = fit(camera, observations, other.state, own)
+    own = replace(own, stamps=max(_jitter(camera, observations, other.state), _LEAST_STAMPS))
+    return fit(camera, observations, other.state, own, other.deviation)
+
+
+def _jitter(camera: Camera, observations: Observations, state: State) -> float:
+    """What the images' own times are off their stamps, s rms.
+
+    By how one image differs from the mean of its neighbours: times that drift are nearly a motion
+    that drifts. And by the fast images: in slow ones a hundredth of a pixel, which may be the
+    detector's error, is worth a millisecond.
+    """
+    weights = np.bincount(
+        observations.frames, image_speeds(camera, observations, state) ** 2, len(state.delays)
+    )
+    weights = np.minimum(weights[1:-1], np.minimum(weights[:-2], weights[2:]))
+    beside = np.diff(state.delays, 2)
+    return float(np.sqrt(weights @ beside**2 / (6.0 * np.sum(weights))))
+
+
+def _calm(state: State, freedom: Freedom) -> Freedom:
+    """With a prior of the accelerations that the motion itself shows."""
+    layout = state.spline.layout
+    states = state.spline.states(layout.control_times())
+    angular, linear = (
+        float(np.sqrt(np.median(np.sum(of**2, axis=1))))
+        for of in (states.angular_acceleration, states.linear_acceleration)
+    )
+    return replace(
+        freedom,
+        angular_acceleration=max(_ACCELERATIONS * angular, _LEAST_ACCELERATION),
+        linear_acceleration=max(_ACCELERATIONS * linear, _LEAST_ACCELERATION),
+    )
+
+
+def within(observations: Observations, spline: Spline) -> Observations:
+    """Those keypoints that the motion covers."""
+    return observations.subset(spline.layout.inside(observations.times))
+
+
+def _judged(
+    camera: Camera,
+    posed: Posed,
+    observations: Observations,
+    stamps: Stamps,
+    fitted: Fit,
+    images: int,
+) -> Calibration:
+    opposite = cost_at(camera, observations, fitted, -fitted.state.readout_time)
+    blocks, halves = (
+        blocks_of(camera, observations, fitted),
+        blocks_of(camera, observations, fitted, 2),
+    )
+    formal = fitted.readout_time_deviation
+    values, deviations = _of(blocks, "readout_time"), _of(blocks, "deviation")
+    inflation, mount = disagreement(values, deviations), None
+    if observations.gyro is not None:
+        doubt = disagreement(_of(blocks, "delay"), _of(blocks, "delay_deviation"))
+        mount = mount_of(camera, fitted, observations.gyro, doubt)
+    at = slice(1, 1 + len(fitted.state.lens))
+    lens = lens_errors(fitted.camera, inflation**2 * fitted.border_covariance[at, at])
+    if len(halves) == 2:
+        lens = lens.or_half(lens_difference(halves[0].camera, halves[1].camera))
+    return Calibration(
+        readout_time=fitted.state.readout_time,
+        deviation=math.hypot(
+            formal * inflation,
+            _interval_deviation(fitted, stamps),
+            0.5 * _apart(halves)[0],
+            discrepancy(fitted.state.readout_time, values, inflation * deviations),
+        ),
+        formal_deviation=formal,
+        blocks=blocks,
+        halves=halves,
+        own_stamps=True,
+        lens=lens,
+        inflation=inflation,
+        reversed_cost=opposite - fitted.cost,
+        stamps=stamps,
+        fit=fitted,
+        posed=posed,
+        images=images,
+        mount=mount,
+    )
+
+
+def _of(blocks: tuple[Block, ...], name: str) -> Array:
+    return np.array([getattr(block, name) for block in blocks])
+
+
+def _interval_deviation(fitted: Fit, stamps: Stamps) -> float:
+    """Of the readout time (s), where stamps are even and the images were not."""
+    # So many images know a variance no better than that.
+    chance = 1.0 + 2.0 * math.sqrt(2.0 / len(fitted.state.delays))
+    unsaid = fitted.freedom.stamps**2 - chance * stamps.jitter**2
+    share = math.sqrt(max(unsaid, 0.0)) / stamps.interval
+    return _INTERVAL_SHARE * share * abs(fitted.state.readout_time)

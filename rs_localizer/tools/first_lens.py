@@ -1,0 +1,348 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A first lens, and its model, from images in which the camera hardly moves (Zhang 2000)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.tools.adjust.lens import lens_prior, lens_values
+from rs_localizer.tools.adjust.observe import Observed
+
+_MOST_IMAGES, _LEAST_IMAGES = 30, 4
+# Of the points that the fullest image shows.
+_LEAST_SHARE = 0.6
+# Images with more than so many times the median's error have boards that a hand bends, or mistaken
+# corners: those of public videos have four to seven times it, all others less than twice.
+_ODD = 3.0
+# Focal lengths by image width to begin with, before scenes that are no plane.
+_FOCAL_LENGTHS = (0.35, 0.7, 1.0, 1.4)
+
+
+class _Candidate(NamedTuple):
+    model: DistortionModel
+    numbers: int  # of the distortion
+    flags: int  # of OpenCV's calibration
+
+
+# Kinds of lenses in the order in which they are preferred: a later one is taken where it predicts
+# images that it has not seen better by a tenth; less is what the choice of the images makes. Few
+# images that look alike have lenses far off that fit them, unless the centre is held.
+_CANDIDATES = (
+    _Candidate(
+        DistortionModel.PLUMB_BOB,
+        5,
+        cv2.CALIB_FIX_PRINCIPAL_POINT
+        | cv2.CALIB_FIX_ASPECT_RATIO
+        | cv2.CALIB_ZERO_TANGENT_DIST
+        | cv2.CALIB_FIX_K3,
+    ),
+    _Candidate(DistortionModel.PLUMB_BOB, 5, cv2.CALIB_FIX_K3),
+    _Candidate(DistortionModel.EQUIDISTANT, 4, 0),
+    _Candidate(DistortionModel.RATIONAL_POLYNOMIAL, 8, cv2.CALIB_RATIONAL_MODEL),
+)
+_RICHER = 0.9
+_POSE_STEPS = 4  # of Gauss and Newton from a pose in rays: they double the digits
+_LEAST_POINTS = 8
+# Of Levenberg and Marquardt for a fisheye: steps at most, and by what part of the cost the last one
+# changed it.
+_LENS_STEPS, _SETTLED = 60, 1e-7
+_FLAT = 1e-6  # thickness of a plane by its size
+
+
+def first_lens(size: tuple[int, int], images: list[Observed]) -> Camera:
+    """A lens of the simplest model that predicts images it has not seen as well as any.
+
+    Args:
+        size: width and height, pixels.
+        images: in the order of their stamps.
+
+    Raises:
+        ValueError: when too few images show enough of the map, or show it from one side only.
+    """
+    chosen = _slow(images)
+    if len(chosen) < _LEAST_IMAGES:
+        raise ValueError(
+            f"{len(chosen)} images show enough of the map for a first calibration, at least "
+            f"{_LEAST_IMAGES} are needed; give --calibration"
+        )
+    fewest = max(_LEAST_IMAGES, len(chosen) // 2)
+    while True:
+        lens = _of_simplest_model(size, chosen)
+        errors = np.array([reprojection_error(lens, image) for image in chosen])
+        alike = np.flatnonzero(errors <= _ODD * np.median(errors))
+        if not fewest <= len(alike) < len(chosen):
+            return lens
+        chosen = [chosen[k] for k in alike]
+
+
+def _of_simplest_model(size: tuple[int, int], images: list[Observed]) -> Camera:
+    best, least = None, np.inf
+    for candidate in _CANDIDATES:
+        lens = _calibrated(size, images, candidate)
+        if lens is not None and best is not None and (_folds(lens) or _cancels(lens, images)):
+            continue
+        error = np.inf if lens is None else _unseen_error(lens, images, candidate)
+        if error < least:
+            best, least = lens, _RICHER * error
+    if best is None:
+        raise ValueError("no lens fits the images; show the board from several sides")
+    return best
+
+
+def _unseen_error(lens: Camera, images: list[Observed], candidate: _Candidate) -> float:
+    """Error (px rms) of each half of the images under a lens of the other half."""
+    halves = images[::2], images[1::2]
+    squared, count = 0.0, 0
+    for known, unseen in (halves, halves[::-1]):
+        camera = _calibrated(lens.size, known, candidate, lens.K)
+        if camera is None:
+            return np.inf
+        for image in unseen:
+            squared += reprojection_error(camera, image) ** 2 * len(image.points)
+            count += len(image.points)
+    return float(np.sqrt(squared / count))
+
+
+def reprojection_error(camera: Camera, image: Observed) -> float:
+    """Error (px rms of u and v together) of the best global-shutter pose; infinite without one."""
+    pose = _pose(camera, image)
+    if pose is None:
+        return np.inf
+    rotation, place = pose
+    off = camera.project(image.points @ rotation.T + place) - image.pixels
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
+def _pose(camera: Camera, image: Observed) -> tuple[Array, Array] | None:
+    """Rotation (3,3) and translation (3,) of the best pose; None as for an infinite error."""
+    rays = camera.rays(image.pixels)
+    if not np.isfinite(rays).all():
+        return None
+    solved, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None)
+    if not solved:
+        return None
+    # In pixels, not in rays: far from the middle they are not the same.
+    pose = np.array(cv2.Rodrigues(turn)[0], np.float64), np.array(place, np.float64).ravel()
+    for _ in range(_POSE_STEPS):
+        linear = _linear(camera, image, *pose)
+        if linear is None:
+            return None
+        errors, by_pose, _ = linear
+        pose = _moved(*pose, np.linalg.lstsq(by_pose, -errors, rcond=None)[0])
+    return pose
+
+
+def _moved(rotation: Array, place: Array, step: Any) -> tuple[Array, Array]:
+    change: Array = so3.exp(np.ascontiguousarray(step[:3]))
+    return change @ rotation, change @ place + step[3:]
+
+
+def _linear(
+    camera: Camera, image: Observed, rotation: Array, place: Array
+) -> tuple[Array, Array, Array] | None:
+    """Errors (2n,) px of an image, by its pose (2n,6), and the rays (n,2); None: it looks away."""
+    local = image.points @ rotation.T + place
+    if not np.all(local[:, 2] > 0.0):
+        return None
+    rays = local[:, :2] / local[:, 2:]
+    pixels, by_ray = camera.distort(rays)
+    if not np.isfinite(pixels).all():
+        return None
+    along = -np.einsum("nij,nj->ni", by_ray, rays)[:, :, None]
+    by_point = np.concatenate([by_ray, along], 2) / local[:, 2, None, None]
+    by_pose = np.concatenate([-by_point @ so3.hat(local), by_point], 2).reshape(-1, 6)
+    return (pixels - image.pixels).ravel(), by_pose, rays
+
+
+def _fisheye(size: tuple[int, int], images: list[Observed], K: Array) -> tuple[float, Camera]:
+    """Squared errors (px^2), and the equidistant lens near ``K`` (3,3) that leaves them.
+
+    OpenCV's own asks for boards that are flat, one to an image.
+
+    Raises:
+        ValueError: when no such lens fits.
+    """
+
+    def cost(numbers: Array, poses: list[tuple[Array, Array]]) -> float:
+        camera, total = _equidistant(size, numbers), 0.0
+        for image, pose in zip(posed, poses, strict=True):
+            part = _linear(camera, image, *pose)
+            total += np.inf if part is None else float(part[0] @ part[0])
+        return total
+
+    numbers = np.r_[K[0, 0], K[1, 1], K[0, 2], K[1, 2], np.zeros(4)]
+    first = [(image, _pose(_equidistant(size, numbers), image)) for image in images]
+    posed = [image for image, pose in first if pose is not None]
+    poses = [pose for _, pose in first if pose is not None]
+    if len(posed) < max(_LEAST_IMAGES, len(images) // 2):
+        raise ValueError("no poses by this focal length")
+    least, damping = cost(numbers, poses), 1e-3
+    for _ in range(_LENS_STEPS):
+        camera, parts = _equidistant(size, numbers), []
+        of_lens, slope = np.zeros((8, 8)), np.zeros(8)
+        for image, pose in zip(posed, poses, strict=True):
+            linear = _linear(camera, image, *pose)
+            assert linear is not None
+            errors, by_pose, rays = linear
+            by_lens = _by_fisheye(numbers, rays)
+            own = by_pose.T @ by_pose
+            own[np.diag_indices(6)] *= 1.0 + damping
+            mixed = np.linalg.solve(own, np.column_stack([by_pose.T @ by_lens, by_pose.T @ errors]))
+            parts.append(mixed)
+            of_lens += by_lens.T @ (by_lens - by_pose @ mixed[:, :8])
+            slope += by_lens.T @ (errors - by_pose @ mixed[:, 8])
+        of_lens[np.diag_indices(8)] *= 1.0 + damping
+        step = -np.linalg.solve(of_lens, slope)
+        moved = [
+            _moved(*pose, -mixed[:, 8] - mixed[:, :8] @ step)
+            for pose, mixed in zip(poses, parts, strict=True)
+        ]
+        left = cost(numbers + step, moved) if np.all(numbers[:2] + step[:2] > 0.0) else np.inf
+        if not left < least:
+            damping *= 10.0
+            if damping > 1e6:
+                break
+            continue
+        settled = least - left < _SETTLED * least
+        numbers, poses, least, damping = numbers + step, moved, left, max(0.1 * damping, 1e-9)
+        if settled:
+            break
+    return least * len(images) / len(posed), _equidistant(size, numbers)
+
+
+def as_fisheye(lens: Camera, pixels: Array) -> Camera:
+    """The equidistant lens that is most like another one at some pixels (n,2) of the image.
+
+    Raises:
+        ValueError: when no such lens exists.
+    """
+    rays = lens.rays(pixels)
+    numbers = np.r_[lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2], np.zeros(4)]
+    for _ in range(_POSE_STEPS):
+        fisheye = _equidistant(lens.size, numbers)
+        off = (pixels - fisheye.distort(rays)[0]).ravel()
+        numbers = numbers + np.linalg.lstsq(_by_fisheye(numbers, rays), off, rcond=None)[0]
+    return _equidistant(lens.size, numbers)
+
+
+def _equidistant(size: tuple[int, int], numbers: Array) -> Camera:
+    """Of focal lengths, centre and distortion (8)."""
+    K = np.array([[numbers[0], 0.0, numbers[2]], [0.0, numbers[1], numbers[3]], [0.0, 0.0, 1.0]])
+    return Camera(*size, K=K, D=numbers[4:], distortion_model=DistortionModel.EQUIDISTANT)
+
+
+def _by_fisheye(numbers: Array, rays: Array) -> Array:
+    """Pixels (2n,) by focal lengths, centre and distortion (8) of an equidistant lens."""
+    radius = np.hypot(*rays.T)
+    angle = np.arctan(radius)
+    powers = angle[:, None] ** np.arange(1.0, 10.0, 2.0)
+    unit = rays / np.maximum(radius, 1e-12)[:, None]
+    by_lens = np.zeros((len(rays), 2, 8))
+    for k in range(2):
+        by_lens[:, k, k] = unit[:, k] * (powers @ np.r_[1.0, numbers[4:]])
+        by_lens[:, k, 2 + k] = 1.0
+        by_lens[:, k, 4:] = numbers[k] * unit[:, k, None] * powers[:, 1:]
+    return by_lens.reshape(-1, 8)
+
+
+def _calibrated(
+    size: tuple[int, int],
+    images: list[Observed],
+    candidate: _Candidate,
+    start: Array | None = None,
+) -> Camera | None:
+    """The best lens of this kind, from ``start`` (3,3) or anywhere; None: none fits."""
+    points = [np.asarray(image.points, np.float32)[:, None] for image in images]
+    pixels = [np.asarray(image.pixels, np.float32)[:, None] for image in images]
+    best: tuple[float, Any, Any] | None = None
+    model = candidate.model
+    everything = np.concatenate([image.points for image in images])
+    near = [] if start is None else [(start.copy(), cv2.CALIB_USE_INTRINSIC_GUESS)]
+    for K, flags in near or _starts(size, everything):
+        try:
+            if model == DistortionModel.EQUIDISTANT:
+                error, lens = _fisheye(size, images, K)
+                best = (error, lens.K, lens.D) if best is None or error < best[0] else best
+                continue
+            flags |= candidate.flags
+            error, found, D, _, _ = cv2.calibrateCamera(
+                points, pixels, size, K, np.zeros(candidate.numbers), flags=flags
+            )
+        except (cv2.error, ValueError, np.linalg.LinAlgError):
+            continue
+        if np.isfinite(error) and (best is None or error < best[0]):
+            best = (error, found, D.ravel()[: candidate.numbers])
+    if best is None:
+        return None
+    try:
+        return Camera(width=size[0], height=size[1], K=best[1], D=best[2], distortion_model=model)
+    except ValueError:  # numbers that no camera has
+        return None
+
+
+def _folds(lens: Camera) -> bool:
+    """Whether pixels of the image have no ray.
+
+    A series that fits the middle of the image, where the board was shown, may turn back towards the
+    rim.
+    """
+    if lens.distortion_model == DistortionModel.EQUIDISTANT:  # looks sideways there, and has none
+        return False
+    rim = np.array([(x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0)]) * lens.size
+    return not np.isfinite(lens.rays(rim)).all()
+
+
+def _cancels(lens: Camera, images: list[Observed]) -> bool:
+    """Whether numbers beyond those of any lens make up for each other, which nothing holds there.
+
+    Under the prior of lenses they cost more than all that the points can tell.
+    """
+    prior = lens_prior(lens, None)
+    off = (lens_values(lens) - prior.mean)[4:]
+    equations = 2 * sum(len(image.points) for image in images)
+    return bool(off @ prior.information[4:, 4:] @ off > equations)
+
+
+def _slow(images: list[Observed]) -> list[Observed]:
+    """Images that show much of the map and in which it hardly moves, from all of the recording."""
+    fullest = max((len(image.points) for image in images), default=0)
+    least = max(_LEAST_SHARE * fullest, _LEAST_POINTS)
+    full = [image for image in images if len(image.points) >= least]
+    speeds = [_speed(a, b) for a, b in pairwise(full)]
+    if not speeds:
+        return full
+    slower = [min(pair) for pair in zip([speeds[0], *speeds], [*speeds, speeds[-1]], strict=True)]
+    # The slowest of each part of the recording.
+    parts = np.array_split(np.arange(len(full)), min(_MOST_IMAGES, len(full)))
+    return [full[min(part, key=lambda k: slower[k])] for part in parts]
+
+
+def _speed(before: Observed, after: Observed) -> float:
+    """px per s, of what both images show."""
+    common = (before.points[:, None] == after.points[None]).all(axis=2)
+    first, second = np.nonzero(common)
+    if len(first) == 0:
+        return np.inf
+    displacement = np.linalg.norm(before.pixels[first] - after.pixels[second], axis=1)
+    return float(np.median(displacement)) / max((after.stamp_ns - before.stamp_ns) * 1e-9, 1e-9)
+
+
+def _starts(size: tuple[int, int], everything: Array) -> list[tuple[Array, int]]:
+    spread = np.linalg.svd(everything - everything.mean(axis=0), compute_uv=False)
+    centre = 0.5 * (np.array(size) - 1.0)
+    starts = []
+    for share in _FOCAL_LENGTHS:
+        K = np.array([[0.0, 0.0, centre[0]], [0.0, 0.0, centre[1]], [0.0, 0.0, 1.0]])
+        K[0, 0] = K[1, 1] = share * size[0]
+        starts.append((K, cv2.CALIB_USE_INTRINSIC_GUESS))
+    if spread[2] < _FLAT * spread[0] and np.ptp(everything[:, 2]) < _FLAT * spread[0]:
+        starts.append((starts[0][0].copy(), 0))  # OpenCV finds its own before z = 0
+    return starts

@@ -1,0 +1,254 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How an IMU goes with the camera: offset of its stamps, rotation and gyroscope bias."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.io.imu import ImuRecording
+from rs_localizer.tools.adjust.fit import Fit, fit
+from rs_localizer.tools.adjust.gyro import Gyroscope
+from rs_localizer.tools.adjust.spline import Spline, refined
+from rs_localizer.tools.adjust.system import Undetermined
+from rs_localizer.tools.adjust.variables import DELAY, MOUNT, GyroMount, GyroSamples, Observations
+from rs_localizer.trajectory.online_readout import REVERSED
+
+# The noise of the gyroscope has settled when it changes by less than this share.
+_ROUNDS, _SETTLED = 6, 0.03
+_LEAST_DEVIATION = 1e-6  # rad/s; recordings without noise are simulated
+# A gyroscope sees what images do not: knots may be so much finer than theirs, but no finer than
+# so many samples.
+_MOST_HALVINGS, _LEAST_SAMPLES = 3, 2.0
+_COST_PER_PARAMETER = 2.0  # Akaike, as of the knots of the images alone
+# Determined is what is known to this (s, rad, rad/s).
+_MOST_OFFSET, _MOST_TURN, _MOST_BIAS = 2e-3, np.radians(2.0), np.radians(1.0)
+
+
+# Stamps of camera and IMU are looked for within this (s) of each other, in these steps (s): the
+# turns of a hand hardly change within a step.
+_MOST_DELAY, _DELAY_STEP = 0.5, 0.005
+# So many samples are enough for a first guess.
+_GUESS_SAMPLES = 3000
+_LEAST_GUESS = 100
+# Of the gyroscope's variance, what the camera's turns must explain.
+_LEAST_EXPLAINED = 0.5
+# A unit is wrong, not a scale, where rates differ by more than this.
+_MOST_SCALE = 1.5
+# Weight of a rotation that is given, by what the motion says: it helps where that is nothing.
+_GIVEN_WEIGHT = 1e-3
+
+
+class NoMount(ValueError):
+    """Gyroscope and camera do not go together; the message says why."""
+
+
+def first_mount(samples: GyroSamples, spline: Spline, given: Array | None = None) -> GyroMount:
+    """Delay, rotation and bias under which the gyroscope agrees best with the camera's turns.
+
+    Args:
+        given: (3,3) camera_from_imu, as far as the motion does not tell it.
+
+    Raises:
+        NoMount: when there are too few samples during the motion, or they show other turns.
+    """
+    layout = spline.layout
+    # The same samples at every delay, else the shares they agree by could not be compared.
+    near = samples.subset(samples.covered(layout, 0.0, _MOST_DELAY))
+    if len(near.times) < _LEAST_GUESS:
+        raise NoMount(
+            f"{len(near.times)} samples of the IMU lie in the time of the images, at least "
+            f"{_LEAST_GUESS} are needed"
+        )
+    near = near.subset(np.arange(len(near.times)) % (1 + len(near.times) // _GUESS_SAMPLES) == 0)
+    delays = np.arange(-_MOST_DELAY, _MOST_DELAY + 0.5 * _DELAY_STEP, _DELAY_STEP)
+    matches = [_match(near, spline, float(delay), given) for delay in delays]
+    best = max(matches, key=lambda match: match.explained)
+    if not best.explained > _LEAST_EXPLAINED:
+        raise NoMount(
+            f"the IMU's turn rates are not the camera's: within {1e3 * _MOST_DELAY:.0f} ms of each "
+            f"other's stamps {max(best.explained, 0.0):.0%} of them agree"
+        )
+    if not 1.0 / _MOST_SCALE < best.scale < _MOST_SCALE:
+        raise NoMount(
+            f"the IMU's turn rates are {best.scale:.3g} times the camera's: are they in rad/s?"
+        )
+    return best.mount
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Match:
+    mount: GyroMount
+    explained: float  # share of the gyroscope's variance
+    scale: float  # of the gyroscope's rates by the camera's
+
+
+def _match(samples: GyroSamples, spline: Spline, delay: float, given: Array | None) -> _Match:
+    """The best rotation (Kabsch) and bias at a delay."""
+    inside = samples.covered(spline.layout, delay, 0.0)
+    if np.count_nonzero(inside) < _LEAST_GUESS:
+        return _Match(GyroMount(np.eye(3), np.zeros(3), delay), -np.inf, 1.0)
+    rates = samples.rates[inside]
+    turns = spline.states(samples.times[inside] + delay).angular
+    rate, turn = rates.mean(axis=0), turns.mean(axis=0)
+    product = (turns - turn).T @ (rates - rate)
+    power = float(np.sqrt(np.sum((turns - turn) ** 2) * np.sum((rates - rate) ** 2)))
+    if given is not None:
+        product = product + _GIVEN_WEIGHT * power * given
+    left, strengths, right = np.linalg.svd(product)
+    sign = np.array([1.0, 1.0, np.linalg.det(left @ right)])
+    rotation = left * sign @ right
+    common = float(strengths @ sign)
+    scale = np.sqrt(np.sum((rates - rate) ** 2) / max(float(np.sum((turns - turn) ** 2)), 1e-300))
+    return _Match(
+        GyroMount(rotation, rate - rotation.T @ turn, delay),
+        (common / max(power, 1e-300)) ** 2 * np.sign(common),
+        float(scale),
+    )
+
+
+def gyro_samples(recording: ImuRecording, start_ns: int) -> GyroSamples:
+    """Its finite samples in the order of time, one for each stamp, from a time 0 on."""
+    finite = np.isfinite(recording.angular_velocities).all(axis=1)
+    stamps, order = np.unique(recording.stamps_ns[finite], return_index=True)
+    times = (stamps - start_ns).astype(float) * 1e-9
+    return GyroSamples(times, recording.angular_velocities[finite][order])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MountFound:
+    """What a recording says of its IMU."""
+
+    # s to add to a stamp of the IMU to get the camera's time, where images are stamped at the
+    # exposure of their first row
+    time_offset: float
+    time_offset_deviation: float  # s
+    mount: GyroMount
+    rotation_deviations: Array  # (3,) rad, about the IMU's axes
+    bias_deviations: Array  # (3,) rad/s
+    shape_deviations: Array  # (6,) as of GyroMount.shape
+    noise: float  # rad/s, standard deviation of a sample and axis
+    samples: int
+    inflation: float  # of the offset's deviation, because parts disagree; 1: they do not
+
+    @property
+    def time_offset_determined(self) -> bool:
+        return bool(self.time_offset_deviation < _MOST_OFFSET)
+
+    @property
+    def rotation_determined(self) -> bool:
+        return bool(np.all(self.rotation_deviations < _MOST_TURN))
+
+    @property
+    def bias_determined(self) -> bool:
+        return bool(np.all(self.bias_deviations < _MOST_BIAS))
+
+
+def with_gyro(
+    camera: Camera,
+    observations: Observations,
+    fitted: Fit,
+    samples: GyroSamples,
+    given: Array | None,
+) -> tuple[Observations, Fit]:
+    """The motion again, with a gyroscope and its mount in it.
+
+    Args:
+        observations: keypoints.
+        fitted: motion of the keypoints alone.
+        given: (3,3) camera_from_imu as others say; checked, not believed.
+
+    Returns:
+        The observations with the samples and their noise, and the estimate.
+
+    Raises:
+        NoMount: when the gyroscope shows other turns than the camera.
+        Undetermined: when the joint system cannot be solved.
+    """
+    mount = first_mount(samples, fitted.state.spline, given)
+    guess = replace(fitted, state=replace(fitted.state, mount=mount))
+    samples, joint = _settled(camera, observations, samples, guess)
+    least = _LEAST_SAMPLES * float(np.median(np.diff(samples.times)))
+    for _ in range(_MOST_HALVINGS):
+        spacing = 0.5 * joint.state.spline.layout.spacing
+        if spacing < least:
+            break
+        finer = replace(joint.state, spline=refined(joint.state.spline, spacing))
+        try:
+            quieter, other = _settled(camera, observations, samples, replace(joint, state=finer))
+        except Undetermined:
+            break
+        if not _worth_it(quieter, other, samples, joint):
+            break
+        samples, joint = quieter, other
+    return replace(observations, gyro=samples), joint
+
+
+def _settled(
+    camera: Camera, observations: Observations, samples: GyroSamples, fitted: Fit
+) -> tuple[GyroSamples, Fit]:
+    """The joint estimate when the noise of the gyroscope does not change any more."""
+    samples = _with_noise(samples, fitted)
+    for _ in range(_ROUNDS):
+        joint = replace(observations, gyro=samples)
+        fitted = fit(camera, joint, fitted.state, fitted.freedom, fitted.deviation)
+        before, samples = samples.deviation, _with_noise(samples, fitted)
+        if abs(samples.deviation - before) < _SETTLED * before:
+            break
+    return samples, fitted
+
+
+def _with_noise(samples: GyroSamples, fitted: Fit) -> GyroSamples:
+    noise = Gyroscope(samples, fitted.state).noise(fitted.state)
+    return replace(samples, deviation=max(noise, _LEAST_DEVIATION))
+
+
+def _worth_it(quieter: GyroSamples, finer: Fit, samples: GyroSamples, coarser: Fit) -> bool:
+    """Whether finer knots explain more than they cost: by the likelihood of both noises."""
+    count = np.count_nonzero(quieter.covered(finer.state.spline.layout, 0.0, 0.0))
+    gain = 6.0 * count * np.log(samples.deviation / quieter.deviation)
+    gain += 4.0 * np.count_nonzero(coarser.inliers) * np.log(coarser.deviation / finer.deviation)
+    added = 6 * (len(finer.state.spline.positions) - len(coarser.state.spline.positions))
+    return bool(gain > _COST_PER_PARAMETER * added)
+
+
+def mount_of(camera: Camera, fitted: Fit, samples: GyroSamples, inflation: float) -> MountFound:
+    """What a joint estimate says of the IMU.
+
+    Args:
+        camera: whose images were stamped when their first row was exposed.
+        samples: with the noise that they turned out to have.
+        inflation: of the deviation of the delay, because parts of the recording disagree.
+    """
+    mount, covariance = fitted.state.mount, fitted.border_covariance
+    assert mount is not None
+    deviations = np.sqrt(np.diag(covariance))[-MOUNT:]
+    # The spline's time of an image is its stamp at the middle row, the camera's at the first row.
+    by_offset, later = np.zeros(len(covariance)), middle_row(camera, fitted.state.readout_time)
+    by_offset[DELAY - MOUNT] = 1.0
+    if fitted.freedom.readout_time:
+        by_offset[0] = later
+    return MountFound(
+        time_offset=mount.delay + later * fitted.state.readout_time,
+        time_offset_deviation=inflation * float(np.sqrt(by_offset @ covariance @ by_offset)),
+        mount=mount,
+        rotation_deviations=deviations[:3],
+        bias_deviations=deviations[3:6],
+        shape_deviations=deviations[DELAY + 1 :],
+        noise=samples.deviation,
+        samples=len(Gyroscope(samples, fitted.state).samples.times),
+        inflation=inflation,
+    )
+
+
+def middle_row(camera: Camera, readout_time: float) -> float:
+    """How much later than the first row the middle one is exposed, by (signed) readout time."""
+    if readout_time >= 0.0:
+        return -camera.first_row_time
+    reversed_ = replace(camera, scan_direction=REVERSED[ScanDirection(camera.scan_direction)])
+    return reversed_.first_row_time

@@ -1,0 +1,247 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What gives a map its scale and its place: markers of known places, points a known distance apart.
+
+Both are seen in images beside the landmarks, and triangulated with the refined motion. Markers also
+take part in the adjustment, where they hold frame, size and shape of the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.tools.mapping import MappingError
+from rs_localizer.tools.mapping.gauge import Similarity, through, upright
+from rs_localizer.tools.mapping.observations import MapObservations, Start
+from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, triangulate
+from rs_localizer.tools.mapping.views import View
+
+# Corners of markers are where their map says to this part of their extent, or one of both is wrong.
+_MOST_MISFIT = 0.02
+# Corners that are further off than both, m and part of their extent, are off for a reason.
+_USUAL_MISFIT = 0.005, 0.002
+# Distances contradict each other when the scales that they ask for differ by more than this part.
+_MOST_CONTRADICTION = 0.03
+_LEAST_CORNERS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class PointSight:
+    """A named point in an image."""
+
+    name: str
+    view: int  # row of the views
+    pixel: tuple[float, float]  # raw
+
+
+@dataclass(frozen=True, slots=True)
+class Distance:
+    """What was measured between two named points."""
+
+    one: str
+    other: str
+    metres: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchors:
+    """Points that are seen beside the landmarks."""
+
+    marker_map: MarkerMap | None = None
+    sights: tuple[PointSight, ...] = ()
+    distances: tuple[Distance, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        return sorted({sight.name for sight in self.sights})
+
+    @property
+    def corners(self) -> int:
+        """Number of the marker map's points, which come first."""
+        return 0 if self.marker_map is None else len(self.marker_map.points)
+
+    @property
+    def count(self) -> int:
+        return self.corners + len(self.names)
+
+    def seen(self, views: Sequence[View]) -> tuple[IntArray, IntArray, Array]:
+        """Views (n,), anchors (n,) and pixels (n,2) of all sights."""
+        names = self.names
+        every = [
+            (row, corner, pixel)
+            for row, view in enumerate(views if self.corners else ())
+            for corner, pixel in zip(view.corner_ids.tolist(), view.corners.tolist(), strict=True)
+        ]
+        every += [(of.view, self.corners + names.index(of.name), of.pixel) for of in self.sights]
+        rows, anchors = (np.array([of[k] for of in every], np.int64) for k in (0, 1))
+        return rows, anchors, np.reshape([of[2] for of in every], (-1, 2)).astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placement:
+    """Where a map lies, and what says so."""
+
+    similarity: Similarity  # to metres
+    scaled: bool
+    levelled: bool  # z is up by what was measured, and not only by how the camera was held
+    basis: str
+    doubt: str = ""  # why it may be wrong
+    up: str = "as the camera was held on average (a guess)"
+
+
+def placement(
+    anchors: Anchors, triangulated: Triangulated, rotations: Array, positions: Array
+) -> Placement:
+    """The frame of the map in metres.
+
+    Args:
+        anchors: what is known.
+        triangulated: where they are in the map.
+        rotations, positions: (g,3,3), (g,3) map_from_camera of all views, as they were held.
+
+    Raises:
+        MappingError: when what is known contradicts itself or was not seen.
+    """
+    if anchors.marker_map is not None:
+        return _by_markers(anchors.marker_map, triangulated)
+    turn = upright(_down(rotations))
+    if not anchors.distances:
+        return Placement(
+            Similarity(1.0, turn, -turn @ positions[0]), False, False, "the scale is undetermined"
+        )
+    factors = []
+    for distance in anchors.distances:
+        one, other = (
+            triangulated.points[_row(anchors, name)] for name in (distance.one, distance.other)
+        )
+        apart = float(np.linalg.norm(one - other))
+        if not apart > 0.0:  # NaN: one of them is seen by one image only, or far away
+            raise MappingError(
+                f"the distance {distance.one} {distance.other} gives no scale: each point must be "
+                "given in two images or more that see it from different places"
+            )
+        factors.append(distance.metres / apart)
+    scale = float(np.median(factors))
+    spread = max(factors) / min(factors) - 1.0
+    if spread > _MOST_CONTRADICTION:
+        raise MappingError(
+            f"the distances contradict each other by {100 * spread:.1f} %: check the points' "
+            "pixels and the metres"
+        )
+    return Placement(
+        Similarity(scale, turn, -scale * turn @ positions[0]), True, False,
+        f"{len(factors)} measured distances (which agree within {100 * spread:.1f} %)",
+    )  # fmt: skip
+
+
+def _row(anchors: Anchors, name: str) -> int:
+    if name not in anchors.names:
+        raise MappingError(f"unknown point {name}; points are {', '.join(anchors.names) or 'none'}")
+    return anchors.corners + anchors.names.index(name)
+
+
+def determined_corners(marker_map: MarkerMap, triangulated: Triangulated) -> BoolArray:
+    """Which corners (c,) of the map hold it: those that three images or more see."""
+    count = len(marker_map.points)
+    places, counts = triangulated.points[:count], triangulated.counts[:count]
+    determined: BoolArray = np.isfinite(places).all(axis=1) & (counts > 2)
+    return determined
+
+
+def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
+    truth = marker_map.points
+    places = triangulated.points[: len(truth)]
+    determined = determined_corners(marker_map, triangulated)
+    if np.count_nonzero(determined) < _LEAST_CORNERS:
+        raise MappingError(
+            f"{np.count_nonzero(determined)} corners of the marker map are seen by three images or "
+            f"more, {_LEAST_CORNERS} are needed: show the markers from several places"
+        )
+    similarity = through(places[determined], truth[determined])
+    errors = np.linalg.norm(similarity(places[determined]) - truth[determined], axis=1)
+    extent = float(np.linalg.norm(np.ptp(truth[determined], axis=0)))
+    misfit = float(np.sqrt(np.mean(errors**2)))
+    if misfit > _MOST_MISFIT * extent:
+        raise MappingError(
+            f"the markers do not lie where their map says: corners are off by {1e3 * misfit:.0f} "
+            f"mm (rms) over {extent:.2f} m; check sizes and places in the marker map"
+        )
+    corners = int(np.count_nonzero(determined))
+    basis = f"{corners} corners of markers, within {1e3 * misfit:.1f} mm (rms) of their map"
+    metres, part = _USUAL_MISFIT
+    doubt = ""
+    if misfit > max(metres, part * extent):
+        doubt = (
+            f"the markers' corners are {1e3 * misfit:.1f} mm (rms) off their map, and so may be "
+            "the landmarks: check sizes and places in the marker map, and the readout time"
+        )
+    return Placement(similarity, True, True, basis, doubt, "as in the marker map")
+
+
+def _down(rotations: Array) -> Array:
+    """The direction most often at right angles to the images' rows: people hold cameras level.
+
+    Its sign is that of the images' mean downward direction.
+    """
+    across = rotations[:, :, 0]
+    _, vectors = np.linalg.eigh(across.T @ across)
+    down = rotations[:, :, 1].mean(axis=0)
+    axis: Array = vectors[:, 0]
+    return axis if axis @ down >= 0.0 else -axis
+
+
+# How well corners are where their map says (m): prints are measured to within this.
+_DEVIATION = 0.001
+# Observations that determine a corner.
+_LEAST_OBSERVATIONS = 3
+
+
+def marker_constraints(
+    camera: Camera,
+    seen: MapObservations,
+    start: Start,
+    corners: MapObservations,
+    places: Array,
+) -> tuple[MapObservations, Start, Array | None]:
+    """What is adjusted with the corners of markers, in their frame; without, if too few are seen.
+
+    With the deviations (p,) of all landmarks, m; None: without corners.
+
+    Args:
+        seen, start: of the landmarks.
+        corners: of the same images; their landmarks are rows of ``places``.
+        places: (c,3) m, of the corners.
+    """
+    at = corners.images
+    rough = Sights(start.rotations[at], start.positions[at], corners.pixels, corners.landmarks)
+    triangulated = triangulate(camera, rough, len(places))
+    known = np.isfinite(triangulated.points).all(axis=1) & (
+        triangulated.counts >= _LEAST_OBSERVATIONS
+    )
+    if np.count_nonzero(known) < _LEAST_CORNERS:
+        return seen, start, None
+    to_markers = through(triangulated.points[known], places[known])
+    kept = known[corners.landmarks]
+    count = len(start.points)
+    images = np.concatenate([seen.images, at[kept]])
+    order: IntArray = np.argsort(images, kind="stable")
+    return (
+        MapObservations(
+            seen.stamps_ns,
+            images[order],
+            np.concatenate([seen.landmarks, count + corners.landmarks[kept]])[order],
+            np.concatenate([seen.pixels, corners.pixels[kept]])[order],
+        ),
+        Start(
+            np.concatenate([to_markers(start.points), places]),
+            to_markers.rotation @ start.rotations,
+            to_markers(start.positions),
+        ),
+        np.repeat([np.inf, _DEVIATION], [count, len(places)]),
+    )

@@ -1,0 +1,173 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Where a map is: similarities, and what is known of it when nothing outside of it says so.
+
+While map and motion are adjusted the camera's positions and orientations hold them, on average,
+where they were. The result is then laid over the map as it was given, by the similarity that fits
+best; and the covariances are those of a map that is held so (inner constraints, free network,
+Baarda's S-transform: Teunissen, *Zero order design*, in Optimization and design of geodetic
+networks, 1985). Likewise surveyed markers, whose size is known: in the frame of one of them, the
+errors of its own orientation grow with the distance from it; held by all corners together, what is
+left is the error of the shape alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.tools.adjust.bodies import BODY, PLACE
+from rs_localizer.tools.adjust.spline import Spline
+from rs_localizer.tools.mapping.triangulation import Triangulated
+
+# Points whose spread across their best line is less than this share of that along it leave the
+# rotation about the line open.
+_FLAT = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Similarity:
+    """``x -> scale rotation x + translation``."""
+
+    scale: float
+    rotation: Array  # (3,3)
+    translation: Array  # (3,)
+
+    def __call__(self, points: Array) -> Array:
+        """Points (n,3) in the other frame."""
+        moved: Array = self.scale * points @ self.rotation.T + self.translation
+        return moved
+
+    def moved(self, spline: Spline) -> Spline:
+        """A motion, as it is in the other frame."""
+        return Spline(spline.layout, self.rotation @ spline.rotations, self(spline.positions))
+
+    def covariances(self, before: Array) -> Array:
+        """Covariances of points (n,3,3) in the other frame."""
+        after: Array = self.scale**2 * self.rotation @ before @ self.rotation.T
+        return after
+
+
+def scaled(factor: float) -> Similarity:
+    """Everything becomes larger about the origin."""
+    return Similarity(factor, np.eye(3), np.zeros(3))
+
+
+def through(points: Array, there: Array) -> Similarity:
+    """The similarity that brings points (n,3) to places (n,3), with the least squared distances.
+
+    S. Umeyama, Least-squares estimation of transformation parameters between two point patterns,
+    PAMI 1991.
+
+    Raises:
+        ValueError: for fewer than three points, or points on a line.
+    """
+    if len(points) < 3:
+        raise ValueError(f"three points or more determine a frame and its scale, got {len(points)}")
+    middle, other = points.mean(axis=0), there.mean(axis=0)
+    x, y = points - middle, there - other
+    u, spread, vt = np.linalg.svd(y.T @ x / len(x))
+    if spread[1] < _FLAT * spread[0]:
+        raise ValueError("points on one line do not determine a frame")
+    signs = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    rotation = (u * signs) @ vt
+    scale = float(spread @ signs / np.mean(np.sum(x**2, axis=1)))
+    return Similarity(scale, rotation, other - scale * rotation @ middle)
+
+
+def upright(down: Array) -> Array:
+    """The rotation (3,3) that turns a direction (3,) by the shortest way to ``-z``."""
+    unit = down / np.linalg.norm(down)
+    axis = np.cross(unit, [0.0, 0.0, -1.0])
+    cosine = float(-unit[2])
+    if cosine < -1.0 + 1e-12:  # upside down: any horizontal axis will do
+        return np.diag([1.0, -1.0, -1.0])
+    hat = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    turn: Array = np.eye(3) + hat + hat @ hat / (1.0 + cosine)
+    return turn
+
+
+_ROUNDS, _OUTLIERS = 5, 4.0
+
+
+def laid_over(points: Array, onto: Array, usable: BoolArray) -> tuple[Similarity, BoolArray]:
+    """The similarity of the landmarks that hardly changed, and which (n,) these are."""
+    kept = usable
+    similarity = through(points[kept], onto[kept])
+    for _ in range(_ROUNDS):
+        off = np.linalg.norm(similarity(points) - onto, axis=1)
+        kept = usable & (off <= _OUTLIERS * max(float(np.median(off[usable])), 1e-12))
+        similarity = through(points[kept], onto[kept])
+    return similarity, kept
+
+
+def generators(points: Array, middle: Array) -> Array:
+    """How points (n,3) move with shift, turn and size of the whole about a middle: (n,3,7)."""
+    arms = points - middle
+    motions = np.zeros((len(points), 3, 7))
+    motions[:, :, :3] = np.eye(3)
+    motions[:, :, 3:6] = -so3.hat(arms)
+    motions[:, :, 6] = arms
+    return motions
+
+
+def as_held(covariances: Array, spread: Array, every: Array, of_kept: Array) -> Array:
+    """Covariances (n,3,3) of points when the kept ones hold the whole.
+
+    Args:
+        covariances: in another gauge.
+        spread: (n,3,7) the covariance of all points times ``of_kept``.
+        every: (n,3,7) the generators.
+        of_kept: (n,3,7) likewise, zeros for points that do not hold the whole.
+    """
+    # The whole's shift, turn and size in terms of the points: inverse sum of_kept^T x.
+    inverse = np.linalg.inv(np.einsum("nij,nik->jk", of_kept, of_kept))
+    crossed = every @ inverse @ np.swapaxes(spread, 1, 2)
+    of_whole = inverse @ np.einsum("nij,nik->jk", of_kept, spread) @ inverse
+    out: Array = (
+        covariances - crossed - np.swapaxes(crossed, 1, 2)
+        + every @ of_whole @ np.swapaxes(every, 1, 2)
+    )  # fmt: skip
+    return out
+
+
+def laid_on_held(points: Array, moves: Array, held: Triangulated, by: Array) -> Array:
+    """Moves (n,3,k) of points (n,3) when the whole is laid back by others that hold it.
+
+    Args:
+        held: the others, which count as they are known.
+        by: (m,3,k) how they move, too.
+    """
+    middle, weights = held.points.mean(axis=0), 1.0 / held.spread[:, None, None]
+    motions = (weights * generators(held.points, middle)).reshape(-1, 7)
+    of_whole = np.linalg.lstsq(motions, (weights * by).reshape(len(motions), -1), rcond=None)[0]
+    out: Array = moves - generators(points, middle) @ of_whole
+    return out
+
+
+def of_the_shape(covariance: Array, corners: Array) -> Array:
+    """Covariance (6 m, 6 m) of places and turns (along the map's axes) when all corners hold it.
+
+    Of all rigid motions that lay them over the truth, the best is the identity.
+
+    Args:
+        covariance: (6 m, 6 m) in any frame.
+        corners: (m,4,3) m.
+    """
+    middles = corners.mean(axis=1)
+    origin = middles.mean(axis=0)
+    whole = np.tile(np.eye(BODY), (len(corners), 1, 1))  # how a marker moves with the whole
+    whole[:, :PLACE, PLACE:] = -so3.hat(middles - origin)
+    by_marker = np.zeros((len(corners), corners.shape[1], PLACE, BODY))  # and corners with it
+    by_marker[..., :PLACE] = np.eye(PLACE)
+    by_marker[..., PLACE:] = -so3.hat(corners - middles[:, None])
+    weights = np.einsum("mcij,mcik->mjk", by_marker, by_marker)
+    weighted = weights @ whole
+    moved = np.linalg.inv(np.einsum("mij,mik->jk", whole, weighted))
+    every, held = whole.reshape(-1, BODY), weighted.reshape(-1, BODY)
+    free = np.eye(len(every)) - every @ moved @ held.T
+    out: Array = free @ covariance @ free.T
+    return out

@@ -1,0 +1,527 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A map refined with the rolling shutter that saw it: bundle adjustment in continuous time.
+
+Landmarks are free, the motion is a spline, each keypoint is seen at the time of its own row. An
+adjustment with a global shutter bends the map by what the camera moved while its rows were read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.tools.adjust.cluster_robust import Pull, pull_at_landmarks
+from rs_localizer.tools.adjust.fit import inflation_of, left_over, steepness
+from rs_localizer.tools.adjust.lens import with_lens
+from rs_localizer.tools.adjust.problem import LIMIT, Problem, View, settle
+from rs_localizer.tools.adjust.spline import LONGEST_GAP, Spline
+from rs_localizer.tools.adjust.spline_kernels import CONTROL
+from rs_localizer.tools.adjust.system import Factored, Undetermined
+from rs_localizer.tools.adjust.variables import EXTRINSICS, Freedom, Observations, State, rig_state
+from rs_localizer.tools.mapping.gauge import as_held, generators, laid_over
+from rs_localizer.tools.mapping.initial_trajectory import (
+    ANGULAR_VELOCITY,
+    LINEAR_VELOCITY,
+    acceleration_prior,
+    following,
+    initial_trajectory,
+)
+from rs_localizer.tools.mapping.observations import (
+    LEAST_KEYPOINTS,
+    Adjusted,
+    MapFreedom,
+    MapObservations,
+    ReadoutCheck,
+    RigCamera,
+    Start,
+    check,
+    frame_numbers,
+    shared_landmarks,
+)
+from rs_localizer.trajectory.online_readout import REVERSED
+
+# Beyond so many unknowns of the motion its matrix takes more than 2 GB.
+_MOST_UNKNOWNS = 15000
+# Landmarks are held to where they were by the map's size, which says nothing, but for those that
+# hardly any image sees.
+_LOOSE = 1.0
+# So many landmarks of known place hold the map's frame and size.
+_LEAST_ANCHORS = 3
+# Images in a row that may tell the readout time.
+_LEAST_STRETCH = 20
+
+
+class Preparation:
+    """The keypoints that count, and the first motion."""
+
+    def __init__(
+        self, rig: Sequence[RigCamera], seen: MapObservations, start: Start, freedom: MapFreedom
+    ) -> None:
+        self.rig, self.seen, self.start, self.freedom = rig, seen, start, freedom
+        self.start_ns = int(seen.stamps_ns.min())
+        delays = np.array([one.delay for one in rig])[seen.of_cameras]
+        self.times = np.asarray(1e-9 * (seen.stamps_ns - self.start_ns) + delays, np.float64)
+        if freedom.apart:  # each alone
+            self.times = np.arange(len(delays), dtype=np.float64)
+        self.size = float(np.linalg.norm(np.ptp(start.points, axis=0)))
+        self.deviations, self.floating = self._known()
+        self.used = self._usable()
+        self.spline = self._spline()
+        if freedom.readout_time and not self.tells_readout:
+            raise ValueError(
+                f"estimating the readout time needs {_LEAST_STRETCH} images in a row, at most "
+                f"{LONGEST_GAP} s apart; there are {self._longest()}: give it, or more of the "
+                "recording"
+            )
+        held = CONTROL * len(self.spline.positions)
+        if held > _MOST_UNKNOWNS:
+            raise ValueError(
+                f"{len(self.times)} images have {held} unknowns of motion, at most "
+                f"{_MOST_UNKNOWNS} can be refined at once: leave images out"
+            )
+
+    def _known(self) -> tuple[Array, bool]:
+        """Deviations (p,) of the landmarks, m, and whether nothing holds the whole."""
+        given = self.freedom.deviations
+        if given is None:
+            given = np.full(len(self.start.points), np.inf)
+        anchors = np.count_nonzero(np.isfinite(given))
+        if 0 < anchors < _LEAST_ANCHORS:
+            raise ValueError(
+                f"{anchors} landmarks of known place do not fix a map: give none, or at least "
+                f"{_LEAST_ANCHORS}"
+            )
+        return np.minimum(given, _LOOSE * self.size), anchors == 0
+
+    def _usable(self) -> BoolArray:
+        """Keypoints (n,) that say something of map or motion."""
+        shared = np.zeros(len(self.start.points), np.bool_)
+        found = shared_landmarks(self.seen)
+        shared[: len(found)] = found
+        if self.freedom.deviations is not None:
+            shared |= np.isfinite(self.freedom.deviations)
+        used = shared[self.seen.landmarks]
+        counts = np.bincount(self.seen.images[used], minlength=len(self.times))
+        return used & (counts >= LEAST_KEYPOINTS)[self.seen.images]
+
+    def _spline(self) -> Spline:
+        """Through the images with keypoints, of a rig's frames through those with most.
+
+        Images that follow each other are one stretch.
+        """
+        counts = np.bincount(self.seen.images[self.used], minlength=len(self.times))
+        frames = frame_numbers(self.times, self.seen.of_cameras)
+        order = np.lexsort((-counts, frames))
+        firsts = np.unique(frames[order], return_index=True)[1]
+        best = order[firsts]
+        beyond = np.abs(self.times - self.times[best[frames]])[counts > 0].max()
+        best = best[counts[best] > 0]
+        extrinsics = [self.rig[k].extrinsics for k in self.seen.of_cameras[best]]
+        rotations = self.start.rotations[best] @ np.array([one.axes for one in extrinsics])
+        centres = np.array([one.centre for one in extrinsics])
+        positions = self.start.positions[best] - np.einsum("gij,gj->gi", rotations, centres)
+        longest = max(one.camera.readout_time for one in self.rig) + 2.0 * float(beyond)
+        follow = following(self.times[best], rotations)
+        return initial_trajectory(self.times[best], rotations, positions, longest, follow)
+
+    @property
+    def tells_readout(self) -> bool:
+        """Images on their own tell turn and way per readout only, and not how long it takes."""
+        return self._longest() >= _LEAST_STRETCH
+
+    def _longest(self) -> int:
+        """Images in the longest stretch."""
+        own = self.times[np.unique(self.seen.images[self.used])]
+        return int(np.bincount(self.spline.layout.stretches(own)).max())
+
+    def keypoints(self, camera: int) -> BoolArray:
+        """Which (n,) are used of a camera."""
+        return np.asarray(self.used & (self.seen.of_cameras[self.seen.images] == camera), np.bool_)
+
+    def observations(self) -> list[Observations]:
+        """Of each camera."""
+        every = []
+        for k, one in enumerate(self.rig):
+            used = self.keypoints(k)
+            images, pixels = self.seen.images[used], self.seen.pixels[used]
+            every.append(
+                Observations(
+                    times=self.times[images],
+                    row_times=one.camera.row_time(pixels),
+                    pixels=pixels,
+                    landmarks=self.start.points,
+                    points=self.seen.landmarks[used],
+                    frames=images,
+                    trusted=np.ones(len(images), np.bool_),
+                )
+            )
+        return every
+
+    def state(self, seen: Sequence[Observations]) -> State:
+        """The first guess."""
+        pairs = zip(self.rig, seen, strict=True)
+        return rig_state(self.spline, ((one.camera, own, one.extrinsics) for one, own in pairs))
+
+    def problem(
+        self, seen: Sequence[Observations], start: State, freedom: Freedom, held: bool = False
+    ) -> Problem:
+        """Of map and motion; ``held``: the map is as it is, and nothing but the motion is free."""
+        views = [
+            View(one.camera, own, replace(freedom, mounting=None if held else one.mounting))
+            for one, own in zip(self.rig, seen, strict=True)
+        ]
+        if held:
+            return Problem(views, start)
+        return Problem(views, start, deviations=self.deviations, floating=self.floating)
+
+
+__all__ = ["MapFreedom", "MapObservations", "RefinedMap", "Start", "refine", "refine_rig"]
+
+DRIFT = 0.01
+"""Of a deviation: so little that landmarks follow in proportion, however large that is."""
+# A landmark that is not known to this part of the map's size is not refined.
+_KNOWN = 0.1
+# Nor one that is known worse than to so many times what landmarks usually moved by: seen from one
+# side only, it would be farther off than where it was.
+_WORTH = 1.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedMap:
+    """Landmarks and motion, with what is known of their errors."""
+
+    points: Array  # (p,3) m
+    covariances: Array  # (p,3,3) m^2; NaN where not refined
+    refined: BoolArray  # (p,) others are where they were given
+    sights: IntArray  # (p,) keypoints that fit
+    cameras: tuple[Adjusted, ...]  # with the readout times and the lenses that were found
+    deviation: float  # px, of the noise of u and of v
+    squared_errors: Array  # (n,) px^2, whitened; infinite for keypoints that took no part
+    inliers: BoolArray  # (n,)
+    before: float  # px, noise that the map left as it was given
+    after: float  # px, noise that it leaves now, likewise
+    spline: Spline  # s since ``start_ns``
+    start_ns: int
+    times: Array  # (g,) s, of the images' middle rows
+    tells_readout: bool  # images follow each other closely enough to tell the readout time
+    apart: bool = False  # each image has a pose of its own, of no common motion
+    # The motion and the cameras, off by DRIFT deviations of an error that landmarks share, each: as
+    # many as were asked for, the largest first, in frames of their own.
+    drifts: tuple[RefinedMap, ...] = ()
+
+    @property
+    def fit_share(self) -> float:
+        """Share of the keypoints that fit."""
+        return float(np.mean(self.inliers))
+
+    @property
+    def camera(self) -> Camera:
+        """The first one, with the readout time and the lens that were found."""
+        return self.cameras[0].camera
+
+    @property
+    def readout_time(self) -> float:
+        """Of the first camera, s; negative: against the scan direction."""
+        return self.cameras[0].readout_time
+
+    @property
+    def readout_time_deviation(self) -> float:
+        """Of the first camera, s; NaN where it was given."""
+        return self.cameras[0].readout_time_deviation
+
+    @property
+    def readout_check(self) -> ReadoutCheck | None:
+        """Of the first camera."""
+        return self.cameras[0].readout_check
+
+    @property
+    def camera_as_found(self) -> Camera:
+        """The camera, its scan direction reversed where the readout time is negative."""
+        if self.readout_time >= 0.0:
+            return self.camera
+        direction = REVERSED[ScanDirection(self.camera.scan_direction)]
+        return replace(self.camera, scan_direction=direction)
+
+    def poses(self) -> tuple[Array, Array]:
+        """Of the rig's axes in the map (g,3,3), (g,3) at the images' middle rows."""
+        states = self.spline.states(self.times)
+        return states.rotations, states.positions
+
+
+def refine(
+    camera: Camera,
+    seen: MapObservations,
+    start: Start,
+    freedom: MapFreedom | None = None,
+    *,
+    stamp_offset: float = 0.0,
+    done: Callable[[str], object] = lambda text: None,
+) -> RefinedMap:
+    """The most likely map and motion, as of :func:`refine_rig`.
+
+    Args:
+        camera: its lens, scan direction and readout time (0: a global shutter).
+        stamp_offset: s from a stamp to the first row's exposure.
+    """
+    return refine_rig([RigCamera(camera, stamp_offset)], seen, start, freedom, done=done)
+
+
+def refine_rig(
+    rig: Sequence[RigCamera],
+    seen: MapObservations,
+    start: Start,
+    freedom: MapFreedom | None = None,
+    *,
+    done: Callable[[str], object] = lambda text: None,
+) -> RefinedMap:
+    """The most likely map and motion of a rig.
+
+    Args:
+        rig: its cameras.
+        seen: keypoints of landmarks; those of landmarks that one image alone sees do not count.
+        start: first guess; without landmarks of known places the map as a whole, its size too,
+            stays where this has it.
+        freedom: what is estimated beside (default: landmarks and motion only).
+        done: called with each part of the work that is done.
+
+    Raises:
+        ValueError: when the images make no single map, or are too many.
+    """
+    freedom = freedom or MapFreedom()
+    check(seen, len(start.points), np.array([one.delay for one in rig]))
+    prepared = Preparation(rig, seen, start, freedom)
+    try:
+        return _Refinement(prepared).solved(done)
+    except Undetermined as error:
+        raise ValueError(f"the map cannot be refined: {error}") from error
+
+
+class _Refinement:
+    """One map on its way."""
+
+    def __init__(self, prepared: Preparation) -> None:
+        self.prepared, self.seen = prepared, prepared.observations()
+        self.state = prepared.state(self.seen)
+        given = prepared.freedom
+        self.freedom = Freedom(
+            readout_time=given.readout_time,
+            lens=given.lens,
+            lens_deviations=given.lens_deviations,
+            angular_acceleration=given.angular_acceleration,
+            linear_acceleration=given.linear_acceleration,
+            angular_velocity=ANGULAR_VELOCITY,
+            linear_velocity=LINEAR_VELOCITY,
+        )
+
+    def solved(self, done: Callable[[str], object]) -> RefinedMap:
+        # The motion that goes with the map as it is.
+        held = replace(self.freedom, readout_time=False, lens=False)
+        motion = self.prepared.problem(self.seen, self.state, held, held=True)
+        self.state, before = settle(motion, self.state, motion.noise(self.state, np.inf))
+        done("motion")
+        problem = self._problem(self.freedom)
+        self.state, deviation = settle(problem, self.state, before)
+        done("map")
+        calmer = acceleration_prior(self.state, self.freedom)
+        if calmer is not None:
+            self.freedom, problem = calmer, self._problem(calmer)
+            self.state, deviation = settle(problem, self.state, deviation)
+            done("accelerations")
+        return self._result(problem, before, deviation)
+
+    def _problem(self, freedom: Freedom) -> Problem:
+        return self.prepared.problem(self.seen, self.state, freedom)
+
+    def _result(self, problem: Problem, before: float, deviation: float) -> RefinedMap:
+        state, prepared, seen = self.state, self.prepared, joined(self.seen)
+        squared = problem.errors(state)
+        inliers = squared < (LIMIT * deviation) ** 2
+        sights, images = sights_of(seen, inliers)
+        used = self._freedoms(state.spline) + 3 * int(np.count_nonzero(images))
+        inflation = inflation_of(squared[inliers], deviation, used + problem.border)
+        inflation = self._cluster_robust(problem, deviation, inflation)
+        placed = apply_similarity(problem, state, deviation, images > 1)
+        covariances = inflation * placed.covariances
+        spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        refined = (images > 1) & (spread < _KNOWN * prepared.size)
+        if prepared.freedom.deviations is None and refined.any():
+            moved = np.linalg.norm(placed.points - prepared.start.points, axis=1)
+            refined &= spread < _WORTH * np.median(moved[refined])
+        all_squared = np.full(len(prepared.used), np.inf)
+        ends = np.cumsum([len(own.points) for own in self.seen])[:-1]
+        for k, own in enumerate(np.split(squared, ends)):
+            all_squared[prepared.keypoints(k)] = own
+        found = RefinedMap(
+            points=np.where(refined[:, None], placed.points, prepared.start.points),
+            covariances=np.where(refined[:, None, None], covariances, np.nan),
+            refined=refined,
+            sights=sights,
+            cameras=self._cameras(problem, deviation, inflation, inflation * placed.shared),
+            deviation=deviation * math.sqrt(left_over(len(inliers), used)),
+            squared_errors=all_squared,
+            inliers=all_squared < (LIMIT * deviation) ** 2,
+            before=before,
+            after=deviation,
+            spline=placed.spline,
+            start_ns=prepared.start_ns,
+            times=prepared.times,
+            tells_readout=prepared.tells_readout,
+            apart=prepared.freedom.apart,
+        )
+        return replace(found, drifts=self._drifts(found, problem, deviation, inflation))
+
+    def _drifts(
+        self, found: RefinedMap, problem: Problem, deviation: float, inflation: float
+    ) -> tuple[RefinedMap, ...]:
+        count = self.prepared.freedom.drifts
+        if not count:
+            return ()
+        factored, drifts = Factored(problem.system(self.state, deviation)), []
+        still = np.zeros(3 * len(self.state.landmarks))
+        for mode in DRIFT * math.sqrt(inflation) * factored.modes(count).T:
+            state = problem.moved(self.state, np.concatenate([mode, still]))
+            cameras = tuple(
+                _as_in(one, moved)
+                for one, moved in zip(found.cameras, problem.states(state), strict=True)
+            )
+            drifts.append(replace(found, spline=state.spline, cameras=cameras))
+        return tuple(drifts)
+
+    def _cluster_robust(self, problem: Problem, deviation: float, independent: float) -> float:
+        """The covariances' inflation, with what errors of a second pull together."""
+        seen, squared = joined(self.seen), problem.errors(self.state)
+        every = problem.keypoint_rows(self.state, deviation)
+        rows = [np.dstack([of.values[..., -3:], of.errors]) for of in every]
+        inside = squared[squared < (LIMIT * deviation) ** 2]
+        held = self.prepared.deviations**-2.0
+        pull = pull_at_landmarks(np.concatenate(rows), seen.points, seen.times, held)
+        own = steepness(inside, deviation) ** 2
+        own *= left_over(len(inside), self._freedoms(self.state.spline))
+        return Pull(own * pull.measured, pull.expected).inflation(independent)
+
+    def _freedoms(self, spline: Spline) -> int:
+        """How many numbers of the motion the images determine: a pose each, and an end.
+
+        Those of a global shutter say nothing of what lies between them.
+        """
+        images = sum(len(np.unique(own.frames)) for own in self.seen)
+        rolling = self.freedom.readout_time or any(
+            one.camera.readout_time > 0.0 for one in self.prepared.rig
+        )
+        ends = len(spline.layout.starts) if rolling else 0
+        return CONTROL * min(images + ends, len(spline.positions))
+
+    def _cameras(
+        self, problem: Problem, deviation: float, inflation: float, shared: Array
+    ) -> tuple[Adjusted, ...]:
+        """The cameras, with the covariance (s,s) of what all images share."""
+        asked, spread, found = self._asked(deviation, inflation), np.sqrt(np.diag(shared)), []
+        free = self.freedom.readout_time
+        for k, (one, wanted, state) in enumerate(
+            zip(self.prepared.rig, asked, problem.states(self.state), strict=True)
+        ):
+            own = np.zeros(EXTRINSICS)
+            if one.mounting is not None:
+                own = spread[problem.place("mount", k) :][:EXTRINSICS]
+            readout = float(spread[problem.place("readout", k)]) if free else math.nan
+            given = Adjusted(one.camera, 0.0, readout, wanted, state.extrinsics, own)
+            found.append(_as_in(given, state))
+        return tuple(found)
+
+    def _asked(self, deviation: float, inflation: float) -> list[ReadoutCheck | None]:
+        """Whether readout times that were given are those of the images."""
+        known = [one.camera.readout_time > 0.0 for one in self.prepared.rig]
+        none: list[ReadoutCheck | None] = [None] * len(known)
+        if self.freedom.readout_time or not any(known) or not self.prepared.tells_readout:
+            return none
+        try:
+            asked = self._readout_times(deviation)
+        except Undetermined:
+            return none
+        grown = [replace(one, deviation=math.sqrt(inflation) * one.deviation) for one in asked]
+        return [one if given else None for one, given in zip(grown, known, strict=True)]
+
+    def _readout_times(self, deviation: float) -> list[ReadoutCheck]:
+        """One step of each camera's from the minimum with those that were given."""
+        problem = self._problem(replace(self.freedom, readout_time=True))
+        factored = Factored(problem.system(self.state, deviation))
+        step, variances = factored.step(), np.diag(factored.border_covariance())
+        checks = []
+        for k, one in enumerate(problem.states(self.state)):
+            given, change = float(one.readout_time), float(step[problem.at[k]["readout"]])
+            deviations = np.sqrt(variances[problem.place("readout", k)])
+            checks.append(ReadoutCheck(given, given + change, float(deviations)))
+        return checks
+
+
+def _as_in(one: Adjusted, state: State) -> Adjusted:
+    """A camera with the lens, the readout time and the extrinsics of a state."""
+    readout_time = float(state.readout_time)
+    camera = with_lens(replace(one.camera, readout_time=abs(readout_time)), state.lens)
+    return replace(one, camera=camera, readout_time=readout_time, extrinsics=state.extrinsics)
+
+
+def joined(parts: Sequence[Observations]) -> Observations:
+    """Those of all cameras, of one map, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    names = ("times", "row_times", "pixels", "points", "frames", "trusted")
+    every: dict[str, Any] = {
+        name: np.concatenate([getattr(one, name) for one in parts]) for name in names
+    }
+    return replace(parts[0], **every)
+
+
+def sights_of(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:
+    """How many keypoints (p,) and how many images (p,) show each landmark."""
+    count = len(observations.landmarks)
+    sights = np.bincount(observations.points[inliers], minlength=count)
+    pairs = np.unique(
+        np.column_stack([observations.points[inliers], observations.frames[inliers]]), axis=0
+    )
+    return sights, np.bincount(pairs[:, 0], minlength=count)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Map and motion in the frame of the map as it was given."""
+
+    points: Array  # (p,3) m
+    covariances: Array  # (p,3,3) m^2, inverse of the normal matrix
+    shared: Array  # (s,s) covariance of readout time and lens, likewise
+    spline: Spline
+
+
+def apply_similarity(problem: Problem, state: State, deviation: float, usable: BoolArray) -> Placed:
+    """Lay the map over the given one, unless landmarks of known place hold it.
+
+    Args:
+        problem: whose minimum the state is.
+        state: map and motion.
+        deviation: px, of the noise.
+        usable: (p,) which landmarks may hold the whole.
+
+    Raises:
+        Undetermined: when the images leave something open.
+    """
+    factored = Factored(problem.system(state, deviation))
+    if not problem.floating:
+        return Placed(state.landmarks, *factored.block_covariances(), state.spline)
+    given = problem.views[0].observations.landmarks
+    whole, kept = laid_over(state.landmarks, given, usable)
+    every = generators(state.landmarks, state.landmarks[kept].mean(axis=0))
+    of_kept = np.where(kept[:, None, None], every, 0.0)
+    spread = factored.solve(np.zeros((problem.groups.kept, 7)), of_kept)[1]
+    covariances, shared = factored.block_covariances()
+    held = as_held(covariances, spread, every, of_kept)
+    return Placed(
+        whole(state.landmarks), whole.covariances(held), shared, whole.moved(state.spline)
+    )

@@ -1,0 +1,125 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What is to be said of a map that was built."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rs_localizer.core.arrays import BoolArray
+from rs_localizer.tools.mapping.build import Built
+from rs_localizer.tools.mapping.views import View
+
+PICTURES = ("map.png", "residuals.png")
+# Advice is given where more than this share of the images is blurred or has no pose.
+_MANY = 0.1
+
+
+def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
+    """The table: what was measured, name and text.
+
+    Args:
+        images: of the recording.
+        views: of them that were looked at.
+    """
+    refined, covariances, structure = built.refined, built.landmarks.covariances, built.structure
+    modes = built.landmarks.error_modes
+    assert covariances is not None
+    assert modes is not None
+    spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+    shared = np.linalg.norm(modes, axis=(1, 2))
+    unit = "mm" if built.placement.scaled else "units of the map / 1000"
+    joined = f"{structure.parts[0]} of {len(built.keyframes)}"
+    others = structure.parts[1:]
+    return [
+        ("images", f"{images}, {views} used, {np.count_nonzero(built.blurred)} of them blurred"),
+        ("keyframes registered by COLMAP", joined + (f"; other parts: {others}" if others else "")),
+        ("reprojection error of COLMAP", f"{structure.error:.2f} px (mean)"),
+        ("images with a pose", f"{len(built.posed)} of {views}"),
+        ("landmarks", f"{len(built.landmarks)} of {len(structure.points)} points"),
+        ("deviation of a landmark", f"{1e3 * np.median(spread):.1f} {unit} (median)"),
+        ("deviation that landmarks share", f"{1e3 * np.median(shared):.1f} {unit} (median)"),
+        ("noise before the refinement", f"{refined.before:.2f} px"),
+        ("noise after it", f"{refined.after:.2f} px"),
+        *_of_shutter(built),
+        ("lens", _lens(built)),
+        ("scale", built.placement.basis),
+        ("z is up", built.placement.up),
+    ]
+
+
+def advice(built: Built, views: Sequence[View]) -> list[str]:
+    """What to film otherwise, for a better map."""
+    said = []
+    posed = np.zeros(len(views), np.bool_)
+    posed[built.posed] = True
+    start = views[0].stamp_ns
+    seconds = np.array([1e-9 * (view.stamp_ns - start) for view in views])
+    if np.mean(~posed) > _MANY:
+        said.append(f"{_when(~posed, seconds)}, images have no pose: film there more slowly")
+    if np.mean(built.blurred) > _MANY:
+        said.append(f"{_when(built.blurred, seconds)}, images are blurred: more light, less speed")
+    if len(built.structure.parts) > 1:
+        said.append(
+            f"{sum(built.structure.parts[1:])} keyframes are not connected with the others: film "
+            "what lies between, and come back to where you began"
+        )
+    shutter = built.shutter
+    known = shutter.visible and shutter.axis_known if shutter else not built.refined.apart
+    if not known:
+        said.append(
+            "for the readout time, film at the camera's own rate (no time lapse, no stabilisation) "
+            "and turn the camera briskly, sideways and up and down, for some seconds"
+        )
+    return said
+
+
+def written(built: Built, images: int, views: Sequence[View]) -> str:
+    """The same as a page of Markdown, with the pictures."""
+    table = "\n".join(f"| {name} | {text} |" for name, text in rows(built, images, len(views)))
+    shown = "\n\n".join(f"![{name}]({name})" for name in PICTURES)
+    film = "".join(f"* {text}\n" for text in advice(built, views))
+    film = f"\nTo film otherwise:\n\n{film}" if film else ""
+    return f"# Map\n\n| | |\n|---|---|\n{table}\n{film}\n{shown}\n"
+
+
+def _of_shutter(built: Built) -> list[tuple[str, str]]:
+    fit, known = built.shutter, built.camera.readout_time
+    if fit is None:
+        text = f"{1e3 * known:.2f} ms (given)" if known else "unknown, or none"
+        if built.refined.apart:
+            text = "invisible: no smooth motion joins the images, each has a pose of its own"
+        return [("readout time", text)]
+    best = f"{1e3 * fit.readout_time:.2f} +- {1e3 * fit.deviation:.2f} ms, {fit.direction}"
+    axis = "" if fit.axis_known else ", or along the other axis: the images fit both alike"
+    why = "" if fit.possible else f", longer than {1e3 * fit.interval:.1f} ms between images"
+    noises = (
+        f"{fit.noise:.3f} px, with a global shutter {fit.global_noise:.3f} px; "
+        f"{100 * fit.better_images:.0f} % of the images fit better"
+    )
+    if fit.visible:
+        return [("readout time", f"{best} (estimated{axis})"), ("noise with that", noises)]
+    return [
+        ("readout time", f"invisible in these images (best fit {best}{why})"),
+        ("noise with that", noises),
+    ]
+
+
+def _lens(built: Built) -> str:
+    camera = built.camera
+    if camera.K[0, 0] == built.structure.camera.K[0, 0]:
+        return "as calibrated"
+    coefficients = ", ".join(f"{value:.4f}" for value in camera.D)
+    return (
+        f"estimated: focal length {camera.K[0, 0]:.1f}, {camera.K[1, 1]:.1f} px, centre "
+        f"{camera.K[0, 2]:.1f}, {camera.K[1, 2]:.1f} px, distortion {coefficients}"
+    )
+
+
+def _when(rows: BoolArray, seconds: np.ndarray) -> str:
+    """The times of views as a sentence: at most three stretches, the longest ones."""
+    marks = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(int)))
+    parts = sorted(zip(marks[::2], marks[1::2] - 1, strict=True), key=lambda p: p[0] - p[1])[:3]
+    return "from " + ", ".join(f"{seconds[a]:.1f} to {seconds[b]:.1f} s" for a, b in sorted(parts))

@@ -1,0 +1,200 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A map refined with the shutter that its images show, where nobody knows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.tools.adjust.problem import LIMIT, noise_of
+from rs_localizer.tools.mapping.initial_trajectory import usual_accelerations
+from rs_localizer.tools.mapping.observations import MapFreedom, MapObservations, Start
+from rs_localizer.tools.mapping.refine import RefinedMap, refine
+
+# A readout time is believed beyond so many deviations: two axes with two directions each are tried,
+# four chances together one in 8,000, and deviations, which few seconds tell, may be too small by a
+# third.
+_SIGNIFICANT = 4.0
+# And where the images' gains are so by chance less often than this: a wrong model that absorbs
+# something else helps some images and harms others.
+_CHANCE = 0.01
+LEAST_FIT = 0.8
+"""Share of the keypoints that fit a good map: nine in ten do."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShutterFit:
+    """What an unknown shutter was found to be."""
+
+    readout_time: float  # s, of the rolling shutter that fits best
+    deviation: float  # s
+    direction: ScanDirection
+    noise: float  # px, that it leaves
+    global_noise: float  # px, that the global shutter leaves which fits best
+    better_images: float  # share of the images that fit it better than a global shutter
+    chance: float  # that the images' gains over a global shutter are so by chance
+    axis_chance: float  # likewise, over a shutter along the other axis; 0: not tried
+    interval: float  # s, between the images
+
+    @property
+    def possible(self) -> bool:
+        """Whether a camera can read an image out so slowly."""
+        return self.readout_time < self.interval
+
+    @property
+    def visible(self) -> bool:
+        """Whether the images show a rolling shutter."""
+        significant = self.readout_time > _SIGNIFICANT * self.deviation
+        return significant and self.chance < _CHANCE and self.possible
+
+    @property
+    def axis_known(self) -> bool:
+        """Whether they show along which axis it goes."""
+        return self.axis_chance < _CHANCE
+
+
+def likely_axes(size: tuple[int, int], given: str | None) -> list[ScanDirection]:
+    """Scan directions to try, their reverses included, the likelier first; only a given one.
+
+    The rows of sensors lie along their longer side, also where a driver or a phone has turned the
+    images.
+    """
+    if given is not None:
+        return [ScanDirection(given)]
+    axes = [ScanDirection.TOP_TO_BOTTOM, ScanDirection.LEFT_TO_RIGHT]
+    return axes if size[0] >= size[1] else axes[::-1]
+
+
+# How well COLMAP's lens is known: focal length and centre by focal length (of one phone's video 21
+# images give 384.2 px, 42 give 383.2), distortion. Under a steady motion a focal length along the
+# scan stands for a shutter: looser ones leave the two to chance.
+_LENS_DEVIATIONS = 0.005, 0.02
+
+
+def colmap_freedom(seen: MapObservations, start: Start, lens: bool) -> MapFreedom:
+    """What is free of a map that COLMAP has begun; ``lens``: that of its lens, too.
+
+    A time lapse, whose stamps are closer than its images were, moves faster than any hand.
+    """
+    times = 1e-9 * (seen.stamps_ns - seen.stamps_ns[0])
+    angular, linear = usual_accelerations(times, start.rotations, start.positions)
+    usual = MapFreedom()
+    return replace(
+        usual,
+        lens=lens,
+        lens_deviations=_LENS_DEVIATIONS,
+        angular_acceleration=max(usual.angular_acceleration, angular),
+        linear_acceleration=max(usual.linear_acceleration, linear),
+    )
+
+
+def fit_shutter(
+    camera: Camera,
+    observations: MapObservations,
+    start: Start,
+    freedom: MapFreedom,
+    directions: Sequence[ScanDirection],
+    done: Callable[[str], object],
+) -> tuple[RefinedMap, ShutterFit | None]:
+    """The map refined with the shutter that explains the images best.
+
+    A shutter that does not explain them significantly better than a global one is not believed.
+    Where no smooth motion fits them, or as well as the first guess (a time lapse, cuts), each image
+    has a pose of its own, as COLMAP has it, and the shutter stays unknown.
+
+    Args:
+        camera: its lens; the shutter does not matter.
+        observations, start, freedom: as of :func:`refine`.
+        directions: to try, each with its reverse; the first is preferred where they fit alike.
+        done: called with each part of the work that is done.
+
+    Returns:
+        the map, and what the shutter was found to be; None: too few images follow each other, or
+        they are ``apart``.
+
+    Raises:
+        ValueError: as :func:`refine`.
+    """
+    camera = replace(camera, readout_time=0.0, scan_direction=directions[0])
+    smooth = None
+    with suppress(ValueError):  # what is wrong with the images is raised below
+        smooth = _of_one_motion(camera, observations, start, freedom, directions, done)
+        best = smooth[0]
+        if best.fit_share >= LEAST_FIT and best.after <= _noise(camera, observations, start):
+            return smooth
+    try:
+        apart = refine(camera, observations, start, replace(freedom, apart=True))
+    except ValueError:
+        if smooth is None:
+            raise
+        return smooth
+    return smooth if smooth and apart.fit_share < LEAST_FIT else (apart, None)
+
+
+def _noise(camera: Camera, observations: MapObservations, start: Start) -> float:
+    """Standard deviation (px) of what the first guess leaves."""
+    images = observations.images
+    away = start.points[observations.landmarks] - start.positions[images]
+    local = np.einsum("nji,nj->ni", start.rotations[images], away)
+    errors = np.sum((camera.project(local) - observations.pixels) ** 2, axis=1)
+    return noise_of(errors[np.isfinite(errors)], np.inf)
+
+
+def _of_one_motion(
+    camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
+    directions: Sequence[ScanDirection], done: Callable[[str], object],
+) -> tuple[RefinedMap, ShutterFit | None]:  # fmt: skip
+    """As :func:`fit_shutter`, with one smooth motion through images that follow each other."""
+    still = refine(camera, observations, start, freedom, done=done)
+    if not still.tells_readout:
+        return still, None
+    freedom = replace(freedom, readout_time=True)
+    fits = [
+        refine(
+            replace(still.camera, scan_direction=direction), observations, start, freedom, done=done
+        )
+        for direction in directions
+    ]
+    costs = [_costs(of, still, observations) for of in (still, *fits)]
+    best, axis_chance = 0, 0.0
+    if len(fits) > 1:
+        first, second = (_chance(costs[3 - k] - costs[k]) for k in (1, 2))
+        best, axis_chance = int(second < _CHANCE), min(first, second)
+    gains, chosen = costs[0] - costs[1 + best], fits[best]
+    shutter = ShutterFit(
+        readout_time=chosen.camera_as_found.readout_time,
+        deviation=chosen.readout_time_deviation,
+        direction=ScanDirection(chosen.camera_as_found.scan_direction),
+        noise=chosen.after,
+        global_noise=still.after,
+        better_images=float(np.mean(gains > 0.0)),
+        chance=_chance(gains),
+        axis_chance=axis_chance,
+        interval=1e-9 * float(np.median(np.diff(observations.stamps_ns))),
+    )
+    return (chosen if shutter.visible else still), shutter
+
+
+def _costs(fit: RefinedMap, still: RefinedMap, observations: MapObservations) -> Array:
+    """Squared errors of the images (g,), those of outliers cut off: alike in all fits."""
+    limit = (LIMIT * still.deviation) ** 2
+    squared = np.minimum(np.where(np.isfinite(fit.squared_errors), fit.squared_errors, 0.0), limit)
+    sums = np.bincount(observations.images, squared, len(observations.stamps_ns))
+    return np.asarray(sums, np.float64)
+
+
+def _chance(gains: Array) -> float:
+    """Probability that gains (g,) of images are so large by chance (Wilcoxon's signed-rank test).
+
+    Images at rest gain nothing, those of a quick turn much.
+    """
+    from scipy.stats import wilcoxon  # takes a second
+
+    return float(wilcoxon(gains, alternative="greater").pvalue)

@@ -1,0 +1,124 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Views on a first map: the pose of each, and the landmarks that it shows.
+
+Keyframes may lie too far apart to tell how the camera moved while one was read out. The images
+between them do: each is localized with the rolling shutter, by the code of the node.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.config import Matching, NodeConfig
+from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.io.clouds import Keypoints
+from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.localizer import Localizer
+from rs_localizer.matching import Matcher, Matches
+from rs_localizer.tools.mapping.colmap import Structure
+from rs_localizer.tools.mapping.views import View
+from rs_localizer.tracking import Tracker
+
+# A map that a global shutter has bent is off by more than good ones (px).
+_THRESHOLD = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """Views with a pose, and the landmarks that they show."""
+
+    views: IntArray  # (k,) rows of the views that have a pose, rising
+    rotations: Array  # (k,3,3) map_from_camera at the middle row
+    positions: Array  # (k,3) m
+    points: IntArray  # (n,) rows of the map
+    images: IntArray  # (n,) rows of ``views``, rising
+    pixels: Array  # (n,2) raw
+
+
+def track_on_map(
+    views: Sequence[View],
+    structure: Structure,
+    camera: Camera,
+    done: Callable[[], object] = lambda: None,
+) -> Tracked:
+    """Poses of all views: of the keyframes as COLMAP has them, the others are localized.
+
+    Args:
+        views: in the order of their stamps.
+        structure: of about the right size, in metres.
+        camera: with its readout time; 0: a global shutter, or unknown.
+        done: called after each view.
+    """
+    tracker = _MapTracker(Map(structure.points, None, structure.descriptors, "map"), camera)
+    order = np.argsort(structure.seen_views, kind="stable")
+    rows_of = structure.seen_views[order]
+    starts = np.searchsorted(rows_of, structure.views)
+    ends = np.searchsorted(rows_of, structure.views, side="right")
+    keyframes = {view: k for k, view in enumerate(structure.views.tolist())}
+    rows, poses, points, pixels = [], [], [], []
+    for row, view in enumerate(views):
+        k = keyframes.get(row)
+        if k is not None:
+            of = order[starts[k] : ends[k]]
+            poses.append((structure.rotations[k], structure.positions[k]))
+            points.append(structure.seen_points[of])
+            pixels.append(structure.pixels[of])
+            rows.append(row)
+        else:
+            estimate, matches = tracker.localize(view)
+            if estimate:
+                poses.append((estimate.rotation.T, estimate.position))
+                points.append(matches.landmarks[estimate.inliers])
+                pixels.append(view.features.pixels[matches.keypoints[estimate.inliers]])
+                rows.append(row)
+        done()
+    counts = [len(of) for of in points]
+    return Tracked(
+        np.array(rows, np.int64),
+        np.array([rotation for rotation, _ in poses]).reshape(-1, 3, 3),
+        np.array([position for _, position in poses]).reshape(-1, 3),
+        np.concatenate([*points, np.zeros(0, np.int64)]),
+        np.repeat(np.arange(len(rows)), counts),
+        np.concatenate([*pixels, np.zeros((0, 2))]),
+    )
+
+
+class _MapTracker:
+    """One view after the other, as the node takes keypoints."""
+
+    def __init__(self, landmarks: Map, camera: Camera) -> None:
+        self._matcher, self._settings = Matcher(landmarks), Matching()
+        self._localizer = Localizer(camera, NodeConfig(inlier_threshold=_THRESHOLD))
+        self._tracker = Tracker(self._localizer) if camera.readout_time > 0.0 else None
+        self._camera = camera
+
+    def localize(self, view: View) -> tuple[Estimate | Failure, Matches]:
+        features = view.features
+        keypoints = Keypoints(
+            view.stamp_ns, features.pixels, None, features.descriptors, features.scores, 0
+        )
+        if self._tracker is not None:
+            prior = self._tracker.prediction(view.stamp_ns)
+            if prior is not None:
+                estimate, matches = self._match(keypoints, prior)
+                if estimate:
+                    return estimate, matches
+        return self._match(keypoints, None)
+
+    def _match(
+        self, keypoints: Keypoints, prior: Prior | None
+    ) -> tuple[Estimate | Failure, Matches]:
+        matches = self._matcher.match(keypoints, self._settings, self._camera, prior)
+        points = self._matcher.map.points[matches.landmarks]
+        cloud = (points, keypoints.pixels[matches.keypoints], matches.scores)
+        if self._tracker is None:
+            return self._localizer.localize(*cloud), matches
+        # The time from image to image is all that counts, not the row.
+        return self._tracker.localize(keypoints.stamp_ns, *cloud), matches

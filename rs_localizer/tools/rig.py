@@ -1,0 +1,260 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Where the cameras of a rig are on it, and how their clocks differ, from recordings of each.
+
+One motion runs through the keypoints of all cameras, that of the first one. Beside it each camera
+has what a calibration of its own has (:mod:`rs_localizer.tools.calibration`), and each but the
+first :class:`.Extrinsics`. Cameras need not see the same: they see parts of one map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import argrelmax, correlate, correlation_lags
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.tools.adjust.cluster_robust import cluster_robust
+from rs_localizer.tools.adjust.fit import Fit, solve
+from rs_localizer.tools.adjust.lens import with_lens
+from rs_localizer.tools.adjust.problem import Problem, View
+from rs_localizer.tools.adjust.spline import Spline, refined
+from rs_localizer.tools.adjust.system import Undetermined
+from rs_localizer.tools.adjust.variables import EXTRINSICS, Extrinsics, Freedom, Mounting, State
+from rs_localizer.tools.calibration import Calibration, cut, disagreement, discrepancy
+from rs_localizer.tools.imu import middle_row
+
+# Turn rates are compared at this interval (s), over at least this time and this part of the shorter
+# recording; so many of the offsets at which they agree best are tried.
+_STEP, _LEAST_SECONDS, _LEAST_SHARE, _TRIED = 0.01, 2.0, 0.3, 10
+# How far the axes of two cameras of one body turn about their mean (rad): half a step of the above
+# at 5 rad/s, and a degree of the splines of cameras whose lens is not known yet.
+_MOST_TURNED = 0.05
+# Parts of the recording that are estimated on their own.
+_PARTS = 3
+DETERMINED = math.radians(0.1), 5e-3, 1.5e-3
+"""A turn, a place and an offset are determined to these deviations (rad, m, s): a hand's 67 deg/s
+makes 0.1 deg of 1.5 ms, and frames of a pair notice extrinsics that are 0.2 deg or 1 cm off
+(docs/rigs.md): by two deviations.
+"""
+
+
+class Recording(NamedTuple):
+    """One camera's part: what it was calibrated with, and what came of it."""
+
+    camera: Camera
+    calibration: Calibration
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mounted:
+    """A camera of a rig as the recordings of all say; the axes are those of the first camera."""
+
+    camera: Camera  # with its lens; the readout time and scan direction it was assumed to have
+    readout_time: float  # s; negative: against that direction
+    # ``offset``: s, to add to its stamps, of first rows, for the time of the first camera's.
+    extrinsics: Extrinsics
+    deviations: Array  # (7,) of a step of these: rad, m, s
+    # Of the seven above one after the other: what parts of the recording say by themselves makes
+    # them so much larger; 1: nothing.
+    inflations: Array
+
+    @property
+    def undetermined(self) -> str:
+        """What the recording does not determine, with figures; empty: all is."""
+        units = (
+            ("rotation", np.degrees(1.0), "deg"),
+            ("position", 1e3, "mm"),
+            ("clock", 1e3, "ms"),
+        )
+        largest = (float(np.max(of)) for of in np.split(self.deviations, [3, 6]))
+        return ", ".join(
+            f"{name} +- {unit * value:.2g} {of} (known to less than {unit * limit:.2g} it would be)"
+            for (name, unit, of), value, limit in zip(units, largest, DETERMINED, strict=True)
+            if not value < limit
+        )
+
+
+def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
+    """Extrinsics and clock offsets of the cameras of a rig, in the axes and clock of the first.
+
+    Raises:
+        ValueError: for a single camera, or when the motions of two cameras are not one, or do not
+            determine how the cameras are mounted; the message names the camera.
+    """
+    if len(recordings) < 2:
+        raise ValueError(f"a rig has several cameras, not {len(recordings)}")
+    first, *_ = recordings
+    own = recordings[first].calibration
+    spline, start_ns = own.fit.state.spline, own.posed.start_ns
+    spacing = min(each.calibration.fit.state.spline.layout.spacing for each in recordings.values())
+    if spacing < spline.layout.spacing:
+        spline = refined(spline, spacing)
+    cameras: list[View] = []
+    states: list[State] = []
+    for name, (camera, calibration) in recordings.items():
+        state, shift = calibration.fit.state, 1e-9 * (calibration.posed.start_ns - start_ns)
+        freedom = _freedom(own, calibration)
+        if name != first:
+            try:
+                extrinsics = first_extrinsics(spline, state.spline, shift)
+            except Undetermined as error:
+                raise ValueError(f"{name}: {error}") from error
+            nothing = Mounting(extrinsics, np.full(EXTRINSICS, np.inf))
+            state = replace(state, extrinsics=extrinsics)
+            freedom = replace(freedom, mounting=nothing)
+        seen = calibration.posed.observations
+        seen = replace(seen, times=seen.times + shift)
+        seen = seen.subset(spline.layout.inside(seen.times + state.extrinsics.offset))
+        states.append(replace(state, spline=spline, mount=None))
+        cameras.append(View(camera, seen, freedom))
+    noises = np.array([each.calibration.fit.deviation for each in recordings.values()])
+    start = replace(states[0], others=tuple(states[1:]))
+    try:
+        whole = _Joint.of(Problem(cameras, start, noises), start)
+    except Undetermined as error:
+        raise ValueError(f"{', '.join(recordings)}: {error}") from error
+    parts = list(_parts(whole))
+    return {name: _mounted(place, whole, parts) for place, name in enumerate(recordings)}
+
+
+def _freedom(first: Calibration, own: Calibration) -> Freedom:
+    """What a camera's own calibration freed; the accelerations are the rig's."""
+    names = ("lens", "lens_deviations", "landmarks", "paper", "stamps")
+    return replace(first.fit.freedom, **{name: getattr(own.fit.freedom, name) for name in names})
+
+
+def first_extrinsics(rig: Spline, own: Spline, shift: float) -> Extrinsics:
+    """A first guess, from the motions of the rig and of the camera alone through one map.
+
+    Args:
+        shift: s, to add to the times of ``own`` for the stamps that the offset is to be added to.
+
+    Raises:
+        Undetermined: when the two do not turn alike at any offset.
+    """
+    grids = [_turning(spline) for spline in (rig, own)]
+    (begin, speeds, known), (own_begin, own_speeds, own_known) = grids
+    # Correlation coefficients of the turn rates at all offsets, where both are known.
+    sums = {
+        (a, b): correlate(known * speeds**a, own_known * own_speeds**b)
+        for a, b in ((0, 0), (0, 1), (1, 0), (0, 2), (2, 0), (1, 1))
+    }
+    count = np.maximum(sums[0, 0], 1.0)
+    products = sums[1, 1] - sums[1, 0] * sums[0, 1] / count
+    spreads = [sums[2, 0] - sums[1, 0] ** 2 / count, sums[0, 2] - sums[0, 1] ** 2 / count]
+    least = max(_LEAST_SECONDS / _STEP, _LEAST_SHARE * min(np.sum(known), np.sum(own_known)))
+    alike = products / np.sqrt(np.maximum(spreads[0] * spreads[1], 1e-12))
+    alike[sums[0, 0] < least] = -1.0
+    peaks = argrelmax(alike, mode="wrap")[0]
+    peaks = peaks[alike[peaks] > 0.0]
+    lags = correlation_lags(len(speeds), len(own_speeds))[peaks[np.argsort(-alike[peaks])[:_TRIED]]]
+    guesses = [
+        _at_offset(rig, own, begin - own_begin + float(lag) * _STEP) for lag in lags.tolist()
+    ]
+    best, turned = min(guesses, key=lambda guess: guess[1], default=(None, math.inf))
+    if best is None or not turned < _MOST_TURNED:
+        raise Undetermined(
+            "it does not turn as the first camera does"
+            + (f" (to {math.degrees(turned):.1f} deg at best)" if guesses else "")
+            + f": do both move as one, unevenly, and for {least * _STEP:.0f} s at the same time?"
+        )
+    return replace(best, offset=best.offset - shift)
+
+
+def _turning(spline: Spline) -> tuple[float, Array, Array]:
+    """Turn rates (n,) rad/s at even times from the first (s) on, and 1 where known, otherwise 0."""
+    layout = spline.layout
+    times = np.arange(layout.starts[0], layout.ends[-1], _STEP)
+    speeds = np.linalg.norm(spline.states(times).angular, axis=1)
+    return float(times[0]), speeds, layout.inside(times).astype(float)
+
+
+def _at_offset(rig: Spline, own: Spline, offset: float) -> tuple[Extrinsics, float]:
+    """Extrinsics at a later time of the rig (s), and how far (rad) the axes turn about them."""
+    times = np.arange(own.layout.starts[0], own.layout.ends[-1], _STEP)
+    times = times[own.layout.inside(times) & rig.layout.inside(times + offset)]
+    body, camera = rig.states(times + offset), own.states(times)
+    axes = Rotation.from_matrix(np.swapaxes(camera.rotations, 1, 2) @ body.rotations)
+    centres = np.einsum("nji,nj->ni", body.rotations, camera.positions - body.positions)
+    mean = axes.mean()
+    turned = float(np.median((axes * mean.inv()).magnitude()))
+    return Extrinsics(mean.as_matrix(), np.median(centres, axis=0), offset), turned
+
+
+class _Joint(NamedTuple):
+    problem: Problem
+    fit: Fit
+
+    @classmethod
+    def of(cls, problem: Problem, start: State) -> _Joint:
+        """The estimate; with errors of a second taken together, unless images have own times."""
+        found = solve(problem, start)
+        if any(camera.freedom.stamps > 0.0 for camera in problem.views):
+            return cls(problem, found)
+        return cls(problem, cluster_robust(problem, found))
+
+    @property
+    def states(self) -> tuple[State, ...]:
+        """Of all cameras."""
+        return self.fit.state, *self.fit.state.others
+
+    def numbers(self, place: int, about: Extrinsics) -> tuple[Array, Array]:
+        """Turn, displacement and stamps' offset by some extrinsics; their deviations (7,)."""
+        if place == 0:
+            return np.zeros(EXTRINSICS), np.zeros(EXTRINSICS)
+        problem, camera = self.problem, self.problem.views[place].camera
+        own, first = self.states[place], self.states[0]
+        # A stamp is that of the first row; the estimate compares the times of middle rows.
+        later = middle_row(camera, own.readout_time)
+        first_later = middle_row(self.problem.camera, first.readout_time)
+        values = own.extrinsics.beside(replace(about, offset=later * own.readout_time))
+        values[6] += first_later * first.readout_time
+        by_border = np.zeros((EXTRINSICS, self.problem.border))
+        by_border[:, problem.place("mount", place) :][:, :EXTRINSICS] = np.eye(EXTRINSICS)
+        by_border[6, [problem.place("readout", place), 0]] = -later, first_later
+        covariance = by_border @ self.fit.border_covariance @ by_border.T
+        return values, np.sqrt(np.diag(covariance))
+
+
+def _parts(whole: _Joint) -> Iterator[_Joint]:
+    """Equal parts of the recording, each with all numbers of its own."""
+    layout = whole.fit.state.spline.layout
+    for start, end in pairwise(np.linspace(layout.starts[0], layout.ends[-1], _PARTS + 1)):
+        state = cut(whole.fit.state, start, end)
+        if state is None:
+            continue
+        views = []
+        for view, one in zip(whole.problem.views, (state, *state.others), strict=True):
+            times = view.observations.times + one.extrinsics.offset
+            views.append(view.subset((times >= start) & (times < end)))
+        with suppress(ValueError):  # undetermined, or without one of the cameras
+            yield _Joint.of(Problem(views, state, whole.problem.ratios), state)
+
+
+def _mounted(place: int, whole: _Joint, parts: list[_Joint]) -> Mounted:
+    state = whole.states[place]
+    extrinsics = state.extrinsics
+    values, deviations = whole.numbers(place, extrinsics)
+    inflations, beside = np.ones(EXTRINSICS), np.zeros(EXTRINSICS)
+    if place > 0 and len(parts) > 1:
+        each = np.array([part.numbers(place, extrinsics) for part in parts])
+        for k, (own, noise) in enumerate(each.transpose(2, 1, 0)):
+            inflations[k] = disagreement(own, noise)
+            beside[k] = discrepancy(float(values[k]), own, inflations[k] * noise)
+    deviations = np.hypot(inflations * deviations, beside)
+    return Mounted(
+        camera=with_lens(whole.problem.views[place].camera, state.lens),
+        readout_time=state.readout_time,
+        extrinsics=replace(extrinsics, offset=float(values[6])),
+        deviations=deviations,
+        inflations=inflations,
+    )

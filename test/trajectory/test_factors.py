@@ -1,0 +1,162 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Each factor's derivatives against differences, and the system against dense algebra."""
+
+from dataclasses import replace
+
+import numpy as np
+import projector
+import pytest
+from dense import are_derivatives, fitting, normal_of
+from test_fit import READOUT, make_camera
+
+from rs_localizer.core import so3
+from rs_localizer.tools.adjust.gyro import Gyroscope
+from rs_localizer.tools.adjust.lens import lens_prior
+from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
+from rs_localizer.tools.adjust.priors import Floating, lens_term, mount_term
+from rs_localizer.tools.adjust.problem import Problem, View
+from rs_localizer.tools.adjust.spline import Layout, Spline
+from rs_localizer.tools.adjust.system import Factored, Quadratic, System
+from rs_localizer.tools.adjust.variables import (
+    Accelerations,
+    Extrinsics,
+    Freedom,
+    GyroMount,
+    GyroSamples,
+    Mounting,
+    Observations,
+    State,
+    start_state,
+)
+
+MOUNTED = Mounting(
+    Extrinsics(so3.exp(np.array([0.1, 0.2, -0.1])), np.array([0.05, -0.02, 0.1]), 2e-3),
+    np.full(7, 0.1),
+)
+FREEDOMS = {
+    "board": Freedom(lens=True, landmarks=0.01, stamps=1e-3),
+    "mounted": Freedom(lens=True, mounting=MOUNTED, fading=0.1),
+    "bodies": Freedom(readout_time=False, mounting=MOUNTED),
+}
+
+
+def small(
+    of: str = "board", direction: str = "top_to_bottom", distortion: str = "plumb_bob",
+    controls: float = 0.4,
+) -> tuple[Problem, State]:  # fmt: skip
+    """Keypoints of one camera with errors of zero."""
+    rng, camera = np.random.default_rng(0), make_camera(scan_direction=direction)
+    if distortion == "equidistant":
+        camera = replace(camera, D=np.array([0.01, -0.02, 0.003, 0.001]),
+                         distortion_model=distortion)  # fmt: skip
+    motion, landmarks = projector.Motion.random(rng), projector.room(rng, 8)
+    layout = Layout.over(np.array([[0.0, controls]]), 0.04)
+    spline = Spline(layout, *motion.pose(layout.control_times()))
+    count = 60
+    pixels, frames = rng.uniform(0.0, 400.0, (count, 2)), np.sort(rng.integers(0, 5, count))
+    seen = Observations(
+        times=0.05 + 0.07 * frames, row_times=camera.row_time(pixels), pixels=pixels,
+        landmarks=landmarks, points=rng.integers(0, 8, count), frames=frames,
+        trusted=np.ones(count, bool),
+        bodies=np.repeat([-1, 0], 4) if of == "bodies" else None,
+    )  # fmt: skip
+    state = start_state(camera, seen, spline, READOUT)
+    extrinsics = MOUNTED.given if FREEDOMS[of].mounting else state.extrinsics
+    state = replace(state, delays=rng.normal(0.0, 1e-3, 5), extrinsics=extrinsics)
+    return fitting(Problem([View(camera, seen, FREEDOMS[of])], state), state), state
+
+
+@pytest.mark.parametrize("of", list(FREEDOMS))
+@pytest.mark.parametrize(
+    ("direction", "distortion"), [("top_to_bottom", "plumb_bob"), ("right_to_left", "equidistant")]
+)
+def test_keypoints(of, direction, distortion):
+    problem, state = small(of, direction, distortion)
+    are_derivatives(lambda one: problem.keypoint_rows(one, 100.0)[0], problem, state)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.7])
+def test_accelerations(memory):
+    problem, state = small()
+    expected = Accelerations(3.0, 2.0, memory)
+    are_derivatives(lambda one: acceleration_rows(one.spline, expected), problem, state)
+
+
+def test_velocities_of_images_that_stand_alone():
+    problem, state = small(controls=0.04)
+    are_derivatives(lambda one: rest_rows(one.spline, 2.0, 1.0), problem, state)
+
+
+def test_where_the_whole_is():
+    problem, state = small()
+    floating = Floating(state.spline)
+    are_derivatives(lambda one: floating.rows(one.spline), problem, state)
+
+
+def test_a_gyroscope():
+    problem, state = small()
+    mount = GyroMount(MOUNTED.given.axes, np.array([0.02, -0.01, 0.03]), 0.003, np.full(6, 0.02))
+    samples = GyroSamples(np.linspace(0.05, 0.3, 7), np.zeros((7, 3)), 1e4)
+    seen = replace(problem.views[0].observations, gyro=samples)
+    state = replace(state, mount=mount)
+    problem = Problem([replace(problem.views[0], observations=seen)], state)
+    # So that Tukey's weights are one.
+    gyro = Gyroscope(samples, state)
+    are_derivatives(lambda one: gyro.terms(one, problem.at[0]["gyro"])[0], problem, state)
+
+
+def test_priors_of_lens_and_mount():
+    """The slope is half the derivative of the cost."""
+    problem, state = small("mounted")
+    prior = lens_prior(problem.camera, None)
+    extrinsics = state.extrinsics.moved(np.full(7, 1e-4))
+    off = replace(state, lens=state.lens + 0.01, extrinsics=extrinsics)
+    for name, term in (
+        ("lens", lambda one, at: lens_term(one.lens, prior, at)),
+        ("mount", lambda one, at: mount_term(one.extrinsics, MOUNTED, at)),
+    ):
+        known = term(off, problem.at[0][name])
+        for column, slope in zip(known.columns, known.slope, strict=True):
+            step = np.zeros(problem.groups.kept)
+            step[column] = 1e-6
+            costs = [term(problem.moved(off, s * step), problem.at[0][name]).cost for s in (1, -1)]
+            assert (costs[0] - costs[1]) / 4e-6 == pytest.approx(slope, rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("of", list(FREEDOMS))
+@pytest.mark.parametrize("length", [0.24, 2.0])  # a dense motion, and a band
+def test_steps_and_covariances_are_those_of_the_dense_system(of, length):
+    problem, state = small(of, controls=length)
+    terms = problem.terms(state, 1.0)
+    rng = np.random.default_rng(2)
+    terms[0] = terms[0]._replace(errors=rng.normal(size=terms[0].errors.shape))
+    system = System(problem.groups, terms)
+    assert system.dense == (length < 1.0)
+    matrix, slope = normal_of(problem.groups, terms)
+    scale, factored = 1.0 / np.sqrt(np.diag(matrix)), Factored(system)
+    inverse = np.linalg.inv(matrix * scale * scale[:, None]) * scale * scale[:, None]
+    expected = -inverse @ slope
+    np.testing.assert_allclose(factored.step(), expected, atol=1e-5 * np.abs(expected).max())
+    motion, kept = problem.groups.motion, problem.groups.kept
+    border = inverse[motion:kept, motion:kept]
+    scale = np.sqrt(np.diag(border))
+    np.testing.assert_allclose(
+        factored.border_covariance() / scale / scale[:, None], border / scale / scale[:, None],
+        atol=1e-5,
+    )  # fmt: skip
+    firsts = rng.integers(0, motion // 6 - 3, 4)
+    for first, found in zip(firsts, factored.local_covariances(firsts), strict=True):
+        own = inverse[6 * first : 6 * first + 24, 6 * first : 6 * first + 24]
+        np.testing.assert_allclose(found, own, atol=1e-5 * np.abs(own).max())
+
+
+def test_damping_multiplies_the_diagonal():
+    problem, state = small()
+    terms = problem.terms(state, 1.0)
+    matrix, slope = normal_of(problem.groups, terms)
+    matrix[np.diag_indices(len(matrix))] *= 1.5
+    expected = -np.linalg.solve(matrix, slope)
+    found = Factored(problem.system(state, 1.0), 0.5).step()
+    np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max() + 1e-12)
+    assert any(isinstance(term, Quadratic) for term in terms)
