@@ -205,9 +205,14 @@ def run(args: argparse.Namespace) -> None:
             )  # fmt: skip
             folder = out / COLMAP
             folder.mkdir()
-            built = build_map(inputs, Workshop(folder, Effort(args.threads, args.seed), stage))
+            built = build_map(inputs, Workshop(folder, _effort(args), stage))
         _write(out, built, looked)
     _tell(args, built, looked)
+
+
+def _effort(args: argparse.Namespace) -> Effort:
+    features = max(args.max_keypoints, Effort().features)
+    return Effort(args.threads, args.seed, features)
 
 
 def _check_points(args: argparse.Namespace) -> None:
@@ -249,9 +254,8 @@ def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
             "warning: nothing determines the scale: poses and velocities are in units of the map; "
             "give --markers, or --point and --distance"
         )
-    check = built.refined.readout_check
-    if check is not None and check.differs:
-        print(f"warning: {check.message}")
+    if built.readout_check is not None and built.readout_check.differs:
+        print(f"warning: {built.readout_check.message}; the map has what was estimated")
     if built.placement.doubt:
         print(f"warning: {built.placement.doubt}")
     for text in advice(built, looked.views):

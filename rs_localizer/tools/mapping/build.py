@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.anchors import (
@@ -35,7 +36,12 @@ from rs_localizer.tools.mapping.anchors import (
 )
 from rs_localizer.tools.mapping.colmap import Effort, Stage, Structure, build_structure
 from rs_localizer.tools.mapping.gauge import Similarity, laid_on_held, scaled
-from rs_localizer.tools.mapping.observations import MapObservations, Start, most_observed
+from rs_localizer.tools.mapping.observations import (
+    MapObservations,
+    ReadoutCheck,
+    Start,
+    most_observed,
+)
 from rs_localizer.tools.mapping.refine import DRIFT, RefinedMap, refine
 from rs_localizer.tools.mapping.shutter_fit import (
     LEAST_FIT,
@@ -132,7 +138,8 @@ class Built:
     blurred: BoolArray  # of the views
     structure: Structure  # as COLMAP had it, moved into this frame as a whole
     kept: IntArray  # (l,) rows of the structure's points that are landmarks
-    shutter: ShutterFit | None  # None: it was given
+    shutter: ShutterFit | None  # None: it was given, and the images do not contradict it
+    readout_check: ReadoutCheck | None  # of a given one
     refined: RefinedMap  # in a frame of its own
     posed: IntArray  # (g,) rows of the views with a pose
     rotations: Array  # (g,3,3) map_from_camera at their middle rows
@@ -166,7 +173,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
     )
     with work.stage("track", len(inputs.views)) as step:
         tracked = track_on_map(inputs.views, structure, camera, lambda: step(1))
-    refined, shutter, rows = _refined(inputs, tracked, structure, camera, work)
+    refined, shutter, rows, check = _refined(inputs, tracked, structure, camera, work)
     estimated = None if inputs.camera is not None else structure.camera.focal_length
     check_fit(refined.fit_share, estimated)
     motion = Motion(rows, refined.times, refined)
@@ -195,6 +202,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
         structure=structure.moved(similarity),
         kept=kept,
         shutter=shutter,
+        readout_check=check,
         refined=refined,
         posed=motion.rows,
         rotations=similarity.rotation @ rotations,
@@ -277,8 +285,8 @@ def _structure(inputs: Given, keyframes: IntArray, work: Workshop) -> Structure:
 
 def _refined(
     inputs: Given, tracked: Tracked, structure: Structure, camera: Camera, work: Workshop
-) -> tuple[RefinedMap, ShutterFit | None, IntArray]:
-    """The refined map, what is found of an unknown shutter, and the rows of its views."""
+) -> tuple[RefinedMap, ShutterFit | None, IntArray, ReadoutCheck | None]:
+    """The refined map; a shutter that was unknown or wrong; rows of views; check of a given one."""
     of = most_observed(tracked.points, tracked.images, work.effort.adjusted)[tracked.points]
     used, images = np.unique(tracked.images[of], return_inverse=True)
     rows = tracked.views[used]
@@ -296,15 +304,21 @@ def _refined(
         )
         freedom = replace(freedom, deviations=deviations)
     directions = likely_axes(camera.size, inputs.scan_direction)
-    unknown = inputs.readout_time is None
+    unknown, check = inputs.readout_time is None, None
     with work.stage("refine", 3 * (1 + len(directions)) if unknown else 3) as step:
 
         def done(_: str) -> None:
             step(1)
 
         if not unknown:
-            return refine(camera, observations, start, freedom, done=done), None, rows
-        return *fit_shutter(camera, observations, start, freedom, directions, done), rows
+            refined = refine(camera, observations, start, freedom, done=done)
+            check = refined.readout_check
+            if check is None or not check.differs:
+                return refined, None, rows, check
+            # A map adjusted with the wrong one is bent to it, and fits it nearly as well.
+            directions = [ScanDirection(camera.scan_direction)]
+        fitted = fit_shutter(camera, observations, start, freedom, directions, done)
+        return *fitted, rows, check
 
 
 def _corners(inputs: Given, stamps_ns: IntArray) -> MapObservations:

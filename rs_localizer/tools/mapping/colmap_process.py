@@ -24,7 +24,7 @@ DATABASE, SPARSE, ARRAYS = "database.db", "sparse", "arrays.npz"
 # Errors of COLMAP's log that say what raised the exception anyway are left out.
 _ONLY_FATAL = 3
 # Images and pairs of images between two steps of the progress bar.
-_IMAGES_AT_ONCE, _PAIRS_AT_ONCE = 8, 100
+_IMAGES_AT_ONCE, _PAIRS_AT_ONCE = 8, 25
 # COLMAP's own least number of matches of two images (its ``min_num_matches``).
 LEAST_MATCHES = 15
 
@@ -35,7 +35,7 @@ def main(task: dict[str, Any]) -> None:
     Args:
         task: ``images`` and ``folder`` (paths), ``names`` of the images, ``pairs`` of rows of them,
             ``camera`` (COLMAP's model and parameters; null: one simple radial camera, which COLMAP
-            calibrates), ``seed`` and ``threads`` of the mapping.
+            calibrates), ``features`` of an image, ``seed`` and ``threads`` of the mapping.
     """
     pycolmap.logging.minloglevel = _ONLY_FATAL
     pycolmap.set_random_seed(task["seed"])
@@ -67,13 +67,15 @@ def _extract(task: dict[str, Any], database: Path) -> None:
         reader.camera_model = camera["model"]
         reader.camera_params = ",".join(repr(value) for value in camera["params"])
     single = pycolmap.CameraMode.SINGLE
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features = task["features"]
     with pycolmap.Database.open(database):
         pass  # which creates it
     pycolmap.import_images(database, images, single, names, reader)
     _say("stage", "extract", len(names))
     for start in range(0, len(names), _IMAGES_AT_ONCE):
         some = names[start : start + _IMAGES_AT_ONCE]
-        pycolmap.extract_features(database, images, some, single, reader)
+        pycolmap.extract_features(database, images, some, single, reader, extraction)
         _say("step", len(some))
 
 
