@@ -68,9 +68,9 @@ COMMANDS = {
         "write a recording with ground truth: a scene, a motion, a rolling-shutter camera",
         "rs_localizer simulate flight --trajectory poses.txt --duration 30 --noise 1",
     ),
-    "markers": Command(
+    "markers make": Command(
         "rs_localizer.cli.markers",
-        "make prints of markers or a board, true to scale, with their map; check a map",
+        "prints of markers or a board, true to scale, with their map",
         "rs_localizer markers make wall --family apriltag_36h11 --page a4",
     ),
     "detect": Command(

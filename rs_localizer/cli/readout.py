@@ -4,26 +4,20 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 
+from rs_localizer.cli.options import argument
 from rs_localizer.readout import COMMON, MEASURE, as_json, find_readout, known_cameras
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "name",
-        nargs="?",
-        default="",
-        metavar="NAME",
-        help='words of its name: "sony a7siii", imx219 (default: list all)',
-    )
-    parser.add_argument(
-        "mode", nargs="?", default="", metavar="MODE", help='words of its mode: "3840x2160 60"'
-    )
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    name: str = argument('words of its name: "sony a7siii", imx219 (default: list all)', "NAME", "")
+    mode: str = argument('words of its mode: "3840x2160 60"', "MODE", "")
 
 
-def run(args: argparse.Namespace) -> list[dict[str, object]]:
-    entries = find_readout(args.name, args.mode) if args.name else known_cameras()
+def run(options: Options) -> list[dict[str, object]]:
+    entries = find_readout(options.name, options.mode) if options.name else known_cameras()
     width = max(len(entry.name) for entry in entries)
     modes = max(len(entry.mode) for entry in entries)
     print(f"{'camera':{width}}  {'mode':{modes}}  median ms  quartiles ms   number  source")
@@ -35,6 +29,6 @@ def run(args: argparse.Namespace) -> list[dict[str, object]]:
             f"{entry.number:6}  {entry.source}{note if entry.upper_bound else ''}"
         )
     print("Published values, perhaps of other modes: rs_localizer calibrate measures yours.")
-    if not args.name:
+    if not options.name:
         print(f"Not known of {', '.join(COMMON)}: {MEASURE}")
     return [as_json(entry) for entry in entries]

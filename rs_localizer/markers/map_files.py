@@ -182,7 +182,7 @@ _EXPLANATION = """\
 #   corners: instead of these three: top left, top right, bottom right, bottom left, from the front
 #   position_deviation, rotation_deviation: standard deviations of a survey along the axes of
 #     map_frame, m and rad
-# Measure what was put up, write it here, and check it: rs_localizer markers check FILE;
+# Measure what was put up, write it here, and check it: rs_localizer map info FILE;
 # rs_localizer detect names a marker that is not where this file has it.
 """
 

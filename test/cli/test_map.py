@@ -3,6 +3,7 @@
 """``rs_localizer map``: what it says and writes."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -95,9 +96,9 @@ def test_make_and_check(tmp_path, capsys):
     assert (tmp_path / "wall.v2.pdf").read_bytes().startswith(b"%PDF")
     made = read_marker_map(tmp_path / "wall.v2.yaml")
     assert [marker.name for marker in made.markers] == [f"marker 4x4_50 {k}" for k in range(6)]
-    assert main(["markers", "check", f"{out}.yaml"]) == 0
+    assert main(["map", "info", f"{out}.yaml"]) == 0
     said = capsys.readouterr().out
-    assert "6 markers and 0 boards of 4x4_50 in map; no problem found" in said
+    assert re.search(r"markers of 4x4_50 +6, ids 0 to 5\n", said)
     # Nothing is overwritten.
     assert make(out, "--size", "0.05") == 1
     assert "exists already" in capsys.readouterr().err
@@ -113,10 +114,9 @@ def test_problems_of_a_map_are_named(tmp_path, capsys):
     text = path.read_text()
     path.write_text(text.replace("size: 0.05", "size: 50.0"))
     capsys.readouterr()
-    assert main(["markers", "check", str(path)]) == 1
-    said = capsys.readouterr()
-    assert said.out.startswith("markers of 50 m: are sizes and positions, given in metres, in")
-    assert said.err == f"rs_localizer markers: {path} has a problem\n"
+    assert main(["map", "info", str(path)]) == 1
+    text_of = "markers of 50 m: are sizes and positions, given in metres, in another unit?"
+    assert capsys.readouterr().err == f"rs_localizer map: {path}: {text_of}\n"
     path.write_text(text.replace("id: 1", "id: 0"))
-    assert main(["markers", "check", str(path)]) == 1
+    assert main(["map", "info", str(path)]) == 1
     assert "marker 4x4_50 0 is there twice" in capsys.readouterr().err
