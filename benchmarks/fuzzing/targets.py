@@ -57,6 +57,8 @@ _TWISTS = b"# t wx wy wz vx vy vz\n1.5 0 0 1 0 0 0\n2.5 1 0 1 0 0 0.6\n"
 _WPILIB = b"""{"tags": [{"ID": 1, "pose": {"translation": {"x": 1.0, "y": 0.0, "z": 1.5},
 "rotation": {"quaternion": {"W": 0.5, "X": 0.5, "Y": 0.5, "Z": 0.5}}}}],
 "field": {"length": 16.5, "width": 8.1}}"""
+_EUROC = b"#timestamp,px,py,pz,qw,qx,qy,qz\n1403636579763555584,1,2,3,1,0,0,0,0.1,0.2\n"
+_TARGET = b"target_type: aprilgrid\ntagCols: 4\ntagRows: 3\ntagSize: 0.05\ntagSpacing: 0.3\n"
 _MARKERS = b"""# markers of a room, surveyed with a tape measure; lengths in metres, poses of each
 map_frame: map
 markers:
@@ -123,7 +125,7 @@ def targets(folder: Path) -> dict[str, Target]:
         ),
         "name:=value": Target(_bytes(_ASSIGNMENTS), _assign, (ValueError,)),
         "trajectory": Target(
-            _bytes((_TUM,)), _file(folder / "poses.txt", read_tum), (TrajectoryError,)
+            _bytes((_TUM, _EUROC)), _file(folder / "poses.txt", read_tum), (TrajectoryError,)
         ),
         "calibration": Target(
             _bytes(seeds.CALIBRATIONS),
@@ -131,7 +133,9 @@ def targets(folder: Path) -> dict[str, Target]:
             (CalibrationError,),
         ),
         "marker map": Target(
-            _bytes((_MARKERS,)), _file(folder / "markers.yaml", read_marker_map), (MarkerMapError,)
+            _bytes((_MARKERS, _TARGET)),
+            _file(folder / "markers.yaml", read_marker_map),
+            (MarkerMapError,),
         ),
     } | _more_files(folder)
 

@@ -53,7 +53,7 @@ def _has_messages(path: Path) -> bool:
         ) as db:
             query = "SELECT count(*) FROM sqlite_master WHERE name IN ('messages', 'topics')"
             return bool(db.execute(query).fetchone()[0] == 2)
-    except sqlite3.Error:
+    except (sqlite3.Error, UnicodeDecodeError):  # its words may be none
         return path.suffix == ".db3"
 
 

@@ -166,7 +166,7 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64]
                 continue
             if not np.isfinite(values).all():
                 raise ValueError
-        except (ValueError, InvalidOperation):
+        except (ValueError, IndexError, InvalidOperation):
             if not rows and "," in line and not line[0].isdigit():
                 continue  # the heading
             raise TrajectoryError(

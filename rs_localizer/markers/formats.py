@@ -134,7 +134,7 @@ def _write_apriltag_ros(marker_map: MarkerMap, family: str) -> str:
 OWN = "rs_localizer"
 # By its keys a file is recognized; its reader, its writer, and what messages call it.
 _KEYS = {
-    OWN: ("markers", "boards"), "wpilib": ("tags",),
+    OWN: ("markers", "boards", "target_type"), "wpilib": ("tags",),
     "apriltag_ros": ("tag_bundles", "standalone_tags"),
 }  # fmt: skip
 _FOREIGN = {
