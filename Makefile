@@ -93,5 +93,5 @@ $(ready): setup.py pyproject.toml Makefile
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(OUT) build install log rs_localizer/compiled *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .coverage
+	rm -rf $(VENV) $(OUT) build install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .coverage
 	find rs_localizer benchmarks test -name __pycache__ -type d -prune -exec rm -rf {} +

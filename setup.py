@@ -2,13 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package for colcon (ament_python) and for pip."""
 
-import json
 import os
-import sys
 from glob import glob
-from pathlib import Path
 
-from setuptools import Distribution, find_packages, setup
+from setuptools import find_packages, setup
 
 package_name = "rs_localizer"
 
@@ -27,25 +24,7 @@ if os.environ.get("AMENT_PREFIX_PATH"):
     # executables as soon as a library imports pkg_resources, as Ubuntu's Matplotlib does.
     requirements = ["setuptools"]
 
-
-class WithMachineCode(Distribution):
-    """A wheel of one Python and one kind of machine: packaging/compile_kernels.py has been here."""
-
-    def has_ext_modules(self) -> bool:
-        return True
-
-
-distribution = Distribution
-compiled = Path(package_name, "compiled", "about.json")
-if compiled.is_file() and not os.environ.get("AMENT_PREFIX_PATH"):
-    about = json.loads(compiled.read_text())
-    if about["python"] != "{}.{}".format(*sys.version_info):
-        raise SystemExit(f"{compiled.parent} is for Python {about['python']}: compile again")
-    distribution = WithMachineCode
-    requirements[requirements.index("numba")] = f"numba=={about['numba']}"
-
 setup(
-    distclass=distribution,
     name=package_name,
     version="1.0.0",
     description="Pose and velocity of a rolling-shutter camera from a single image",
@@ -53,7 +32,7 @@ setup(
     maintainer_email="maintainers@users.noreply.h-seed-b0484be4.example",
     license="Apache-2.0",
     packages=find_packages(include=[package_name, f"{package_name}.*"]),
-    package_data={package_name: ["py.typed", "data/**/*", "compiled/**/*"]},
+    package_data={package_name: ["py.typed", "data/**/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),

@@ -133,7 +133,6 @@ class Tracker:
         self._aid: GyroscopeAid | None = None
         if inertial is not None:
             self._aid = GyroscopeAid(inertial, localizer.camera.readout_time)
-            self._aid.warm_up()
         self._without_gyro = Acceleration(_LEAST_ACCELERATION, localizer.config.acceleration.linear)
 
     def reset(self) -> None:

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package as ROS, colcon and pip see it: description, versions, content, import rule."""
 
-import json
 import os
 import re
 import shlex
@@ -176,8 +175,7 @@ def test_conda_brings_what_pip_brings(setup_says):
     recipe = yaml.safe_load((ROOT / "packaging/conda/recipe.yaml").read_text())
     for line in declared["install_requires"]:
         name, bound = re.fullmatch(r"([\w-]+)(.*)", line).groups()
-        # With machine code in the tree setup.py pins Numba, which conda compiles itself.
-        wanted[CONDA.get(name, name)] = "" if name == "numba" else bound
+        wanted[CONDA.get(name, name)] = bound
     found = dict((*line.split(), "")[:2] for line in recipe["requirements"]["run"])
     assert found.pop("python") == declared["python_requires"]
     assert found == wanted
@@ -209,26 +207,12 @@ def test_the_container_is_built_of_files_that_exist():
     assert named <= copied
 
 
-def test_machine_code_makes_a_wheel_of_this_python_and_this_numba(
-    tmp_path, monkeypatch, setup_says
-):
-    (tmp_path / "rs_localizer" / "compiled").mkdir(parents=True)
-    about = tmp_path / "rs_localizer" / "compiled" / "about.json"
-    said = setup_says(tmp_path)
-    assert said["distclass"] is setuptools.Distribution
-    assert "numba" in said["install_requires"]
-    version = "{}.{}".format(*sys.version_info)
-    about.write_text(json.dumps({"python": version, "numba": "0.99.1", "cpus": ["x86-64-v3"]}))
-    said = setup_says(tmp_path)
-    assert said["distclass"]().has_ext_modules()
-    assert "numba==0.99.1" in said["install_requires"]
-    about.write_text(json.dumps({"python": "3.9", "numba": "0.99.1", "cpus": []}))
-    with pytest.raises(SystemExit, match=r"is for Python 3\.9: compile again"):
-        setup_says(tmp_path)
-    # rosdep brings all there; Ubuntu's OpenCV is no pip package: a requirement would stop the
-    # installed executables.
+def test_beside_ros_pip_requires_nothing(monkeypatch, setup_says):
+    """Rosdep brings all there; Ubuntu's OpenCV is no pip package: a requirement would stop the
+    installed executables.
+    """
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy")
-    assert setup_says(tmp_path)["install_requires"] == ["setuptools"]
+    assert setup_says(ROOT)["install_requires"] == ["setuptools"]
 
 
 def test_rosdep_knows_every_key():

@@ -28,6 +28,7 @@ from tqdm import tqdm
 
 from benchmarks.data import HAND_MOTION
 from benchmarks.experiments.errors import angles
+from benchmarks.room_mapping import Piece, Room, without_refinement
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.evaluation.cube_clip import CAMERA, SENSOR
@@ -41,7 +42,6 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.simulation.frames import middle_stamp
 from rs_localizer.tools.mapping.pictures import save_pictures
 from rs_localizer.tools.mapping.report import rows
-from rs_localizer.tools.room_mapping import Piece, Room, without_refinement
 
 _WALK = Piece(28.0, 11.8, 15.0)
 _FLIGHTS = {"another walk": Piece(40.0, 8.0), "quick turns": Piece(54.8, 6.0)}

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -14,10 +15,9 @@ from rs_localizer.solvers.table import SOLVERS
 
 if WORKING:
     from rs_localizer.config import NodeConfig
-    from rs_localizer.core.simd import shipped
+    from rs_localizer.core.simd import compiler
     from rs_localizer.core.simd.jit import cache_directory
     from rs_localizer.markers import detection
-    from rs_localizer.pipeline.compiling import note_compiled
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.tools import warm_up as trajectory
 
@@ -44,24 +44,26 @@ def run(arguments: argparse.Namespace) -> dict[str, object]:
     steps: dict[str, Callable[[], None]] = {"markers": detection.warm_up}
     seconds = dict[str, float]()
     for name in arguments.solver or SOLVERS:
-        config = NodeConfig(solver=name, readout_time=_READOUT_TIME)
-        steps[f"solver {name}"] = FrameLocalizer(config).warm_up
+        localizer = FrameLocalizer(NodeConfig(solver=name, readout_time=_READOUT_TIME))
+        steps[f"solver {name}"] = localizer.warm_up_rest
     if not arguments.solver:
+        steps["with an IMU"] = FrameLocalizer(NodeConfig(readout_time=_READOUT_TIME)).warm_up_imu
         steps["calibrate, smooth"] = trajectory.warm_up
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "cache of kernels .* at the next start", RuntimeWarning)
         for name, compiles in steps.items():
             started = time.monotonic()
             try:
-                compiles()
+                with compiler.told(_tell):
+                    compiles()
             except RuntimeWarning as warning:
                 raise OSError(str(warning)) from warning
-            if name.startswith("solver "):
-                note_compiled(name.removeprefix("solver "))
             seconds[name] = time.monotonic() - started
-            print(f"{name:20} {seconds[name]:6.1f} s", flush=True)
-    places = f"{cache_directory()}"
-    if shipped.FOLDER.is_dir():
-        places = f"{shipped.FOLDER}, and what it has not for this CPU in {places}"
-    print(f"kernels are in {places}")
-    return {"seconds": seconds, "kernels": places}
+            print(f"{name:24} {seconds[name]:6.1f} s", flush=True)
+    print(f"kernels are in {cache_directory()}")
+    return {"seconds": seconds, "kernels": str(cache_directory())}
+
+
+def _tell(count: int, name: str) -> None:
+    if sys.stderr.isatty():
+        print(f"\r\033[Kcompiling {count}: {name}\r", end="", file=sys.stderr, flush=True)

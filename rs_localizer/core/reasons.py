@@ -39,6 +39,8 @@ class Reason(StrEnum):
     # Images that cannot be searched.
     BAD_IMAGE = "bad_image"
     NO_TIME = "no_time"
+    # What it takes is not compiled yet, at the first start on a machine.
+    COMPILING = "compiling"
     # Our own fault.
     INTERNAL_ERROR = "internal_error"
 
@@ -60,6 +62,7 @@ class ImuReason(StrEnum):
     DOUBTED = "imu_doubted"
     DISAGREES = "imu_disagrees"
     TURNED = "imu_turned"
+    COMPILING = "imu_compiling"
 
 
 class Notice(StrEnum):

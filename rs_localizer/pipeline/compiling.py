@@ -1,35 +1,47 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels are compiled in a process of their own: a node does not keep the compiler's memory."""
+"""What is compiled when: what a plain frame needs before it, the rest beside the frames.
+
+Whoever calls a kernel that is not in the cache waits for the process that compiles it
+(:mod:`rs_localizer.core.simd`); a node's frames do not wait but are refused. So this asks for
+kernels by calling them, in the order in which they are likely to be needed.
+"""
+
+from __future__ import annotations
 
 import ctypes
 import hashlib
+import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numba
+import numpy as np
 from numba.core.registry import cpu_target
 
-from rs_localizer.core.simd import shipped
-from rs_localizer.core.simd.jit import PARTS, cache_directory, digest
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.simd.jit import cache_directory, digest
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.localizer import Localizer
+from rs_localizer.tracking import Tracker
 
-_PACKAGE = Path(__file__).resolve().parents[1]
-# Until the end of its input says that the process that waits for it has ended. Collections of
-# garbage would look through all that the compiler keeps.
-_PROGRAM = """
-import gc, os, sys, threading, warnings
+# The same sources as here; the end of its input says that whoever waits for it has ended.
+_REST = """
+import os, sys, threading
 threading.Thread(target=lambda: os._exit(sys.stdin.read() == ""), daemon=True).start()
-gc.disable()
-warnings.filterwarnings("error", "cache of kernels .* at the next start", RuntimeWarning)
+os.nice(10)
 from rs_localizer.config import NodeConfig
-from rs_localizer.pipeline.compiling import note_compiled
 from rs_localizer.pipeline.frames import FrameLocalizer
-solver = sys.argv[1]
-FrameLocalizer(NodeConfig(solver=solver, readout_time=0.03)).warm_up()
-note_compiled(solver)
+FrameLocalizer(NodeConfig(solver=sys.argv[1], readout_time=0.03)).warm_up_rest()
 """
+_LAST = "trajectory"  # folder with kernels of frames: others come before it
+_READOUT_TIME, _PERIOD_NS = 0.03, 33_000_000
+_POINTS, _FRAMES = 60, 3  # beside fewer than min_inliers
+_TURN_RATE = 1.0  # rad/s: faster than rest, and slow enough for all points to be found
 
 # Mappings of LLVM's library: where, what may be done there, and kB that are no longer the file's.
 _MAPPING = re.compile(
@@ -39,34 +51,69 @@ _MAPPING = re.compile(
 _MADV_DONTNEED = 4  # Linux, <bits/mman-linux.h>
 
 
-def is_compiled(solver: str) -> bool:
-    """Whether all kernels of a solver's frames are on disk, by the note of who compiled them."""
-    return shipped.FOLDER.is_dir() or _note(solver).is_file()
+def plain_frames(localizer: Localizer, inertial: InertialSettings | None = None) -> None:
+    """Call what frames of a moving camera before a scene that is no plane need.
+
+    Args:
+        localizer: of the settings; its camera may be another.
+        inertial: of the IMU beside it; None: there is none.
+    """
+    camera = next(iter(localizer.rig.cameras.values()))
+    rng = np.random.default_rng(0)
+    count = max(_POINTS, localizer.config.min_inliers)
+    pixels = rng.uniform(0.2, 0.8, (count, 2)) * camera.size
+    rays = np.nan_to_num(camera.rays(pixels))
+    points = (2.0 + np.arange(count) % 3)[:, None] * np.column_stack([rays, np.ones(count)])
+    scores = np.arange(count, dtype=np.float64)
+    try:
+        tracker = Tracker(Localizer(_timed(camera), localizer.config), inertial)
+    except ValueError:  # a global shutter
+        Localizer(camera, localizer.config).localize(points, pixels, scores)
+        return
+    # Rolls by a frame's period, and by its rows.
+    centre, row_times = 0.5 * np.array(camera.size), camera.row_time(pixels) * _READOUT_TIME
+    for k in range(_FRAMES):
+        time_ns = (k + 1) * _PERIOD_NS
+        angle = _TURN_RATE * (1e-9 * time_ns + row_times)
+        x, y = (pixels - centre).T
+        turned = x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)
+        each = centre + np.column_stack(turned) + rng.normal(0.0, 0.3, pixels.shape)
+        times = time_ns + np.arange(-300, 30) * 2_000_000
+        rates = np.tile([0.0, 0.0, -_TURN_RATE], (len(times), 1))
+        samples = None if inertial is None else ImuSamples(times, rates)
+        tracker.localize(time_ns, points, each, scores, imu=samples)
 
 
-def note_compiled(solver: str) -> None:
-    """Note that all kernels of a solver's frames are on disk.
+def _timed(camera: Camera) -> Camera:
+    return camera if camera.readout_time > 0.0 else replace(camera, readout_time=_READOUT_TIME)
+
+
+def is_whole(solver: str) -> bool:
+    """Whether the rest of the kernels of a solver's frames has been compiled, by a note of it."""
+    return _note(solver).is_file()
+
+
+def note_whole(solver: str) -> None:
+    """Note beside the machine code that all kernels of a solver's frames are there.
 
     Raises:
-        OSError: when that cannot be written there.
+        OSError: when that cannot be written.
     """
     note = _note(solver)
-    if not shipped.FOLDER.is_dir() and note.parent.is_dir():
-        note.touch()
+    for path in (*reversed(note.parent.parents), note.parent):
+        path.mkdir(0o700, exist_ok=True)
+    note.touch()
 
 
-def compile_in_child(solver: str) -> None:
-    """Compile what frames by a solver need and is not on disk yet.
-
-    What fails there is compiled in this process, which then says why.
-    """
-    if is_compiled(solver):
-        return
-    program = [sys.executable, "-c", _PROGRAM, solver]
-    with subprocess.Popen(
-        program, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    ) as child:
-        child.wait()
+def compile_rest(solver: str) -> subprocess.Popen[bytes] | None:
+    """Compile the rest in a process beside this one, unless that has been done."""
+    if is_whole(solver):
+        return None
+    return subprocess.Popen(
+        [sys.executable, "-c", _REST, solver], stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
 
 
 def give_back_compiler() -> None:
@@ -92,4 +139,4 @@ def _note(solver: str) -> Path:
     target = cpu_target.target_context.codegen().magic_tuple()
     about = repr((solver, sys.version, numba.__version__, target))
     name = f"rs_localizer.{solver}-{hashlib.sha256(about.encode()).hexdigest()[:16]}"
-    return cache_directory() / digest(PARTS[-1], _PACKAGE) / name
+    return cache_directory() / digest(_LAST) / name

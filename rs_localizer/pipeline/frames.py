@@ -6,6 +6,7 @@ Both feed their messages to a :class:`FrameLocalizer` and publish what
 :func:`rs_localizer.io.outputs.messages` makes of the result, so that both say the same.
 """
 
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Notice, Reason
+from rs_localizer.core.simd.jit import NotCompiled
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.prior import Prior
@@ -35,6 +37,7 @@ from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms import Transforms, TransformTree
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher, MatchError
+from rs_localizer.pipeline.compiling import note_whole, plain_frames
 from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
 from rs_localizer.pipeline.imu import ImuInput, inertial_settings
 from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
@@ -223,6 +226,20 @@ _STILL = Estimate(
 )
 
 
+# Settings that change what is made of an estimate, or which points come to it, and not how it is
+# made. All others start the track afresh.
+_BESIDE = frozenset({
+    "readout_time_deviation", "estimate_readout_time", "pose_time", "max_points", "base_frame",
+    "odom_frame", "publish_tf", "tf_rate", "hold", "two_d_mode", "orientation_covariance",
+    "transform_tolerance", "map_file", "map_frame", "marker_map", "matching", "autostart",
+})  # fmt: skip
+
+
+def _of_estimates(config: NodeConfig) -> tuple[object, ...]:
+    config = replace(config, imu=replace(config.imu, wait=0.0))
+    return tuple(getattr(config, it.name) for it in fields(config) if it.name not in _BESIDE)
+
+
 class FrameLocalizer:
     """Localizes correspondences, or keypoints by a map, with the latest camera and settings.
 
@@ -265,8 +282,25 @@ class FrameLocalizer:
 
     @config.setter
     def config(self, config: NodeConfig) -> None:
+        self.change(config)
+
+    def change(self, config: NodeConfig) -> bool:
+        """Use these settings from the next frame on; whether they start the track afresh.
+
+        What no frame's estimate depends on, as of outputs and transforms, leaves track, IMU and
+        readout watch as they are.
+        """
+        if _of_estimates(config) == _of_estimates(self._settings):
+            # The readout that was adopted stays.
+            now = self.config
+            self._config = replace(
+                config, readout_time=now.readout_time, scan_direction=now.scan_direction
+            )
+            self._settings = config
+            return False
         self._use(self._calibration or ANY_CALIBRATION, config)
         self._settings = config
+        return True
 
     def _use(self, calibration: Calibration, config: NodeConfig) -> None:
         # Nothing changes if this raises: camera, tracker and settings always belong together.
@@ -318,14 +352,28 @@ class FrameLocalizer:
         self._tracker.reset()
 
     def warm_up(self) -> None:
-        """Compile all that the present settings need, from points to messages."""
-        self._tracker.localizer.warm_up()
+        """Have compiled, or load, what a plain frame needs, from points to messages."""
+        plain_frames(self._tracker.localizer)
         so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
         twist_at(_STILL, 0.5, 1.0)
+
+    def warm_up_rest(self) -> None:
+        """The same of what any frame may need but for an IMU's; notes that it is there.
+
+        Raises:
+            OSError: when it could not be kept.
+        """
+        self.warm_up()
+        self._tracker.localizer.warm_up()
         so3.log(np.eye(3))
         so3.exp_many(np.zeros((1, 3)))  # of the watch over the readout time
-        matching.warm_up()
         online_readout.warm_up(self._camera)
+        matching.warm_up()
+        note_whole(self._config.solver)
+
+    def warm_up_imu(self) -> None:
+        """The same of what plain frames beside an IMU need."""
+        plain_frames(self._tracker.localizer, inertial_settings(self._config))
 
     def calibrate(self, calibration: Calibration) -> None:
         """Use this calibration from the next frame on.
@@ -451,7 +499,11 @@ class FrameLocalizer:
         self._expect(time_ns, cloud.frame)
         matches = (cloud.points, cloud.pixels, cloud.scores)
         result = self.imu.track(tracker, config, time_ns, frame, self.transforms, matches)
-        adopted = watch.add(Watched(time_ns, cloud, result, config, camera))
+        try:
+            adopted = watch.add(Watched(time_ns, cloud, result, config, camera))
+        except NotCompiled:  # what it takes comes, and the next frames tell it more
+            watch.reset()
+            adopted = config
         wrong_axis = watch.wrong_axis
         if adopted is not config:
             self._use(self._calibration, adopted)

@@ -19,6 +19,7 @@ from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.reasons import ImuReason
+from rs_localizer.core.simd.jit import NotCompiled
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.inertial.buffer import LONGEST_PERIOD_NS, Lack, Lacking, ReadingBuffer, Readings
 from rs_localizer.inertial.samples import ImuSamples
@@ -26,6 +27,7 @@ from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.watch import Alone, InertialStatus
 from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.transforms import TransformError, Transforms
+from rs_localizer.pipeline.compiling import plain_frames
 from rs_localizer.pipeline.refusal import IMU_REASONS, Notify
 from rs_localizer.tracking import Tracker
 
@@ -116,6 +118,7 @@ class ImuInput:
         self._reported: ImuReason | None = None
         self._status: InertialStatus | None = None
         self._given_offset = 0.0
+        self._prepared = False
 
     def add(self, reading: ImuReading) -> None:
         """Take a reading."""
@@ -190,10 +193,21 @@ class ImuInput:
             result = tracker.localize(time_ns, *matches)
             self._count(config, tracker, samples)
         else:
+            try:
+                self._prepare(tracker, config)
+            except NotCompiled:
+                self._count(config, tracker, Unused(ImuReason.COMPILING))
+                return tracker.localize(time_ns, *matches)
             result = tracker.localize(time_ns, *matches, imu=samples)
             self._count(config, tracker, _why(tracker.inertial))
             self._compare_gravity(config, samples, result)
         return result
+
+    def _prepare(self, tracker: Tracker, config: NodeConfig) -> None:
+        """Have compiled what an IMU takes, when its first readings are there."""
+        if not self._prepared:
+            plain_frames(tracker.localizer, inertial_settings(config))
+            self._prepared = True
 
     def _compare_gravity(
         self, config: NodeConfig, samples: ImuSamples, result: Estimate | Failure

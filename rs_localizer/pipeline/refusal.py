@@ -165,6 +165,10 @@ REASONS: dict[str, Meaning] = {
         "a newer frame came before it; from half a second on, the previous frames are forgotten",
         "nothing, if it is rare; otherwise, do two senders use this topic?",
     ),
+    Reason.COMPILING: Meaning(
+        "what this frame takes is being compiled, at the first start on a machine",
+        "it ends within minutes; `rs_localizer warm` beforehand",
+    ),
     Reason.NO_TRANSFORM: Meaning(
         "TF has no transform from the camera to base_frame",
         "record /tf and /tf_static, too; a robot_state_publisher has to run",
@@ -219,6 +223,10 @@ IMU_REASONS: dict[str, Meaning] = {
     ImuReason.TURNED: Meaning(
         "the gyroscope's axes disagree with TF",
         "the transform between the two frame_ids; the angle is in the diagnostics",
+    ),
+    ImuReason.COMPILING: Meaning(
+        "what an IMU takes is being compiled, at the first start on a machine",
+        "it ends within minutes; `rs_localizer warm` beforehand",
     ),
 }
 """Why an image was localized by the camera alone."""

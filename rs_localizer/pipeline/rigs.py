@@ -35,6 +35,7 @@ from rs_localizer.io.outputs import CameraShare, Localized
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS
 from rs_localizer.io.transforms import Transform, TransformError, Transforms
 from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline.compiling import plain_frames
 from rs_localizer.pipeline.frames import ANY_CALIBRATION, FrameLocalizer, oddities
 from rs_localizer.pipeline.inputs import INPUTS, Input
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
@@ -156,7 +157,7 @@ class RigLocalizer(FrameLocalizer):
         super().reset()
 
     def warm_up(self) -> None:
-        self._tracker.localizer.warm_up()
+        plain_frames(self._tracker.localizer)
         so3.quaternion(np.eye(3))
         matching.warm_up()
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from recorded import add_telemetry, write_mp4
 
+from benchmarks.room_mapping import Piece, Room
 from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
@@ -20,7 +21,6 @@ from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.offline.table import read_parquet
 from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.tools.mapping.gauge import through
-from rs_localizer.tools.room_mapping import Piece, Room
 
 pytest.importorskip("pycolmap")
 pytest.importorskip("pyarrow", reason="needs pyarrow", exc_type=ImportError)

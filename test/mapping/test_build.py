@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.experiments.mapped_room import Errors, localized
+from benchmarks.room_mapping import Piece, Room, without_refinement
 from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.core.arrays import Array
@@ -31,7 +32,6 @@ from rs_localizer.tools.mapping.colmap import SPARSE, Effort
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.report import written
 from rs_localizer.tools.mapping.views import View
-from rs_localizer.tools.room_mapping import Piece, Room, without_refinement
 
 pytest.importorskip("pycolmap")
 

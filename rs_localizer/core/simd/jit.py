@@ -1,24 +1,28 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How kernels of this package are compiled and where the machine code is kept."""
+"""How kernels of this package are compiled and where the machine code is kept.
+
+Numba's own cache, in one folder for each state of the sources. A kernel that is not there is
+compiled by a process of its own (:mod:`rs_localizer.core.simd.compiler`) and loaded from there:
+whoever compiled and whoever comes later run the same bits, and nobody keeps the memory of a
+compiler. Who must not wait (:func:`at_once`) gets :class:`NotCompiled` meanwhile.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import gc
 import hashlib
 import importlib
 import importlib.util
 import os
 import pickle
-import re
-import shutil
 import stat
+import threading
 import time
 import warnings
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeVar, cast
 
@@ -26,7 +30,8 @@ import llvmlite.binding
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
-from rs_localizer.core.simd import shipped
+from rs_localizer.core.simd import compiler
+from rs_localizer.core.simd.compiler import Request
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -34,14 +39,17 @@ if importlib.util.find_spec("scipy") is None:  # Numba would say so in the first
     raise ModuleNotFoundError("No module named 'scipy', which compiled kernels need", name="scipy")
 
 PARTS = (
-    *("core", "solvers", "estimation", "inertial", "matching", "markers", "trajectory", "mapping"),
-    "simulation",
+    *("core", "solvers", "estimation", "inertial", "matching", "markers", "trajectory"),
+    *("simulation", "tools"),
 )
 """Folders of the package with kernels; a kernel calls those of its own and of earlier ones."""
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 # What reading a file that was cut off, overwritten or written by another program may raise.
-_DAMAGE = (EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError)
+_DAMAGE = (
+    *(EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError),
+    pickle.UnpicklingError,
+)
 _CHECKSUM_BYTES = 4
 # A kernel whose object file is larger than this (bytes) is called where it is. Copied into its
 # callers, as Numba does with all, it would be optimized and translated once more for each.
@@ -49,11 +57,44 @@ _CHECKSUM_BYTES = 4
 _LARGE = 8192
 # A module without a function.
 _NOTHING = llvmlite.binding.parse_assembly("").as_bitcode()
-_said: set[str] = set()
 _DAY = 86400.0
-# Kernels of other versions, in other environments, may be at work beside this one.
-_KEPT = 30.0 * _DAY
-_OURS = re.compile(r"[0-9a-f]{16}")
+_OTHERS = stat.S_IWGRP | stat.S_IWOTH
+_said: set[str] = set()
+
+
+class NotCompiled(Exception):
+    """A kernel is being compiled, and who called it must not wait."""
+
+
+class _Missing(Exception):
+    """A kernel is not in the cache."""
+
+
+class _Thread(threading.local):
+    waits = True  # for kernels that are not there
+    asks = False  # whether the cache has a kernel
+    compiles = False  # what it needs, by itself
+
+
+_thread = _Thread()
+
+
+@contextlib.contextmanager
+def at_once() -> Iterator[None]:
+    """Within ``with``, this thread waits for no compiler; kernels that lack are ordered.
+
+    What calls one that is not there raises :class:`NotCompiled`.
+    """
+    before, _thread.waits = _thread.waits, False
+    try:
+        yield
+    finally:
+        _thread.waits = before
+
+
+def compile_here() -> None:
+    """From now on compile in this thread what is not in the cache."""
+    _thread.compiles = True
 
 
 def cache_directory() -> Path:
@@ -68,31 +109,7 @@ def cache_directory() -> Path:
     return Path(chosen) if config.CACHE_DIR else Path(chosen) / "rs_localizer"
 
 
-@functools.cache
-def open_to_others(folder: Path) -> Path | None:
-    """The first of a folder and those above it into which other users can put files.
-
-    What is kept there runs in this process; a folder that is not there yet is made for its user.
-    """
-    users, hidden = {0, os.geteuid()}, False
-    folder = folder.resolve()
-    for path in (*reversed(folder.parents), folder):
-        try:
-            about = path.stat()
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-        except OSError:
-            return path
-        # In /tmp (sticky), nobody can replace what is another's.
-        sticky = path != folder and about.st_mode & stat.S_ISVTX
-        shared = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not sticky and not hidden
-        if about.st_uid not in users or shared:
-            return path
-        hidden |= not about.st_mode & (stat.S_IXGRP | stat.S_IXOTH)
-    return None
-
-
-def digest(part: str, package: Path) -> str:
+def digest(part: str, package: Path = _PACKAGE) -> str:
     """Of all sources that may be compiled into a kernel of this part.
 
     Numba notices a change of the file that holds a kernel, not of what the kernel calls in other
@@ -146,28 +163,36 @@ def _compiled(function: F, inline: str) -> F:
         tuple(map(numba.types.unliteral, positional)),
         {name: numba.types.unliteral(kind) for name, kind in named.items()},
     )
-    compiled.compile = _uncollected(compiled.compile)
     if Path(function.__code__.co_filename).is_file():  # not what was typed at a prompt
         compiled._cache = _Cache(function)
+        if function.__module__.startswith(f"{_PACKAGE.name}.") and is_global(function):
+            compiled.compile = functools.partial(_obtained, compiled, compiled.compile)
     return cast(F, compiled)
 
 
-def _uncollected(compiler: Callable[..., Any]) -> Callable[..., Any]:
-    """The same without collections of garbage, which look through all of what compilers keep.
+def is_global(function: Any) -> bool:
+    """Whether it can be looked up in its module; one that is made within a function cannot."""
+    return "<locals>" not in function.__qualname__
 
-    They took 13 s of 94 for the kernels of the default solver.
-    """
 
-    def compiled(signature: Any) -> Any:
-        collects = gc.isenabled()
-        gc.disable()
-        try:
-            return compiler(signature)
-        finally:
-            if collects:
-                gc.enable()
-
-    return compiled
+def _obtained(compiled: Any, compile_or_load: Callable[..., Any], signature: Any) -> Any:
+    """The entry point of a kernel: from the cache, where a process of its own compiles to."""
+    if _thread.compiles:
+        return compile_or_load(signature)
+    before, _thread.asks = _thread.asks, True
+    try:
+        return compile_or_load(signature)
+    except _Missing:
+        pass
+    finally:
+        _thread.asks = before
+    request = Request(compiled.__module__, compiled.__qualname__, tuple(signature))
+    # Not within Numba's lock, which other threads need to load what they have.
+    if not _thread.waits:
+        compiler.order(request)
+        raise NotCompiled(compiled.__qualname__)
+    compiler.obtain(request)
+    return compile_or_load(signature)  # or compiled here: which says what is wrong
 
 
 class _Locator:
@@ -180,8 +205,7 @@ class _Locator:
         names = function.__module__.split(".")
         part = names[1] if names[0] == _PACKAGE.name and len(names) > 1 else ""
         self._py_file = file  # Numba's name, for its warnings
-        self.folder = Path(_digest(part, _PACKAGE), function.__module__)
-        self._directory = cache_directory() / self.folder
+        self._directory = cache_directory() / _digest(part, _PACKAGE) / function.__module__
         self._line = function.__code__.co_firstlineno
 
     @classmethod
@@ -189,10 +213,8 @@ class _Locator:
         return cls(function, file)
 
     def ensure_cache_path(self) -> None:
-        folder = self._directory
-        for path in (*reversed(folder.relative_to(cache_directory().parent).parents), folder):
-            (cache_directory().parent / path).mkdir(0o700, parents=True, exist_ok=True)
-        _remove_others(folder.parent)
+        for path in (*reversed(self._directory.parents), self._directory):
+            path.mkdir(0o700, exist_ok=True)
 
     def get_cache_path(self) -> str:
         return str(self._directory)
@@ -285,12 +307,6 @@ class _File(IndexDataCacheFile):
             raise ValueError("the checksum is wrong")
         return pickle.loads(code)
 
-    def remove(self) -> None:
-        """Remove the function's files, as far as that is allowed."""
-        start = self._index_name.removesuffix("nbi")
-        for path in Path(self._cache_path).glob(f"{start}*"):
-            path.unlink(missing_ok=True)
-
 
 class _Cache(FunctionCache):
     """The machine code of a function on disk; whatever is wrong there, the function is compiled."""
@@ -299,60 +315,37 @@ class _Cache(FunctionCache):
 
     def __init__(self, function: Any) -> None:
         super().__init__(function)
-        locator = self._impl.locator
-        # One that is made within a function cannot be looked up where its callers are loaded.
-        self._is_global = "<locals>" not in function.__qualname__
-        name, stamp = self._impl.filename_base, locator.get_source_stamp()
-        self._cache_file: _File = _File(self._cache_path, name, stamp)
-        self._shipped = _File(str(shipped.FOLDER / locator.folder), name, stamp)
+        self._is_global = is_global(function)
+        stamp = self._impl.locator.get_source_stamp()
+        self._cache_file: _File = _File(self._cache_path, self._impl.filename_base, stamp)
+
+    def holds(self, signature: Any, target: Any) -> bool:
+        """Whether a signature is there, by its files."""
+        with contextlib.suppress(*_DAMAGE, OSError):
+            target.refresh()
+            return self._cache_file.load(self._index_key(signature, target.codegen())) is not None
+        return False
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """What came with the package, so that a machine's users get the same bits, else theirs."""
-        overload = self._load_shipped(signature, target)
-        return self._load_own(signature, target) if overload is None else overload
-
-    def _load_own(self, signature: Any, target: Any) -> Any:
-        if not self._is_own():
-            return None
+        overload = None
         try:
-            overload = super().load_overload(signature, target)
-            if overload is not None:
-                _mark(Path(self._cache_path).parent)
-            return overload
-        except (*_DAMAGE, pickle.UnpicklingError) as error:
+            if _is_ours(Path(self._cache_path)):
+                overload = super().load_overload(signature, target)
+        except _DAMAGE as error:
             if not isinstance(error, _AnotherCallee):
-                _say(f"damaged files are compiled anew ({self._cache_file._index_path}: {error!r})")
+                _say(f"damaged files are compiled anew ({self._cache_path}: {error!r})")
             with contextlib.suppress(OSError):  # saving says what is wrong with the folder
-                self._cache_file.remove()
+                self.flush()
         except OSError:
             pass
-        return None
-
-    def _load_shipped(self, signature: Any, target: Any) -> Any:
-        if not shipped.FOLDER.is_dir():
-            return None
-        target.refresh()  # or the code would call a runtime that is not there yet
-        try:
-            for key in shipped.keys(self._index_key(signature, target.codegen())):
-                machine_code = self._shipped.load(key)
-                if machine_code is not None:
-                    return self._impl.rebuild(target, machine_code)
-        except (*_DAMAGE, pickle.UnpicklingError, OSError) as error:
-            _say(f"what came with the package is damaged ({shipped.FOLDER}: {error!r})")
-        return None
-
-    def _is_own(self) -> bool:
-        intruded = open_to_others(Path(self._cache_path))
-        if intruded is not None:
-            _say(
-                f"not used, since other users can write to {intruded}: chmod -R go-w, or remove it"
-            )
-        return intruded is None
+        if overload is None and _thread.asks:
+            raise _Missing
+        return overload
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         if self._is_global and len(compiled.library._get_compiled_object()) > _LARGE:
             _call_where_it_is(compiled)
-        if not self._is_own():
+        if not _is_ours(Path(self._cache_path)):
             return
         try:
             super().save_overload(signature, compiled)
@@ -361,35 +354,24 @@ class _Cache(FunctionCache):
 
 
 @functools.cache
-def _mark(folder: Path) -> None:
-    """Note that a folder is in use: by its time of change, once a day."""
-    with contextlib.suppress(OSError):  # which is not ours to write
-        if time.time() - folder.stat().st_mtime > _DAY:
-            os.utime(folder)
+def _is_ours(folder: Path) -> bool:
+    """Whether nobody else puts files into a folder: what is there runs in this process.
 
-
-@functools.cache
-def _remove_others(used: Path) -> None:
-    """Remove the neighbours of a folder that have not been marked for a month.
-
-    A process that still had one open compiles again what it has not loaded.
+    Marks the one above as used, once a day: :func:`compiler.serve` removes what nobody used.
     """
-    oldest = time.time() - _KEPT
-    with contextlib.suppress(OSError):
-        for folder in used.parent.iterdir():
-            if folder != used and _holds_kernels(folder) and folder.stat().st_mtime < oldest:
-                shutil.rmtree(folder, ignore_errors=True)
-
-
-def _holds_kernels(folder: Path) -> bool:
-    """Whether there are kernels of this package, and nothing else.
-
-    ``NUMBA_CACHE_DIR`` is everybody's, and an empty folder may be anybody's.
-    """
-    if not _OURS.fullmatch(folder.name) or not folder.is_dir():
-        return False
-    names = [item.name for item in folder.iterdir()]
-    return bool(names) and all(name.startswith("rs_localizer.") for name in names)
+    with contextlib.suppress(OSError):  # what is not there yet will be made for this user
+        for path in (folder, *folder.parents):
+            about = path.stat()
+            # In /tmp (sticky), nobody can replace what is another's.
+            sticky = path != folder and about.st_mode & stat.S_ISVTX
+            if about.st_uid not in {0, os.geteuid()} or (about.st_mode & _OTHERS and not sticky):
+                _say(
+                    f"not used, since other users can write to {path}: chmod -R go-w, or remove it"
+                )
+                return False
+        if time.time() - folder.parent.stat().st_mtime > _DAY:
+            os.utime(folder.parent)
+    return True
 
 
 def _say(text: str) -> None:

@@ -18,7 +18,7 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
 from rs_localizer.io.topics import GIVEN_POSES
-from rs_localizer.pipeline.compiling import compile_in_child, give_back_compiler, is_compiled
+from rs_localizer.pipeline.compiling import compile_rest, give_back_compiler
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.given_pose import read_given_pose
 from rs_localizer.pipeline.inputs import Input, Results, Role
@@ -40,13 +40,11 @@ from rs_localizer.ros.node.inputs import FAST_DATA, LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import WINDOW
-from rs_localizer.ros.node.worker import Need, Worker
+from rs_localizer.ros.node.worker import Need, Worker, in_thread
 from rs_localizer.settings import NODE_NAME
 
 # In a serialized message, which begins with four bytes of CDR and the stamp of its header.
 _AFTER_STAMP = 12
-# A change of settings that takes longer (s) has compiled kernels, and says so.
-_LONG_CHANGE = 0.5
 
 
 class Feed:
@@ -75,7 +73,7 @@ class Feed:
         self._needs_tf: Callable[[], None] | None = needs_tf
         # The last that was handed on of what is repeated, and what it says; by topic.
         self._repeated: dict[str, tuple[bytes, Any]] = {}
-        self.changing = False  # whether the worker compiles kernels for new settings
+        self._wanted: NodeConfig | None = None  # settings whose kernels are being loaded
 
     def topics(self, config: NodeConfig) -> dict[str, Topic]:
         """The inputs of these settings; what changes the state comes before the frames."""
@@ -96,9 +94,26 @@ class Feed:
             }
         return found
 
+    @property
+    def changing(self) -> bool:
+        """Whether kernels of new settings are being loaded or compiled."""
+        return self._wanted is not None
+
     def take_config(self, config: NodeConfig) -> None:
-        """Use these settings from the next frame on."""
-        self._worker.update("settings", lambda frames: self._change(frames, config))
+        """Use these settings as soon as their kernels are there; frames have the old ones before.
+
+        Of several changes that wait the last one counts.
+        """
+        waits, self._wanted = self.changing, config
+        if not waits:
+            in_thread(self._prepare)
+
+    def _prepare(self) -> None:
+        while (config := self._wanted) is not None:
+            load_kernels(frame_localizer(config))
+            if self._wanted is config:
+                self._wanted = None
+                self._worker.update("settings", lambda frames: self._change(frames, config))
 
     def reset(self) -> None:
         """Forget the previous frames."""
@@ -189,14 +204,8 @@ class Feed:
             self._say(described(frames.map))
 
     def _change(self, frames: FrameLocalizer, config: NodeConfig) -> None:
-        self.changing = True
-        try:
-            frames.config = config
-            seconds = warm_up(frames)
-        finally:
-            self.changing = False
-        if seconds > _LONG_CHANGE:
-            self._say(f"kernels for the new settings are ready after {seconds:.1f} s")
+        if frames.change(config):
+            self._say("new settings: the previous frames are forgotten")
 
 
 def _lacks_samples(frames: FrameLocalizer, message: Any) -> bool:
@@ -208,10 +217,9 @@ def described(landmarks: Map) -> str:
     return f"the map has {len(landmarks)} landmarks in frame {landmarks.frame!r}"
 
 
-def warm_up(frames: FrameLocalizer) -> float:
-    """Compile all kernels that the settings need; how many seconds it took."""
+def load_kernels(frames: FrameLocalizer) -> float:
+    """Load what a plain frame needs, compiled where it has to be; how many seconds it took."""
     started = time.monotonic()
-    compile_in_child(frames.config.solver)
     frames.warm_up()
     give_back_compiler()
     return time.monotonic() - started
@@ -267,20 +275,14 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
 
     def kernels(self) -> Callable[[], None]:
         frames = frame_localizer(self.config)
-        log = self.get_logger()
-        self.compiles = not is_compiled(self.config.solver)
-        log.info(
-            "compiling kernels (once on this machine, up to a minute)"
-            if self.compiles
-            else "loading kernels"
-        )
 
-        def compiles() -> None:
+        def load() -> None:
             with contextlib.suppress(ValueError):  # of which on_configure tells, at once
                 frames.load_map()
-                log.info(f"kernels are ready after {warm_up(frames):.1f} s")
+                seconds = load_kernels(frames)
+                self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
 
-        return compiles
+        return load
 
     def check(self, config: NodeConfig) -> None:
         frame_localizer(config)
@@ -291,7 +293,6 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         frames.load_map()
         if frames.map is not None:
             self.get_logger().info(described(frames.map))
-        frames.warm_up()  # what has been set since they were compiled
         self._undo.callback(self._broadcaster.close)
         self._broadcaster.configure(config)
         outputs = Outputs(self)
@@ -303,6 +304,12 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
             for each in publish:
                 each(frame)
 
+        rest = compile_rest(config.solver)
+        if rest is not None:
+            self.get_logger().info(
+                "compiling what few frames need, beside them; they are refused meanwhile: compiling"
+            )
+            self._undo.callback(rest.kill)
         self._localizer = frames
         worker = self.employ(frames, publish_all)
         say, needs_tf = self.get_logger().info, self._imu_came.trigger

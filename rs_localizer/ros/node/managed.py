@@ -24,6 +24,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
+from rs_localizer.core.simd import compiler
 from rs_localizer.process.stopping import StopRequest
 from rs_localizer.ros.node import parameters
 from rs_localizer.ros.node.health import Diagnostics, Health
@@ -44,6 +45,8 @@ def _failure(function: Callable[[], None]) -> str:
     return ""
 
 
+# Kernels between two lines of the log that say how far the compiler is.
+_TOLD = 10
 Result = TypeVar("Result")
 Kept = TypeVar("Kept")
 
@@ -54,8 +57,8 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
     A node says what it does by overriding :meth:`kernels`, :meth:`check`, :meth:`open`,
     :meth:`close`, :meth:`begin`, :meth:`end`, :meth:`change` and :meth:`examine`.
 
-    Before it is configured, a thread compiles what it needs (see :meth:`prepare`), which takes up
-    to a minute at the first start on a machine; services and diagnostics answer meanwhile.
+    Before it is configured, a thread loads what it needs (see :meth:`prepare`), which is compiled
+    at the first start on a machine; services and diagnostics answer meanwhile.
 
     Args:
         name: of the node.
@@ -80,7 +83,7 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
     ) -> None:
         super().__init__(name, **options)
         self._prepared: Future | None = None
-        self.compiles = True  # what it prepares; otherwise it loads what has been compiled
+        self.compiled = 0  # kernels that were not in the cache
         # A request to configure waits; others shall not wait for it.
         group = ReentrantCallbackGroup()
         for service in self.services:
@@ -111,7 +114,7 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
     # -- what a node does --------------------------------------------------------------------
 
     def kernels(self) -> Callable[[], None]:
-        """What compiles the kernels of the present settings, to be called in another thread."""
+        """What calls the kernels of the present settings, to be called in another thread."""
         raise NotImplementedError
 
     def check(self, config: Config) -> None:
@@ -188,16 +191,28 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
         """Label of the present state; ``compiling`` or ``loading`` while kernels are prepared."""
         label: str = self._state_machine.current_state[1]
         if self._prepared is not None and not self._prepared.done() and label == "unconfigured":
-            return "compiling" if self.compiles else "loading"
+            return "compiling" if self.compiled else "loading"
         return label
 
     def prepare(self) -> Future:
-        """Compile in a thread; the result is what failed, or empty."""
+        """Load kernels in a thread, and compile those that lack; the result is what failed."""
         if self._prepared is None or self._prepared.done():
             self._prepared = prepared = Future()
-            compiles = self.kernels()
-            in_thread(lambda: prepared.set_result(_failure(compiles)))
+            load = self.kernels()
+            self.get_logger().info("loading kernels")
+            in_thread(lambda: prepared.set_result(_failure(functools.partial(self._load, load))))
         return self._prepared
+
+    def _load(self, load: Callable[[], None]) -> None:
+        with compiler.told(self._compiling):
+            load()
+
+    def _compiling(self, count: int, _: str) -> None:
+        if self.compiled == 0:
+            self.get_logger().info("compiling kernels (once on this machine, a minute of a core)")
+        elif count % _TOLD == 0:
+            self.get_logger().info(f"compiling kernels: {count} so far")
+        self.compiled = count
 
     def configure(self, failure: str) -> bool:
         """Configure after :meth:`prepare`, if nobody else has; whether that worked."""

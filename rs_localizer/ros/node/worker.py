@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.simd.jit import NotCompiled, at_once
 from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node.refusals import describe
 from rs_localizer.ros.node.statistics import Statistics
@@ -225,9 +226,12 @@ class Worker(Generic[State, Result]):
             self._finish(item.arrival, result)
 
     def _attempt(self, function: Callable[[], Any]) -> Any:
-        """What it returns; if it fails, a refusal."""
+        """What it returns; if it fails, or waits for a compiler, a refusal."""
         try:
-            return function()
+            with at_once():
+                return function()
+        except NotCompiled as missing:
+            return Refusal(Reason.COMPILING, f"{missing} is being compiled")
         except Exception as error:  # of one message: the others go on
             return Refusal(Reason.INTERNAL_ERROR, describe(error))
 

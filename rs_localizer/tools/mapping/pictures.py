@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of a map that was built: landmarks and cameras, residuals before and after."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.evaluation.plots import BLUE, ORANGE
-from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.tools.mapping.build import Built
 
 _DPI = 110
@@ -86,43 +84,3 @@ def _global_errors(built: Built) -> Array:
     local = np.einsum("nji,nj->ni", structure.rotations[at], offset)
     errors: Array = np.linalg.norm(structure.camera.project(local) - structure.pixels, axis=1)
     return errors[np.isfinite(errors)]
-
-
-def localized_picture(
-    landmarks: Array, truth: Trajectory, estimates: Mapping[str, Trajectory]
-) -> Figure:
-    """From above: landmarks (n,3), the path of the camera and what several methods say of it.
-
-    The first method is drawn above the others.
-    """
-    figure = Figure(figsize=(10.0, 5.2), dpi=_DPI, layout=ConstrainedLayoutEngine(h_pad=_RIM))
-    for axes, near in zip(figure.subplots(1, 2), (False, True), strict=True):
-        axes.plot(
-            truth.positions[:, 0], truth.positions[:, 1], color="#c9c9c9", linewidth=5.0,
-            label="truth",
-        )  # fmt: skip
-        styles = (("x", ORANGE), (".", BLUE))[-len(estimates) :]
-        for (name, estimate), (marker, color) in zip(
-            reversed(list(estimates.items())), styles, strict=True
-        ):
-            axes.plot(
-                estimate.positions[:, 0], estimate.positions[:, 1], marker, markersize=4.0,
-                color=color, label=name,
-            )  # fmt: skip
-        shown = truth.positions if near else np.vstack([landmarks, truth.positions])
-        low, high = np.percentile(
-            shown, [0.0 if near else _RARE, 100.0 - _RARE * (not near)], axis=0
-        )
-        if not near:
-            axes.scatter(
-                *landmarks[:, :2].T, s=2.0, color="#8a8a8a", linewidths=0, label="landmarks"
-            )
-        half, middle = 0.55 * float(np.max((high - low)[:2])), 0.5 * (low + high)
-        axes.set(
-            xlabel="x (m)", ylabel="y (m)", aspect="equal",
-            xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half),
-        )  # fmt: skip
-        axes.set_title("its path" if near else "the room from above")
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=4)
-    return figure

@@ -8,15 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.core.simd import jit
+from rs_localizer.core.simd import compiler, jit
 
 DAY = 86400.0
 
 
 @pytest.fixture
 def cache(tmp_path) -> Path:
-    jit._mark.cache_clear()
-    jit._remove_others.cache_clear()
+    jit._is_ours.cache_clear()
     return tmp_path
 
 
@@ -30,7 +29,6 @@ def folder(cache: Path, name: str, days: float, inside: str = "rs_localizer.core
 
 
 def test_what_nobody_used_for_a_month_is_removed(cache):
-    used = folder(cache, "0" * 16, 100)
     old = folder(cache, "0123456789abcdef", 31)
     staying = [
         folder(cache, "1" * 16, 29),  # another version, still in use
@@ -42,14 +40,14 @@ def test_what_nobody_used_for_a_month_is_removed(cache):
     empty.mkdir()
     os.utime(empty, times=(time.time() - 100 * DAY,) * 2)
     staying.append(empty)
-    jit._remove_others(used)
+    compiler._remove_old(cache)
     assert not old.exists()
-    assert all(path.is_dir() for path in [used, *staying])
+    assert all(path.is_dir() for path in staying)
     assert (cache / "3333333333333333").is_file()
 
 
 def test_use_keeps_a_folder(cache):
-    used, old = folder(cache, "0" * 16, 0), folder(cache, "1" * 16, 31)
-    jit._mark(old)
-    jit._remove_others(used)
-    assert old.is_dir()
+    used = folder(cache, "1" * 16, 31)
+    assert jit._is_ours(used / "rs_localizer.core.so3")
+    compiler._remove_old(cache)
+    assert used.is_dir()

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo as a user starts it, with a few frames; and what Ctrl-C leaves of it."""
+"""The demo as a user starts it, with a few frames; and what Ctrl-C and a node's death leave."""
 
 import os
 import re
@@ -12,6 +12,8 @@ import time
 import cv2
 import PIL.Image
 import pytest
+
+from rs_localizer.ros.graph import live
 
 DEMO = [sys.executable, "-m", "rs_localizer", "demo", "--quick"]
 PICTURES = (
@@ -36,7 +38,7 @@ def test_quick_demo(tmp_path):
     assert figures(demo.stdout, "frames") == [[12.0, 12.0], [12.0, 12.0], [22.0, 22.0]]
     # Global shutter may miss a frame or two; rolling shutter must not.
     assert [counts[0] for counts in figures(demo.stdout, "localized")] == [12.0, 12.0, 22.0]
-    (webcam, flight, cube) = figures(demo.stdout, "residual of the inliers")
+    flight, webcam, cube = figures(demo.stdout, "residual of the inliers")
     assert webcam[0] < webcam[1] < 0.2
     assert flight[0] < 2.0
     assert cube[0] < 0.5
@@ -51,6 +53,13 @@ def test_quick_demo(tmp_path):
     for name in PICTURES:
         assert cv2.imread(str(tmp_path / "out" / name)).std() > 5.0
     assert {file.name for file in (tmp_path / "out").iterdir()} == {*PICTURES, "cube.gif"}
+    # Offline first, the node last: it says the same, bit for bit.
+    assert demo.stdout.index("flight_inliers.png") < demo.stdout.index("Starting a live node")
+    assert "has answered 12 of 12 frames, 12 as above to the last bit" in demo.stdout
+    # What it takes is said before, and what to do with an own camera at the end.
+    first, *_, last = demo.stdout.strip().splitlines()
+    assert re.match(r"about \d+ min at the first time .* of memory, .* of disk", first)
+    assert "localizer --ros-args" in last
 
 
 def children(pid: int) -> list[int]:
@@ -63,10 +72,12 @@ def test_a_signal_leaves_no_process_behind(tmp_path):
         demo = subprocess.Popen(
             [*DEMO, "--out", str(tmp_path / "out")], stdout=log, stderr=log, start_new_session=True
         )
-    deadline = time.monotonic() + 60.0
-    while len(nodes := children(demo.pid)) < 2:
+    deadline = time.monotonic() + 240.0
+    while "Starting a live node" not in (tmp_path / "log").read_text():
         assert demo.poll() is None, (tmp_path / "log").read_text()
         assert time.monotonic() < deadline
+        time.sleep(0.02)
+    while not (nodes := children(demo.pid)):
         time.sleep(0.02)
     demo.send_signal(signal.SIGINT)
     assert demo.wait(30.0) == 130
@@ -74,3 +85,22 @@ def test_a_signal_leaves_no_process_behind(tmp_path):
     for node in nodes:
         with pytest.raises(ProcessLookupError):
             os.kill(node, 0)
+
+
+def test_a_node_that_dies_is_told_with_its_last_words(tmp_path):
+    settings = {"solver": "r6p_vcwt", "readout_time": -1.0}
+    with (
+        pytest.raises(live.LiveError, match=r"(?s)ended with 1; the last lines .*readout_time"),
+        live.LiveNode(settings, tmp_path / "log", 0) as node,
+    ):
+        node.wait(lambda line: None)
+
+
+def test_a_node_that_falls_silent_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "_SILENCE", 0.5)
+    monkeypatch.setattr(live, "_NODE", "import time; time.sleep(60)")
+    with (
+        pytest.raises(live.LiveError, match=r"(?s)has said nothing for 1 s; .*\n  nothing$"),
+        live.LiveNode({}, tmp_path / "log", 0) as node,
+    ):
+        node.wait(lambda line: None)

@@ -1,0 +1,249 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The process that compiles kernels into the cache, and what asks it to.
+
+It works in a fork that is replaced when it has grown: a compiler keeps what it has made. A lock in
+the cache lets one process at a time compile, so that no kernel is compiled twice.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import ctypes
+import fcntl
+import functools
+import gc
+import importlib
+import os
+import pickle
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection, wait
+from operator import attrgetter
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, NamedTuple, NoReturn
+
+# The paths of who asks come first, so that both import the same sources.
+_PROGRAM = """
+import sys
+from multiprocessing.connection import Connection
+asked = Connection(0, writable=False)
+sys.path[:] = asked.recv()
+from rs_localizer.core.simd.compiler import serve
+serve(asked)
+"""
+# s without a request after which the process ends; the next one starts it again.
+_IDLE = 20.0
+# kB from which a fork is replaced. One for each kernel takes a third more of the processor, since
+# what is Numba's own is compiled in each; one for all comes to 1,260 MB.
+_MOST, _GROWN = 400_000, 3
+_PR_SET_PDEATHSIG = 1  # Linux, <linux/prctl.h>
+# s: kernels of other versions, in other environments, may be at work beside this one.
+_KEPT = 30.0 * 86400.0
+_OURS = re.compile(r"[0-9a-f]{16}")
+
+
+class Request(NamedTuple):
+    """A kernel, and the types of its arguments."""
+
+    module: str
+    name: str
+    arguments: tuple[Any, ...]
+
+
+class _Compiler:
+    """The process, which is started when there is something to do."""
+
+    def __init__(self) -> None:
+        self._child: subprocess.Popen[bytes] | None = None
+        self._lock = threading.Lock()
+        self._orders: SimpleQueue[Request] | None = None
+        self._ordered: set[Request] = set()
+        self.count = 0
+        self.listeners: list[Callable[[int, str], object]] = []
+
+    def obtain(self, request: Request) -> bool:
+        with self._lock:
+            self.count += 1
+            for listener in self.listeners:
+                listener(self.count, request.name)
+            for _ in range(2):  # it may just have ended, for want of work
+                with contextlib.suppress(OSError, EOFError):
+                    return self._ask(request)
+                self._end()
+        return False
+
+    def order(self, request: Request) -> None:
+        if request in self._ordered:
+            return
+        self._ordered.add(request)
+        if self._orders is None:
+            self._orders = SimpleQueue()
+            # Of an executor the end of the program would wait for what it is at.
+            threading.Thread(target=self._follow, args=(self._orders,), daemon=True).start()
+        self._orders.put(request)
+
+    def _follow(self, orders: SimpleQueue[Request]) -> NoReturn:
+        while True:
+            self.obtain(orders.get())
+
+    def _ask(self, request: Request) -> bool:
+        from numba.core import serialize
+
+        dumps: Callable[[Any], bytes] = serialize.dumps
+        if self._child is None:
+            self._child = subprocess.Popen(
+                [sys.executable, "-c", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+            assert self._child.stdin is not None
+            assert self._child.stdout is not None
+            self._ask_by = Connection(os.dup(self._child.stdin.fileno()), readable=False)
+            self._hear_by = Connection(os.dup(self._child.stdout.fileno()), writable=False)
+            self._child.stdin.close()
+            self._child.stdout.close()
+            self._ask_by.send(sys.path)
+        self._ask_by.send_bytes(dumps(request))
+        return bool(self._hear_by.recv())
+
+    def _end(self) -> None:
+        if self._child is not None:
+            self._child.terminate()
+            self._child.wait()
+            self._ask_by.close()
+            self._hear_by.close()
+            self._child = None
+
+    def close(self) -> None:
+        """End the process, whatever it is at."""
+        if self._child is not None:
+            self._child.terminate()
+            self._child.wait()
+
+
+_compiler = _Compiler()
+atexit.register(lambda: _compiler.close())
+
+
+def _forget() -> None:
+    """In a fork: its parent's process is not its own."""
+    global _compiler
+    _compiler = _Compiler()
+
+
+os.register_at_fork(after_in_child=_forget)
+
+
+def obtain(request: Request) -> bool:
+    """Have a kernel compiled into the cache, unless it is there; whether it is there now."""
+    return _compiler.obtain(request)
+
+
+def order(request: Request) -> None:
+    """The same without waiting for it; once."""
+    _compiler.order(request)
+
+
+@contextlib.contextmanager
+def told(listener: Callable[[int, str], object]) -> Any:
+    """Within ``with``, ``listener`` is told of each kernel before it is compiled.
+
+    It takes how many this process has asked for so far, and the kernel's name.
+    """
+    _compiler.listeners.append(listener)
+    try:
+        yield
+    finally:
+        _compiler.listeners.remove(listener)
+
+
+# -- the process itself ------------------------------------------------------------------------
+
+
+def serve(asked: Connection[Any, Any]) -> None:
+    """Compile what is asked for, until the asking process ends or nobody asks."""
+    import numba
+
+    from rs_localizer.core.simd import jit
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: its end is that of who asks
+    njit: Any = numba.njit
+    njit(lambda: 0)()  # what all have in common is done before the forks
+    answers, asking = Connection(os.dup(1), readable=False), os.getppid()
+    os.dup2(2, 1)
+    _remove_old(jit.cache_directory())
+    while True:
+        if (pid := os.fork()) == 0:
+            _compile_all(asked, answers)
+        code = _code_of(pid, asking)
+        if code == 0:
+            return
+        if code != _GROWN:
+            answers.send(False)  # it broke off, as without memory
+
+
+def _compile_all(asked: Connection[Any, Any], answers: Connection[Any, Any]) -> NoReturn:
+    """In a fork: compile until nobody asks, or until it has grown."""
+    from rs_localizer.core.simd import jit
+
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    gc.disable()  # collections would look through all that the compiler keeps: a seventh
+    jit.compile_here()
+    with contextlib.suppress(EOFError):
+        while asked.poll(_IDLE):
+            answers.send(_kept(Request(*pickle.loads(asked.recv_bytes()))))
+            if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > _MOST:
+                os._exit(_GROWN)
+    os._exit(0)
+
+
+def _code_of(pid: int, asking: int) -> int:
+    """The exit code of a fork, which ends with whoever asks."""
+    ended = os.pidfd_open(pid)
+    while not wait([ended], 1.0):
+        if os.getppid() != asking:
+            os._exit(0)
+    os.close(ended)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def _kept(request: Request) -> bool:
+    """Compile a kernel unless it is there; whether it is there now."""
+    from numba.core.registry import cpu_target
+
+    kernel = attrgetter(request.name)(importlib.import_module(request.module))
+    holds = functools.partial(kernel._cache.holds, request.arguments, cpu_target.target_context)
+    try:
+        kernel._cache._impl.locator.ensure_cache_path()
+        lock = Path(kernel._cache.cache_path).parent / "rs_localizer.lock"
+        with lock.open("a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if not holds():
+                kernel.compile(request.arguments)
+            return bool(holds())
+    except Exception:  # whoever asks compiles it itself, and says what is wrong
+        return False
+
+
+def _remove_old(caches: Path) -> None:
+    """Remove folders of kernels that nobody used for a month, and nothing else.
+
+    ``NUMBA_CACHE_DIR`` is everybody's, and an empty folder may be anybody's.
+    """
+    with contextlib.suppress(OSError):
+        for folder in caches.iterdir():
+            if not _OURS.fullmatch(folder.name) or not folder.is_dir():
+                continue
+            names = [item.name for item in folder.iterdir()]
+            ours = bool(names) and all(name.startswith("rs_localizer.") for name in names)
+            if ours and folder.stat().st_mtime < time.time() - _KEPT:
+                shutil.rmtree(folder, ignore_errors=True)

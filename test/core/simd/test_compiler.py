@@ -1,0 +1,126 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels come from a process that compiles them, once; and nobody has to wait."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+FIRST = """
+import numpy as np
+from rs_localizer.core import so3
+from rs_localizer.core.simd import compiler
+with compiler.told(lambda count, name: print(count, name, flush=True)):
+    print(repr(so3.exp_many(np.linspace(0.0, 3.0, 30).reshape(10, 3)).tobytes().hex()))
+print("asked a process:", compiler._compiler._child is not None)
+"""
+AT_ONCE = """
+import time
+import numpy as np
+from rs_localizer.core import so3
+from rs_localizer.core.simd.jit import NotCompiled, at_once
+turn, refused = np.eye(3), 0
+while True:
+    try:
+        with at_once():
+            assert np.all(so3.log(turn) == 0.0)
+        break
+    except NotCompiled as missing:
+        refused += 1
+        time.sleep(0.1)
+print(refused > 0, so3.log.overloads != {})
+"""
+LONG = """
+import numpy as np
+from rs_localizer.core import so3
+print("begins", flush=True)
+so3.exp_many(np.zeros((1, 3)))
+"""
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Starts a program whose cache is empty at first."""
+
+    def start(program: str) -> subprocess.Popen[str]:
+        environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+        environment.pop("NUMBA_CACHE_DIR", None)
+        return subprocess.Popen(
+            [sys.executable, "-W", "error", "-c", program], env=environment, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+        )  # fmt: skip
+
+    return start
+
+
+def said(process: subprocess.Popen[str]) -> list[str]:
+    out, errors = process.communicate(timeout=200)
+    assert process.returncode == 0, errors
+    assert errors == ""
+    return out.splitlines()
+
+
+def test_who_has_it_compiled_and_who_loads_it_have_the_same_bits(start):
+    *compiled, bits, asked = said(start(FIRST))
+    assert compiled == ["1 _exp_many"]
+    assert asked == "asked a process: True"
+    assert said(start(FIRST)) == [bits, "asked a process: False"]
+
+
+def test_two_processes_that_need_a_kernel_at_once_have_the_same_bits(start, tmp_path):
+    both = [start(FIRST) for _ in range(2)]
+    first, second = (said(one)[-2] for one in both)
+    assert first == second
+    assert len(list((tmp_path / "cache").rglob("*_exp_many*.nbc"))) == 1
+
+
+def test_who_must_not_wait_is_told_until_it_is_there(start):
+    assert said(start(AT_ONCE)) == ["True True"]
+
+
+def test_the_compiler_ends_with_who_asks_it(start):
+    process = start(LONG)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "begins\n"
+    group = os.getpgid(process.pid)
+    deadline = time.monotonic() + 60.0
+    while len(members(group)) < 3:  # who asks, who waits, who compiles
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    while members(group):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def members(group: int) -> list[int]:
+    """Processes of a group that are no zombies."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, its_group = path.read_text().rpartition(")")[2].split()[:3]
+        except OSError:
+            continue
+        if int(its_group) == group and state != "Z":
+            found.append(int(path.parent.name))
+    return found
+
+
+def test_without_a_compiler_a_kernel_is_compiled_where_it_is_called(start, tmp_path):
+    """A cache that cannot be written is a warning, and no reason to fail."""
+    (tmp_path / "cache").write_text("a file")
+    process = start(
+        FIRST.replace(
+            "with compiler", "import warnings\nwarnings.simplefilter('default')\nwith compiler"
+        )
+    )
+    out, errors = process.communicate(timeout=200)
+    assert process.returncode == 0, errors
+    assert "kernels are compiled again at the next start" in errors
+    assert out.splitlines()[0] == "1 _exp_many"
