@@ -96,6 +96,30 @@ class Roi:
     height: int
 
 
+# A principal point is no farther from the middle, and beside it, as a share of width and height.
+_CENTRAL, _BESIDE = 0.05, 0.1
+
+
+def _check_exchanged(K: Array, width: int, height: int) -> None:
+    """Refuse a principal point in the middle of an image with width and height exchanged."""
+    off = np.abs(K[:2, 2] / [width, height] - 0.5)
+    exchanged = np.abs(K[:2, 2] / [height, width] - 0.5)
+    if np.all(off > _BESIDE) and np.all(exchanged < _CENTRAL):
+        raise ValueError(
+            f"the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is in the middle of an image of "
+            f"{height}x{width}, not of {width}x{height}: are width and height exchanged?"
+        )
+
+
+def _matrix(K: Any) -> Array:
+    """A camera matrix (3,3), or its nine numbers as CameraInfo has them."""
+    matrix = numbers("K", K)
+    matrix = matrix.reshape(3, 3) if matrix.shape == (9,) else matrix
+    if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
+        raise ValueError(f"K must be a finite 3x3 matrix, got {matrix.tolist()}")
+    return matrix
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A calibrated camera with its shutter.
@@ -146,12 +170,10 @@ class Camera:
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__  # the dataclass is frozen; this is its constructor
-        K = numbers("K", self.K)
+        K = _matrix(self.K)
         D = np.zeros(0) if self.D is None else numbers("D", self.D).ravel()
         set_field(self, "width", pixel_count("width", self.width))
         set_field(self, "height", pixel_count("height", self.height))
-        if K.shape != (3, 3) or not np.all(np.isfinite(K)):
-            raise ValueError(f"K must be a finite 3x3 matrix, got {K.tolist()}")
         if K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
             raise ValueError(
                 f"the camera is not calibrated: focal lengths are {K[0, 0]:g}, {K[1, 1]:g}"
@@ -193,6 +215,8 @@ class Camera:
             or roi.y_offset + roi.height > self.height
         ):
             raise ValueError(f"{roi} does not lie on a sensor of {self.width}x{self.height}")
+        if roi is None:
+            _check_exchanged(K, self.width, self.height)
         for array in (K, D):
             array.flags.writeable = False
         set_field(self, "K", K)

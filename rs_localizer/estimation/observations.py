@@ -60,6 +60,8 @@ def checked(
 ) -> tuple[Array, Array, Array | None]:
     """Points (n,3), pixels (n,2) and scores (n,) as contiguous float64 arrays.
 
+    OpenCV's (n,1,3) and (n,1,2) are taken, too.
+
     Those that are read-only are copied: to Numba they are another type, whose kernels nothing has
     compiled yet.
 
@@ -70,6 +72,10 @@ def checked(
     pixels = np.require(pixels, np.float64, ["C", "W"])
     if points.size == 0 and pixels.size == 0:  # empty lists have no second dimension
         points, pixels = points.reshape(0, 3), pixels.reshape(0, 2)
+    points, pixels = (
+        array[:, 0] if array.ndim == 3 and array.shape[1] == 1 else array
+        for array in (points, pixels)
+    )
     n = len(points)
     if points.shape != (n, 3) or pixels.shape != (n, 2):
         raise ValueError(

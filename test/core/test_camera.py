@@ -24,6 +24,20 @@ def pixels(count=200, seed=0):
     return np.random.default_rng(seed).uniform([0, 0], [639, 479], (count, 2))
 
 
+def test_a_matrix_of_nine_numbers_as_camera_info_has_it():
+    K = [500.0, 0.0, 319.5, 0.0, 510.0, 239.5, 0.0, 0.0, 1.0]
+    np.testing.assert_array_equal(Camera(640, 480, K).K, np.reshape(K, (3, 3)))
+
+
+def test_width_and_height_that_are_exchanged():
+    K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
+    with pytest.raises(ValueError, match="of 640x480, not of 480x640: are width and height exch"):
+        Camera(480, 640, K)
+    # Of a lens that is turned with its image, and of one that is mounted beside the middle.
+    Camera(480, 640, [[500.0, 0, 239.5], [0, 510, 319.5], [0, 0, 1]])
+    Camera(480, 640, [[500.0, 0, 319.5], [0, 510, 300.0], [0, 0, 1]])
+
+
 @pytest.mark.parametrize(("model", "D"), LENSES)
 def test_rays_lead_back_to_their_pixels_by_opencv(model, D):
     raw = pixels()
