@@ -25,7 +25,7 @@ PAGES = {
     "Start": "concepts install camera cameras/index",
     "Use": "node reasons detector features imu rigs recordings calibration mapping map_build maps "
     "simulation viewing integrations examples library policy",
-    "Understand": "solvers estimator honesty benchmarks architecture api",
+    "Understand": "limits solvers estimator honesty benchmarks architecture api",
 }
 OTHERS = (
     *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README", "examples/README"),
