@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 # Those of docs/cameras are made by docs/make_cameras.py, where the site has been built.
-FOLDERS = (".", "docs", "docs/adr", "benchmarks")
+FOLDERS = (".", "docs", "docs/adr", "benchmarks", "examples")
 PAGES = sorted(page for folder in FOLDERS for page in (ROOT / folder).glob("*.md"))
 NAMES = [str(path.relative_to(ROOT)) for path in PAGES]
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
