@@ -567,21 +567,6 @@ class DetectorConfig:
         "Topic of the images; auto: image if it has a publisher, otherwise image/compressed",
         read_only=True,
     )
-    readout_time: float = setting(
-        0.0,
-        "Only for the debug image: time from the first to the last row, in s, as the localizer's",
-        (0.0, 0.2),
-    )
-    scan_direction: str = setting(
-        ScanDirection.TOP_TO_BOTTOM,
-        "Only for the debug image: direction in which the shutter moves, as the localizer's",
-    )
-    stamp_offset: float = setting(
-        0.0,
-        "Only for the debug image: time from header.stamp to the middle of the exposure of the "
-        "first row, in s, as the localizer's",
-        (-10.0, 10.0),
-    )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
 
     def __post_init__(self) -> None:

@@ -98,4 +98,3 @@ class Notice(StrEnum):
     INCOMPATIBLE_PUBLISHER = "incompatible_publisher"
     NO_POSE = "no_pose"
     NO_IMAGES = "no_images"
-    OTHER_BODY = "other_body"

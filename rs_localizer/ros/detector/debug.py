@@ -1,161 +1,81 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The debug pictures of the marker detector: drawn when the localizer's answer has come."""
+"""The debug pictures of the detectors: what was found, and which of it the localizer has kept."""
 
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Generic, TypeVar
 
+import cv2
 import numpy as np
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import CameraInfo
+from numpy.typing import NDArray
 
-from rs_localizer.config import DetectorConfig
-from rs_localizer.core.camera import Camera
-from rs_localizer.core.reasons import Notice, Reason
-from rs_localizer.io.camera_info import Calibration, read_camera_info
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.clouds import EmptyCloudError, read_correspondences
 from rs_localizer.io.images import Image
 from rs_localizer.io.messages import MessageError, stamp_ns
-from rs_localizer.io.topics import CAMERA_INFO, ODOMETRY, POSE
-from rs_localizer.markers.overlay import CameraPath, Picture, draw_detections, draw_world
-from rs_localizer.markers.poses import rotation_of_quaternion
-from rs_localizer.pipeline.images import Detected
-from rs_localizer.ros.node.conversion import xyz
-from rs_localizer.ros.node.inputs import LATCHED, Topic
-from rs_localizer.ros.node.refusals import Refusals
-from rs_localizer.ros.node.worker import Worker
-from rs_localizer.settings import NODE_NAME
 
-# Images that wait for a pose; those without one are shown without cubes.
+Result = TypeVar("Result")
+Picture = NDArray[np.uint8]  # (h,w,3) blue, green, red
+Drawn = tuple[Image, Picture, Array]
+"""An image, its picture, and the pixels (n,2) of the points that went to the localizer."""
+
+# Images that wait for their inliers; the oldest is then shown as it is.
 _WAITING = 3
 # After so many images without an answer nobody localizes, and none waits.
 _PATIENCE = 10
-# Poses that wait for an image.
-_MOST_POSES = 100
-
-_POSE, _ODOMETRY = f"{NODE_NAME}/{POSE}", f"{NODE_NAME}/{ODOMETRY}"
-
-Show = Callable[[Image, Picture], None]
+# Kept points are green dots, others red crosses: they differ by shape, too.
+_KEPT, _REFUSED = (60, 220, 60), (60, 60, 255)
+_SIZE = 4  # px
 
 
-class DebugPictures:
-    """Holds images until their poses come; lives in the worker's thread.
+class DebugPictures(Generic[Result]):
+    """Holds images until their inliers come; lives in the worker's thread.
 
     Args:
+        draw: makes the picture of what was found.
         show: takes the finished picture of an image.
-        notice: told why no cubes are drawn, by a name and one sentence.
     """
 
-    def __init__(self, show: Show, notice: Callable[[str, str], None]) -> None:
-        self._show = show
-        self._notice = notice
-        self._calibration: Calibration | None = None
-        self._waiting: deque[Detected] = deque()
-        self._poses: dict[int, CameraPath] = {}  # without a twist, by stamp
+    def __init__(
+        self, draw: Callable[[Result], Drawn], show: Callable[[Image, Picture], None]
+    ) -> None:
+        self._draw, self._show = draw, show
+        self._waiting: deque[Result] = deque()
         self._unanswered = _PATIENCE
 
-    def add(self, detected: Detected, config: DetectorConfig) -> None:
+    def add(self, result: Result) -> None:
         """Take an image; the oldest that still waits is shown as it is."""
-        self._waiting.append(detected)
+        self._waiting.append(result)
         self._unanswered += 1
         while len(self._waiting) > (_WAITING if self._unanswered <= _PATIENCE else 0):
-            oldest = self._waiting.popleft()
-            self._finish(oldest, self._pose_of(oldest, config), config)
-        for stamp in [s for s in self._poses if s < detected.image.stamp_ns - 10**9]:
-            del self._poses[stamp]
+            image, picture, _ = self._draw(self._waiting.popleft())
+            self._show(image, picture)
 
-    def take_camera_info(self, calibration: Calibration) -> None:
-        self._calibration = calibration
-
-    def take_pose(self, message: Any) -> None:
-        """A geometry_msgs/PoseStamped; of use where no odometry comes, without a twist."""
+    def take_inliers(self, message: Any) -> None:
+        """A sensor_msgs/PointCloud2 of the localizer: show the image that it belongs to."""
         self._unanswered = 0
-        still = np.zeros(3)
-        self._poses[stamp_ns(message)] = _path(message, message.pose, still, still)
-        while len(self._poses) > _MOST_POSES:
-            del self._poses[next(iter(self._poses))]
-
-    def take_odometry(self, message: Any, config: DetectorConfig) -> None:
-        """A nav_msgs/Odometry, of the camera in the map: show the image that it belongs to."""
-        if self._calibration is not None and message.child_frame_id != self._calibration.frame:
-            self._notice(
-                Notice.OTHER_BODY,
-                f"the odometry is of {message.child_frame_id}, not of the camera "
-                f"({self._calibration.frame}): no cubes are drawn",
-            )
+        try:
+            kept = read_correspondences(message).pixels
+        except (MessageError, EmptyCloudError):
             return
-        self._unanswered = 0
-        twist = message.twist.twist
-        path = _path(message, message.pose.pose, xyz(twist.linear), xyz(twist.angular))
-        for item in self._waiting:
-            if self._belongs(path, item, config):
-                while self._waiting[0] is not item:
-                    self._finish(self._waiting.popleft(), None, config)
-                self._finish(self._waiting.popleft(), path, config)
+        stamp = stamp_ns(message)
+        while self._waiting:
+            image, picture, pixels = self._draw(self._waiting[0])
+            if image.stamp_ns > stamp:
                 return
-
-    def _belongs(self, path: CameraPath, detected: Detected, config: DetectorConfig) -> bool:
-        """With ``pose_time: mid_frame``, the pose's stamp is up to a readout later."""
-        after = (path.stamp_ns - detected.image.stamp_ns) * 1e-9 - config.stamp_offset
-        offset = abs(config.stamp_offset)
-        return -offset - 1e-6 <= after <= config.readout_time + offset + 1e-6
-
-    def _pose_of(self, detected: Detected, config: DetectorConfig) -> CameraPath | None:
-        paths = (path for path in self._poses.values() if self._belongs(path, detected, config))
-        return next(paths, None)
-
-    def _finish(self, detected: Detected, path: CameraPath | None, config: DetectorConfig) -> None:
-        picture = draw_detections(detected.image.pixels, detected.detections)
-        camera = self._camera(config)
-        if path is not None and camera is not None:
-            first_row_ns = detected.image.stamp_ns + round(1e9 * config.stamp_offset)
-            draw_world(picture, detected.detections, detected.map, camera, path, first_row_ns)
-        self._show(detected.image, picture)
-
-    def _camera(self, config: DetectorConfig) -> Camera | None:
-        if self._calibration is None:
-            return None
-        try:
-            return self._calibration.camera(config.readout_time, config.scan_direction)
-        except MessageError as error:
-            self._notice(Reason.BAD_CAMERA_INFO, str(error))
-            return None
+            self._waiting.popleft()
+            if image.stamp_ns == stamp:
+                draw_kept(picture, pixels, kept)
+            self._show(image, picture)
 
 
-def _path(message: Any, pose: Any, linear: Any, angular: Any) -> CameraPath:
-    q = pose.orientation
-    rotation = rotation_of_quaternion([q.x, q.y, q.z, q.w])
-    return CameraPath(stamp_ns(message), xyz(pose.position), rotation, linear, angular)
-
-
-def picture_topics(
-    worker: Worker[Any, Any], pictures: DebugPictures, refusals: Refusals
-) -> dict[str, Topic]:
-    """What the pictures need besides the images: the calibration, and the localizer's answers.
-
-    Args:
-        worker: gets the updates, called in the thread of the inputs.
-        pictures: of the worker.
-        refusals: told of messages that cannot be used.
-    """
-
-    def take_camera_info(message: CameraInfo) -> None:
-        try:
-            calibration = read_camera_info(message)
-        except MessageError as error:
-            refusals.notice(Reason.BAD_CAMERA_INFO, str(error))
-            return
-        worker.update(CAMERA_INFO, lambda _: pictures.take_camera_info(calibration))
-
-    def take_pose(message: PoseStamped) -> None:
-        worker.update(POSE, lambda _: pictures.take_pose(message))
-
-    def take_odometry(message: Odometry) -> None:
-        worker.update(ODOMETRY, lambda work: pictures.take_odometry(message, work.config))
-
-    return {
-        CAMERA_INFO: Topic(CameraInfo, take_camera_info, LATCHED),
-        _POSE: Topic(PoseStamped, take_pose),
-        _ODOMETRY: Topic(Odometry, take_odometry),
-    }
+def draw_kept(picture: Picture, pixels: Array, kept: Array) -> None:
+    """Add green dots where points were kept, and red crosses where they were not."""
+    inliers = {(round(u, 1), round(v, 1)) for u, v in kept.tolist()}
+    for u, v in pixels.tolist():
+        place = round(u), round(v)
+        if (round(u, 1), round(v, 1)) in inliers:
+            cv2.circle(picture, place, _SIZE, _KEPT, -1, cv2.LINE_AA)
+        else:
+            cv2.drawMarker(picture, place, _REFUSED, cv2.MARKER_TILTED_CROSS, 2 * _SIZE, 2)

@@ -9,8 +9,8 @@ from rs_localizer.features.extraction import draw_features
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
-from rs_localizer.ros.detector.node import Drawing, Finder, ImageNode, Show, Sight, Work
-from rs_localizer.ros.node.worker import Worker
+from rs_localizer.ros.detector.debug import Drawn
+from rs_localizer.ros.detector.node import Finder, ImageNode, Sight
 from rs_localizer.settings import FEATURES_NAME
 
 
@@ -36,14 +36,9 @@ class FeatureDetectorNode(ImageNode[FeatureConfig, Extracted]):
     def make_cloud(self, extracted: Extracted, make: Make) -> Any:
         return keypoints(extracted, make)
 
-    def make_drawing(
-        self, show: Show, worker: Worker[Work[FeatureConfig, Extracted], Extracted]
-    ) -> Drawing[Extracted, FeatureConfig]:
-        return Drawing(
-            lambda extracted, _: show(
-                extracted.image, draw_features(extracted.image.pixels, extracted.features)
-            )
-        )
+    def draw(self, extracted: Extracted) -> Drawn:
+        picture = draw_features(extracted.image.pixels, extracted.features)
+        return extracted.image, picture, extracted.features.pixels
 
     def describe(self, finder: Finder[Extracted]) -> str:
         return f"{self.config.features}, at most {self.config.max_keypoints} keypoints an image"

@@ -8,9 +8,10 @@ from rs_localizer.config import DetectorConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import CORRESPONDENCES
+from rs_localizer.markers.overlay import draw_detections
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.ros.detector.node import Drawing, Finder, ImageNode, Show, Sight, Work
-from rs_localizer.ros.node.worker import Worker
+from rs_localizer.ros.detector.debug import Drawn
+from rs_localizer.ros.detector.node import Finder, ImageNode, Sight
 from rs_localizer.settings import DETECTOR_NAME
 
 
@@ -54,14 +55,10 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
     def make_cloud(self, detected: Detected, make: Make) -> Any:
         return correspondences(detected, make)
 
-    def make_drawing(
-        self, show: Show, worker: Worker[Work[DetectorConfig, Detected], Detected]
-    ) -> Drawing[Detected, DetectorConfig]:
-        # Late: most nodes never draw, and need nothing of cubes, cameras and poses.
-        from rs_localizer.ros.detector.debug import DebugPictures, picture_topics
-
-        pictures = DebugPictures(show, self.refusals.notice)
-        return Drawing(pictures.add, picture_topics(worker, pictures, self.refusals))
+    def draw(self, detected: Detected) -> Drawn:
+        detections = detected.detections
+        picture = draw_detections(detected.image.pixels, detections)
+        return detected.image, picture, detections.pixels
 
     def describe(self, finder: Finder[Detected]) -> str:
         assert isinstance(finder, FrameDetector)

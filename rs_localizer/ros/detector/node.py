@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
@@ -26,8 +24,9 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.io import topics
 from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make, make_header
-from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
+from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE, INLIERS
 from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.ros.detector.debug import DebugPictures, Drawn, Picture
 from rs_localizer.ros.node.conversion import create_output, make_message
 from rs_localizer.ros.node.health import (
     Health,
@@ -42,6 +41,7 @@ from rs_localizer.ros.node.inputs import Silence, Topic
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.statistics import WINDOW, Summary
 from rs_localizer.ros.node.worker import Worker
+from rs_localizer.settings import NODE_NAME
 
 Result = TypeVar("Result")
 
@@ -80,6 +80,7 @@ def judge(
 
 # Types of the topics whose messages are looked at.
 _IMAGES = {IMAGE: ImageMessage, COMPRESSED_IMAGE: CompressedImage}
+_INLIERS = f"{NODE_NAME}/{INLIERS}"  # of the localizer, for debug pictures
 # How often the node looks whether somebody listens, in s.
 _LOOK_PERIOD = 0.2
 
@@ -99,21 +100,13 @@ class Finder(Protocol[Result_co]):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Drawing(Generic[Result, Settings]):
-    """Makes debug pictures."""
-
-    draw: Callable[[Result, Settings], None]  # called in the worker's thread
-    topics: Mapping[str, Topic] = field(default_factory=dict)  # what it needs besides the images
-
-
 @dataclass(slots=True)
 class Work(Generic[Settings, Result]):
     """What the worker alone touches."""
 
     finder: Finder[Result]
     config: Settings
-    draw: Callable[[Result, Settings], None] | None = None  # makes the debug picture
+    pictures: DebugPictures[Result] | None = None  # as soon as one has been wanted
 
 
 class ImageNode(
@@ -122,7 +115,7 @@ class ImageNode(
     """Looks at images; see :class:`rs_localizer.ros.node.managed.ManagedNode`.
 
     A node says what it looks for by overriding :meth:`make_finder`, :meth:`make_cloud`,
-    :meth:`make_drawing` and :meth:`describe`.
+    :meth:`draw` and :meth:`describe`.
     """
 
     lack = Notice.NO_IMAGES
@@ -138,7 +131,6 @@ class ImageNode(
     ) -> None:
         self._outputs: ImageOutputs[Result] | None = None
         self._topics: dict[str, Topic] = {}  # all that may be listened to
-        self._for_pictures: tuple[str, ...] | None = None  # none was wanted so far
         self._timer: Timer | None = None
         self._listening: tuple[str, ...] = ()
         super().__init__(name, kind, tell, **options)
@@ -153,10 +145,8 @@ class ImageNode(
         """The sensor_msgs/PointCloud2 of an image."""
         raise NotImplementedError
 
-    def make_drawing(
-        self, show: Show, worker: Worker[Work[Settings, Result], Result]
-    ) -> Drawing[Result, Settings]:
-        """What makes debug pictures, which ``show`` takes, in the worker's thread."""
+    def draw(self, result: Result) -> Drawn:
+        """The debug picture of an image, in the worker's thread."""
         raise NotImplementedError
 
     def describe(self, finder: Finder[Result]) -> str:
@@ -181,11 +171,20 @@ class ImageNode(
 
         def publish(result: Result) -> None:
             outputs.publish(result)
-            if work.draw is not None and outputs.pictures_wanted():
-                work.draw(result, work.config)
+            if outputs.pictures_wanted():
+                if work.pictures is None:
+                    work.pictures = DebugPictures(self.draw, outputs.show)
+                work.pictures.add(result)
 
-        self._topics = _image_topics(self.employ(work, publish))
-        self._for_pictures = None
+        worker = self.employ(work, publish)
+        self._topics = _image_topics(worker)
+
+        def take_inliers(message: PointCloud2) -> None:
+            worker.update(
+                INLIERS, lambda work: work.pictures and work.pictures.take_inliers(message)
+            )
+
+        self._topics[_INLIERS] = Topic(PointCloud2, take_inliers)
         self._description = self.describe(finder)
 
     def close(self) -> None:
@@ -236,27 +235,12 @@ class ImageNode(
         assert self._outputs is not None
         wanted: tuple[str, ...] = ()
         if self._outputs.pictures_wanted():
-            wanted = (*self._prepare_pictures(), self._image_topic())
+            wanted = (_INLIERS, self._image_topic())
         elif self._outputs.clouds_wanted():
             wanted = (self._image_topic(),)
         if wanted != self._listening:
             self.listen({name: self._topics[name] for name in wanted})
             self._listening = wanted
-
-    def _prepare_pictures(self) -> tuple[str, ...]:
-        """The topics that pictures need; what draws them is not there before one is wanted."""
-        if self._for_pictures is None:
-            assert self._outputs is not None
-            assert self.worker is not None
-            drawing = self.make_drawing(self._outputs.show, self.worker)
-
-            def take(work: Work[Settings, Result]) -> None:
-                work.draw = drawing.draw
-
-            self.worker.update("drawing", take)
-            self._topics.update(drawing.topics)
-            self._for_pictures = tuple(drawing.topics)
-        return self._for_pictures
 
     def _image_topic(self) -> str:
         """The topic of the images; where none has a publisher, the one so far."""
@@ -282,9 +266,6 @@ def _image_topics(worker: Worker[Work[Settings, Result], Result]) -> dict[str, T
 
 
 _JPEG_QUALITY = 85
-
-Picture = NDArray[np.uint8]  # (h,w,3) blue, green, red
-Show = Callable[[Image, Picture], None]
 
 
 class ImageOutputs(Generic[Result]):
