@@ -28,6 +28,13 @@ POSE_WITH_COVARIANCE = "pose_with_covariance"
 TWIST_WITH_COVARIANCE = "twist_with_covariance"
 ODOMETRY = "odometry"
 INLIERS = "inliers"
+# Of the node alone, and their types.
+INTEGRITY, MAP_MARKERS, CAMERA_MARKER = "integrity", "map_markers", "camera_marker"
+LIVE = {
+    INTEGRITY: "std_msgs/msg/Float64",
+    MAP_MARKERS: "visualization_msgs/msg/MarkerArray",
+    CAMERA_MARKER: "visualization_msgs/msg/MarkerArray",
+}
 DEBUG_IMAGE = "debug_image"
 COMPRESSED_DEBUG_IMAGE = "debug_image/compressed"
 # Of everybody.

@@ -15,6 +15,7 @@ import numpy as np
 from rs_localizer import matching
 from rs_localizer.config import MatchBy, Matching, NodeConfig
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Notice, Reason
@@ -341,6 +342,22 @@ class FrameLocalizer:
     def map(self) -> Map | None:
         """The map that keypoints are matched with."""
         return self._landmarks.map
+
+    @property
+    def map_points(self) -> Array | None:
+        """Landmarks (n,3), or corners (n,4,3) of markers; None: correspondences bring their own."""
+        if self.map is not None:
+            return self.map.points
+        return None if self._tags is None else self._tags.corners
+
+    @property
+    def view_corners(self) -> Array | None:
+        """Bearings (4,3) of the image's corners, in camera axes; None: no camera is known."""
+        if self._calibration is None:
+            return None
+        width, height = np.array(self._camera.size) - 1.0
+        corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+        return self._camera.bearings(corners)
 
     def reset(self) -> None:
         """Forget the previous frames."""

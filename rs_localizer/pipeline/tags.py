@@ -51,6 +51,7 @@ class Tags:
         self._kinds = {
             m.family.kind.replace("apriltag_", "tag"): m.family.kind for m in marker_map.markers
         }
+        self.corners = np.array([marker.corners for marker in marker_map.markers])  # (n,4,3)
         self._agreed = self._images = 0
 
     def match(self, message: Any) -> Correspondences | Refusal:

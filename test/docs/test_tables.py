@@ -13,6 +13,7 @@ from rs_localizer.cli.main import COMMANDS
 from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import TYPES
+from rs_localizer.io.topics import LIVE
 from rs_localizer.offline.table import COLUMNS
 from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.ros.localizer.node import Feed
@@ -101,7 +102,8 @@ def test_the_topics_of_the_localizer():
         if name[0] == "~" and way != "in"
     }
     assert sent.pop("reset") == "std_srvs/Trigger"
-    assert sent == {name: kind.replace("/msg/", "/") for name, kind in TYPES.items()}
+    every = {**TYPES, **LIVE}
+    assert sent == {name: kind.replace("/msg/", "/") for name, kind in every.items()}
 
 
 def test_the_diagram_of_the_node_has_every_topic():

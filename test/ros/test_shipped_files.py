@@ -19,12 +19,20 @@ from rclpy.context import Context
 from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.recording import PARAMETERS
+from rs_localizer.io.topics import DEBUG_IMAGE, LIVE, MAP_MARKERS
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Chessboard
 from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.ros.localizer.node import Feed
-from rs_localizer.settings import NODE_NAME, build, load_params_file, settings, write_parameters
+from rs_localizer.settings import (
+    DETECTOR_NAME,
+    NODE_NAME,
+    build,
+    load_params_file,
+    settings,
+    write_parameters,
+)
 
 ROOT = Path(__file__).parents[2]
 # Displays of RViz and what they can show.
@@ -32,6 +40,14 @@ RVIZ = {
     "PoseWithCovariance": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "Odometry": "nav_msgs/msg/Odometry",
     "PointCloud2": "sensor_msgs/msg/PointCloud2",
+    "MarkerArray": "visualization_msgs/msg/MarkerArray",
+    "Image": "sensor_msgs/msg/Image",
+}
+# What the nodes publish, by its name in the namespace of both.
+SENT = {
+    **{f"{NODE_NAME}/{name}": kind for name, kind in {**TYPES, **LIVE}.items()},
+    f"{DETECTOR_NAME}/{MAP_MARKERS}": LIVE[MAP_MARKERS],
+    f"{DETECTOR_NAME}/{DEBUG_IMAGE}": "sensor_msgs/msg/Image",
 }
 
 
@@ -258,20 +274,21 @@ def test_rviz_shows_what_the_node_publishes():
     view = yaml.safe_load((ROOT / "config" / "rs_localizer.rviz").read_text())
     displays = view["Visualization Manager"]["Displays"]
     shown = {
-        item["Topic"]["Value"].removeprefix(f"{NODE_NAME}/"): RVIZ[item["Class"].split("/")[1]]
+        item["Topic"]["Value"]: RVIZ[item["Class"].split("/")[1]]
         for item in displays
         if "Topic" in item
     }
-    assert shown.items() <= TYPES.items()
-    assert set(shown) == {"pose_with_covariance", "odometry", "inliers"}
+    assert shown.items() <= SENT.items()
+    assert len(shown) == 7
     assert "rviz_default_plugins/TF" in [item["Class"] for item in displays]
 
 
 def test_foxglove_shows_what_the_node_publishes():
     text = (ROOT / "config" / "rs_localizer.foxglove.json").read_text()
     layout = json.loads(text)
-    topics = set(re.findall(rf'"/{NODE_NAME}/(\w+)', text))
-    assert {"pose_with_covariance", "inliers", "twist"} <= topics <= set(TYPES)
+    topics = set(re.findall(r'"/(\w+/\w+)', text))
+    assert len(topics) == 8
+    assert topics <= set(SENT)
     panels = re.findall(r'"(?:first|second)": "([^"]+)"', text)
     assert sorted(panels) == sorted(layout["configById"])
 

@@ -4,6 +4,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import Make
@@ -12,6 +14,7 @@ from rs_localizer.markers.overlay import draw_detections
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
 from rs_localizer.ros.detector.debug import Drawn
 from rs_localizer.ros.detector.node import Finder, ImageNode, Sight
+from rs_localizer.ros.node.views import MapView
 from rs_localizer.settings import DETECTOR_NAME
 
 
@@ -42,6 +45,7 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
     checked_at_start = False  # the map may come later: on_configure tells
 
     def __init__(self, **options: Any) -> None:
+        self._map_view: MapView | None = None
         super().__init__(DETECTOR_NAME, DetectorConfig, tell, **options)
 
     def check(self, config: DetectorConfig) -> None:
@@ -51,6 +55,27 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
 
     def make_finder(self, config: DetectorConfig) -> FrameDetector:
         return FrameDetector(config, self.refusals.notice)
+
+    def open(self, config: DetectorConfig) -> None:
+        super().open(config)
+        self._map_view = MapView(self)
+        self._show_map(self.make_finder(config))
+
+    def close(self) -> None:
+        super().close()
+        if self._map_view is not None:
+            self._map_view.close()
+            self._map_view = None
+
+    def change(self, config: DetectorConfig) -> None:
+        super().change(config)
+        self._show_map(self.make_finder(config))
+
+    def _show_map(self, finder: Finder[Detected]) -> None:
+        assert isinstance(finder, FrameDetector)
+        corners = [marker.corners for marker, _ in finder.map.all_markers()]
+        if self._map_view is not None and corners:
+            self._map_view.show(finder.map.map_frame, np.array(corners))
 
     def make_cloud(self, detected: Detected, make: Make) -> Any:
         return correspondences(detected, make)

@@ -180,12 +180,14 @@ class ImageNode(
         self._topics = _image_topics(worker)
 
         def take_inliers(message: PointCloud2) -> None:
-            worker.update(
-                INLIERS, lambda work: work.pictures and work.pictures.take_inliers(message)
-            )
+            worker.update(INLIERS, lambda work: self._take_inliers(work, message))
 
         self._topics[_INLIERS] = Topic(PointCloud2, take_inliers)
         self._description = self.describe(finder)
+
+    def _take_inliers(self, work: Work[Settings, Result], message: PointCloud2) -> None:
+        if work.pictures is not None:
+            work.pictures.take_inliers(message)
 
     def close(self) -> None:
         self._topics = {}

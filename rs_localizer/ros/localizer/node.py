@@ -4,20 +4,23 @@
 
 import contextlib
 import functools
+import math
 import time
 from collections.abc import Callable
 from typing import Any
 
 from rclpy.lifecycle import LifecycleNode
 from rclpy.serialization import deserialize_message
+from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray  # type: ignore[import-untyped]
 
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
-from rs_localizer.io.topics import GIVEN_POSES
+from rs_localizer.io.topics import CAMERA_MARKER, GIVEN_POSES, INTEGRITY, LIVE
 from rs_localizer.pipeline.compiling import compile_rest, give_back_compiler
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.given_pose import read_given_pose
@@ -40,6 +43,7 @@ from rs_localizer.ros.node.inputs import FAST_DATA, LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import WINDOW
+from rs_localizer.ros.node.views import MapView, camera_marker
 from rs_localizer.ros.node.worker import Need, Worker, in_thread
 from rs_localizer.settings import NODE_NAME
 
@@ -296,13 +300,25 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         self._undo.callback(self._broadcaster.close)
         self._broadcaster.configure(config)
         outputs = Outputs(self)
-        publish = [outputs.publish]
         self._undo.callback(outputs.close)
-        publish.append(lambda frame: self._broadcaster.publish(frame, frames.config))
+        map_view = MapView(self)
+        self._undo.callback(map_view.close)
+        camera_view, integrity = (
+            create_output(self, message_class(LIVE[name]), f"~/{name}")
+            for name in (CAMERA_MARKER, INTEGRITY)
+        )
+        for publisher in (camera_view, integrity):
+            self._undo.callback(self.destroy_lifecycle_publisher, publisher)
 
         def publish_all(frame: Localized) -> None:
-            for each in publish:
-                each(frame)
+            outputs.publish(frame)
+            self._broadcaster.publish(frame, frames.config)
+            map_view.show(frame.map_frame, frames.map_points)
+            corners = frames.view_corners
+            if corners is not None and camera_view.get_subscription_count():
+                camera_view.publish(MarkerArray(markers=[camera_marker(frame, corners)]))
+            if math.isfinite(frame.estimate.integrity):
+                integrity.publish(Float64(data=frame.estimate.integrity))
 
         rest = compile_rest(config.solver)
         if rest is not None:
