@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.shutter import Motion
-from rs_localizer.inertial.filter import GyroscopeFilter, Predicted, clipped_product
+from rs_localizer.inertial.filter import GyroscopeFilter, Predicted
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.turning import turn_between, turn_within
@@ -76,21 +76,3 @@ def test_a_smaller_covariance_of_the_motion_leaves_all_definite(smaller):
     assert np.linalg.eigvalsh(predicted.covariance / np.outer(scale, scale)).min() > 0.0
     gyroscope.update(predicted, np.zeros(18), 0.5 * predicted.covariance)
     assert np.all(np.diag(gyroscope.errors.covariance) > 0.0)
-
-
-@pytest.mark.parametrize("size", [1, 2, 3, 18])
-@pytest.mark.parametrize("kind", ["any", "equal", "repeated", "scales", "diagonal"])
-def test_eigenvalues_beyond_the_limit_are_clipped(size, kind):
-    rng = np.random.default_rng(size)
-    vectors = np.linalg.qr(rng.normal(size=(size, size)))[0]
-    if kind == "diagonal":
-        vectors = np.eye(size)
-    values = {
-        "equal": np.ones(size),
-        "repeated": np.round(rng.normal(0.0, 2.0, size)),
-        "scales": 10.0 ** rng.uniform(-12.0, 3.0, size),
-    }.get(kind, rng.normal(0.0, 2.0, size))
-    columns = rng.normal(size=(size, 4))
-    expected = (vectors * np.minimum(values, 0.5)) @ vectors.T @ columns
-    found = clipped_product((vectors * values) @ vectors.T, 0.5, columns)
-    np.testing.assert_allclose(found, expected, atol=1e-13 * max(1.0, np.abs(values).max()))
