@@ -190,3 +190,37 @@ def test_nothing_runs_away_beyond_the_rows(tau):
         found = twist_at(seen, tau, READOUT_TIME)
         assert np.abs(found.angular).max() < 0.5 / READOUT_TIME
         assert np.linalg.eigvalsh(found.covariance).min() > 0.0
+
+
+def test_a_camera_at_rest_may_have_begun_to_move_within_the_delay():
+    motion, delay = estimate(0.0), 0.1
+    motion = replace(motion, linear_velocity=np.zeros(3))
+    pose, twist = pose_at(motion, 0.0), twist_at(motion, 0.0, READOUT_TIME)
+    doubted, _ = with_timing(pose, twist, 0.0, delay, Acceleration(20.0, 5.0))
+    way = 0.5 * np.repeat([5.0, 20.0], 3) * delay**2
+    np.testing.assert_allclose(doubted.covariance - pose.covariance, np.diag(way**2), atol=1e-12)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_what_no_row_has_seen_grows_with_the_distance(known):
+    """Shaking goes on at one of its rates; what a gyroscope's last sample leaves, likewise."""
+    samples = np.linspace(-0.6, 0.6, 25)
+    rates = 0.02 * np.sin(np.outer(samples, [20.0, 25.0, 30.0]))
+    motion = replace(
+        estimate(0.0), shake=0.002 * SIZES * np.ones((SHAKING, 3)),
+        joint_covariance=np.zeros((102, 102)),
+    )  # fmt: skip
+    rows = np.linspace(-0.5, 0.5, 17)
+    seen = np.mean([motion.shake_at(row)[1] ** 2 for row in rows])
+    if known:
+        turn = GyroRotation.of(samples, rates)
+        motion = replace(motion, shake=np.zeros((0, 3)), joint_covariance=np.zeros((18, 18)))
+        motion = motion.turned(turn, (0.0, np.inf))
+        swung = turn.at_rows(rows)[1]
+        seen = np.mean((swung - swung.mean(axis=0)) ** 2)
+    for tau in (0.7, 0.8, 1.4):
+        expected = seen * (tau - 0.5) ** 2
+        if known:
+            expected = 3.0 * seen * (1.0 + 2.0 * (tau - 0.5)) ** 2 * (tau - 0.6) ** 2
+        found = pose_at(motion, tau).covariance[3:, 3:]
+        np.testing.assert_allclose(found, expected * np.eye(3), rtol=1e-6, atol=1e-14)
