@@ -492,7 +492,7 @@ class NodeConfig(LocalizerConfig):
         (0.0, 0.0, -1.0), "Direction in which things fall in the map, of any length: imu.gravity"
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
-    # Of each of the cameras, by its name.
+    # Of each of the cameras that have a name; empty: there is one, without.
     of_cameras: Mapping[str, CameraSettings] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -512,13 +512,8 @@ class NodeConfig(LocalizerConfig):
         if self.base_frame == self.odom_frame:
             raise ValueError(f"base_frame and odom_frame are both {self.odom_frame!r}")
 
-    @property
-    def is_rig(self) -> bool:
-        """Whether there are several cameras, by name."""
-        return self.cameras != NO_NAMES
-
     def _check_cameras(self) -> None:
-        if not self.is_rig:
+        if self.cameras == NO_NAMES:
             return
         wrong = [name for name in self.cameras if not _NAME.fullmatch(name)]
         if wrong or not self.cameras or len(set(self.cameras)) < len(self.cameras):

@@ -86,6 +86,7 @@ class _Given(NamedTuple):
     prior: Prior | None
     expected_share: float
     turn: GyroRotation | None
+    error_modes: ErrorModes | None
 
 
 class Localizer:
@@ -112,8 +113,6 @@ class Localizer:
             raise ValueError(f"give either config or settings, got both: {', '.join(settings)}")
         self.config = config or localizer_config(settings)
         self.rig = camera
-        self.error_modes: ErrorModes | None = None
-        """Of the map whose points are given, where it tells; covariances then have them."""
         self._solver = find_solver(self.config.solver)
         self._search = MotionSearch(
             camera.focal_length, self.config, self._solver, start_solver(self._solver)
@@ -218,14 +217,18 @@ class Localizer:
         expected_share: float = 0.5,
         turn: GyroRotation | None = None,
         stamps: Mapping[str, float] | None = None,
+        error_modes: ErrorModes | None = None,
     ) -> Estimate | Failure:
-        """As :meth:`localize`, however uncertain it is: the next frames may know better."""
+        """As :meth:`localize`, however uncertain it is: the next frames may know better.
+
+        ``error_modes``: of the map whose points are given, where it tells; covariances have them.
+        """
         if prior is not None:
             instance("prior", prior, Prior)
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
         sights = self._sights(points, pixels, scores, stamps)
-        given = _Given(*sights, prior, expected_share, turn)
+        given = _Given(*sights, prior, expected_share, turn, error_modes)
         lens = None if prior is None else prior.lens
         if (turn is not None or lens is not None) and not given.exposure.alone:
             raise ValueError("a known turn, or a lens, is that of a camera alone, not of a rig")
@@ -260,7 +263,7 @@ class Localizer:
 
     def _found(self, given: _Given, lens: LensError | None) -> Estimate | Failure:
         """What there is to find by a lens that other frames tell of, or by the calibration's."""
-        exposure, counts, points, pixels, scores, prior, expected_share, turn = given
+        exposure, counts, points, pixels, scores, prior, expected_share, turn, modes = given
         terms, assumed = self._assume(exposure.span)
         if prior is not None or turn is not None:
             terms, assumed, prior = of_frame(terms, assumed, prior, turn)
@@ -280,6 +283,7 @@ class Localizer:
             Sighted(exposure, points, pixels, usable, turn),
             lens,
             prior is not None and prior.asks_lens,
+            modes,
         )
         # 2. Near the predicted motion, if the points agree with it (tracking).
         if prior is not None and prior.motion is not None:
@@ -400,7 +404,7 @@ class Localizer:
         enough = np.count_nonzero(posterior.inliers) >= self.config.min_inliers
         if enough and posterior.determined and np.all(np.isfinite(posterior.state)):
             effect = calibration_effect(
-                observed, posterior, own_terms, self.config.calibration, self.error_modes
+                observed, posterior, own_terms, self.config.calibration, observed.error_modes
             )
         known = math.hypot(posterior.declared, effect.residual)  # px, of map and calibration
         failure = refusal(

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,9 +25,11 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
+from rs_localizer.core.rig import Rig
 from rs_localizer.core.shutter import motion_of, numbers_of
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.motion_model import (
     FADING,
@@ -37,13 +40,14 @@ from rs_localizer.estimation.motion_model import (
     with_mean_turn,
 )
 from rs_localizer.estimation.prior import Prior, offset_between, pivot_of, state_in
-from rs_localizer.inertial.aiding import Before, Found, GyroPrediction, GyroscopeAid, without_gyro
-from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
-from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.settings import InertialSettings
-from rs_localizer.inertial.watch import InertialStatus
 from rs_localizer.localizer import Localizer
 from rs_localizer.solvers.table import find_solver
+
+if TYPE_CHECKING:  # without a gyroscope nobody needs them
+    from rs_localizer.inertial.aiding import Before, Found, GyroPrediction, GyroscopeAid
+    from rs_localizer.inertial.samples import ImuSamples
+    from rs_localizer.inertial.settings import InertialSettings
+    from rs_localizer.inertial.watch import InertialStatus
 
 
 class Memory(Enum):
@@ -76,6 +80,23 @@ FAR_OFF = 0.5
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least acceleration that a configuration may have, rad/s^2 and m/s^2.
 _LEAST_ACCELERATION = 0.001
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameContext:
+    """Knowledge of a frame beside its points."""
+
+    # A readout time that is far off makes wrong velocities per readout of those from frame to
+    # frame: then each image speaks for itself, and the frames before give a first guess.
+    trusts_readout_time: bool = True
+    # s; velocities per readout say that much less of how far the camera goes.
+    readout_time_deviation: float = 0.0
+    of_rest: float = 0.0  # logarithm of the odds for a global shutter, beside those of any
+    error_modes: ErrorModes | None = None  # of the map whose points are given, where it tells
+
+
+ORDINARY = FrameContext()
+"""Of a frame of which nothing else is known."""
 
 
 @dataclass(slots=True)
@@ -120,18 +141,13 @@ class Tracker:
         elif inertial is not None:
             inertial = replace(inertial, estimate_time_offset=False)
         self.localizer, self._memory = localizer, memory
-        # A readout time that is far off makes wrong velocities per readout of those from frame to
-        # frame: then each image speaks for itself, and the frames before give a first guess.
-        self.trusts_readout_time = True
-        # s; velocities per readout say that much less of how far the camera goes.
-        self.readout_time_deviation = 0.0
-        # Then, logarithm of the odds for a global shutter, beside those of any.
-        self.of_rest = 0.0
         self._track: _Track | None = None
         self._given: tuple[int, Prior] | None = None
         self._last_ns, self._too_close = 0, 0
         self._aid: GyroscopeAid | None = None
         if inertial is not None:
+            from rs_localizer.inertial.aiding import GyroscopeAid
+
             self._aid = GyroscopeAid(inertial, localizer.camera.readout_time)
         self._without_gyro = Acceleration(_LEAST_ACCELERATION, localizer.config.acceleration.linear)
 
@@ -146,12 +162,15 @@ class Tracker:
         """What became of the gyroscope; None without one."""
         return None if self._aid is None else self._aid.status
 
-    @property
-    def _trusts_motion(self) -> bool:
+    def mount(self, rig: Rig) -> None:
+        """Localize with the same cameras where they are now; the rig's axes stay the same."""
+        self.localizer = Localizer(rig, self.localizer.config)
+
+    def _trusts_motion(self, context: FrameContext) -> bool:
         """Whether how far the camera goes from frame to frame tells how it moves within one."""
         least = min(camera.readout_time for camera in self.localizer.rig.cameras.values())
-        known = self.readout_time_deviation < FAR_OFF * least
-        return self._memory is Memory.MOTION and self.trusts_readout_time and known
+        known = context.readout_time_deviation < FAR_OFF * least
+        return self._memory is Memory.MOTION and context.trusts_readout_time and known
 
     def _follows(self, time_ns: int) -> bool:
         """Whether the motion of the last frame with a pose predicts that at a time."""
@@ -182,7 +201,9 @@ class Tracker:
         """
         self._given = time_ns, prior
 
-    def prediction(self, time_ns: int, span: float | None = None) -> Prior | None:
+    def prediction(
+        self, time_ns: int, span: float | None = None, context: FrameContext = ORDINARY
+    ) -> Prior | None:
         """What the last frames, or others, say of the motion at a time; None: nobody does.
 
         ``span``: s, of the row times of the frame; None: as of the last one.
@@ -207,8 +228,8 @@ class Tracker:
             _scaled(acceleration, track.process_noise_scale), dt, readout_time
         )
         covariance += swing
-        if self.readout_time_deviation > 0.0:
-            share = self.readout_time_deviation / readout_time
+        if context.readout_time_deviation > 0.0:
+            share = context.readout_time_deviation / readout_time
             velocity = np.r_[motion.angular_velocity, motion.linear_velocity]
             displacement = share * dt / readout_time * velocity
             covariance[:6, :6] += np.outer(displacement, displacement)
@@ -229,6 +250,7 @@ class Tracker:
         scores: ArrayLike | None = None,
         imu: ImuSamples | None = None,
         stamps: Mapping[str, float] | None = None,
+        context: FrameContext = ORDINARY,
     ) -> Estimate | Failure:
         """Localize the frame whose middle row was exposed at ``time_ns``.
 
@@ -240,6 +262,7 @@ class Tracker:
                 exposure of this one; None: the camera goes alone.
             stamps: of a rig, s after ``time_ns`` at which the first rows were exposed (None: then);
                 the time of the estimate counts from there, too.
+            context: what else is known of this frame.
         """
         later, span = 0, None
         if isinstance(points, Mapping) and points:
@@ -258,17 +281,21 @@ class Tracker:
             turn = None if predicted is None else predicted.turn
             prior = None if predicted is None else predicted.prior
             if prior is None:
-                prior = self._prior(time_ns, turn, span)
+                prior = self._prior(time_ns, turn, span, context)
             if self._track is not None and prior is not None:
                 prior = self._track.experience.with_lens(prior)
-            found = self.localizer.find(points, pixels, scores, prior, share, turn, stamps)
+            found = self.localizer.find(
+                points, pixels, scores, prior, share, turn, stamps, context.error_modes
+            )
             return found, prior
 
         if self._aid is None:
             result, prior = localized(None)
-            if not result and self._track is not None and not self._trusts_motion:
+            if not result and self._track is not None and not self._trusts_motion(context):
                 # What other frames said may no longer hold: a hand bent the board, and let it go.
-                alone = self.localizer.find(points, pixels, scores, stamps=stamps)
+                alone = self.localizer.find(
+                    points, pixels, scores, stamps=stamps, error_modes=context.error_modes
+                )
                 if alone:
                     result, prior, self._track = alone, None, None
         else:
@@ -276,31 +303,39 @@ class Tracker:
                 imu, time_ns, lambda: self._before(time_ns), localized
             )
         if result:
-            self._remember(time_ns, prior, result)
-            if self._aid is not None and imu is not None and self._aid.wants_sight():
+            self._remember(time_ns, prior, result, context)
+            if self._aid is not None and imu is not None:
                 lens, camera = result.lens, self.localizer.camera
                 camera = camera if lens is None else lens.mended(camera)
                 assert pixels is not None and not isinstance(points, Mapping)  # noqa: PT018
-                self._aid.seek(row_offset_likelihood(camera, points, pixels, result, time_ns))
+                self._aid.seek(camera, points, pixels, result, time_ns)
         elif self._track is not None and self._memory is Memory.MOTION:
             self._track.failures += 1
             if self._track.failures >= _MOST_FAILURES:
                 self._track = None
         return self.localizer.accepted(result)
 
-    def _prior(self, time_ns: int, turn: GyroRotation | None, span: float | None) -> Prior | None:
+    def _prior(
+        self, time_ns: int, turn: GyroRotation | None, span: float | None, context: FrameContext
+    ) -> Prior | None:
         """What is known of a frame of whose motion a gyroscope predicts no more than the turn."""
         if self._memory is Memory.NOTHING:
-            return Prior(of_rest=self.of_rest) if turn is None else None
+            return Prior(of_rest=context.of_rest) if turn is None else None
         if self._memory is Memory.MAP_AND_LENS:
             return None if self._track is None else Prior(scales=self._track.experience.scales)
-        prior = self.prediction(time_ns, span)
-        if prior is not None and not self._trusts_motion:
-            rest = self.of_rest if turn is None else 0.0
+        prior = self.prediction(time_ns, span, context)
+        if prior is not None and not self._trusts_motion(context):
+            rest = context.of_rest if turn is None else 0.0
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
-        return prior if turn is None else without_gyro(prior, turn)
+        if turn is None:
+            return prior
+        from rs_localizer.inertial.aiding import without_gyro
 
-    def _remember(self, time_ns: int, prior: Prior | None, result: Estimate) -> None:
+        return without_gyro(prior, turn)
+
+    def _remember(
+        self, time_ns: int, prior: Prior | None, result: Estimate, context: FrameContext
+    ) -> None:
         """Keep what the next frames are to know of this one."""
         track = self._track
         if self._memory is Memory.MOTION:
@@ -308,7 +343,7 @@ class Tracker:
         elif self._memory is Memory.MAP_AND_LENS:
             experience = Experience.of(result) if track is None else track.experience.and_of(result)
             self._track = _Track(result, time_ns, 0.0, experience, np.ones(2))
-        if track is None or self._track is None or self._trusts_motion:
+        if track is None or self._track is None or self._trusts_motion(context):
             return
         seconds = 1e-9 * (time_ns - track.time_ns)
         if 0.0 < seconds < _LONGEST_GAP:
@@ -322,6 +357,8 @@ class Tracker:
         track = self._track
         if track is None:
             return None
+        from rs_localizer.inertial.aiding import Before
+
         readout_time = self.localizer.camera.readout_time
         motion, covariance, added = unshaken(track.estimate)
         dt = 1e-9 * (time_ns - track.time_ns)

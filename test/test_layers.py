@@ -21,22 +21,17 @@ MAY_IMPORT: dict[str, set[str]] = {
     "inertial": {"core", "estimation"},
     "localizer": METHOD - {"inertial", "localizer", "tracking"},
     "tracking": METHOD - {"tracking"},
-    "trajectory": METHOD,
     "io": {"core"},
     "settings": {"config", "io"},
     "readout": {"data"},
     "matching": {"core", "config", "estimation", "io"},
     "markers": {"core", "io"},
     "features": {"core", "config", "io"},
-    "pipeline": {*METHOD, "io", "features", "markers", "matching", "trajectory"},
-    "offline": {
-        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings")
-    },
-    "simulation": {
-        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings")
-    },
+    "pipeline": {*METHOD, "io", "features", "markers", "matching"},
+    "offline": {*(*METHOD, "io", "features", "markers", "matching", "pipeline", "settings")},
+    "simulation": {*(*METHOD, "io", "features", "markers", "matching", "pipeline", "settings")},
     "evaluation": {
-        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
+        *(*METHOD, "io", "features", "markers", "matching", "pipeline", "settings"),
         *("data", "simulation"),
     },
 }
@@ -146,6 +141,7 @@ BY_KEYWORDS = {
     "solvers/minimal.py: solve_minimal",
     "localizer.py: localize",
     "localizer.py: find",
+    "tracking.py: localize",
 }
 
 

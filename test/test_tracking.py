@@ -10,7 +10,7 @@ import rs_localizer as rsl
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.state import step_between
 from rs_localizer.pipeline.pose_at_time import twist_at
-from rs_localizer.tracking import Tracker
+from rs_localizer.tracking import FrameContext, Tracker
 
 READOUT = 0.03
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
@@ -222,14 +222,17 @@ def test_a_measured_rate_or_direction_helps_on_a_wall(kind):
 
 def test_with_a_readout_time_far_off_each_image_speaks_for_itself():
     hand, localizer = Hand(), rsl.Localizer(CAMERA)
-    trusting, doubting, unsure = (Tracker(localizer) for _ in range(3))
-    doubting.trusts_readout_time = False
-    unsure.readout_time_deviation = 0.6 * CAMERA.readout_time
+    trackers = [Tracker(localizer) for _ in range(3)]
+    unsure = FrameContext(readout_time_deviation=0.6 * CAMERA.readout_time)
+    contexts = (FrameContext(trusts_readout_time=False), FrameContext(), unsure)
     errors = []
     for t in times(8):
         # Frames follow each other twice as fast as they say: so do turns, but not those within.
         data, truth = hand.frame(2.0 * t, 150, noise=0.3), hand.motion(2.0 * t)
-        found = [one.localize(ns(t), *data) for one in (doubting, trusting, unsure)]
+        found = [
+            one.localize(ns(t), *data, context=context)
+            for one, context in zip(trackers, contexts, strict=True)
+        ]
         assert found[0].tracked == (t > 0.0)  # near the motion before, all the same
         # What nobody knows is not believed either.
         np.testing.assert_array_equal(found[2].joint_covariance, found[0].joint_covariance)
@@ -244,8 +247,8 @@ def test_where_the_readout_time_is_in_doubt_so_is_how_far_the_camera_goes():
     hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA))
     tracker.localize(ns(0.0), *hand.frame(0.0, 150, noise=0.3))
     sure = tracker.prediction(ns(0.04))
-    tracker.readout_time_deviation = 0.2 * CAMERA.readout_time
-    unsure = tracker.prediction(ns(0.04))
+    known = FrameContext(readout_time_deviation=0.2 * CAMERA.readout_time)
+    unsure = tracker.prediction(ns(0.04), context=known)
     added = unsure.covariance - sure.covariance
     turn = 0.2 * 0.04 / CAMERA.readout_time * sure.motion.angular_velocity
     np.testing.assert_allclose(added[:3, :3], np.outer(turn, turn), atol=1e-12)

@@ -19,7 +19,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.state import ANGULAR, POSE, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
@@ -29,8 +29,7 @@ from rs_localizer.tools.adjust.observe import Observed, collect
 from rs_localizer.tools.adjust.problem import LIMIT, Problem, View
 from rs_localizer.tools.calibration import calibrate, within
 from rs_localizer.tools.first_lens import first_lens
-from rs_localizer.tracking import Memory, Tracker
-from rs_localizer.trajectory.online_readout import REVERSED
+from rs_localizer.tracking import FrameContext, Memory, Tracker
 
 Pose = Estimate | GlobalPose
 Poses = Sequence[Pose | Failure | None]
@@ -90,8 +89,11 @@ def localized(name: str, camera: Camera, images: Sequence[Observed], config: Nod
         ]
     if name == "tracked":
         tracker = Tracker(Localizer(camera, config))
-        tracker.readout_time_deviation = config.readout_time_deviation
-        return [tracker.localize(image.stamp_ns, image.points, image.pixels) for image in images]
+        known = FrameContext(readout_time_deviation=config.readout_time_deviation)
+        return [
+            tracker.localize(image.stamp_ns, image.points, image.pixels, context=known)
+            for image in images
+        ]
     if name in PEERS:
         return [PEERS[name](camera, image.points, image.pixels) for image in images]
     localizer = Localizer(camera, config)

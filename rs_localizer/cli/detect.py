@@ -156,7 +156,7 @@ def _look(
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
         with BagWriter(out, args.storage) as bag:
             cameras = {"": args}
-            if settings.is_rig:
+            if settings.of_cameras:
                 rig = cameras_of(with_values(args, recordings=[args.images]), settings)
                 cameras = {name: own.args for name, own in rig.items()}
                 if args.calibration is not None and not is_bag(args.images):

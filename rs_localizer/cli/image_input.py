@@ -168,7 +168,7 @@ def tell_telemetry(
     path = args.images
     if args.no_telemetry:
         return
-    is_rig = measured is None and build(shutter_values(args)).is_rig
+    is_rig = measured is None and bool(build(shutter_values(args)).of_cameras)
     if path.suffix == ".insv" and importlib.util.find_spec("av") is not None:
         names = LENSES[: count_lenses(path)]
         if len(names) > 1 and measured is None and not is_rig:

@@ -69,7 +69,6 @@ if WORKING:
     )
     from rs_localizer.offline.table import FrameTable, read_parquet, schema, write_parquet
     from rs_localizer.pipeline.frames import FrameLocalizer
-    from rs_localizer.pipeline.rigs import frame_localizer
     from rs_localizer.tools.smoothed import smooth_frames
     from rs_localizer.tools.warm_up import warm_up
 
@@ -152,7 +151,7 @@ def _check_place(options: Options) -> None:
 def _settings(options: Options) -> NodeConfig:
     """The settings that the options give; refuses those that cannot be."""
     also = [] if options.map is None else [f"map_file:={json.dumps(str(options.map))}"]
-    return given_settings(options, also, frame_localizer)
+    return given_settings(options, also, FrameLocalizer)
 
 
 def _name(recording: Path) -> str:
@@ -234,14 +233,14 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
     def notice(name: str, text: str) -> None:
         notices[name] = notices.get(name, (0, ""))[0] + 1, text
 
-    if config.is_rig and options.parquet is not None:
+    if config.of_cameras and options.parquet is not None:
         raise UsageError("--parquet is for one camera: leave it out with cameras")
     with open_bag(path) as bag:
         topics, localizer = prepare(bag, config, given_topics(options), notice)
         unused = IMU not in topics.of and config.imu.use != ImuUse.NONE
         if unused and (several := imu_topics(bag)):
             print(f"no IMU is used: choose {' or '.join(several)} with -r imu:=TOPIC")
-        if options.smooth and config.readout_time == 0.0 and not config.is_rig:
+        if options.smooth and config.readout_time == 0.0 and not config.of_cameras:
             raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
         localizer.warm_up()
         table = None
@@ -344,7 +343,7 @@ def _replay(
             if answer.stamp_ns not in smoothed:
                 tally.table.add(answer.stamp_ns, answer.result)
     tally.seconds = time.perf_counter() - start
-    if localizer.config.is_rig:
+    if localizer.config.of_cameras:
         # Images of several cameras are one frame.
         lost = sum(n for reason, n in tally.refused.items() if reason not in NO_FRAMES)
         tally.total = tally.localized + lost
@@ -460,6 +459,6 @@ def _replay_of_many(options: Options, recording: Path, out: Path) -> Figures:
 
 
 def _warm(options: Options) -> None:
-    frame_localizer(_settings(options)).warm_up()
+    FrameLocalizer(_settings(options)).warm_up()
     if options.smooth:
         warm_up()

@@ -52,7 +52,7 @@ def cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, OfRig]
         frames = [f"{name}_optical_frame" for name in names]
     else:
         (path,) = args.recordings
-        names, topics, frames = _in_one_file(path, config.cameras if config.is_rig else None)
+        names, topics, frames = _in_one_file(path, config.cameras if config.of_cameras else None)
     if len(set(names)) < max(len(names), 2) or not all(name[:1].isalpha() for name in names):
         raise UsageError(
             f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
@@ -138,7 +138,7 @@ def map_cameras(args: argparse.Namespace, config: NodeConfig) -> list[MapCamera]
     Raises:
         UsageError: when it is not known how they are mounted, or what their shutters are.
     """
-    if len(args.recordings) == 1 and not config.is_rig:
+    if len(args.recordings) == 1 and not config.of_cameras:
         check_there(args.recordings)
         alone = with_values(args, recording=args.recordings[0])
         return [MapCamera("", alone, config, None)]

@@ -14,3 +14,12 @@ class ScanDirection(StrEnum):
     BOTTOM_TO_TOP = "bottom_to_top"
     LEFT_TO_RIGHT = "left_to_right"
     RIGHT_TO_LEFT = "right_to_left"
+
+
+REVERSED = {
+    ScanDirection.TOP_TO_BOTTOM: ScanDirection.BOTTOM_TO_TOP,
+    ScanDirection.BOTTOM_TO_TOP: ScanDirection.TOP_TO_BOTTOM,
+    ScanDirection.LEFT_TO_RIGHT: ScanDirection.RIGHT_TO_LEFT,
+    ScanDirection.RIGHT_TO_LEFT: ScanDirection.LEFT_TO_RIGHT,
+}
+"""The opposite of each direction."""

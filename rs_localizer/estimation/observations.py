@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +32,9 @@ from rs_localizer.estimation.residuals import (
     linearized,
     squared_errors,
 )
+
+if TYPE_CHECKING:
+    from rs_localizer.estimation.calibration import ErrorModes
 
 
 @kernel
@@ -387,6 +390,7 @@ class Observed:
     sighted: Sighted
     lens: LensError | None = None  # what its camera lacked
     asks_lens: bool = False  # what the frame says of that
+    error_modes: ErrorModes | None = None  # of the map
 
     @property
     def centre(self) -> Array:

@@ -56,18 +56,6 @@ class ImuSamples:
         return slice(max(first - MARGIN, 0), last + MARGIN)
 
 
-def needed(readout_time: float, middle_ns: int, period_ns: int) -> tuple[int, int]:
-    """First and last time (ns) of what a frame wants.
-
-    Args:
-        readout_time: s.
-        middle_ns: exposure of its middle row.
-        period_ns: from sample to sample.
-    """
-    reach = round(0.5e9 * readout_time) + MARGIN * period_ns
-    return middle_ns - reach, middle_ns + reach
-
-
 # Readings farther apart than so many periods are a gap: one that is missing can be told from its
 # neighbours, as far as a vibration goes that they can show, two cannot.
 _MOST_PERIODS = 2.5

@@ -2,24 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether a gyroscope can be believed, by what the camera sees.
 
-Whether another rotation camera <- imu would make gyroscope and camera agree.
-
-The rotation that carries the gyroscope's turns into the camera's (Wahba, "A least squares estimate
-of satellite attitude", 1965; by the singular values of their correlation: Markley, 1988).
-
-The time offset of a gyroscope from turns of the camera between frames.
-
-Each pair of frames has a turn; at the right offset, and less its bias, the gyroscope turned as much
-meanwhile. A vibration makes the error a wave of the offset, so it is searched for on a grid, and
-the bias is the best at each point of it (variable projection). The curvature at the minimum tells
-how well the offset is known.
+One that contradicts it in many frames is dropped, until another offset of its stamps makes the two
+agree; or another rotation camera <- imu would, which is then said: the rotation that carries the
+gyroscope's turns into the camera's (Wahba, "A least squares estimate of satellite attitude", 1965;
+by the singular values of their correlation: Markley, 1988).
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -27,11 +19,10 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.rate_spline import rotations_at_knots, spline, turns_at
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.so3 import log
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.inertial.filter import GyroscopeFilter
+from rs_localizer.inertial.offset_search import BY_TURNS, OffsetSearch, Orientation
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.turning import turn_between
@@ -64,14 +55,6 @@ class InertialStatus:
         return self.alone is Alone.NONE
 
 
-# Offsets to try, s; finer than a tenth of the cycle of what can shake a camera at 100 Hz.
-_FARTHEST, _STEP = 0.06, 0.001
-# Squared errors per degree of freedom of turns that agree; covariances are a little off.
-_AGREE = 4.0
-_FEWEST = 12  # pairs
-_LEAST_DEVIATION = 1e-5  # s
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraTurn:
     """The turn of the camera between two frames."""
@@ -80,89 +63,6 @@ class CameraTurn:
     to_ns: int
     rotation: Array  # (3,3) camera_then_from_camera_now
     deviation: float  # rad, of each axis
-
-
-@dataclass(frozen=True, slots=True)
-class OffsetFit:
-    """The best offset."""
-
-    time_offset: float  # s, to be added to the times of the samples
-    deviation: float  # s
-    misfit: float  # squared errors per degree of freedom
-    at_rest: float  # the same for a gyroscope that shows nothing
-
-    @property
-    def explains(self) -> bool:
-        """Whether the gyroscope agrees with the camera at this offset, and it moved enough."""
-        return self.misfit < min(_AGREE, 0.1 * self.at_rest)
-
-
-def fit_offset(times_ns: IntArray, rates: Array, turns: Sequence[CameraTurn]) -> OffsetFit | None:
-    """The offset at which a gyroscope agrees best with the turns of a camera.
-
-    Args:
-        times_ns: (n,) of the samples.
-        rates: (n,3) rad/s, camera axes.
-        turns: of the camera; those that the samples do not cover at all offsets do not count.
-
-    Returns:
-        None if too few count.
-    """
-    reach = round(1e9 * _FARTHEST)
-    covered = [
-        turn
-        for turn in turns
-        if turn.from_ns - reach > times_ns[0] and turn.to_ns + reach < times_ns[-1]
-    ]
-    if len(covered) < _FEWEST:
-        return None
-    origin = int(times_ns[0])
-    times = np.asarray(1e-9 * (times_ns - origin), np.float64)
-    cubics = spline(times, np.ascontiguousarray(rates))
-    knots = rotations_at_knots(times, cubics)
-    start = 1e-9 * np.array([turn.from_ns - origin for turn in covered])
-    end = 1e-9 * np.array([turn.to_ns - origin for turn in covered])
-    seen = np.array([turn.rotation for turn in covered])
-    weight = 1.0 / np.array([turn.deviation for turn in covered])
-
-    def errors(offset: float) -> Array:
-        before, _ = turns_at(start - offset, times, cubics, knots)
-        after, _ = turns_at(end - offset, times, cubics, knots)
-        shown = after @ np.swapaxes(before, 1, 2)
-        # What the camera turned more than the gyroscope showed, in the axes of then: -dt b.
-        return _logs(shown @ np.swapaxes(seen, 1, 2))
-
-    def misfit(offset: float) -> float:
-        error, along = errors(offset) * weight[:, None], -(end - start) * weight
-        bias = along @ error / (along @ along)
-        return float(np.sum((error - along[:, None] * bias) ** 2))
-
-    grid = np.arange(-_FARTHEST, _FARTHEST + 0.5 * _STEP, _STEP)
-    costs = np.array([misfit(offset) for offset in grid])
-    best = int(np.clip(np.argmin(costs), 1, len(grid) - 2))
-    step = _STEP
-    offset, low, middle, high = grid[best], *costs[best - 1 : best + 2]
-    for _ in range(3):  # parabolas through three points, closer and closer
-        bend = low - 2.0 * middle + high
-        if not bend > 0.0:
-            return None
-        offset += float(np.clip(0.5 * step * (low - high) / bend, -step, step))
-        curvature = bend / step**2
-        step *= 0.25
-        low, middle, high = (misfit(offset + shift) for shift in (-step, 0.0, step))
-    freedom = 3 * len(covered) - 4
-    per_freedom = middle / freedom
-    turned = np.einsum("n,ni->", weight**2, _logs(seen) ** 2)
-    return OffsetFit(
-        float(offset),
-        max(math.sqrt(2.0 * max(per_freedom, 1.0) / curvature), _LEAST_DEVIATION),
-        per_freedom,
-        float(turned) / freedom,
-    )
-
-
-def _logs(rotations: Array) -> Array:
-    return np.array([log(np.ascontiguousarray(rotation)) for rotation in rotations])
 
 
 # Turns that a rotation explains, as a part of their sum of squares that it leaves.
@@ -216,15 +116,6 @@ _TELLING = 5.0
 _ALLOWED = 0.03
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Believed:
-    """A frame with a pose, as the gyroscope is compared with it."""
-
-    middle_ns: int
-    rotation: Array  # (3,3) camera_from_map
-    covariance: Array  # (3,3) of it, rad^2
-
-
 class GyroscopeWatch:
     """Drops a gyroscope that contradicts the camera, finds out why, and takes it up again."""
 
@@ -238,7 +129,8 @@ class GyroscopeWatch:
         self.angle = 0.0
         self._contradictions: deque[bool] = deque(maxlen=_WATCHED)
         self._turns: deque[CameraTurn] = deque(maxlen=_KEPT)
-        self._last: Believed | None = None
+        self._last: Orientation | None = None
+        self._search = OffsetSearch(step=BY_TURNS)
         self._samples: deque[tuple[IntArray, Array]] = deque()
         self._untried = 0
 
@@ -259,7 +151,7 @@ class GyroscopeWatch:
         times, rates = zip(*self._samples, strict=True)
         return np.concatenate(times), np.concatenate(rates)
 
-    def judge(self, contradicts: bool, frame: Believed | None) -> None:
+    def judge(self, contradicts: bool, frame: Orientation | None) -> None:
         """Take in a frame.
 
         Args:
@@ -272,32 +164,34 @@ class GyroscopeWatch:
         if self.dropped is Alone.NONE:
             if sum(self._contradictions) >= _CONTRADICTIONS:
                 self.dropped, self._untried = Alone.DISAGREES, 0
+                self._search = OffsetSearch(step=BY_TURNS)
                 self._filter.reset()  # what it learned of such a gyroscope is nothing
             return
+        if frame is not None and self._settings.estimate_time_offset:
+            self._search.add(frame)
+            found = self._search.look(*self.heard)
+            if found is not None:
+                self._filter.reset(found.time_offset, 2.0 * found.deviation)
+                self.take_up()
+                return
         self._untried += 1
         if self._untried >= _TRY_EVERY:
             self._untried = 0
             self._explain()
 
-    def _follow(self, frame: Believed) -> None:
+    def _follow(self, frame: Orientation) -> None:
         last, self._last = self._last, frame
         if last is None or not 0 < frame.middle_ns - last.middle_ns <= _LONGEST_PAIR_NS:
             return
         turn = frame.rotation @ last.rotation.T
-        deviation = np.sqrt((np.trace(frame.covariance) + np.trace(last.covariance)) / 3.0)
-        self._turns.append(CameraTurn(last.middle_ns, frame.middle_ns, turn, float(deviation)))
+        deviation = math.hypot(frame.deviation, last.deviation)
+        self._turns.append(CameraTurn(last.middle_ns, frame.middle_ns, turn, deviation))
 
     def _explain(self) -> None:
-        """Find a time offset that makes the two agree, or say that the mounting does not."""
+        """Take it up where the two agree, or say that the mounting does not."""
         if not self._samples:
             return
-        times, rates = self.heard
-        fit = fit_offset(times, rates, self._turns)
-        if fit is not None and fit.explains and self._settings.estimate_time_offset:
-            self._filter.reset(fit.time_offset, 2.0 * fit.deviation)
-            self.take_up()
-            return
-        shown, seen = self._compared(ImuSamples(times, rates))
+        shown, seen = self._compared(ImuSamples(*self.heard))
         if len(seen) and np.sum((seen - shown) ** 2) < _ALLOWED * np.sum(seen**2):
             self.take_up()
             return

@@ -35,10 +35,10 @@ from rs_localizer.pipeline.inputs import (
     Results,
     Role,
     input_named,
+    inputs_of,
     with_role,
 )
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
-from rs_localizer.pipeline.rigs import frame_localizer, inputs_of, last_results
 
 Item = tuple[str, int, Any]
 """Topic, time of recording in ns, message."""
@@ -330,7 +330,7 @@ def prepare(
     Raises:
         ValueError: for topics, transforms or a map that are missing or cannot be used.
     """
-    if config.is_rig:
+    if config.of_cameras:
         topics = find_rig_topics(bag, config.cameras, given)
     else:
         topics = find_topics(bag, given)
@@ -340,7 +340,7 @@ def prepare(
         raise BagError(f"{bag.path} has {topics.frames} and no map; give one with --map")
     if DETECTIONS in topics.of and not config.marker_map:
         raise BagError(f"{bag.path} has {topics.frames}; -p marker_map:=FILE says where tags are")
-    localizer = frame_localizer(config, notice, find_transforms(bag, topics, config))
+    localizer = FrameLocalizer(config, notice, find_transforms(bag, topics, config))
     localizer.load_map()
     return topics, localizer
 
@@ -376,7 +376,7 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
         topic, recorded_ns, message = last
         for result in _each(inputs[topic].take(localizer, message)):
             yield Answer(recorded_ns, stamp_ns(message), result)
-    for result in last_results(localizer):
+    for result in localizer.flush():
         assert last is not None  # which waits
         yield Answer(last[1], stamp_ns(last[2]), result)
 

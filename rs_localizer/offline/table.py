@@ -239,7 +239,7 @@ def localize_recording(
         ImportError: without pyarrow (``pip install 'rs_localizer[table]'``).
     """
     config = _config(map, settings)
-    if config.is_rig:
+    if config.of_cameras:
         raise ValueError("a table is of one camera: leave the setting cameras out")
     with open_bag(Path(source)) as bag:
         topics, localizer = prepare(bag, config)

@@ -3,25 +3,30 @@
 """A frame from message to pose: what the live node and the offline replay share.
 
 Both feed their messages to a :class:`FrameLocalizer` and publish what
-:func:`rs_localizer.io.outputs.messages` makes of the result, so that both say the same.
+:func:`rs_localizer.io.outputs.messages` makes of the result, so that both say the same. A camera is
+a rig of one. A rig of several has the axes of its first camera whose ``camera_info`` has come;
+where the others are, TF says, at the time of the frame. Poses are those of ``base_frame``.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rs_localizer import matching
-from rs_localizer.config import MatchBy, Matching, NodeConfig
+from rs_localizer.config import CameraSettings, MatchBy, NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Notice, Reason
+from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
 from rs_localizer.core.simd.jit import NotCompiled
-from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.calibration import ErrorModes
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import (
@@ -29,134 +34,32 @@ from rs_localizer.io.clouds import (
     Keypoints,
     read_correspondences,
     read_keypoints,
+    select_inliers,
     thinned,
 )
-from rs_localizer.io.maps.files import read_map_file
-from rs_localizer.io.maps.landmarks import Map, MapError
-from rs_localizer.io.outputs import Localized
-from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
-from rs_localizer.io.transforms import Transforms, TransformTree
+from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.outputs import CameraShare, Localized
+from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, MAP_POINTS
+from rs_localizer.io.transforms import Transform, TransformError, Transforms, TransformTree
 from rs_localizer.localizer import Localizer
-from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.pipeline.compiling import note_whole, plain_frames
 from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
 from rs_localizer.pipeline.imu import ImuInput, inertial_settings
+from rs_localizer.pipeline.inputs import INPUTS
+from rs_localizer.pipeline.landmarks import Landmarks, read_landmarks
 from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch, Watched
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
+from rs_localizer.pipeline.rig_frames import FrameAssembler, Image
+from rs_localizer.pipeline.rig_watch import RigWatch
 from rs_localizer.pipeline.stream import Stream
-from rs_localizer.pipeline.tags import Tags, read_tags
 from rs_localizer.solvers.table import find_solver
-from rs_localizer.tracking import Memory, Tracker
-from rs_localizer.trajectory import online_readout
+from rs_localizer.tracking import FrameContext, Memory, Tracker
 
-
-class Landmarks:
-    """The map that keypoints are matched with, as soon as there is one.
-
-    Args:
-        notice: told what is odd.
-    """
-
-    def __init__(self, notice: Notify) -> None:
-        self._notice = notice
-        self._matcher: Matcher | None = None
-        self.error_modes: ErrorModes | None = None
-        self.lacking = False
-        """Whether keypoints have come before a map, and no frame has been localized since."""
-
-    @property
-    def map(self) -> Map | None:
-        """The present one."""
-        return None if self._matcher is None else self._matcher.map
-
-    def use(self, landmarks: Map) -> None:
-        """Match with this map from now on."""
-        previous = self.map
-        if previous is not None and landmarks.equals(previous):
-            return  # published again
-        for name, text in oddities_of_map(landmarks, previous).items():
-            self._notice(name, text)
-        self._matcher = Matcher(landmarks)
-        modes = landmarks.error_modes
-        self.error_modes = None if modes is None else ErrorModes(landmarks.points, modes)
-        self.lacking = False
-
-    def how(self, keypoints: Keypoints, settings: Matching) -> MatchBy | Refusal:
-        """By what they can be matched."""
-        if self._matcher is None:
-            self.lacking = True
-            return Refusal(
-                Reason.NO_MAP, "no usable map has come yet, on map_points or as map_file"
-            )
-        try:
-            by = self._matcher.choose(keypoints, settings)
-        except MatchError as error:
-            return Refusal(Reason.BAD_KEYPOINTS, str(error))
-        if by == MatchBy.DESCRIPTOR and len(keypoints) > settings.max_keypoints:
-            self._notice(
-                Notice.TOO_MANY_KEYPOINTS,
-                f"{len(keypoints)} keypoints have come, matching.max_keypoints of them, "
-                f"{settings.max_keypoints}, are matched",
-            )
-        return by
-
-    def match(
-        self, keypoints: Keypoints, settings: Matching, camera: Camera, prior: Prior | None
-    ) -> Correspondences | Refusal:
-        """Correspondences, all over the map or where a motion predicts them only."""
-        assert self._matcher is not None
-        matches = self._matcher.match(keypoints, settings, camera, prior)
-        if len(matches) == 0:
-            return Refusal(
-                Reason.NO_MATCHES,
-                f"none of {len(keypoints)} keypoints matches one of {len(self._matcher.map)} "
-                f"landmarks by {matches.by}",
-            )
-        return matching.correspondences(matches, keypoints, self._matcher.map)
-
-
-def read_landmarks(file: str, frame: str) -> Map:
-    """The map of a file, to match keypoints with.
-
-    Args:
-        file: its path; ``~`` is the user's home.
-        frame: of its points.
-
-    Raises:
-        MapError: for a file that cannot be read or holds no such map.
-    """
-    path = Path(file).expanduser()
-    try:
-        landmarks = read_map_file(path, frame)
-    except MapError as error:
-        raise MapError(f"map_file: {error}") from error
-    except OSError as error:
-        raise MapError(f"map_file: {path} cannot be read: {error.strerror or error}") from error
-    if landmarks.ids is None and landmarks.descriptors is None:
-        raise MapError(
-            f"map_file: {path}: keypoints cannot be matched with a map that has neither ids "
-            "nor descriptors"
-        )
-    return landmarks
-
-
-def oddities_of_map(landmarks: Map, previous: Map | None) -> dict[Notice, str]:
-    """What is worth telling of a map that takes the place of another, or of none."""
-    notices: dict[Notice, str] = {}
-    if landmarks.dropped:
-        notices[Notice.MAP_INCOMPLETE] = (
-            f"{landmarks.dropped} landmarks are left out: they hold NaN or infinity, or no "
-            "descriptor"
-        )
-    if previous is not None:
-        notices[Notice.MAP_REPLACED] = (
-            f"a map of {len(landmarks)} landmarks in frame {landmarks.frame!r} replaces the "
-            f"one of {len(previous)} in frame {previous.frame!r}"
-        )
-    return notices
-
+if TYPE_CHECKING:
+    from rs_localizer.inertial.samples import ImuSamples
+    from rs_localizer.pipeline.tags import Tags
 
 # From this chance on of a wrong pose or map, it is more probable than not.
 _DOUBTFUL = 0.5
@@ -242,16 +145,16 @@ def _of_estimates(config: NodeConfig) -> tuple[object, ...]:
 
 
 class FrameLocalizer:
-    """Localizes correspondences, or keypoints by a map, with the latest camera and settings.
+    """Localizes correspondences, or keypoints by a map, with the latest cameras and settings.
 
-    With ``tracking``, a readout time and a rolling-shutter solver it remembers the previous frame;
+    With ``tracking``, readout times and a rolling-shutter solver it remembers the previous frame;
     new settings, a new camera, points in another frame and a time before the last one start it
     afresh.
 
     Args:
         config: settings; assigning :attr:`config` changes them from the next frame on.
         notice: told of what is odd but no refusal.
-        transforms: where the camera is on ``base_frame``; asked once a frame, so that a mounting
+        transforms: where the cameras are on ``base_frame``; asked once a frame, so that a mounting
             may change and move. Without it there is none.
 
     Raises:
@@ -268,14 +171,18 @@ class FrameLocalizer:
         self.transforms: Transforms = TransformTree() if transforms is None else transforms
         self.imu: ImuInput = ImuInput(notice)
         self.readout_watch = ReadoutWatch(notice)
+        self.rig_watch = RigWatch(config, notice)
+        self.calibrations: dict[str, Calibration] = {}
+        """What the last usable camera_info of each camera said; of one without a name: ``""``."""
+        self._mounts: dict[str, Transform] = {}  # of several cameras, on the first one
+        self._assembler = FrameAssembler(config.cameras, config.rig.window, notice)
         self._landmarks = Landmarks(notice)
         self._tags: Tags | None = None
         self._stream = Stream(notice, self._forget_motion)
         self._pose_prior = PosePrior(notice)
-        self._calibration: Calibration | None = None
         self._too_many = False  # whether clouds above max_points have been noticed
-        self._settings = config  # a readout time that is estimated takes the place of theirs
-        self._use(ANY_CALIBRATION, config)
+        self._settings = self._config = config  # an estimated readout time takes the place of one
+        self._use(config)
 
     @property
     def config(self) -> NodeConfig:
@@ -299,24 +206,57 @@ class FrameLocalizer:
             )
             self._settings = config
             return False
-        self._use(self._calibration or ANY_CALIBRATION, config)
+        self._use(config)
         self._settings = config
         return True
 
-    def _use(self, calibration: Calibration, config: NodeConfig) -> None:
-        # Nothing changes if this raises: camera, tracker and settings always belong together.
-        camera = calibration.camera(config.readout_time, config.scan_direction)
-        localizer = Localizer(camera, config)
+    @property
+    def _alone(self) -> bool:
+        """Whether there is one camera, without a name."""
+        return not self._config.of_cameras
+
+    def _use(self, config: NodeConfig) -> None:
+        # Nothing changes if this raises: cameras, tracker and settings always belong together.
+        seen = {
+            name: self.calibrations.get(name, ANY_CALIBRATION).camera(
+                own.readout_time, own.scan_direction
+            )
+            for name, own in _shutters(config).items()
+        }
+        alone = not config.of_cameras
+        device = next(iter(seen.values())) if alone else self._rig(seen)
         rolling = find_solver(config.solver).rolling_shutter
-        timed = config.readout_time > 0.0 and rolling
+        timed = rolling and all(camera.readout_time > 0.0 for camera in seen.values())
         memory = Memory.NOTHING
         if config.tracking and rolling:
             # Without a readout time frames cannot predict each other; map and lens stay the same.
             memory = Memory.MOTION if timed else Memory.MAP_AND_LENS
-        inertial = inertial_settings(config) if timed else None
-        self._tracker = Tracker(localizer, inertial, memory)
-        self._camera, self._config = camera, config
+        inertial = inertial_settings(config) if timed and alone else None
+        self._tracker = Tracker(Localizer(device, config), inertial, memory)
+        if config.rig != self._config.rig:
+            self._assembler = FrameAssembler(config.cameras, config.rig.window, self._notice)
+        self._cameras, self._config = seen, config
         self.readout_watch.reset()
+        self.rig_watch = RigWatch(config, self._notice)
+
+    def _rig(self, cameras: Mapping[str, Camera]) -> Rig:
+        """The rig of the cameras whose mounting is known; before there is one, of any."""
+        mounts = self._mounts or dict.fromkeys(cameras, Transform(np.eye(3), np.zeros(3)))
+        return Rig(
+            {name: cameras[name] for name in mounts},
+            {name: (it.rotation, it.translation) for name, it in mounts.items()},
+        )
+
+    @property
+    def rig(self) -> Rig:
+        """Of several cameras, as far as they are known."""
+        return self._rig(self._cameras)
+
+    @property
+    def _camera(self) -> Camera:
+        """The only one."""
+        (camera,) = self._cameras.values()
+        return camera
 
     def _middle_row_ns(self, stamp_ns: int) -> int:
         """When the middle row of the image with this stamp was exposed."""
@@ -324,19 +264,21 @@ class FrameLocalizer:
 
     @property
     def calibration(self) -> Calibration | None:
-        """What the last usable camera_info said."""
-        return self._calibration
+        """What the last usable camera_info of the first camera said."""
+        return self.calibrations.get(self._config.cameras[0])
 
     @property
     def camera_frame(self) -> str:
-        """The camera's optical frame; empty as long as it is unknown."""
-        return "" if self._calibration is None else self._calibration.frame
+        """The optical frame of the first camera that is known; empty as long as none is."""
+        known = (self.calibrations.get(name) for name in self._config.cameras)
+        return next((calibration.frame for calibration in known if calibration), "")
 
     @property
     def missing(self) -> tuple[str, ...]:
         """The inputs that have to come before a frame can be localized."""
-        camera = (CAMERA_INFO,) if self._calibration is None else ()
-        return (*camera, MAP_POINTS) if self._landmarks.lacking else camera
+        infos = tuple(f"{name}/{CAMERA_INFO}".lstrip("/") for name in self._config.cameras)
+        infos = () if self.calibrations else infos
+        return (*infos, MAP_POINTS) if self._landmarks.lacking else infos
 
     @property
     def map(self) -> Map | None:
@@ -362,6 +304,8 @@ class FrameLocalizer:
     def reset(self) -> None:
         """Forget the previous frames."""
         self._stream.reset()
+        self._assembler.reset()
+        self.rig_watch.reset()
         self._forget_motion()
 
     def _forget_motion(self) -> None:
@@ -373,6 +317,8 @@ class FrameLocalizer:
         plain_frames(self._tracker.localizer)
         so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
         twist_at(_STILL, 0.5, 1.0)
+        if not self._alone:
+            matching.warm_up()
 
     def warm_up_rest(self) -> None:
         """The same of what any frame may need but for an IMU's; notes that it is there.
@@ -383,8 +329,6 @@ class FrameLocalizer:
         self.warm_up()
         self._tracker.localizer.warm_up()
         so3.log(np.eye(3))
-        so3.exp_many(np.zeros((1, 3)))  # of the watch over the readout time
-        online_readout.warm_up(self._camera)
         matching.warm_up()
         note_whole(self._config.solver)
 
@@ -392,26 +336,36 @@ class FrameLocalizer:
         """The same of what plain frames beside an IMU need."""
         plain_frames(self._tracker.localizer, inertial_settings(self._config))
 
-    def calibrate(self, calibration: Calibration) -> None:
-        """Use this calibration from the next frame on.
+    def calibrate(self, calibration: Calibration, name: str = "") -> None:
+        """Use this calibration of a camera from the next frame on.
 
         Raises:
             MessageError: for one that no camera can have; the previous stays.
         """
-        if calibration == self._calibration:  # drivers repeat it with every image
+        before = self.calibrations.get(name)
+        if calibration == before:  # drivers repeat it with every image
             return
-        self._use(calibration, self._settings)
-        before, self._calibration = self._calibration, calibration
+        own, frame = _shutters(self._settings)[name], self.camera_frame
+        self._cameras[name] = calibration.camera(own.readout_time, own.scan_direction)
+        self.calibrations[name] = calibration
+        self._mounts.pop(name, None)
+        if before is None and self.camera_frame == frame:
+            return  # one more of a rig
+        self._mounts = {}  # relative to other axes
+        self._use(self._settings)
         if before is not None:
+            of = f" of {name}" if name else ""
             self._notice(
                 Notice.CAMERA_CHANGED,
-                f"camera_info changed from {before.frame!r}, {before.width} x {before.height}, "
+                f"camera_info{of} changed from {before.frame!r}, {before.width} x {before.height}, "
                 f"to {calibration.frame!r}, {calibration.width} x {calibration.height}; the "
                 "previous frames are forgotten (if it goes to and fro, two cameras publish it)",
             )
 
     def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
         """Whether readings of the frame with this stamp may yet come within so many s."""
+        if not self._alone:
+            return False  # a rig has none
         time_ns = self._middle_row_ns(stamp_ns)
         return self.imu.awaits(self._tracker, self._config, time_ns, patience)
 
@@ -421,7 +375,9 @@ class FrameLocalizer:
         Raises:
             ValueError: for a file that cannot be read or holds no such map.
         """
-        if self.config.marker_map:
+        if self.config.marker_map:  # others need no detector
+            from rs_localizer.pipeline.tags import read_tags
+
             self._tags = read_tags(self.config.marker_map, self._notice)
         if self.config.map_file:
             self.use_map(read_landmarks(self.config.map_file, self.config.map_frame))
@@ -438,10 +394,10 @@ class FrameLocalizer:
 
     def _expect(self, time_ns: int, map_frame: str) -> None:
         """Tell the tracker what others know of the pose at a time, if it knows nothing itself."""
-        if self._calibration is None or self._tracker.prediction(time_ns) is not None:
+        if not self.calibrations or self._tracker.prediction(time_ns) is not None:
             return
         prior = self._pose_prior.prior(
-            time_ns, map_frame, self._calibration.frame, self._config, self.transforms
+            time_ns, map_frame, self.camera_frame, self._config, self.transforms
         )
         if prior is not None:
             self._tracker.expect(time_ns, prior)
@@ -481,7 +437,7 @@ class FrameLocalizer:
             time_ns = self._middle_row_ns(keypoints.stamp_ns)
             if self.map is not None:
                 self._expect(time_ns, self.map.frame)
-            prior = self._tracker.prediction(time_ns)
+            prior = self._tracker.prediction(time_ns, context=self._context)
             result = None if prior is None else self._localize_by_map(keypoints, prior)
             # Without its mounting a pose is none the worse.
             if result or (result is not None and result.reason is Reason.NO_TRANSFORM):
@@ -495,41 +451,106 @@ class FrameLocalizer:
         cloud = self._tags.match(message)
         return cloud if isinstance(cloud, Refusal) else self.localize_cloud(cloud)
 
+    def add(self, name: str, kind: str, message: Any) -> Iterator[Localized | Refusal]:
+        """Take an image of a camera by its name; the results of frames that it completes."""
+        if name not in self.calibrations:
+            text = f"no usable camera_info of {name} has come yet"
+            self._notice(Notice.NO_IMAGES, f"{name} is left out: {text}")
+            yield Refusal(Reason.NO_CAMERA_INFO, text)
+            return
+        own, camera = self._config.of_cameras[name], self._cameras[name]
+        cloud = self._read(name, kind, message, camera)
+        if isinstance(cloud, Refusal):
+            yield cloud
+            return
+        for notice, text in oddities(cloud, camera, self.calibrations[name].frame).items():
+            self._notice(notice, f"{name}: {text}")
+        cloud = thinned(cloud, self._config.max_points // len(self._config.cameras), camera.size)
+        watch, frame = self.rig_watch, self.camera_frame
+        start_ns = watch.start_ns(name, cloud.stamp_ns + round(own.stamp_offset * 1e9))
+        middle_ns = start_ns - round(camera.first_row_time * own.readout_time * 1e9)
+        image = Image(name, start_ns, middle_ns, cloud)
+        for images in self._assembler.add(image) if watch.is_usable(name) else []:
+            yield self._localize_frame(images)
+        fixed = {
+            each: mount
+            for each, mount in self._mounts.items()
+            if not self.transforms.moves(self.calibrations[each].frame, frame)
+        }
+        watch.add(image, camera, fixed)
+
+    def flush(self) -> list[Localized | Refusal]:
+        """The results of what still waits for other images: none will come."""
+        return [self._localize_frame(frame) for frame in self._assembler.flush()]
+
+    def _read(
+        self, name: str, kind: str, message: Any, camera: Camera
+    ) -> Correspondences | Refusal:
+        """What a camera saw of the map."""
+        read: Callable[[Any], Any]
+        read = read_correspondences if kind == CORRESPONDENCES else read_keypoints
+        found: Correspondences | Keypoints | Refusal
+        found = read_or_refuse(read, message, INPUTS[kind].refused)
+        if isinstance(found, Refusal):
+            return replace(found, detail=f"{name}: {found.detail}")
+        if isinstance(found, Correspondences):
+            return found
+        by = self._landmarks.how(found, self._config.matching)
+        if isinstance(by, Refusal):
+            return by
+        return self._landmarks.match(found, self._config.matching, camera, None)
+
     def _localize_by_map(self, keypoints: Keypoints, prior: Prior | None) -> Localized | Refusal:
         cloud = self._landmarks.match(keypoints, self._config.matching, self._camera, prior)
         return cloud if isinstance(cloud, Refusal) else self._localize(cloud)
 
     def _localize(self, cloud: Correspondences) -> Localized | Refusal:
-        if self._calibration is None:
+        if not self.calibrations:
             return Refusal(Reason.NO_CAMERA_INFO, "no usable camera_info has come yet")
-        config, camera, frame = self._config, self._camera, self._calibration.frame
+        config, camera, frame = self._config, self._camera, self.camera_frame
         for name, text in oddities(cloud, camera, frame).items():
             self._notice(name, text)
         cloud = self._thinned(cloud)
-        watch, tracker = self.readout_watch, self._tracker
-        deviation = max(config.readout_time_deviation, watch.error)
-        time_ns = self._middle_row_ns(cloud.stamp_ns)
-        tracker.of_rest = watch.of_rest
-        tracker.trusts_readout_time = watch.trusted
-        tracker.readout_time_deviation = deviation
-        tracker.localizer.error_modes = self._landmarks.error_modes
+        time_ns, context = self._middle_row_ns(cloud.stamp_ns), self._context
         self._expect(time_ns, cloud.frame)
-        matches = (cloud.points, cloud.pixels, cloud.scores)
-        result = self.imu.track(tracker, config, time_ns, frame, self.transforms, matches)
+
+        def localized(samples: ImuSamples | None) -> Estimate | Failure:
+            matches = cloud.points, cloud.pixels, cloud.scores
+            return self._tracker.localize(time_ns, *matches, imu=samples, context=context)
+
+        result = self.imu.track(self._tracker, config, time_ns, frame, self.transforms, localized)
         try:
-            adopted = watch.add(Watched(time_ns, cloud, result, config, camera))
+            adopted = self.readout_watch.add(Watched(time_ns, cloud, result, config, camera))
         except NotCompiled:  # what it takes comes, and the next frames tell it more
-            watch.reset()
+            self.readout_watch.reset()
             adopted = config
-        wrong_axis = watch.wrong_axis
-        if adopted is not config:
-            self._use(self._calibration, adopted)
-        if wrong_axis:
-            return Refusal(Reason.SCAN_AXIS, wrong_axis)
+        if result and not self.readout_watch.wrong_axis:
+            self._stream.pace(time_ns, result, config)
+            self._pose_prior.judge(result)
+        published = self._published(cloud, result, context.readout_time_deviation)
+        if adopted is not config:  # from the next frame on
+            self._use(adopted)
+        return self.mounted(published) if published else published
+
+    @property
+    def _context(self) -> FrameContext:
+        """Knowledge of the next frame."""
+        watch = self.readout_watch
+        deviation = max(self._config.readout_time_deviation, watch.error)
+        return FrameContext(watch.trusted, deviation, watch.of_rest, self._landmarks.error_modes)
+
+    def _published(
+        self, cloud: Correspondences, result: Estimate | Failure, deviation: float
+    ) -> Localized | Refusal:
+        """A result at the published moment, unless the watch over the shutter denies it.
+
+        ``deviation``: s, of the readout time.
+        """
+        watch = self.readout_watch
+        if watch.wrong_axis:
+            return Refusal(Reason.SCAN_AXIS, watch.wrong_axis)
         if not result:
             return Refusal(result.reason, result.detail)
-        self._stream.pace(time_ns, result, config)
-        self._pose_prior.judge(result)
         if result.integrity > _DOUBTFUL:
             text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
             self._notice(Notice.DOUBTFUL, text)
@@ -538,7 +559,7 @@ class FrameLocalizer:
         readout = ReadoutKnown(
             deviation, watch.may_be_reversed, watch.surely_global, watch.other_axis
         )
-        return self.mounted(of_camera(cloud, result, config, camera, frame, readout))
+        return of_camera(cloud, result, self._config, self._camera, self.camera_frame, readout)
 
     def _thinned(self, cloud: Correspondences) -> Correspondences:
         """The cloud with no more points than ``max_points``, which is said once."""
@@ -551,6 +572,123 @@ class FrameLocalizer:
             )
         return thinned(cloud, most, self._camera.size)
 
+    def _localize_frame(self, images: Sequence[Image]) -> Localized | Refusal:
+        reference = images[0].cloud
+        others = {image.cloud.frame for image in images} - {reference.frame}
+        if others:
+            return Refusal(
+                Reason.BAD_CLOUD,
+                f"the points of {images[0].camera} are in frame {reference.frame!r}, others in "
+                f"{', '.join(map(repr, sorted(others)))}: cameras of a rig see one map",
+            )
+        refusal = self._stream.follow(images[0].start_ns, reference.frame)
+        if refusal is not None:
+            return refusal
+        refusal = self._mount(images)
+        images = [image for image in images if image.camera in self._mounts]
+        if not images:
+            assert refusal is not None
+            return refusal
+        # Seconds since the first image: nothing is lost of stamps since 1970.
+        origin_ns = images[0].start_ns
+        starts = {image.camera: 1e-9 * (image.start_ns - origin_ns) for image in images}
+        matches = {image.camera: _matches(image.cloud, images) for image in images}
+        context = FrameContext(error_modes=self._landmarks.error_modes)
+        result = self._tracker.localize(origin_ns, matches, stamps=starts, context=context)
+        self.rig_watch.judge(bool(result))
+        if not result:
+            return Refusal(result.reason, result.detail)
+        assert isinstance(result, RigEstimate)
+        self._landmarks.lacking = False  # who sends correspondences needs none
+        return self.mounted(self._localized(images, result, origin_ns))
+
+    def _mount(self, images: Sequence[Image]) -> Refusal | None:
+        """Look up where cameras are that move; why one of this frame is not known."""
+        frame, stamp_ns = self.camera_frame, images[0].cloud.stamp_ns or None
+        mounts, refusal = dict(self._mounts), None
+        for image in images:
+            name = image.camera
+            own = self.calibrations[name].frame
+            try:
+                if name in mounts and not self.transforms.moves(own, frame):
+                    continue
+                mounts[name] = self.transforms.lookup(own, frame, stamp_ns)
+            except TransformError as error:
+                mounts.pop(name, None)
+                text = f"from {frame!r} to {own!r} of camera {name}: {error}"
+                refusal = Refusal(Reason.NO_TRANSFORM, text)
+                self._notice(Notice.NO_IMAGES, f"{name} is left out: no transform {text}")
+        if any(mounts.get(name) is not self._mounts.get(name) for name in {*mounts, *self._mounts}):
+            self._mounts = {name: mounts[name] for name in self._config.cameras if name in mounts}
+            if self._mounts:
+                self._tracker.mount(self.rig)
+        return refusal
+
+    def _localized(self, images: Sequence[Image], result: RigEstimate, origin_ns: int) -> Localized:
+        """Pose and twist of the rig's axes at the published moment."""
+        config, cloud = self._config, images[0].cloud
+        time_ns = origin_ns + round(1e9 * result.time)
+        # What is published has stamps of that camera's clock.
+        own_ns = self.rig_watch.offset_ns(images[0].camera)
+        stamp_ns = time_ns - own_ns if config.pose_time == PoseTime.MID_FRAME else cloud.stamp_ns
+        tau = (stamp_ns + own_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
+        moving = find_solver(config.solver).rolling_shutter
+        table = _table(config.cameras, images)
+        return Localized(
+            input_stamp_ns=cloud.stamp_ns,
+            stamp_ns=stamp_ns,
+            map_frame=cloud.frame,
+            body_frame=self.camera_frame,
+            pose=pose_at(result, tau),
+            twist=twist_at(result, tau, result.span) if moving else None,
+            inliers=select_inliers(table, np.asarray(result.inliers), np.asarray(result.residuals)),
+            dropped=sum(image.cloud.dropped for image in images),
+            estimate=result,
+            cameras=tuple(_share(image, result) for image in images),
+        )
+
     def mounted(self, localized: Localized) -> Localized | Refusal:
         """The result of ``base_frame``, from that of the camera."""
         return of_body(localized, self.config, self.transforms)
+
+
+def _shutters(config: NodeConfig) -> Mapping[str, CameraSettings]:
+    """Readout time, direction and stamp offset of each camera."""
+    own = CameraSettings(config.readout_time, config.scan_direction, config.stamp_offset)
+    return config.of_cameras or {"": own}
+
+
+def _matches(cloud: Correspondences, images: Sequence[Image]) -> tuple[Array, ...]:
+    """Points and pixels of an image; with scores, where all images have them."""
+    if any(image.cloud.scores is None for image in images):
+        return cloud.points, cloud.pixels
+    assert cloud.scores is not None
+    return cloud.points, cloud.pixels, cloud.scores
+
+
+def _table(names: Sequence[str], images: Sequence[Image]) -> NDArray[Any]:
+    """The rows of all images, of the fields that all have, and which of the cameras it was."""
+    types = [image.cloud.table.dtype for image in images]
+    fields = [name for name in types[0].names or () if all(name in (t.names or ()) for t in types)]
+    kinds: list[tuple[str, Any]] = [
+        (name, np.result_type(*(t[name].newbyteorder("<") for t in types))) for name in fields
+    ]
+    rows = np.empty(sum(len(image.cloud.table) for image in images), [*kinds, ("camera", "u1")])
+    first = 0
+    for image in images:
+        last = first + len(image.cloud.table)
+        for name in fields:
+            rows[name][first:last] = image.cloud.table[name]
+        rows["camera"][first:last] = names.index(image.camera)
+        first = last
+    return rows
+
+
+def _share(image: Image, result: RigEstimate) -> CameraShare:
+    name = image.camera
+    assert isinstance(result.inliers, ByCamera)  # as all of a rig
+    assert isinstance(result.residuals, ByCamera)
+    inliers = result.inliers[name]
+    kept = np.asarray(result.residuals[name][inliers])
+    rms = float(np.sqrt(kept @ kept / max(len(kept), 1)))
+    return CameraShare(name, len(inliers), len(kept), rms, image.start_ns)

@@ -10,10 +10,10 @@ recording gives the same poses live and offline.
 import itertools
 import math
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.core import so3
@@ -169,36 +169,36 @@ class ImuInput:
         time_ns: int,
         camera_frame: str,
         transforms: Transforms,
-        matches: tuple[ArrayLike, ArrayLike, ArrayLike | None],
+        localized: Callable[[ImuSamples | None], Estimate | Failure],
     ) -> Estimate | Failure:
         """Localize the frame whose middle row was exposed at ``time_ns``, with its readings.
 
         Args:
-            tracker: localizes.
+            tracker: that localizes.
             config: the settings.
             time_ns: by the camera's clock.
             camera_frame: the camera's axes.
             transforms: how the IMU is turned against them.
-            given: points, pixels and scores, as :meth:`Tracker.localize` takes them.
+            localized: the frame by the tracker, with samples or with the camera alone.
         """
         if not self._wanted(config):
-            return tracker.localize(time_ns, *matches)
+            return localized(None)
         if tracker.inertial is None:
             unknown = config.readout_time == 0.0
             reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
             self._count(config, None, Unused(reason))
-            return tracker.localize(time_ns, *matches)
+            return localized(None)
         samples = self._samples(tracker, config, time_ns, camera_frame, transforms)
         if isinstance(samples, Unused):
-            result = tracker.localize(time_ns, *matches)
+            result = localized(None)
             self._count(config, tracker, samples)
         else:
             try:
                 self._prepare(tracker, config)
             except NotCompiled:
                 self._count(config, tracker, Unused(ImuReason.COMPILING))
-                return tracker.localize(time_ns, *matches)
-            result = tracker.localize(time_ns, *matches, imu=samples)
+                return localized(None)
+            result = localized(samples)
             self._count(config, tracker, _why(tracker.inertial))
             self._compare_gravity(config, samples, result)
         return result

@@ -9,8 +9,8 @@ reader. Launch files read this list: it imports no kernels.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Any, Union
 
@@ -24,6 +24,7 @@ from rs_localizer.io.messages import MessageError
 from rs_localizer.pipeline.refusal import Refusal
 
 if TYPE_CHECKING:
+    from rs_localizer.config import NodeConfig
     from rs_localizer.io.outputs import Localized
     from rs_localizer.pipeline.frames import FrameLocalizer
 
@@ -180,3 +181,30 @@ def said(name: str) -> str:
 def with_role(role: Role) -> list[Input]:
     """The inputs of a role."""
     return [row for row in _ROWS if row.role == role]
+
+
+_OWN = (topics.CAMERA_INFO, topics.CORRESPONDENCES, topics.KEYPOINTS)
+"""Inputs that each camera of a rig has below its name."""
+
+
+def inputs_of(config: NodeConfig) -> Mapping[str, Input]:
+    """All inputs by name; of cameras with names ``NAME/correspondences`` and so on."""
+    if not config.of_cameras:
+        return INPUTS
+    rows = {item.topic: item for item in INPUTS.values() if item.topic == topics.MAP_POINTS}
+    named = [_of_camera(INPUTS[topic], name) for topic in _OWN for name in config.cameras]
+    # What changes the state comes first.
+    infos, frames = named[: len(config.cameras)], named[len(config.cameras) :]
+    return {item.topic: item for item in (*infos, *rows.values(), *frames)}
+
+
+def _of_camera(item: Input, name: str) -> Input:
+    """An input of a camera with a name."""
+    own = replace(item, topic=f"{name}/{item.topic}", about=f"{name}: {item.about}")
+    if item.topic == topics.CAMERA_INFO:
+        return replace(
+            own,
+            use=lambda localizer, found: localizer.calibrate(found, name),
+            held=lambda localizer: localizer.calibrations.get(name),
+        )
+    return replace(own, use=lambda localizer, message: localizer.add(name, item.topic, message))

@@ -219,9 +219,7 @@ def _mounted(
     # Who gives no time gets the latest, as everywhere in TF.
     timed = min(localized.input_stamp_ns, localized.stamp_ns) > 0
     stamp_ns = localized.stamp_ns if timed else None
-    # A rig's frame lasts as long as all of its exposures.
-    span = localized.estimate.span if config.is_rig else config.readout_time
-    span_ns = round(span * 1e9) if localized.twist else 0
+    span_ns = round(localized.estimate.span * 1e9) if localized.twist else 0
     try:
         mounting = find_mounting(transforms, localized.body_frame, base, stamp_ns, span_ns)
     except TransformError as error:

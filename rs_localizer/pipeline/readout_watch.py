@@ -5,23 +5,21 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import Enum, auto
 
 import numpy as np
 
 from rs_localizer.config import LONGEST_READOUT_TIME, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice
-from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.core.shake import FUNCTIONS, shake_at
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline.readout_estimate import MeasuredReadout, ReadoutEstimate
 from rs_localizer.pipeline.refusal import Notify
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import FAR_OFF
-from rs_localizer.trajectory.online_readout import REVERSED, ReadoutMonitor
-from rs_localizer.trajectory.readout_equations import MeasuredReadout, Measurement
 
 _OTHER_AXIS = {
     ScanDirection.TOP_TO_BOTTOM: ScanDirection.LEFT_TO_RIGHT,
@@ -41,15 +39,14 @@ _CERTAIN, _DOUBT, _LEAST = 12.0, 3.0, -4.0
 # Frames that are tried at the beginning, and when the axis that is set shows no motion; of others,
 # every so many, as long as nothing speaks for the other axis.
 _TRIED_FIRST, _SUSPECTED, _EVERY = 5, 40, 10
-# Frames in which motion along the other axis has to agree; it takes 22 in a row for a measurement,
-# and a few for odds of 100 that it agrees (see :class:`.ShutterHypotheses`).
-_CHANCES, _AGREES, _CONTRADICTS = 40, 4.6, 2.0
-# Frames from one measurement of the readout time to the next: it takes as long as some frames.
-_MEASURED_EVERY = 5
+# Odds (logarithms) that motion along the other axis agrees, or does not.
+_AGREES, _CONTRADICTS = 4.6, 2.0
 # A readout time along the other axis counts when it is known to a twelfth, and more than half of
 # the one that is set: of a real global shutter with errors of its lens, 5.1 +- 1.2 and 32.8 +- 3.0
 # ms of 20 were seen.
 _KNOWN, _LEAST_SHARE = 0.08, 0.5
+# Triples of frames from which on a measurement counts: fewer have no scatter worth the name.
+_LEAST_TRIPLES = 20
 # Residuals count up to this multiple of the inlier threshold.
 _TRUNCATED = 2.0
 _LEAST_NOISE = 0.1  # px
@@ -75,18 +72,18 @@ class Watched:
 
 
 class ScanAxis:
-    """Whether the shutter moves over rows or over columns, from the frames themselves.
+    """Odds that the shutter moves over columns where rows are set, or over rows.
 
     Drivers that rotate images turn the scan sideways and say nothing of it. The axis that is set
     and the other one are compared by what their motions leave of each frame, until one of them is
-    certain; the direction along the other one comes from its motions from frame to frame
-    (:mod:`rs_localizer.trajectory.online_readout`).
+    certain; the direction along the other one comes from its motions from frame to frame.
     """
 
     def __init__(self) -> None:
         self._localizer: Localizer | None = None  # by the other axis
-        self._monitor, self._monitored = ReadoutMonitor(), 0
+        self._estimate = ReadoutEstimate()
         self._evidence = 0.0  # logarithm of the odds of the other axis
+        self._moves = 0.0  # of those that its motions agree from frame to frame
         self._dense = _TRIED_FIRST  # frames that are still to be tried, each
         self._skipped = 0  # since the last one that was
         self._suspected = self._confirmed = self._certain = False
@@ -104,8 +101,11 @@ class ScanAxis:
     @property
     def doubtful(self) -> bool:
         """Whether they do, and its motions do not contradict: errors of map and lens may do it."""
-        early = self._monitored < _CHANCES and self._monitor.odds.rolling > -_CONTRADICTS
-        return self.leans and (self.direction is not None or early)
+        return self.leans and not self._contradicted
+
+    @property
+    def _contradicted(self) -> bool:
+        return self.direction is None and self._moves < -_CONTRADICTS
 
     @property
     def wrong(self) -> bool:
@@ -118,8 +118,7 @@ class ScanAxis:
     @property
     def undecided(self) -> bool:
         """Whether it probably is the other axis: few motions agree yet."""
-        agrees = self._monitor.odds.rolling > _AGREES
-        return self._evidence > _CERTAIN and not self.wrong and agrees
+        return self._evidence > _CERTAIN and not self.wrong and self._moves > _AGREES
 
     def suspect(self) -> None:
         """Look closely for a while: the axis that is set shows no motion."""
@@ -153,34 +152,29 @@ class ScanAxis:
         if found and self.leans:
             self._measure(sideways, found)
         self._certain = self.wrong and self._evidence > 0.0  # stays until as much speaks against it
-        contradicted = self.direction is None and self._monitor.odds.rolling < -_CONTRADICTS
-        if found and self._evidence > 0.0 and not contradicted:
+        if found and self._evidence > 0.0 and not self._contradicted:
             self.other = found
 
     def _measure(self, frame: Watched, estimate: Estimate) -> None:
-        try:
-            _look(self._monitor, frame, estimate)
-            self._monitored += 1
-            due = self._monitored % _MEASURED_EVERY == 0
-            measured = self._monitor.measure() if due else None
-        except np.linalg.LinAlgError:
-            self._monitor.reset()
+        _look(self._estimate, frame, estimate)
+        measured, usual = self._estimate.measured, frame.camera.readout_time
+        if measured is None:
             return
-        if measured is None or not measured.contradicts(0.0):
+        self._moves = max(measured.odds(value, 0.0) for value in (usual, -usual))
+        if measured.triples < _LEAST_TRIPLES or not measured.contradicts(0.0):
             return
-        large = abs(measured.readout_time) > _LEAST_SHARE * frame.camera.readout_time
-        if not (large and measured.relative_deviation < _KNOWN):
-            return
-        direction = ScanDirection(frame.camera.scan_direction)
-        self.measured = replace(measured, readout_time=abs(measured.readout_time))
-        self.direction = direction if measured.readout_time > 0.0 else REVERSED[direction]
+        large = abs(measured.readout_time) > _LEAST_SHARE * usual
+        if large and measured.relative_deviation < _KNOWN:
+            direction = ScanDirection(frame.camera.scan_direction)
+            self.measured = replace(measured, readout_time=abs(measured.readout_time))
+            self.direction = direction if measured.readout_time > 0.0 else REVERSED[direction]
 
 
-def _look(monitor: ReadoutMonitor, frame: Watched, estimate: Estimate) -> None:
-    """Let a monitor take a frame, with the lens that explains it best."""
-    lens, cloud = estimate.lens, frame.cloud
+def _look(estimate: ReadoutEstimate, frame: Watched, found: Estimate) -> None:
+    """Let an estimate take a frame, with the lens that explains it best."""
+    lens, cloud = found.lens, frame.cloud
     camera = frame.camera if lens is None else lens.mended(frame.camera)
-    monitor.add(frame.time_ns, camera, estimate, cloud.points, cloud.pixels)
+    estimate.add(frame.time_ns, camera, found, cloud.points, cloud.pixels)
 
 
 def _costs(frames: Sequence[Watched], most: float) -> list[float]:
@@ -207,28 +201,22 @@ def _costs(frames: Sequence[Watched], most: float) -> list[float]:
     return [cost(frame) for frame in frames]
 
 
-# Frames from one measurement to the next: few at first, more when there is more to compute.
-_AT_FIRST, _LATER = 5, 30
-_GROWTH = 0.1
-# Triples at which a measurement may look while one frame is localized, if that is not less than a
-# round of it: a third of a millisecond.
-_SHARE = 300
 # A value is adopted when it is known to this share of itself, by so many frames.
 _WELL_KNOWN, _ENOUGH = 0.02, 60
 # So many deviations below zero, rows run the other way.
 _SURELY = 4.0
 # Of the setting: from here on nothing tells the shutter from a global one.
 _GLOBAL = 0.2
-_CERTAINLY = math.log(1e9)  # of the odds for a global one that was found
+# Logarithms of odds: of a global shutter or a reversed one that are enough to doubt, and of a
+# global one to be certain; and what is then said of rest.
+_SUSPICIOUS, _ALL_BUT_SURE, _AT_REST = 2.0, math.log(100.0), math.log(1e9)
+# A shaken camera turns differently between its frames than within them, whatever its shutter: then
+# at no readout time squared errors are those of noise.
+_MOST_MISFIT = 1.5
 
 
-class _Kind(Enum):
-    """What is wrong about a readout time."""
-
-    DURATION = auto()
-    REVERSED = auto()
-    GLOBAL = auto()
-    AXIS = auto()
+# What may be wrong about a readout time; each is said once.
+_DURATION, _REVERSED, _GLOBAL_SHUTTER, _AXIS = "duration", "reversed", "global shutter", "axis"
 
 
 class ReadoutWatch:
@@ -245,10 +233,8 @@ class ReadoutWatch:
 
     def reset(self) -> None:
         """Forget all frames."""
-        self._monitor, self._axis = ReadoutMonitor(), ScanAxis()
-        self._under_way: Measurement | None = None
-        self._frames, self._next = 0, _AT_FIRST
-        self._said: set[_Kind] = set()
+        self._estimate, self._axis = ReadoutEstimate(), ScanAxis()
+        self._said: set[str] = set()
         # What the last seconds of motion showed; None: nothing yet.
         self.measured: MeasuredReadout | None = None
         self.fault = ""  # how that contradicts the setting, in one sentence
@@ -261,8 +247,8 @@ class ReadoutWatch:
         # Whether, of these, the shutter is a global one; and whether this leaves nothing but noise:
         # one that shakes by more than half the rate of its images looks like it otherwise.
         self.global_shutter = self.surely_global = False
-        # Whether rows are measured to run the other way.
-        self._reversed = False
+        # Whether rows may run the other way: then an image begins where it is said to end.
+        self.may_be_reversed = False
         # Whether the last frames move, but not as the setting says, and no measurement tells.
         self.doubtful = False
         # Whether what the camera does from frame to frame tells what it does within them: after a
@@ -287,14 +273,9 @@ class ReadoutWatch:
         return self.fault if self._axis.wrong else ""
 
     @property
-    def may_be_reversed(self) -> bool:
-        """Whether rows may run the other way: then an image begins where it is said to end."""
-        return self._reversed or (self.doubtful and self._monitor.odds.may_be_reversed)
-
-    @property
     def of_rest(self) -> float:
         """Logarithm of the odds that what looks like motion within an image is none."""
-        return _CERTAINLY if self.global_shutter else 0.0
+        return _AT_REST if self.global_shutter else 0.0
 
     def add(self, frame: Watched) -> NodeConfig:
         """Take a frame.
@@ -308,40 +289,49 @@ class ReadoutWatch:
         wanted = estimates or config.readout_time > 0.0
         if not (wanted and find_solver(config.solver).rolling_shutter):
             return config
-        adopted = self._compare(frame, estimates)
+        adopted, shown = self._compare(frame, estimates)
         if self.far_off or self.doubtful or (self._axis.leans and self.other_axis):
             self.trusted = False
-        elif _is_some(config, self.measured) or self._monitor.odds.shown:
+        elif shown:
             self.trusted = True
         return adopted
 
-    def _compare(self, frame: Watched, estimates: bool) -> NodeConfig:
-        """Compare a frame with what is set; ``estimates``: the settings ask for what is found."""
+    def _compare(self, frame: Watched, estimates: bool) -> tuple[NodeConfig, bool]:
+        """The settings after a frame, and whether it shows the readout time that is set.
+
+        ``estimates``: the settings ask for what is found.
+        """
         config = frame.config
         self._axis.add(frame)
         if self._axis.wrong:
-            return self._other_axis(config, estimates)
+            return self._other_axis(config, estimates), False
         if not frame.result:
-            return config
-        try:
-            measured = self._measure(frame, frame.result)
-        except np.linalg.LinAlgError:  # a frame that says nothing must not stop the next ones
-            self._monitor.reset()
-            self._under_way, self.doubtful = None, False
-            return config
-        if self._axis.doubtful:
-            return config
-        if measured is not None:
+            return config, False
+        _look(self._estimate, frame, frame.result)
+        measured = self._estimate.measured
+        if self._axis.doubtful or measured is None:
+            return config, False
+        enough = measured.triples >= _LEAST_TRIPLES
+        if enough:
             self.measured = measured
-            if estimates:
-                return self._adopt(config, measured, ScanDirection(config.scan_direction))
-            self._judge(config, measured, _wrong(config, measured))
-        self._doubt(config)
-        if _is_some(config, self.measured):
+        if estimates:
+            adopts = enough and self.measured is measured
+            along = ScanDirection(config.scan_direction)
+            return (self._adopt(config, measured, along) if adopts else config), False
+        usual = config.readout_time
+        of_set = min(measured.odds(usual, value) for value in (0.0, -usual))
+        self._judge(config, measured, enough)
+        some = measured.readout_time - _SURELY * measured.deviation > FAR_OFF * usual
+        silent = self.fault == "" and not (enough and some)
+        self.doubtful = silent and of_set < -_SUSPICIOUS
+        self.may_be_reversed = measured.odds(-usual, usual) > 0.0 and (
+            self.doubtful or (self.far_off and not self.global_shutter)
+        )
+        if enough and some:
             self._axis.confirm()
         elif self.far_off or self.doubtful:
             self._axis.suspect()
-        return config
+        return config, of_set > _SUSPICIOUS
 
     def _other_axis(self, config: NodeConfig, estimates: bool) -> NodeConfig:
         """Say that the shutter moves along the other axis, or adopt it."""
@@ -350,63 +340,37 @@ class ReadoutWatch:
         assert direction is not None
         value = _milliseconds(abs(measured.readout_time), measured.deviation)
         self._contradict(
-            _Kind.AXIS,
+            _AXIS,
             f"the image shows a shutter that moves {direction} in {value}, not "
             f"{config.scan_direction}; no poses are published until scan_direction is {direction}",
         )
         return self._adopt(config, measured, direction) if estimates else config
 
-    def _doubt(self, config: NodeConfig) -> None:
-        """What a few frames tell, as long as a measurement says nothing else."""
-        odds = self._monitor.odds
-        silent = self.fault == "" and not _is_some(config, self.measured)
-        self.doubtful = silent and odds.doubtful
-        if silent and odds.certain:
-            self.far_off = self.global_shutter = self.surely_global = True
-            self.doubtful = False
-            self._contradict(_Kind.GLOBAL, _sentence(_Kind.GLOBAL, config, None))
-
-    def _judge(self, config: NodeConfig, measured: MeasuredReadout, wrong: _Kind | None) -> None:
-        sure = self._monitor.odds.certain  # of a global one, whatever errors of the map look like
-        if wrong is None:
-            self.fault = ""
-        elif sure:
-            self._contradict(_Kind.GLOBAL, _sentence(_Kind.GLOBAL, config, None))
-        else:
-            self._contradict(wrong, _sentence(wrong, config, measured))
-        off = math.hypot(measured.readout_time - config.readout_time, measured.deviation)
-        shorter = config.readout_time / max(
-            abs(measured.readout_time), _GLOBAL * config.readout_time, measured.deviation
+    def _judge(self, config: NodeConfig, measured: MeasuredReadout, enough: bool) -> None:
+        """Whether the setting is contradicted, and by what."""
+        usual = config.readout_time
+        sure = measured.misfit < _MOST_MISFIT and (
+            min(measured.odds(0.0, value) for value in (usual, -usual)) > _ALL_BUT_SURE
         )
-        self.error = 0.0 if wrong is None else off * max(shorter, 1.0)
+        wrong, self.fault = _verdict(config, measured, sure) if sure or enough else ("", "")
+        if wrong:
+            self._contradict(wrong, self.fault)
+        off = math.hypot(measured.readout_time - usual, measured.deviation)
+        shorter = usual / max(abs(measured.readout_time), _GLOBAL * usual, measured.deviation)
+        self.error = off * max(shorter, 1.0) if wrong else 0.0
         # A global shutter may be no worse.
-        short = measured.readout_time < FAR_OFF * config.readout_time
-        self.far_off = short and (self.far_off or wrong is not None)
+        short = measured.readout_time < FAR_OFF * usual
+        self.far_off = short and (self.far_off or bool(wrong))
         self.global_shutter = self.far_off and (
-            self.global_shutter if wrong is None else sure or wrong is _Kind.GLOBAL
+            wrong == _GLOBAL_SHUTTER if wrong else self.global_shutter
         )
         self.surely_global = self.global_shutter and (self.surely_global or sure)
-        self._reversed = wrong is _Kind.REVERSED and not sure
 
-    def _contradict(self, kind: _Kind, text: str) -> None:
+    def _contradict(self, kind: str, text: str) -> None:
         self.fault = text
         if kind not in self._said:
             self._said.add(kind)
             self._notice(Notice.READOUT_TIME, text)
-
-    def _measure(self, frame: Watched, estimate: Estimate) -> MeasuredReadout | None:
-        _look(self._monitor, frame, estimate)
-        self._frames += 1
-        if self._frames >= self._next:
-            self._next += min(max(_AT_FIRST, round(_GROWTH * self._frames)), _LATER)
-            self._under_way = self._monitor.measurement()
-        if self._under_way is None:
-            return None
-        self._under_way.advance(_SHARE)
-        if not self._under_way.done:
-            return None
-        measured, self._under_way = self._under_way.found, None
-        return measured
 
     def _adopt(
         self, config: NodeConfig, measured: MeasuredReadout, along: ScanDirection
@@ -434,37 +398,26 @@ class ReadoutWatch:
         )
 
 
-def _is_some(config: NodeConfig, measured: MeasuredReadout | None) -> bool:
-    """Whether the readout time was measured, and nearer to the one that is set than to none."""
-    if measured is None:
-        return False
-    return measured.readout_time - _SURELY * measured.deviation > FAR_OFF * config.readout_time
+def _verdict(config: NodeConfig, measured: MeasuredReadout, at_rest: bool) -> tuple[str, str]:
+    """What is wrong about the readout time that is set, and the sentence that says so; or nothing.
 
-
-def _wrong(config: NodeConfig, measured: MeasuredReadout) -> _Kind | None:
-    if not measured.contradicts(config.readout_time):
-        return None
-    if abs(measured.readout_time) < _GLOBAL * config.readout_time:
-        return _Kind.GLOBAL
-    reversed_ = measured.readout_time < -_SURELY * measured.deviation
-    return _Kind.REVERSED if reversed_ else _Kind.DURATION
-
-
-def _sentence(kind: _Kind, config: NodeConfig, measured: MeasuredReadout | None) -> str:
-    if kind is _Kind.REVERSED and measured is not None:
+    ``at_rest``: all rows are certainly exposed at once, whatever errors of the map look like.
+    """
+    usual, found = config.readout_time, measured.readout_time
+    if not (at_rest or measured.contradicts(usual)):
+        return "", ""
+    instant = at_rest or abs(found) < _GLOBAL * usual
+    if not instant and found < -_SURELY * measured.deviation:
         direction = ScanDirection(config.scan_direction)
-        duration = _milliseconds(-measured.readout_time, measured.deviation)
-        return (
-            f"the shutter moves against scan_direction {direction}, in {duration}: is it "
-            f"{REVERSED[direction]}?"
+        return _REVERSED, (
+            f"the shutter moves against scan_direction {direction}, in "
+            f"{_milliseconds(-found, measured.deviation)}: is it {REVERSED[direction]}?"
         )
-    estimated = (
-        "estimated readout time 0 ms (a global shutter)"
-        if measured is None
-        else f"estimated readout time {_milliseconds(measured.readout_time, measured.deviation)}"
-        + (" (a global shutter)" if kind is _Kind.GLOBAL else "")
+    said = "0 ms" if at_rest else _milliseconds(found, measured.deviation)
+    return _GLOBAL_SHUTTER if instant else _DURATION, (
+        f"estimated readout time {said}{' (a global shutter)' if instant else ''} differs from "
+        f"readout_time = {1e3 * usual:g} ms"
     )
-    return f"{estimated} differs from readout_time = {1e3 * config.readout_time:g} ms"
 
 
 def _milliseconds(value: float, deviation: float) -> str:

@@ -10,14 +10,13 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools.adjust.fit import Fit, fit
 from rs_localizer.tools.adjust.gyro import Gyroscope
 from rs_localizer.tools.adjust.spline import Spline, refined
 from rs_localizer.tools.adjust.system import Undetermined
 from rs_localizer.tools.adjust.variables import DELAY, MOUNT, GyroMount, GyroSamples, Observations
-from rs_localizer.trajectory.online_readout import REVERSED
 
 # The noise of the gyroscope has settled when it changes by less than this share.
 _ROUNDS, _SETTLED = 6, 0.03

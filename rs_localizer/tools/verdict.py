@@ -7,9 +7,8 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.tools.calibration import Calibration
-from rs_localizer.trajectory.online_readout import REVERSED
 
 # Of the images' own times (s rms): beyond the first they are worth a word, beyond the second the
 # stamps are none that a camera gave.

@@ -67,8 +67,9 @@ def test_a_camera_at_rest_says_nothing():
 def test_a_hand_alone_is_left_to_the_filter():
     recorded = record(Camera(), hand, Rich(), (1, 8), 5)
     tracker = tracker_of(recorded)
-    followed(tracker, recorded, 8)
-    assert not tracker._aid.wants_sight()
+    going, _ = followed(tracker, recorded, 8)
+    assert all(going)
+    assert tracker._aid._search._seen == 0
 
 
 @pytest.mark.parametrize("shaking", [((0.2, 60.0),), pytest.param((), marks=pytest.mark.bench)])

@@ -7,12 +7,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.inertial.gravity import STANDARD_GRAVITY, gravity_seen
-from rs_localizer.inertial.samples import MARGIN, ImuSamples, needed
+from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.turning import GyroscopeErrors
 from rs_localizer.inertial.watch import fit_mounting
 
 ERRORS = GyroscopeErrors(np.zeros(3), 0.0, 1e-8 * np.eye(4), 1e-4)
 TIMES = 10**12 + np.arange(400) * 2_500_000
+
+
+def test_samples_that_do_not_cover_an_interval_are_none():
+    samples = ImuSamples(TIMES, np.zeros((400, 3)))
+    inside = samples.around(int(TIMES[200]), int(TIMES[210]))
+    assert TIMES[inside][0] < TIMES[200] < TIMES[210] < TIMES[inside][-1]
+    assert samples.around(int(TIMES[0]) - 1, int(TIMES[5])) is None
+    assert samples.around(int(TIMES[5]), int(TIMES[-1]) + 1) is None
 
 
 def test_samples_are_checked():
@@ -22,17 +30,6 @@ def test_samples_are_checked():
         ImuSamples(np.array([1, 2]), np.zeros((3, 3)))
     with pytest.raises(ValueError, match="specific_force must be"):
         ImuSamples(np.array([1, 2]), np.zeros((2, 3)), np.full((2, 3), np.nan))
-
-
-def test_what_is_needed_is_what_is_taken():
-    samples = ImuSamples(TIMES, np.zeros((400, 3)))
-    first, last = needed(0.03, int(TIMES[200]), 2_500_000)
-    part = samples.around(int(TIMES[200]) - 15_000_000, int(TIMES[200]) + 15_000_000)
-    assert TIMES[part][0] >= first
-    assert TIMES[part][-1] <= last
-    assert part == slice(195 - MARGIN, 206 + MARGIN) or len(TIMES[part]) >= 13 + 2 * (MARGIN - 1)
-    assert samples.around(int(TIMES[0]) - 1, int(TIMES[5])) is None
-    assert samples.around(int(TIMES[5]), int(TIMES[-1]) + 1) is None
 
 
 def test_the_mounting_is_found():

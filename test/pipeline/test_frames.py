@@ -73,6 +73,7 @@ class MockLocalizer(Localizer):
         expected_share: float = 0.5,
         turn: object = None,
         stamps: object = None,
+        error_modes: object = None,
     ) -> Estimate | Failure:
         self.priors.append(prior)
         if len(points) < 4:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import rs_localizer.pipeline.frames
+import rs_localizer.pipeline.landmarks
 from rs_localizer.config import Matching, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
@@ -17,7 +17,8 @@ from rs_localizer.io.maps.landmarks import Map, MapError, map_rows
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.matching import Matcher
-from rs_localizer.pipeline.frames import FrameLocalizer, read_landmarks
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.landmarks import read_landmarks
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room
@@ -202,7 +203,7 @@ def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
             asked.append(arguments[3] is not None)
             return super().match(*arguments)
 
-    monkeypatch.setattr(rs_localizer.pipeline.frames, "Matcher", Asked)
+    monkeypatch.setattr(rs_localizer.pipeline.landmarks, "Matcher", Asked)
     node = localizer(make_camera_info)
     node.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames[:3]:

@@ -23,12 +23,12 @@ from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.offline.replay import find_topics, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import simulate_frames
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.simulation.true_motion import RecordedMotion, TrueState, sampled_states
-from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 from .clouds import cloud_of
 

@@ -32,7 +32,7 @@ def localize(path, seen=None, **settings):
         )
         answers = [answer.result for answer in replay(bag, topics, localizer)]
     if seen is not None:
-        seen.update(localizer.watch.values)
+        seen.update(localizer.rig_watch.values)
     frames = [answer for answer in answers if answer]
     return frames, [answer for answer in answers if not answer], notices
 
@@ -232,7 +232,7 @@ def test_cameras_do_not_go_with_what_is_of_one():
         build({"cameras": ["left"], "readout_time": 0.03, "estimate_readout_time": True})
     with pytest.raises(ValueError, match=r"rear\.readout_time: no such camera; cameras names left"):
         build({"cameras": ["left"], "readout_time": 0.03, "rear.readout_time": 0.02})
-    assert not NodeConfig().is_rig
+    assert not NodeConfig().of_cameras
 
 
 def test_a_fault_of_the_reference_ends_when_all_agree_again():

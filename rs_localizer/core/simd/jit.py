@@ -39,7 +39,7 @@ if importlib.util.find_spec("scipy") is None:  # Numba would say so in the first
     raise ModuleNotFoundError("No module named 'scipy', which compiled kernels need", name="scipy")
 
 PARTS = (
-    *("core", "solvers", "estimation", "inertial", "matching", "markers", "trajectory"),
+    *("core", "solvers", "estimation", "inertial", "matching", "markers"),
     *("simulation", "tools"),
 )
 """Folders of the package with kernels; a kernel calls those of its own and of earlier ones."""

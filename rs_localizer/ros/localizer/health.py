@@ -12,6 +12,7 @@ from rs_localizer.io.outputs import CameraShare, Localized
 from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.inputs import Role, input_named, said
 from rs_localizer.pipeline.map_to_odom import Holding
+from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.pipeline.refusal import IMU_REASONS
 from rs_localizer.ros.node.health import (
     Health,
@@ -24,7 +25,6 @@ from rs_localizer.ros.node.health import (
 )
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.statistics import Summary
-from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,9 +24,8 @@ from rs_localizer.io.topics import CAMERA_MARKER, GIVEN_POSES, INTEGRITY, LIVE
 from rs_localizer.pipeline.compiling import compile_rest, give_back_compiler
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.given_pose import read_given_pose
-from rs_localizer.pipeline.inputs import Input, Results, Role
+from rs_localizer.pipeline.inputs import Input, Results, Role, inputs_of
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.pipeline.rigs import RigLocalizer, frame_localizer, inputs_of
 from rs_localizer.ros.localizer import transforms
 from rs_localizer.ros.localizer.health import (
     Answer,
@@ -91,7 +90,7 @@ class Feed:
             for name, item in inputs_of(config).items()
             if not item.also or installed(*item.types)  # of packages that most do not have
         }
-        if not config.is_rig:
+        if not config.of_cameras:
             found |= {
                 name: Topic(message_class(kind), self._take_pose)
                 for name, kind in GIVEN_POSES.items()
@@ -114,7 +113,7 @@ class Feed:
 
     def _prepare(self) -> None:
         while (config := self._wanted) is not None:
-            load_kernels(frame_localizer(config))
+            load_kernels(FrameLocalizer(config))
             if self._wanted is config:
                 self._wanted = None
                 self._worker.update("settings", lambda frames: self._change(frames, config))
@@ -278,7 +277,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         self._imu_came = self.create_guard_condition(lambda: self._broadcaster.tf.listen("the IMU"))
 
     def kernels(self) -> Callable[[], None]:
-        frames = frame_localizer(self.config)
+        frames = FrameLocalizer(self.config)
 
         def load() -> None:
             with contextlib.suppress(ValueError):  # of which on_configure tells, at once
@@ -289,11 +288,11 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         return load
 
     def check(self, config: NodeConfig) -> None:
-        frame_localizer(config)
+        FrameLocalizer(config)
         transforms.check(config)
 
     def open(self, config: NodeConfig) -> None:
-        frames = frame_localizer(config, self.refusals.notice, self._broadcaster.tf)
+        frames = FrameLocalizer(config, self.refusals.notice, self._broadcaster.tf)
         frames.load_map()
         if frames.map is not None:
             self.get_logger().info(described(frames.map))
@@ -340,7 +339,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def begin(self, config: NodeConfig) -> None:
         assert self._feed is not None
         topics = self.listen(self._feed.topics(config))
-        if config.readout_time == 0.0 and not config.is_rig:
+        if config.readout_time == 0.0 and not config.of_cameras:
             until = " until it is estimated" if config.estimate_readout_time else ""
             self.warn(
                 "readout_time is 0 (unknown): no twist is published and frames are not tracked"
@@ -363,7 +362,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         missing = () if frames is None else frames.missing
         watch = None if frames is None else frames.readout_watch
         imu = None if frames is None else frames.imu.state
-        rig = frames.watch if isinstance(frames, RigLocalizer) else None
+        rig = None if frames is None else frames.rig_watch
         inputs = {
             name: item for name, item in self.silence.items() if name in inputs_of(self.config)
         }

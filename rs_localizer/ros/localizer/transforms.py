@@ -56,7 +56,7 @@ def needed(config: NodeConfig) -> str:
     """The setting that needs TF, and its value; empty if there is none."""
     if config.base_frame:
         return f"base_frame {config.base_frame!r}"
-    if config.is_rig:
+    if config.of_cameras:
         return f"cameras {', '.join(config.cameras)}"
     return f"publish_tf {config.publish_tf}" if config.publish_tf != PublishTf.NONE else ""
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.tools.adjust.cluster_robust import Pull, pull_at_landmarks
 from rs_localizer.tools.adjust.fit import inflation_of, left_over, steepness
 from rs_localizer.tools.adjust.lens import with_lens
@@ -46,7 +46,6 @@ from rs_localizer.tools.mapping.observations import (
     frame_numbers,
     shared_landmarks,
 )
-from rs_localizer.trajectory.online_readout import REVERSED
 
 # Beyond so many unknowns of the motion its matrix takes more than 2 GB.
 _MOST_UNKNOWNS = 15000

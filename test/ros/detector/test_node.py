@@ -148,6 +148,6 @@ def test_the_detectors_do_not_import_the_estimator(kind):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     names = done.stdout.split()
     parts = {name.split(".")[1] for name in names}
-    assert parts.isdisjoint({"estimation", "localizer", "tracking", "trajectory", "matching"})
+    assert parts.isdisjoint({"estimation", "localizer", "tracking", "matching"})
     assert kind == "markers" or "markers" not in parts
     assert len(names) < MOST[kind]

@@ -15,6 +15,7 @@ from rs_localizer.core.reasons import ImuReason
 from rs_localizer.inertial.watch import Alone, InertialStatus
 from rs_localizer.io.outputs import CameraShare
 from rs_localizer.pipeline.imu import ImuState, Unused
+from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.localizer.health import (
     Condition,
@@ -28,7 +29,6 @@ from rs_localizer.ros.node.health import Level
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
-from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 COMES = Silence("/camera_info", 0.1, heard=True, cause="", mismatch=False)
 FRAMES = replace(COMES, topic="/correspondences")

@@ -1,0 +1,124 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The map that keypoints are matched with."""
+
+from pathlib import Path
+
+from rs_localizer import matching
+from rs_localizer.config import MatchBy, Matching
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Notice, Reason
+from rs_localizer.estimation.calibration import ErrorModes
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.io.clouds import Correspondences, Keypoints
+from rs_localizer.io.maps.landmarks import Map, MapError
+from rs_localizer.matching import Matcher, MatchError
+from rs_localizer.pipeline.refusal import Notify, Refusal
+
+
+class Landmarks:
+    """The map that keypoints are matched with, as soon as there is one.
+
+    Args:
+        notice: told what is odd.
+    """
+
+    def __init__(self, notice: Notify) -> None:
+        self._notice = notice
+        self._matcher: Matcher | None = None
+        self.error_modes: ErrorModes | None = None
+        self.lacking = False
+        """Whether keypoints have come before a map, and no frame has been localized since."""
+
+    @property
+    def map(self) -> Map | None:
+        """The present one."""
+        return None if self._matcher is None else self._matcher.map
+
+    def use(self, landmarks: Map) -> None:
+        """Match with this map from now on."""
+        previous = self.map
+        if previous is not None and landmarks.equals(previous):
+            return  # published again
+        for name, text in oddities_of_map(landmarks, previous).items():
+            self._notice(name, text)
+        self._matcher = Matcher(landmarks)
+        modes = landmarks.error_modes
+        self.error_modes = None if modes is None else ErrorModes(landmarks.points, modes)
+        self.lacking = False
+
+    def how(self, keypoints: Keypoints, settings: Matching) -> MatchBy | Refusal:
+        """By what they can be matched."""
+        if self._matcher is None:
+            self.lacking = True
+            return Refusal(
+                Reason.NO_MAP, "no usable map has come yet, on map_points or as map_file"
+            )
+        try:
+            by = self._matcher.choose(keypoints, settings)
+        except MatchError as error:
+            return Refusal(Reason.BAD_KEYPOINTS, str(error))
+        if by == MatchBy.DESCRIPTOR and len(keypoints) > settings.max_keypoints:
+            self._notice(
+                Notice.TOO_MANY_KEYPOINTS,
+                f"{len(keypoints)} keypoints have come, matching.max_keypoints of them, "
+                f"{settings.max_keypoints}, are matched",
+            )
+        return by
+
+    def match(
+        self, keypoints: Keypoints, settings: Matching, camera: Camera, prior: Prior | None
+    ) -> Correspondences | Refusal:
+        """Correspondences, all over the map or where a motion predicts them only."""
+        assert self._matcher is not None
+        matches = self._matcher.match(keypoints, settings, camera, prior)
+        if len(matches) == 0:
+            return Refusal(
+                Reason.NO_MATCHES,
+                f"none of {len(keypoints)} keypoints matches one of {len(self._matcher.map)} "
+                f"landmarks by {matches.by}",
+            )
+        return matching.correspondences(matches, keypoints, self._matcher.map)
+
+
+def read_landmarks(file: str, frame: str) -> Map:
+    """The map of a file, to match keypoints with.
+
+    Args:
+        file: its path; ``~`` is the user's home.
+        frame: of its points.
+
+    Raises:
+        MapError: for a file that cannot be read or holds no such map.
+    """
+    from rs_localizer.io.maps.files import read_map_file  # formats that most never read
+
+    path = Path(file).expanduser()
+    try:
+        landmarks = read_map_file(path, frame)
+    except MapError as error:
+        raise MapError(f"map_file: {error}") from error
+    except OSError as error:
+        raise MapError(f"map_file: {path} cannot be read: {error.strerror or error}") from error
+    if landmarks.ids is None and landmarks.descriptors is None:
+        raise MapError(
+            f"map_file: {path}: keypoints cannot be matched with a map that has neither ids "
+            "nor descriptors"
+        )
+    return landmarks
+
+
+def oddities_of_map(landmarks: Map, previous: Map | None) -> dict[Notice, str]:
+    """What is worth telling of a map that takes the place of another, or of none."""
+    notices: dict[Notice, str] = {}
+    if landmarks.dropped:
+        notices[Notice.MAP_INCOMPLETE] = (
+            f"{landmarks.dropped} landmarks are left out: they hold NaN or infinity, or no "
+            "descriptor"
+        )
+    if previous is not None:
+        notices[Notice.MAP_REPLACED] = (
+            f"a map of {len(landmarks)} landmarks in frame {landmarks.frame!r} replaces the "
+            f"one of {len(previous)} in frame {previous.frame!r}"
+        )
+    return notices

@@ -1,0 +1,235 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The readout time from neighbouring frames: value, deviation, alarms; on an own projector."""
+
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+import projector
+import pytest
+
+from rs_localizer.core import so3
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.shutter import Motion, numbers_of, project_rolling
+from rs_localizer.core.types import Estimate
+from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline.readout_estimate import (
+    Equation,
+    MeasuredReadout,
+    ReadoutEstimate,
+    View,
+    equation,
+    view,
+)
+from rs_localizer.tracking import Tracker
+
+READOUT = 0.03
+CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
+
+
+@cache
+def recording(
+    points: str = "room", seconds: float = 2.0, turn: float = 0.14, noise: float = 1.0
+) -> list[projector.Frame]:
+    rng = np.random.default_rng(7)
+    motion = projector.Motion.random(rng, turn, 0.6 * turn)
+    landmarks = projector.room(rng) if points == "room" else projector.board()
+    return projector.record(
+        rng, motion, landmarks, readout=READOUT, seconds=seconds, noise=noise, outliers=0.1
+    )
+
+
+def watch(
+    frames: list[projector.Frame], believed: float, camera: Camera = CAMERA
+) -> list[MeasuredReadout | None]:
+    """The estimate after every fifth frame; tracked where a readout time is given."""
+    localizer = Localizer(replace(camera, readout_time=believed))
+    tracker = Tracker(localizer) if believed > 0.0 else None
+    estimate = ReadoutEstimate()
+    said = []
+    for k, frame in enumerate(frames):
+        time_ns = round((frame.stamp + 0.5 * READOUT) * 1e9)
+        seen = frame.points, frame.pixels
+        result = tracker.localize(time_ns, *seen) if tracker else localizer.localize(*seen)
+        if isinstance(result, Estimate):
+            estimate.add(time_ns, camera, result, *seen)
+        if k % 5 == 4:
+            said.append(estimate.measured)
+    return said
+
+
+@pytest.mark.parametrize(
+    ("points", "believed"),
+    [
+        ("room", READOUT),
+        ("room", 1.2 * READOUT),
+        pytest.param("room", 0.8 * READOUT, marks=pytest.mark.bench),
+        pytest.param("room", 0.0, marks=pytest.mark.bench),
+        pytest.param("board", 1.2 * READOUT, marks=pytest.mark.bench),
+    ],
+)
+def test_the_readout_time_whatever_is_believed(points, believed):
+    noise, turn = (1.0, 0.14) if points == "room" else (0.3, 0.06)
+    said = watch(recording(points, turn=turn, noise=noise), believed)
+    found = said[-1]
+    assert abs(found.readout_time - READOUT) < 3.0 * found.deviation < 0.06 * READOUT
+    alarms = [measured for measured in said if measured and measured.contradicts(believed)]
+    if believed == READOUT:
+        assert not alarms
+    else:
+        assert len(alarms) > len(said) / 2  # from within the first half on
+
+
+def test_a_reversed_direction_is_a_negative_readout_time():
+    camera = replace(CAMERA, scan_direction="bottom_to_top")
+    said = watch(recording(), READOUT, camera)
+    assert said[-1].readout_time == pytest.approx(-READOUT, rel=0.03)
+    assert said[-1].contradicts(READOUT)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.003])
+def test_no_alarm_at_rest_nor_at_slow_motion(turn):
+    said = watch(recording(turn=turn), READOUT)
+    assert not any(measured and measured.contradicts(READOUT) for measured in said)
+
+
+def test_time_that_goes_back_starts_afresh():
+    frames, estimate = recording(seconds=0.5), ReadoutEstimate()
+    result = Localizer(CAMERA).localize(frames[0].points, frames[0].pixels)
+    for k, of in enumerate(triples(READOUT, 1.0)):
+        estimate.take(of, 1.0 / 30.0)
+        if k == 5:
+            assert estimate.measured is not None
+    for time_ns in (10**9, 10**9 - 1):
+        estimate.add(time_ns, CAMERA, result, frames[0].points, frames[0].pixels)
+    assert estimate.measured is None
+
+
+def test_contradiction_needs_both_many_deviations_and_a_real_difference():
+    assert not MeasuredReadout(0.030, 1e-3, 100, 100.0).contradicts(0.033)
+    assert not MeasuredReadout(0.030, 1e-6, 100, 100.0).contradicts(0.031)
+    assert MeasuredReadout(0.030, 5e-4, 100, 100.0).contradicts(0.033)
+    assert MeasuredReadout(-0.030, 5e-4, 100, 100.0).contradicts(0.030)
+
+
+NOISE = 1e-3
+
+
+def triples(true: float, speed: float, off: float = 0.01, shaking: float = 0.0) -> list[Equation]:
+    """Triples whose velocities are off by the same everywhere, by ten times the noise."""
+    rng, count = np.random.default_rng(1), 20
+    x = speed * np.cumsum(rng.normal(size=(count, 6)), axis=0) / np.sqrt(count)
+    images = rng.normal(0.0, NOISE, (count + 2, 6)) + rng.normal(0.0, shaking, (count + 2, 6))
+    y = true * x + rng.normal(0.0, off, 6)
+    y += (images[:-2] + 4.0 * images[1:-1] + images[2:]) / 6.0
+    none, spread = np.zeros((6, 6)), 0.5 * NOISE**2 * np.eye(6)
+    return [Equation(*pair, none, none, spread) for pair in zip(x, y, strict=True)]
+
+
+def measured(of: list[Equation]) -> MeasuredReadout | None:
+    estimate = ReadoutEstimate()
+    for triple in of:
+        estimate.take(triple, 1.0)
+    return estimate.measured
+
+
+@pytest.mark.parametrize("true", [READOUT, 0.0, -READOUT])
+def test_few_frames_tell_which_it_is_behind_errors_of_the_map(true):
+    found = measured(triples(true, speed=1.0))
+    for other in {READOUT, 0.0, -READOUT} - {true}:
+        assert found.odds(true, other) > 4.6
+    assert found.misfit < 1.5
+
+
+def test_at_rest_nothing_is_known():
+    found = measured(triples(0.0, speed=1e-5))
+    assert found is None or abs(found.odds(0.0, READOUT)) < 0.1
+
+
+def test_a_camera_that_shakes_within_its_frames_is_seen():
+    assert measured(triples(0.0, speed=3.0, shaking=10.0 * NOISE)).misfit > 1.5
+
+
+def test_a_jump_says_nothing():
+    of = triples(READOUT, speed=1.0)
+    jumped = of[10]._replace(x=of[10].x + 100.0)
+    assert measured([*of[:10], jumped]) == measured(of[:10])
+
+
+def test_a_covariance_that_is_none_is_left_out():
+    of = triples(READOUT, speed=1.0)
+    singular = of[10]._replace(yy=np.zeros((6, 6)))
+    assert measured([*of[:10], singular]).odds(READOUT, 0.0) > 2.0
+
+
+def covariance(rng: np.random.Generator, size: int) -> np.ndarray:
+    root = rng.normal(size=(size, 2 * size))
+    scale = 10.0 ** rng.uniform(-2.0, 0.0, size)
+    return root @ root.T * np.outer(scale, scale)
+
+
+def test_the_equation_of_three_views_holds_for_a_steady_turn():
+    """A camera that turns and travels steadily in its own axes: y = T x with T = 1 / rate."""
+    rng = np.random.default_rng(1)
+    turn, travel, readout = rng.normal(0.0, 0.3, 3), rng.normal(0.0, 0.3, 3), 0.02
+    start, views, times = so3.exp(rng.normal(size=3)), [], (-0.03, 0.0, 0.05)
+    for time in times:
+        fine = np.linspace(0.0, time, 2001)
+        path = np.array([so3.exp(turn * t) @ travel for t in fine])
+        motion = readout * np.concatenate([turn, travel])
+        way = np.mean(0.5 * (path[1:] + path[:-1]), axis=0) * time
+        views.append(View(start @ so3.exp(turn * time), start @ way, motion, covariance(rng, 12)))
+    of = equation(*views, times[1] - times[0], times[2] - times[1])
+    np.testing.assert_allclose(of.y, readout * of.x, atol=1e-6)
+    spans = np.array([-1.0, 0.0, 1.0]) / (times[2] - times[0])
+    ratio = (times[2] - times[1]) / (times[1] - times[0])
+    simpson = np.array([2.0 - ratio, 2.0 + ratio + 1.0 / ratio, 2.0 - 1.0 / ratio]) / 6.0
+    expected = np.zeros((12, 12))
+    for each, span, share in zip(views, spans, simpson, strict=True):
+        turned = np.kron(np.eye(4), views[1].rotation.T @ each.rotation)
+        turned[:3, :3] = turned[6:9, 6:9] = np.eye(3)
+        lift = np.kron(np.diag([span, share]), np.eye(6)) @ turned
+        expected += lift @ each.covariance @ lift.T
+    found = np.block([[of.xx, of.yx.T], [of.yx, of.yy]])
+    np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
+def test_an_image_alone_finds_its_motion_and_says_how_well(direction):
+    """Many noisy images of one motion: the steps scatter as their covariance says."""
+    rng = np.random.default_rng(2)
+    camera = Camera(
+        projector.WIDTH, projector.HEIGHT, projector.K, projector.D, scan_direction=direction
+    )
+    true = Motion(so3.exp(0.1 * rng.normal(size=3)), rng.normal(0.0, 0.1, 3),
+                  rng.normal(0.0, 0.05, 3), rng.normal(0.0, 0.02, 3))  # fmt: skip
+    points = np.column_stack([rng.uniform(-1.0, 1.0, (80, 2)), rng.uniform(2.0, 4.0, 80)])
+    exact, _ = project_rolling(camera, true.at_rows, points)
+    shown = camera.inside(exact)
+    points, exact = points[shown], exact[shown]
+    seen = partial(
+        Estimate, *numbers_of(true)[:4], inliers=np.ones(len(points), bool),
+        residuals=np.zeros(len(points)), joint_covariance=np.eye(18), global_shutter_inliers=0,
+        iterations=0,
+    )()  # fmt: skip
+    distances = []
+    for _ in range(60):
+        noisy = exact + rng.normal(0.0, 0.3, exact.shape)
+        distances.append(
+            step(seen, alone := view(camera, seen, points, noisy))
+            @ np.linalg.solve(alone.covariance, step(seen, alone))
+        )
+    # Chi-squared of 12 degrees of freedom, but that the noise is an estimate.
+    assert np.mean(distances) == pytest.approx(12.0, rel=0.2)
+    assert np.abs(step(seen, view(camera, seen, points, exact))).max() < 1e-9
+    few = replace(seen, inliers=np.arange(len(points)) < 12)
+    assert view(camera, few, points, exact) is None
+
+
+def step(before: Estimate, found: View) -> np.ndarray:
+    """From an estimate to what the image alone says (12,)."""
+    turn = so3.log(np.ascontiguousarray(before.rotation @ found.rotation))
+    moved = before.rotation @ (found.position - before.position)
+    return np.r_[turn, moved, found.motion[:3] - before.angular_velocity,
+                 found.motion[3:] - before.linear_velocity]  # fmt: skip
