@@ -182,6 +182,8 @@ def find_topic(bag: BagReader, types: tuple[str, ...], given: str | None, option
     if len(of_type) != 1:
         what = "several topics" if of_type else "no topic"
         choose = f"; choose one with {option}" if of_type else ""
+        if types == (INFO_TYPE,) and not of_type:  # as a part of a split recording has it
+            choose = "; give --calibration FILE"
         raise SourceError(f"{bag.path} has {what} of type {' or '.join(types)}: {known}{choose}")
     return of_type[0]
 
