@@ -59,6 +59,7 @@ class Video:
         self.path, self._lens = Path(path), lens
         self.claimed, self.read = 0, 0  # images by the container (0: it does not say), and read
         self.lasts, self.until = 0.0, 0.0  # s, by the container (0: ...), and of the last image
+        self.damaged = 0  # packets that could not be decoded
         if not self.path.is_file():
             raise VideoError(f"{path} does not exist")
 
@@ -84,13 +85,20 @@ class Video:
     @property
     def fault(self) -> str | None:
         """That images are missing, after all have been read: the end of a file is not believed."""
-        if self.read + _UNCOUNTED < self.claimed:
-            said = f"has {self.claimed} images, {self.read} could be read"
+        step = _NEAR * self.lasts / max(self.claimed, 1)  # an edit list hides images, not the end
+        ends_early = not self.lasts or self.until + step < self.lasts
+        if self.damaged:
+            said = f"has {self.damaged} images that cannot be decoded"
+        elif self.read + _UNCOUNTED < self.claimed and ends_early:
+            said = f"says that it has {self.claimed} images, {self.read} could be read"
         elif not self.claimed and self.until + _UNTIMED < self.lasts:
-            said = f"lasts {self.lasts:.1f} s, images could be read until {self.until:.1f} s"
+            said = (
+                f"says that it lasts {self.lasts:.1f} s, images could be read until "
+                f"{self.until:.1f} s"
+            )
         else:
             return None
-        return f"{self.path.name} says that it {said}: it is damaged or cut off"
+        return f"{self.path.name} {said}: it is damaged or cut off"
 
     def _by_pyav(self) -> Iterator[VideoImage]:
         with _container(self.path) as container:
@@ -105,10 +113,20 @@ class Video:
             self.claimed, last = stream.frames, -np.inf
             self.lasts = (container.duration or 0) * 1e-6
             for packet in container.demux(stream):
-                for frame in _decoded(packet):
+                for frame in self._decoded(packet):
                     seconds = float(frame.time) if timed and frame.time is not None else last
                     is_new, last = seconds > last, max(last, seconds)
                     yield _compressed(frame.to_ndarray(format="bgr24"), seconds if is_new else None)
+
+    def _decoded(self, packet: Any) -> list[Any]:
+        """The images of a packet; of a damaged one none, as OpenCV has it."""
+        import av
+
+        try:
+            return list(packet.decode())
+        except av.FFmpegError:
+            self.damaged += 1
+            return []
 
     def _by_opencv(self) -> Iterator[VideoImage]:
         # It gives up after so many packets of other streams in a row.
@@ -136,20 +154,12 @@ class Video:
             video.release()
 
 
+_MOST_PIXELS = 150_000_000  # of an image: no camera has more
 # FFmpeg's AVFMT_NOTIMESTAMPS, of raw streams.
 _NO_TIMES = 0x0080
-# Images, which an edit list may hide, and s that another stream may go on.
-_UNCOUNTED, _UNTIMED = 1, 2.0
-
-
-def _decoded(packet: Any) -> list[Any]:
-    """The images of a packet; of a damaged one none, as OpenCV has it."""
-    import av
-
-    try:
-        return list(packet.decode())
-    except av.FFmpegError:
-        return []
+# Images that may be missing, images from the last one to the end, and s that another stream may
+# go on.
+_UNCOUNTED, _NEAR, _UNTIMED = 1, 3.0, 2.0
 
 
 def count_lenses(path: Path) -> int:
@@ -178,7 +188,10 @@ def _container(path: Path) -> Iterator[Any]:
 
 def _lenses(container: Any) -> list[Any]:
     """The streams of images that have a decoder, and the size of the first one."""
-    streams = [s for s in container.streams.video if s.codec_context is not None and s.width]
+    streams = [
+        s for s in container.streams.video
+        if s.codec_context is not None and 0 < s.width * s.height <= _MOST_PIXELS
+    ]  # fmt: skip
     if not streams:
         raise VideoError(f"{container.name} has no stream of images that can be decoded")
     size = streams[0].width, streams[0].height

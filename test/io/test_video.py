@@ -200,6 +200,18 @@ def test_a_video_that_is_cut_off_says_so(tmp_path, monkeypatch, with_pyav):
     assert f"cut.mp4 says that it has 12 images, {read} could be read: it is" in found.fault
 
 
+def test_images_that_cannot_be_decoded_are_counted(tmp_path):
+    data = bytearray(muxed(tmp_path / "a.mp4").read_bytes())
+    start = data.index(b"mdat")
+    middle = start + (data.index(b"moov") - start) // 2
+    data[middle : middle + 200] = bytes(200)
+    (tmp_path / "a.mp4").write_bytes(data)
+    found = Video(tmp_path / "a.mp4")
+    list(found)
+    assert "a.mp4 has " in str(found.fault)
+    assert "images that cannot be decoded: it is damaged or cut off" in str(found.fault)
+
+
 def test_matroska_says_how_long_it_lasts(tmp_path):
     data = muxed(tmp_path / "whole.mkv", images=60).read_bytes()
     whole = Video(tmp_path / "whole.mkv")
