@@ -18,10 +18,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from rs_localizer.cli.options import UsageError as UsageError
-from rs_localizer.cli.options import add_options
-from rs_localizer.cli.options import integer as integer
-from rs_localizer.cli.options import number as number
+from rs_localizer.cli.options import UsageError, add_options
 from rs_localizer.io.atomic_files import atomic_files, check_writable
 
 # Bars are shown by one process. tqdm's own lock for several is a semaphore, of which Python 3.14
@@ -50,7 +47,7 @@ def add_common(parser: argparse.ArgumentParser) -> None:
 
 
 class LateParser(argparse.ArgumentParser):
-    """Of a sub-command, whose module is imported when its turn comes, for ``add_arguments``."""
+    """Parser of a command, whose module is imported when its turn comes."""
 
     _module = ""
 
@@ -64,25 +61,14 @@ class LateParser(argparse.ArgumentParser):
     def _add_arguments(self) -> None:
         name, self._module = self._module, ""
         if name:
-            module = importlib.import_module(name)
-            if hasattr(module, "Options"):
-                add_options(self, module.Options)
-            else:
-                module.add_arguments(self)
+            add_options(self, importlib.import_module(name).Options)
 
     def parse_known_args(self, *args: Any, **kwargs: Any) -> Any:
         self._add_arguments()
         return super().parse_known_args(*args, **kwargs)
 
 
-def add_overwrite(parser: argparse._ActionsContainer) -> None:
-    """For :func:`replaced`."""
-    parser.add_argument("--overwrite", action="store_true", help="replace an earlier result")
-
-
-def replaced(
-    args: argparse.Namespace, mark: str, place: Path | None = None
-) -> Callable[[Path], None] | None:
+def replaced(args: Any, mark: str, place: Path | None = None) -> Callable[[Path], None] | None:
     """What removes an earlier result (it has a file ``mark``) from a place, where wanted.
 
     The place is ``--out`` where none is given.
@@ -107,7 +93,7 @@ def _clear(directory: Path) -> None:
             path.unlink()
 
 
-def refuse_existing(args: argparse.Namespace, *beside: str) -> None:
+def refuse_existing(args: Any, *beside: str) -> None:
     """Raise ``ValueError`` if ``args.out`` exists and is not to be replaced, or a file beside it.
 
     So it does if nothing can be written there. Beside ``OUT.yaml``, ``lens.yaml`` stands for
@@ -119,7 +105,7 @@ def refuse_existing(args: argparse.Namespace, *beside: str) -> None:
     check_writable(args.out)
 
 
-def with_values(args: argparse.Namespace, **values: Any) -> argparse.Namespace:
+def with_values(args: Any, **values: Any) -> argparse.Namespace:
     """The arguments with some of them changed, or added."""
     return argparse.Namespace(**vars(args) | values)
 

@@ -4,29 +4,22 @@
 
 from __future__ import annotations
 
-import argparse
 import json
+import math
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from rs_localizer.cli import (
-    WORKING,
-    UsageError,
-    add_overwrite,
-    image_input,
-    number,
-    refuse_existing,
-    with_values,
-    write_all,
-)
-from rs_localizer.cli.marker_map import add_board_arguments, find_map
+from rs_localizer.cli import WORKING, image_input, refuse_existing, with_values, write_all
+from rs_localizer.cli.marker_map import TargetOptions, find_map
+from rs_localizer.cli.options import Inputs, Settings, UsageError, argument, option
 from rs_localizer.cli.rig_input import cameras_of, mounting_lines, numbers
-from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
-from rs_localizer.io.topics import IMU
+from rs_localizer.cli.settings_args import given_settings, given_topics, remapped
+from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
 
 if WORKING:
     import numpy as np
@@ -156,76 +149,43 @@ _TRANSFORMS, _CAMCHAIN = "transforms.launch.xml", "camchain.yaml"
 _SHARED = ("share.csv", "share.json")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "recordings",
-        type=Path,
-        nargs="+",
-        metavar="RECORDING",
-        help="a bag of correspondences or keypoints; or, with --map or --board, images: a video, "
-        "a folder, a bag; several with --rig",
-    )
-    above = number(0.0, above=True)
-    parser.add_argument(
-        "--rig",
-        action="store_true",
-        help="the recordings are those of cameras on one body, one each, or one bag has topics of "
+@dataclass(frozen=True, kw_only=True)
+class Options(TargetOptions, Settings, Inputs):
+    recordings: list[Path] = argument(
+        "a bag of correspondences or keypoints; or, with --map or --board, images: a video, a "
+        "folder, a bag; several with --rig", "RECORDING",
+    )  # fmt: skip
+    rig: bool = option(
+        "the recordings are those of cameras on one body, one each, or one bag has topics of "
         "several, or one video several lenses (.insv): find where the cameras are, and their "
-        "clocks, too; the first one's axes and clock are the rig's. "
-        "Cameras are named as their files, or as their topics begin; "
-        "--calibration is a camchain, or FILE of all as FILE#NAME",
+        "clocks, too; the first one's axes and clock are the rig's. Cameras are named as their "
+        "files, or as their topics begin; --calibration is a camchain, or FILE of all as "
+        "FILE#NAME", default=False,
+    )  # fmt: skip
+    calibration: Path | None = option("lens; without one it is found, too", "FILE")
+    intrinsics: bool = option("find the lens as well, and write camera_info", default=False)
+    imu: bool = option(
+        "find how the IMU of a bag or of a video goes with the camera: offset of its stamps, "
+        "rotation, bias", default=False,
+    )  # fmt: skip
+    no_telemetry: bool = option(
+        "ignore the gyroscope and the readout time inside a video, or in a log beside it",
+        default=False,
     )
-    parser.add_argument(
-        "--map", type=Path, metavar="FILE", help="map of the keypoints, or marker map of the images"
+    rate: float | None = option(
+        "images per second of a video or of files", "HZ", limits=(0.0, math.inf), above=True
     )
-    add_board_arguments(parser)
-    parser.add_argument(
-        "--calibration", type=Path, metavar="FILE", help="lens; without one it is found, too"
+    out: Path | None = option("parameters for node and replay --params", "FILE.yaml")
+    overwrite: bool = option("replace an earlier result", default=False)
+    plot: Path | None = option("directory for pictures", "DIR")
+    force: bool = option(
+        "write the readout time although it is refused (the exit code stays 1)", default=False
     )
-    parser.add_argument(
-        "--intrinsics", action="store_true", help="find the lens as well, and write camera_info"
-    )
-    parser.add_argument(
-        "--imu",
-        nargs="?",
-        const="",
-        metavar="TOPIC",
-        help="find how the IMU of a bag goes with the camera: offset of its stamps, rotation, bias "
-        "(default: the only topic of its type); of a video, that inside it or in a log beside it",
-    )
-    image_input.add_telemetry(parser)
-    parser.add_argument(
-        "--rate", type=above, metavar="HZ", help="images per second of a video or of files"
-    )
-    add_settings(parser, "scan_direction gives the axis (its reverse is tried as well)")
-    topics = parser.add_argument_group("topics of a bag (default: found by name and type)")
-    add_topics(topics, but=(IMU,))
-    topics.add_argument("--image", metavar="TOPIC")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE.yaml",
-        help="parameters for node and replay --params",
-    )
-    add_overwrite(parser)
-    parser.add_argument(
-        "--plots",
-        type=Path,
-        metavar="DIR",
-        help="directory for pictures",
-    )
-    parser.add_argument(
-        "--force",
-        action="store_true",
-        help="write the readout time although it is refused (the exit code stays 1)",
-    )
-    parser.add_argument(
-        "--share",
-        metavar="CAMERA",
-        help="also write a row of this camera for the table of readout times, to send as a pull "
-        "request: FILE_share.csv beside --out, and FILE_share.json for other programs",
-    )
-    parser.add_argument("--firmware", default="", metavar="TEXT", help="for --share: the camera's")
+    share: str | None = option(
+        "also write a row of this camera for the table of readout times, to send as a pull "
+        "request: FILE_share.csv beside --out, and FILE_share.json for other programs", "CAMERA",
+    )  # fmt: skip
+    firmware: str = option("for --share: the camera's", "TEXT", "")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -240,7 +200,9 @@ class _Source:
     own_stamps: bool = True
 
 
-def run(args: argparse.Namespace) -> Figures | None:
+def run(options: Options) -> Figures | None:
+    topic = remapped(options).get(IMU, "") if options.imu else None
+    args = with_values(options, imu=topic)
     if args.rig:
         _calibrate_rig(args)
         return None
@@ -249,11 +211,11 @@ def run(args: argparse.Namespace) -> Figures | None:
     return calibrate_one(with_values(args, recording=args.recordings[0]))
 
 
-def _finds_lens(args: argparse.Namespace, recording: Path) -> bool:
+def _finds_lens(args: Any, recording: Path) -> bool:
     return args.intrinsics or (args.calibration is None and not is_bag(recording))
 
 
-def calibrate_one(args: argparse.Namespace) -> Figures:
+def calibrate_one(args: Any) -> Figures:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
         lens = _finds_lens(args, args.recording)
@@ -287,9 +249,7 @@ def calibrate_one(args: argparse.Namespace) -> Figures:
     }
 
 
-def _calibrated(
-    args: argparse.Namespace, source: _Source, camera: Camera, config: NodeConfig
-) -> Calibration:
+def _calibrated(args: Any, source: _Source, camera: Camera, config: NodeConfig) -> Calibration:
     """What the images of a camera say, printed."""
     intrinsics = args.intrinsics or source.new_lens
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
@@ -308,14 +268,14 @@ def _calibrated(
         _tell_lens(found)
     for line in imu_lines(found, source.imu, config):
         print(line)
-    if args.plots is not None:
+    if args.plot is not None:
         from rs_localizer.tools.calibration_plots import save_plots
 
-        save_plots(camera, found, args.plots)
+        save_plots(camera, found, args.plot)
     return found
 
 
-def _share(args: argparse.Namespace, found: Calibration) -> None:
+def _share(args: Any, found: Calibration) -> None:
     width, height = found.fit.camera.size
     mode = f"{width}x{height} {1.0 / found.stamps.interval:.4g} Hz"
     values = [(verdict.readout_time(found), found.deviation)]
@@ -339,7 +299,7 @@ def _write_shared(path: Path, entries: Sequence[Known], **more: float | str) -> 
     )
 
 
-def _config(args: argparse.Namespace) -> NodeConfig:
+def _config(args: Any) -> NodeConfig:
     if args.out is not None and args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
     if args.share and args.out is None:
@@ -347,7 +307,7 @@ def _config(args: argparse.Namespace) -> NodeConfig:
     return given_settings(args)
 
 
-def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
+def _read(args: Any, config: NodeConfig) -> _Source:
     path: Path = args.recording
     if not path.exists():
         raise ValueError(f"{path} does not exist")
@@ -358,32 +318,34 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
         found = _detected(args, source.shots)
         image_input.tell_times(source.clock)
         return replace(found, own_stamps=path.is_dir() and args.rate is None, imu=imu)
+    topics = remapped(args)
     with open_bag(path) as bag:
         imu = None
         if args.imu is not None:
-            imu = read_imu_recording(bag, args.imu or None, optical_frame(bag, args.camera_info))
-        if args.image is None and has_frames(bag):
+            frame = optical_frame(bag, topics.get(CAMERA_INFO))
+            imu = read_imu_recording(bag, args.imu or None, frame)
+        if IMAGE not in topics and has_frames(bag):
             return replace(_correspondences(args, bag, config), imu=imu)
         given = None if args.calibration is None else read_calibration(args.calibration)
         return replace(_detected(args, image_input.of_bag(bag, given, args).shots), imu=imu)
 
 
-def _imu_of_video(args: argparse.Namespace, path: Path) -> ImuRecording | None:
+def _imu_of_video(args: Any, path: Path) -> ImuRecording | None:
     if args.imu is None:
         return None
     telemetry = image_input.telemetry_of(path, args)
     if args.imu or telemetry is None or args.rate is not None:
         raise UsageError(
-            "--imu TOPIC is for bags, and --imu for videos with a gyroscope of their own clock "
+            "-r imu:=TOPIC is for bags, and --imu for videos with a gyroscope of their own clock "
             "(without --rate): this one has none that is known"
         )
     return image_input.video_imu(telemetry)
 
 
-def _correspondences(args: argparse.Namespace, bag: BagReader, config: NodeConfig) -> _Source:
+def _correspondences(args: Any, bag: BagReader, config: NodeConfig) -> _Source:
     if args.board is not None:
         raise UsageError("--board is for images; the recording has correspondences")
-    topics = find_topics(bag, given_topics(args, but=(IMU,))).without(IMU)
+    topics = find_topics(bag, given_topics(args)).without(IMU)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     recorded = read_recording(bag, topics, config.matching, landmarks)
     camera = recorded.calibration.camera(0.0, config.scan_direction)
@@ -393,7 +355,7 @@ def _correspondences(args: argparse.Namespace, bag: BagReader, config: NodeConfi
     return _Source(images, camera)
 
 
-def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Source:
+def _detected(args: Any, shots: Iterator[Shot | Carried]) -> _Source:
     marker_map = find_map(args)
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
     detector.warm_up()
@@ -472,7 +434,7 @@ def _tell_lens(found: Calibration) -> None:
 
 
 def _write(
-    args: argparse.Namespace,
+    args: Any,
     found: Calibration,
     marker_map: MarkerMap | None,
     intrinsics: bool,
@@ -519,20 +481,22 @@ def _write(
     return True
 
 
-def _next(args: argparse.Namespace, out: Path, lens: Path | None, shape: Path | None) -> str:
+def _next(args: Any, out: Path, lens: Path | None, shape: Path | None) -> str:
     """The commands that make poses of this recording with what was found."""
     recording, seen = str(args.recording), out.with_name(f"{out.stem}_seen")
     params, poses = ["--params", str(out)], str(out.with_name(f"{out.stem}_poses"))
     if shape is None:  # a recording of correspondences
         return shlex.join(["rs_localizer", "replay", recording, *params, "--out", poses])
-    options = {"--map": shape, "--calibration": lens, "--rate": args.rate, "--image": args.image}
-    detect = ["rs_localizer", "detect", recording, *_words(options), *params, "--out", str(seen)]
+    topics = [word for text in args.remaps for word in ("-r", text)]
+    options = {"--map": shape, "--calibration": lens, "--rate": args.rate}
+    detect = ["rs_localizer", "detect", recording, *_words(options), *topics, *params]
+    detect += ["--out", str(seen)]
     return f"{shlex.join(detect)} && {image_input.replay_command(seen)}"
 
 
-def _calibrate_rig(args: argparse.Namespace) -> None:
+def _calibrate_rig(args: Any) -> None:
     """Calibrate each camera alone, then all together, and say what was found."""
-    for name in ("imu", "share", "workers", "scheduler"):
+    for name in ("imu", "share"):
         if getattr(args, name) is not None:
             raise UsageError(f"--{name} is for one camera: leave it out with --rig")
     # Cameras by name need a readout time; what it is does not matter where it is estimated.
@@ -547,7 +511,7 @@ def _calibrate_rig(args: argparse.Namespace) -> None:
         print(f"{name}:")
         axis = config.of_cameras.get(name, config).scan_direction
         of_camera = replace(config, scan_direction=axis)
-        plots = None if args.plots is None else args.plots / name
+        plots = None if args.plot is None else args.plot / name
         of_args = with_values(own.args, plots=plots)
         source = _read(of_args, of_camera)
         intrinsics |= source.new_lens
@@ -659,7 +623,7 @@ def _write_rig(
     write_all(writers)
 
 
-def _next_of_rig(args: argparse.Namespace) -> str:
+def _next_of_rig(args: Any) -> str:
     """The command that goes on: poses of a video of several lenses, or TF for a live rig."""
     path, stem, recording = args.out, args.out.stem, args.recordings[0]
     if len(args.recordings) > 1 or is_bag(recording) or args.map is None:

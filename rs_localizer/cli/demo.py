@@ -4,19 +4,20 @@
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rs_localizer.cli import WORKING, import_ros, stage
+from rs_localizer.cli.options import option
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.simulation.settings import FrameSettings
@@ -72,17 +73,14 @@ Your own camera, next:
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--out", type=Path, default=Path("out"), metavar="DIR", help="for the pictures"
-    )
-    parser.add_argument(
-        "--solver",
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    out: Path = option("for the pictures", "DIR", Path("out"))
+    solver: str = option(
+        "that is compared with p3p", default=NodeConfig().solver,
         choices=[name for name, row in SOLVERS.items() if row.rolling_shutter],
-        default=NodeConfig().solver,
-        help="solver that is compared with p3p (default: %(default)s)",
-    )
-    parser.add_argument("--quick", action="store_true", help="a few frames of each recording only")
+    )  # fmt: skip
+    quick: bool = option("a few frames of each recording only", default=False)
 
 
 class Act(NamedTuple):
@@ -93,28 +91,28 @@ class Act(NamedTuple):
     results: dict[str, Result]
 
 
-def run(args: argparse.Namespace) -> None:
+def run(options: Options) -> None:
     started = time.monotonic()
-    args.out.mkdir(parents=True, exist_ok=True)
-    methods = {args.solver: args.solver, "p3p (one pose per image)": "p3p"}
-    most = _QUICK_FRAMES if args.quick else None
+    options.out.mkdir(parents=True, exist_ok=True)
+    methods = {options.solver: options.solver, "p3p (one pose per image)": "p3p"}
+    most = _QUICK_FRAMES if options.quick else None
     print(
         f"{_minutes(_FIRST)} at the first time on this machine, {_minutes(_EACH)} later; 0.5 GB of "
-        f"memory, 40 MB of disk for compiled code in {cache_directory()}, 5 MB in {args.out}. If "
-        "it is stopped, the same command goes on with what has been compiled.",
+        f"memory, 40 MB of disk for compiled code in {cache_directory()}, 5 MB in {options.out}. "
+        "If it is stopped, the same command goes on with what has been compiled.",
         flush=True,
     )
     with tempfile.TemporaryDirectory() as directory, compiler.told(_compiling()):
         place = Path(directory)
         flight = _act(_fly(place, most), _CAMERA.readout_time, methods, "Simulated flight")
-        _draw(args.out, **_of_flight(flight))
+        _draw(options.out, **_of_flight(flight))
         webcam = load_recording(data.path(data.WEBCAM), most)
         shown = build(load_params_file(data.path(data.WEBCAM) / "parameters.yaml"))
         board = _act(webcam, shown.readout_time, methods, "Webcam over a board")
         residuals = plots.residual_picture(webcam, board.results, board.readout_time)
-        _draw(args.out, webcam_residuals=residuals)
-        _cube(place, most, methods, args.out / CUBE)
-        _live(flight, args.solver, place)
+        _draw(options.out, webcam_residuals=residuals)
+        _cube(place, most, methods, options.out / CUBE)
+        _live(flight, options.solver, place)
     print(f"done in {time.monotonic() - started:.0f} s\n{_AFTERWARDS}", end="")
 
 

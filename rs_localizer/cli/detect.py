@@ -4,24 +4,17 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rs_localizer.cli import (
-    WORKING,
-    UsageError,
-    add_overwrite,
-    integer,
-    number,
-    replaced,
-    with_values,
-)
+from rs_localizer.cli import WORKING, replaced, with_values
 from rs_localizer.cli.image_input import (
-    add_source_arguments,
+    ImageOptions,
     opened,
     shutter_values,
     tell_left_out,
@@ -30,7 +23,8 @@ from rs_localizer.cli.image_input import (
     time_faults,
     write_shutter,
 )
-from rs_localizer.cli.marker_map import add_board_arguments, find_map
+from rs_localizer.cli.marker_map import TargetOptions, find_map
+from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.cli.rig_input import cameras_of
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
 from rs_localizer.io.bags import STORAGES, BagWriter, is_bag
@@ -57,39 +51,35 @@ Seen = TypeVar("Seen")
 
 # Options of markers and boards.
 _OF_MARKERS = ("map", "board", "pattern", "square", "min_side")
+_LEAST_KEYPOINTS = settings(FeatureConfig)["max_keypoints"].minimum or 1.0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "images",
-        type=Path,
-        metavar="VIDEO|BAG|FOLDER",
-        help="a video (also a stream of JPEG images, .mjpeg), a rosbag2 or ROS 1 bag with raw or "
-        "compressed images, or a folder of .jpg or .png files",
+@dataclass(frozen=True, kw_only=True)
+class Options(TargetOptions, ImageOptions):
+    images: Path = argument(
+        "a video (also a stream of JPEG images, .mjpeg), a rosbag2 or ROS 1 bag with raw or "
+        "compressed images, or a folder of .jpg or .png files", "VIDEO|BAG|FOLDER",
+    )  # fmt: skip
+    min_side: float | None = option(
+        f"markers with a shorter side are left out (default: {DetectorConfig().min_side:g})", "PX",
+        limits=(0.0, math.inf),
+    )  # fmt: skip
+    features: str | None = option(
+        "instead: keypoints with descriptors, to be matched with a map; sift: as COLMAP's",
+        choices=[kind.value for kind in FeatureKind],
     )
-    wanted = parser.add_argument_group("what to look for")
-    wanted.add_argument("--map", type=Path, metavar="FILE", help="marker map")
-    add_board_arguments(wanted)
-    wanted.add_argument(
-        "--min-side",
-        type=number(0.0),
-        metavar="PX",
-        help=f"markers with a shorter side are left out (default: {DetectorConfig().min_side:g})",
-    )
-    _add_feature_arguments(wanted)
-    add_source_arguments(parser)
-    parser.add_argument("--out", type=Path, required=True, help="bag directory to create")
-    add_overwrite(parser)
-    parser.add_argument(
-        "--images", dest="with_images", action="store_true", help="copy compressed images, too"
-    )
-    parser.add_argument("--storage", choices=list(STORAGES), default="mcap")
-    parser.add_argument(
-        "--timing", action="store_true", help="say how long it took, and how much of it OpenCV did"
-    )
+    max_keypoints: int | None = option(
+        "of an image, the best of all its parts (default: "
+        f"{FeatureConfig().max_keypoints})", "N", limits=(_LEAST_KEYPOINTS, math.inf),
+    )  # fmt: skip
+    out: Path = option("bag directory to create", "DIR", required=True)
+    overwrite: bool = option("replace an earlier result", default=False)
+    with_images: bool = option("copy compressed images, too", default=False, flag="--images")
+    storage: str = option("of the bag", default="mcap", choices=list(STORAGES))
+    timing: bool = option("say how long it took, and how much of it OpenCV did", default=False)
 
 
-def run(args: argparse.Namespace) -> Figures | None:
+def run(args: Options) -> Figures | None:
     if args.features is None and args.max_keypoints is not None:
         raise UsageError("--max-keypoints goes with --features")
     if args.features is None and args.map is None and args.board is None:
@@ -103,7 +93,7 @@ def run(args: argparse.Namespace) -> Figures | None:
     return None
 
 
-def detect_one(args: argparse.Namespace) -> Figures:
+def detect_one(args: Options) -> Figures:
     """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
     marker_map = find_map(args)
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
@@ -144,7 +134,7 @@ def detect_one(args: argparse.Namespace) -> Figures:
 
 
 def _look(
-    args: argparse.Namespace,
+    args: Options,
     look: Callable[[Shots, BagWriter, offline.Options, Any], Seen],
     of_map: Mapping[str, float] | None = None,
 ) -> list[tuple[str, Seen, ImageClock | None]]:
@@ -177,7 +167,7 @@ def _look(
     return seen
 
 
-def _place(args: argparse.Namespace, name: str) -> str:
+def _place(args: Options, name: str) -> str:
     return f"{args.out}, {name}" if name else str(args.out)
 
 
@@ -196,29 +186,15 @@ def _tell(what: str, recorded: Recorded, notices: Counter[str]) -> None:
         print(f"note ({count} images): {text}")
 
 
-def _add_feature_arguments(parser: argparse._ActionsContainer) -> None:
-    parser.add_argument(
-        "--features",
-        choices=[kind.value for kind in FeatureKind],
-        help="instead: keypoints with descriptors, to be matched with a map; sift: as COLMAP's",
-    )
-    setting = settings(FeatureConfig)["max_keypoints"]
-    parser.add_argument(
-        "--max-keypoints",
-        type=integer(int(setting.minimum or 1)),
-        metavar="N",
-        help=f"of an image, the best of all its parts (default: {setting.default})",
-    )
-
-
-def detect_features(args: argparse.Namespace) -> None:
+def detect_features(args: Options) -> None:
     """Find the keypoints of all images."""
     for name in _OF_MARKERS:
         if getattr(args, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} is for markers; give it or --features")
-    config = FeatureConfig(features=args.features)
+    kind = args.features or ""
+    config = FeatureConfig(features=kind)
     if args.max_keypoints is not None:
-        config = FeatureConfig(features=args.features, max_keypoints=args.max_keypoints)
+        config = FeatureConfig(features=kind, max_keypoints=args.max_keypoints)
     extractor, images = FrameExtractor(config), 0
 
     def look(shots: Shots, bag: BagWriter, options: offline.Options, bar: Any) -> Extraction:

@@ -4,22 +4,23 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import importlib.util
+import math
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, UsageError, number
-from rs_localizer.cli.settings_args import add_settings, given_values
-from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.cli import WORKING, with_values
+from rs_localizer.cli.options import Inputs, Settings, UsageError, option
+from rs_localizer.cli.settings_args import given_values, remapped
 from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
-from rs_localizer.settings import build, settings, write_parameters
+from rs_localizer.io.topics import CAMERA_INFO, IMAGE
+from rs_localizer.settings import build, write_parameters
 
 if WORKING:
     import numpy as np
@@ -49,64 +50,34 @@ if WORKING:
 _SAME = 0.05
 
 
-def add_source_arguments(parser: argparse.ArgumentParser) -> None:
-    """The camera and the topics of a bag."""
-    camera = parser.add_argument_group("the camera")
-    camera.add_argument(
-        "--calibration",
-        type=Path,
-        metavar="FILE",
-        help=f"{CALIBRATION_KINDS} (default: the bag's camera_info)",
+@dataclass(frozen=True, kw_only=True)
+class ImageOptions(Settings, Inputs):
+    """images: their camera and their times."""
+
+    calibration: Path | None = option(
+        f"{CALIBRATION_KINDS} (default: the bag's camera_info)", "FILE"
     )
-    add_settings(
-        camera,
-        f"as of calibrate; they go to {PARAMETERS} beside the data, for replay --params (default: "
-        f"those in {PARAMETERS} of the bag)",
+    no_telemetry: bool = option(
+        "ignore the gyroscope and the readout time inside a video, or in a log beside it",
+        default=False,
     )
-    add_telemetry(camera)
-    longest = settings()["readout_time"].maximum or 0.0
-    camera.add_argument(
-        "--readout-time",
-        type=number(0.0, longest),
-        metavar="S",
-        help="as -p readout_time:=S, seconds from the first row to the last",
-    )
-    camera.add_argument(
-        "--scan-direction",
-        choices=[direction.value for direction in ScanDirection],
-        help=f"as -p scan_direction:= (default: {ScanDirection.TOP_TO_BOTTOM})",
-    )
-    camera.add_argument(
-        "--rate",
-        type=number(0.0, above=True),
-        metavar="HZ",
-        help="images per second, instead of the presentation times of a video, or for files whose "
-        "names are not times in ns",
-    )
-    camera.add_argument(
-        "--start",
-        type=number(0.0),
-        metavar="S",
-        help="time of the first image of a video or folder (default: "
+    rate: float | None = option(
+        "images per second, instead of the presentation times of a video, or for files whose names "
+        "are not times in ns", "HZ", limits=(0.0, math.inf), above=True,
+    )  # fmt: skip
+    start: float | None = option(
+        "time of the first image of a video or folder, s (default: "
         f"{DEFAULT_START_NS * 1e-9:g}, since ROS takes 0 for none; of names that are times, their "
-        "own)",
-    )
-    bag = parser.add_argument_group("topics of a bag (default: the only ones of their types)")
-    bag.add_argument("--image", metavar="TOPIC")
-    bag.add_argument("--camera-info", metavar="TOPIC")
+        "own)", "S", limits=(0.0, math.inf),
+    )  # fmt: skip
 
 
-def shutter_values(args: argparse.Namespace) -> dict[str, Any]:
+def shutter_values(args: Any) -> dict[str, Any]:
     """The settings that were given, or that stand beside the images of a bag, by dotted name."""
-    also = [
-        f"{name}:={value}"
-        for name in ("readout_time", "scan_direction")
-        if (value := getattr(args, name)) is not None
-    ]
     beside = args.images / PARAMETERS
     if args.params is None and is_bag(args.images) and beside.exists():
-        return given_values(argparse.Namespace(params=beside, assignments=args.assignments), also)
-    values = given_values(args, also)
+        return given_values(with_values(args, params=beside))
+    values = given_values(args)
     telemetry = telemetry_of(args.images, args)
     if telemetry is not None and telemetry.readout_time is not None:
         values.setdefault("readout_time", telemetry.readout_time)
@@ -117,7 +88,7 @@ def shutter_values(args: argparse.Namespace) -> dict[str, Any]:
     return values
 
 
-def telemetry_of(path: Path, args: argparse.Namespace) -> Telemetry | None:
+def telemetry_of(path: Path, args: Any) -> Telemetry | None:
     """What a video says of its camera; None: nothing, or it is not to be used.
 
     Raises:
@@ -144,17 +115,8 @@ def video_imu(telemetry: Telemetry, start_ns: int = DEFAULT_START_NS) -> ImuReco
     return ImuRecording(stamps, telemetry.rates, np.eye(3))
 
 
-def add_telemetry(parser: argparse._ActionsContainer) -> None:
-    """For :func:`telemetry_of`."""
-    parser.add_argument(
-        "--no-telemetry",
-        action="store_true",
-        help="ignore the gyroscope and the readout time inside a video",
-    )
-
-
 def tell_telemetry(
-    args: argparse.Namespace, used: float | None = None, measured: Camera | None = None,
+    args: Any, used: float | None = None, measured: Camera | None = None,
     lens: bool = True,
 ) -> None:  # fmt: skip
     """Say what a video knows of its camera, and what is not used of it.
@@ -209,9 +171,7 @@ def tell_telemetry(
     print(f"{telemetry.camera}: {', '.join(said)}; --no-telemetry ignores them")
 
 
-def write_shutter(
-    args: argparse.Namespace, out: Path, of_map: Mapping[str, float] | None = None
-) -> None:
+def write_shutter(args: Any, out: Path, of_map: Mapping[str, float] | None = None) -> None:
     """What is known of the shutter and of the map, into the directory of a recording."""
     if values := {**(of_map or {}), **shutter_values(args)}:
         write_parameters(out / PARAMETERS, values)
@@ -226,9 +186,7 @@ def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> Non
         print(f"kept for replay: {kept}")
 
 
-def time_faults(
-    args: argparse.Namespace, clock: ImageClock | None, period: float, camera: str = ""
-) -> list[str]:
+def time_faults(args: Any, clock: ImageClock | None, period: float, camera: str = "") -> list[str]:
     """Say where the times are from; what speaks against them, and against the readout time.
 
     Args:
@@ -244,7 +202,7 @@ def time_faults(
     return [fault for fault in faults if fault]
 
 
-def tell_next(args: argparse.Namespace, more: str = "") -> None:
+def tell_next(args: Any, more: str = "") -> None:
     """The command that makes poses of the recording, with further options."""
     if not {"readout_time", "cameras"} & set(shutter_values(args)):
         print(
@@ -273,12 +231,12 @@ class Source:
 
 @contextlib.contextmanager
 def opened(
-    args: argparse.Namespace, path: Path, start: float | None = None, calibrated: bool = True,
+    args: Any, path: Path, start: float | None = None, calibrated: bool = True,
 ) -> Iterator[Source]:  # fmt: skip
     """Images with the lens of ``args.calibration`` or, of a bag, its camera_info.
 
     Args:
-        args: with ``rate``, and the topics ``image`` and ``camera_info`` of a bag.
+        args: with ``rate``, and the ``remaps`` of topics of a bag.
         path: of the images.
         start: time of the first one, s; not of a bag.
         calibrated: refuse images without a calibration.
@@ -287,9 +245,8 @@ def opened(
         UsageError: for options that do not go with it, or that are missing.
     """
     if not is_bag(path):
-        for name in ("image", "camera_info"):
-            if getattr(args, name) is not None:
-                raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
+        if args.remaps:
+            raise UsageError("-r names topics of a bag")
         if getattr(args, "lens", None) is not None:
             if args.rate is not None:
                 raise UsageError("--rate is for one camera: leave it out with cameras")
@@ -321,20 +278,17 @@ def opened(
         yield of_bag(bag, camera, args, calibrated)
 
 
-def of_bag(
-    bag: BagReader, camera: Camera | None, args: argparse.Namespace, calibrated: bool = True
-) -> Source:
+def of_bag(bag: BagReader, camera: Camera | None, args: Any, calibrated: bool = True) -> Source:
     """The images of a bag; without a camera, with that of its camera_info."""
-    topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
+    topics = remapped(args)
+    topic = find_topic(bag, IMAGE_TYPES, topics.get(IMAGE), "-r image:=")
     info = None
     if camera is None and (calibrated or INFO_TYPE in bag.topics.values()):
-        info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
+        info = find_topic(bag, (INFO_TYPE,), topics.get(CAMERA_INFO), "-r camera_info:=")
     return Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
 
 
-def of_files(
-    args: argparse.Namespace, path: Path, camera: Camera | None, start: float | None = None
-) -> Source:
+def of_files(args: Any, path: Path, camera: Camera | None, start: float | None = None) -> Source:
     """The images of a folder, of a video, or of its lens ``args.lens``, if there is one.
 
     Raises:

@@ -94,10 +94,36 @@ COMMANDS = {
         "errors of estimated poses and twists against the truth, as tables and plots",
         "rs_localizer evaluate flight_poses flight",
     ),
-    "map": Command(
-        "rs_localizer.cli.map",
-        "make a map of a room or of markers; refine, align, convert and describe it",
+    "map build": Command(
+        "rs_localizer.cli.map.build",
+        "a map of landmarks from images: structure by COLMAP, refined with the rolling shutter",
         "rs_localizer map build walk.mp4 --calibration lens.yaml --params shutter.yaml --out room",
+    ),
+    "map survey": Command(
+        "rs_localizer.cli.map.survey",
+        "find the poses of all markers that a recording shows; sizes are taken as given",
+        "rs_localizer map survey wall.mp4 --family apriltag_36h11 --size 0.15 --calibration "
+        "lens.yaml --out wall.yaml",
+    ),
+    "map refine": Command(
+        "rs_localizer.cli.map.refine",
+        "adjust a map with the rolling shutter that saw it, or a model of COLMAP",
+        "rs_localizer map refine seen --map room.npz --out refined.npz",
+    ),
+    "map align": Command(
+        "rs_localizer.cli.map.align",
+        "bring a map to metres, to z up, to an origin; what is not given stays as it is",
+        "rs_localizer map align room.npz level.npz --up 0 -1 0 --origin 7",
+    ),
+    "map convert": Command(
+        "rs_localizer.cli.map.convert",
+        "write a map to another file",
+        "rs_localizer map convert wall.yaml field.json",
+    ),
+    "map info": Command(
+        "rs_localizer.cli.map.info",
+        "describe a map of landmarks or of markers, and name sizes in other units",
+        "rs_localizer map info wall.yaml",
     ),
     "warm": Command(
         "rs_localizer.cli.warm",
@@ -162,8 +188,7 @@ def parse(name: str, module: ModuleType, words: Sequence[str]) -> Any:
         UsageError: for words that it does not understand.
     """
     parser = parser_of(name, module)
-    found = parser.parse_args(list(words))
-    return read(module.Options, found) if hasattr(module, "Options") else found
+    return read(module.Options, parser.parse_args(list(words)))
 
 
 def parser_of(name: str, module: ModuleType) -> Parser:
@@ -174,10 +199,7 @@ def parser_of(name: str, module: ModuleType) -> Parser:
         description=f"{summary[0].upper()}{summary[1:]}.",
         epilog=f"example:\n  {COMMANDS[name].example}",
     )
-    if hasattr(module, "Options"):
-        add_options(parser, module.Options)
-    else:
-        module.add_arguments(parser)
+    add_options(parser, module.Options)
     add_common(parser)
     return parser
 
@@ -293,9 +315,12 @@ def complete() -> None:
     import argcomplete
 
     parser = argparse.ArgumentParser(prog="rs_localizer", allow_abbrev=False)
-    commands = parser.add_subparsers(parser_class=LateParser)
+    commands = {"": parser.add_subparsers(parser_class=LateParser)}
     for name, command in COMMANDS.items():
-        own = commands.add_parser(name, help=command.summary)
+        group, _, last = name.rpartition(" ")
+        if group not in commands:
+            commands[group] = commands[""].add_parser(group).add_subparsers(parser_class=LateParser)
+        own = commands[group].add_parser(last, help=command.summary)
         own.come_from(command.module)
         add_common(own)
     argcomplete.autocomplete(parser)

@@ -4,14 +4,16 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from rs_localizer.cli import WORKING, UsageError, number, read_counts
+from rs_localizer.cli import WORKING, read_counts
+from rs_localizer.cli.options import UsageError, option
 
 if WORKING:
     from rs_localizer.markers.map_check import other_units
@@ -30,24 +32,21 @@ _PATTERNS = [
 _BOARD_AXES = np.diag([1.0, -1.0, -1.0])
 
 
-def add_board_arguments(parser: argparse._ActionsContainer) -> None:
-    """A board of its own instead of a map, for :func:`find_map`."""
-    parser.add_argument(
-        "--board",
-        metavar="6x4",
-        help="instead: a board, inner corners (or circles) along a row x rows",
+@dataclass(frozen=True, kw_only=True)
+class TargetOptions:
+    """what to look for: a map of markers, or one board."""
+
+    map: Path | None = option("marker map; also that of keypoints, where they are read", "FILE")
+    board: str | None = option(
+        "instead: inner corners (or circles) along a row x rows of a board", "6x4"
     )
-    parser.add_argument(
-        "--pattern",
-        choices=_PATTERNS,
-        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
+    pattern: str | None = option(
+        f"of the board; inverted: white on black (default: {_CHESSBOARD})", choices=_PATTERNS
     )
-    parser.add_argument(
-        "--square",
-        type=number(0.0, above=True),
-        metavar="M",
-        help="side of its squares in metres, or distance of its rows of circles",
-    )
+    square: float | None = option(
+        "side of its squares in metres, or distance of its rows of circles", "M",
+        limits=(0.0, math.inf), above=True,
+    )  # fmt: skip
 
 
 def read_checked_map(path: Path) -> MarkerMap:
@@ -58,7 +57,7 @@ def read_checked_map(path: Path) -> MarkerMap:
     return marker_map
 
 
-def find_map(args: argparse.Namespace) -> MarkerMap:
+def find_map(args: Any) -> MarkerMap:
     """The map that was given, or that of the board.
 
     Raises:

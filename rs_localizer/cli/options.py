@@ -33,9 +33,11 @@ def argument(help: str, metavar: str, default: Any = MISSING) -> Any:  # noqa: A
     Args:
         help: what it is.
         metavar: its name in the help.
-        default: makes it optional.
+        default: makes it optional; ``list``: none or more.
     """
     about = {"help": help, "metavar": metavar, "positional": True}
+    if default is list:
+        return field(default_factory=list, metadata=about)
     return field(metadata=about) if default is MISSING else field(default=default, metadata=about)
 
 
@@ -54,7 +56,7 @@ def option(
 
     Args:
         help: what it does; a default that is no None, False or empty list is added.
-        metavar: of its value.
+        metavar: of its value; of a list whose values stand behind one flag, ``ID ...``.
         default: ``list`` for one that may be repeated; of a switch, False.
         flag: another name, such as ``-p``.
         choices: of a text.
@@ -132,6 +134,9 @@ class Parser(argparse.ArgumentParser):
 def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
     """Add an argument for each field of a dataclass of options."""
     hints = typing.get_type_hints(kind)
+    for item in fields(kind):  # those of bases come first on the command line
+        if item.metadata["positional"]:
+            _add(parser, item.name, hints[item.name], item)
     groups: dict[type[Any], argparse._ActionsContainer] = {kind: parser}
     # Bases come last in the help: what is the command's own is looked for first.
     for owner in kind.__mro__[:-1]:
@@ -140,13 +145,17 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
                 " ".join((owner.__doc__ or "").split()).rstrip(".")
             )
         for item in fields(kind):
-            if item.name in vars(owner).get("__annotations__", {}):
+            own = item.name in vars(owner).get("__annotations__", {})
+            if own and not item.metadata["positional"]:
                 _add(groups[owner], item.name, hints[item.name], item)
 
 
 def _add(group: argparse._ActionsContainer, name: str, hint: Any, item: Any) -> None:
     about = item.metadata
     one, many = _element(hint)
+    repeated = many is list and not about["metavar"].endswith("...")
+    if typing.get_origin(one) is tuple:  # each time so many
+        one, many = _element(one)
     words: dict[str, Any] = {"help": about["help"].replace("%", "%%")}
     if one is bool:
         words["action"] = "store_true"
@@ -161,16 +170,20 @@ def _add(group: argparse._ActionsContainer, name: str, hint: Any, item: Any) -> 
         if isinstance(many, int):
             words["nargs"] = many
             words["metavar"] = tuple(about["metavar"].split())
+        elif many is list and about["metavar"].endswith("..."):
+            words |= {"nargs": "+", "metavar": about["metavar"].removesuffix(" ...")}
     if about["positional"]:
         if many is list:
-            words["nargs"] = "+"
+            words["nargs"] = "+" if item.default_factory is MISSING else "*"
         elif item.default is not MISSING:
             words |= {"nargs": "?", "default": item.default}
         group.add_argument(name, **words)
         return
     flag = about["flag"] or f"--{name.replace('_', '-')}"
-    if many is list:
+    if repeated:
         words |= {"action": "append", "default": []}
+    elif many is list:
+        words["default"] = []
     elif one is not bool:
         words |= {"default": item.default, "required": about["required"]}
         if item.default is not None:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import argparse
 import csv
 import fcntl
 import functools
@@ -176,17 +175,14 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
         raise ValueError(f"{recording} {pictures}, not matches: first {_detect_command(recording)}")
     with TemporaryDirectory() as place:
         matches = Path(place) / "matches"
-        parser = argparse.ArgumentParser()
-        detect.add_arguments(parser)
-        of_images = parser.parse_args(_detection(options, recording, matches))
-        of_images.images = recording
+        of_images = _detection(options, recording, matches)
         by_markers = of_images.features is None
         (detect.detect_one if by_markers else detect.detect_features)(of_images)
         # What was given is in the file beside the matches now, with what the video says.
         own = matches / PARAMETERS
         alone = replace(
             options, params=own if own.exists() else None, assignments=[],
-            map=None if by_markers else _map_file(options.map),
+            map=None if by_markers else _map_file(options.map), remaps=[],
         )  # fmt: skip
         return _replay_matches(alone, matches, recording, out, timed)
 
@@ -196,24 +192,24 @@ def _map_file(place: Path) -> Path:
     return place / MAP if (place / MAP).is_file() else place
 
 
-def _detection(options: Options, recording: Path, out: Path) -> list[str]:
-    """The arguments of detect that find the matches of images."""
+def _detection(options: Options, recording: Path, out: Path) -> detect.Options:
+    """What finds the matches of images."""
     place = options.map
     assert place is not None
-    if is_marker_file(place):
-        words = ["--map", str(place)]
-    else:
-        words = ["--features", _features_of(read_map_file(_map_file(place), MAP_FRAME))]
+    by_markers = is_marker_file(place)
+    features = None
+    if not by_markers:
+        features = _features_of(read_map_file(_map_file(place), MAP_FRAME))
     calibration, params = options.calibration, options.params
     if (place / MAP).is_file():  # a result of map build
         params = params or place / PARAMETERS
         lens = place / CAMERA
         calibration = calibration or (lens if lens.is_file() and not is_bag(recording) else None)
-    for name, value in (("--calibration", calibration), ("--params", params)):
-        words += [] if value is None else [name, str(value)]
-    words += [word for item in options.assignments for word in ("-p", item)]
-    words += ["--no-telemetry"] if options.no_telemetry else []
-    return [str(recording), *words, "--out", str(out)]
+    return detect.Options(
+        images=recording, out=out, map=place if by_markers else None, features=features,
+        calibration=calibration, params=params, assignments=options.assignments,
+        remaps=options.remaps, no_telemetry=options.no_telemetry,
+    )  # fmt: skip
 
 
 def _features_of(landmarks: Map) -> str:

@@ -4,14 +4,15 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, UsageError, number, with_values
+from rs_localizer.cli import WORKING, with_values
+from rs_localizer.cli.options import UsageError, option
 
 if WORKING:
     import numpy as np
@@ -33,7 +34,7 @@ if WORKING:
 class OfRig:
     """One camera of the recordings."""
 
-    args: argparse.Namespace  # as of a recording of this camera alone
+    args: Any  # as of a recording of this camera alone
     frame: str  # of its optical axes
 
 
@@ -44,7 +45,7 @@ def check_there(recordings: Sequence[Path]) -> None:
             raise ValueError(f"{path} does not exist")
 
 
-def cameras_of(args: argparse.Namespace, config: NodeConfig) -> dict[str, OfRig]:
+def cameras_of(args: Any, config: NodeConfig) -> dict[str, OfRig]:
     """The cameras of ``args.recordings``, by name: of one bag, or of a recording of each."""
     if len(args.recordings) > 1:
         names = [re.sub(r"\W", "_", path.stem, flags=re.ASCII) for path in args.recordings]
@@ -77,7 +78,11 @@ def _in_one_file(
         with open_bag(path) as bag:
             by_name = camera_topics(bag, given)
             frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
-        return list(by_name), [{"recording": path, **own} for own in by_name.values()], frames
+        topics = [
+            {"recording": path, "remaps": [f"{name}:={topic}" for name, topic in own.items()]}
+            for own in by_name.values()
+        ]
+        return list(by_name), topics, frames
     lenses = () if path.is_dir() or not path.exists() else LENSES[: count_lenses(path)]
     if len(lenses) < 2:
         raise UsageError(
@@ -115,24 +120,23 @@ class MapCamera:
     """A camera that a map is made with, alone or of a rig."""
 
     name: str  # empty: it is alone
-    args: argparse.Namespace  # with its ``recording`` and topics
+    args: Any  # with its ``recording`` and topics
     config: NodeConfig  # with its shutter and clock
     mounting: Mounting | None  # None: the axes are its own
 
 
-def add_mounting_argument(parser: argparse.ArgumentParser) -> None:
-    """For :func:`map_cameras`."""
-    parser.add_argument(
-        "--mounting",
-        type=number(0.0, above=True),
-        nargs=3,
-        metavar=("DEG", "M", "S"),
-        help="standard deviations of a rig's extrinsics and clocks as they are given, which are "
+@dataclass(frozen=True, kw_only=True)
+class MountingOptions:
+    """several recordings: cameras on one body, named as their files."""
+
+    mounting: tuple[float, float, float] | None = option(
+        "standard deviations of a rig's extrinsics and clocks as they are given, which are "
         "estimated as well (default: the largest with which calibrate --rig accepts them)",
-    )
+        "DEG M S", limits=(0.0, math.inf), above=True,
+    )  # fmt: skip
 
 
-def map_cameras(args: argparse.Namespace, config: NodeConfig) -> list[MapCamera]:
+def map_cameras(args: Any, config: NodeConfig) -> list[MapCamera]:
     """The cameras of ``args.recordings``; those of a rig in the axes of the first.
 
     Raises:

@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Collection, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from rs_localizer.cli import WORKING, UsageError
+from rs_localizer.cli import WORKING
+from rs_localizer.cli.options import UsageError
+from rs_localizer.io.topics import IMAGE
 from rs_localizer.pipeline.inputs import INPUTS
 
 if WORKING:
@@ -20,21 +20,6 @@ if WORKING:
 _ROWS = {"first": -0.5, "middle": 0.0, "last": 0.5}
 
 
-def add_settings(
-    parser: argparse._ActionsContainer, which: str = "as after --ros-args; may be repeated"
-) -> None:
-    """``--params`` and ``-p``, for :func:`given_settings`; ``which`` says what matters."""
-    parser.add_argument("--params", type=Path, metavar="FILE", help="settings: a ROS 2 params file")
-    parser.add_argument(
-        "-p",
-        dest="assignments",
-        action="append",
-        default=[],
-        metavar="NAME:=VALUE",
-        help=f"one setting: {which}",
-    )
-
-
 def given_values(
     args: Any,
     also: Sequence[str] = (),
@@ -43,7 +28,7 @@ def given_values(
     """The values of a params file, and single ones over them, by dotted name.
 
     Args:
-        args: of :func:`add_settings`.
+        args: with ``params`` and ``assignments``.
         also: further assignments, ``name:=value``.
         check: raises ``ValueError`` for settings that cannot be used.
 
@@ -80,7 +65,11 @@ def _check(values: dict[str, Any], check: Callable[[NodeConfig], object] | None)
 
 
 def row_time(text: str) -> float:
-    """A row by its name or by its time, for ``add_argument(type=...)``."""
+    """A row by its name or by its time.
+
+    Raises:
+        UsageError: for anything else.
+    """
     if text in _ROWS:
         return _ROWS[text]
     try:
@@ -88,32 +77,27 @@ def row_time(text: str) -> float:
     except ValueError:
         tau = float("nan")
     if not -0.5 <= tau <= 0.5:
-        raise argparse.ArgumentTypeError(
-            f"must be {', '.join(_ROWS)}, or a row time from -0.5 to 0.5; got {text!r}"
+        raise UsageError(
+            f"--row: must be {', '.join(_ROWS)}, or a row time from -0.5 to 0.5; got {text!r}"
         )
     return tau
 
 
-def add_topics(group: argparse._ArgumentGroup, but: Collection[str] = ()) -> None:
-    """``-r``, for :func:`given_topics`."""
-    known = ", ".join(name for name in INPUTS if name not in but)
-    group.add_argument(
-        "-r", dest="remaps", action="append", default=[], metavar="INPUT:=TOPIC",
-        help=f"another topic of an input ({known}); may be repeated",
-    )  # fmt: skip
-
-
-def given_topics(options: Any, but: Collection[str] = ()) -> dict[str, str | None]:
-    """Topics that were given by ``-r``, by input.
+def remapped(options: Any) -> dict[str, str]:
+    """Topics that were given by ``-r``, by input, images among them.
 
     Raises:
-        UsageError: for what is no input of the command.
+        UsageError: for what is no input.
     """
-    known = [name for name in INPUTS if name not in but]
-    topics: dict[str, str | None] = {}
+    known, topics = (*INPUTS, IMAGE), dict[str, str]()
     for text in options.remaps:
         name, given, topic = text.partition(":=")
         if not given or not topic or name not in known:
             raise UsageError(f"-r: expected INPUT:=TOPIC of {', '.join(known)}; got {text!r}")
         topics[name] = topic if topic.startswith("/") else f"/{topic}"
     return topics
+
+
+def given_topics(options: Any) -> dict[str, str | None]:
+    """Those of the localizer's inputs."""
+    return {name: topic for name, topic in remapped(options).items() if name in INPUTS}

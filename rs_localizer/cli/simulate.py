@@ -4,13 +4,15 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, UsageError, add_overwrite, integer, number, replaced
+from rs_localizer.cli import WORKING, replaced
+from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import STORAGES, BagWriter
@@ -70,139 +72,26 @@ _START_NS = 1_000_000_000
 _VIBRATION_STREAM = 60
 # Stands for the bundled trajectory.
 _BUNDLED = "tum_vi_room5"
+_FRAMES, _IMAGES, _IMU, _ENCODING = FrameSettings(), ImageSettings(), ImuSettings(), Encoding()
+_POSITIVE = (0.0, math.inf)
 
 
-def option(
-    group: argparse._ArgumentGroup,
-    name: str,
-    kind: Callable[[str], float],
-    default: float,
-    unit: str,
-    text: str = "",
-) -> None:
-    """An option with a number, whose help ends with its default."""
-    said = f"{text} (default: %(default)s)".strip()
-    group.add_argument(name, type=kind, default=default, metavar=unit, help=said)
+def _words(numbers: tuple[float, ...]) -> str:
+    return " ".join(f"{number:g}" for number in numbers)
 
 
-def add_motion_arguments(group: argparse._ArgumentGroup) -> None:
-    """Options that :func:`motion_of` and :func:`stamps_of` read."""
-    group.add_argument(
-        "--trajectory",
-        type=Path,
-        metavar="FILE",
-        help="follow recorded poses: TUM text, also .gz; gaps are left out, never bridged "
-        f"({_BUNDLED}: the bundled motion of a hand-held rig)",
-    )
-    group.add_argument(
-        "--axes",
-        choices=sorted(BODY_FROM_CAMERA),
-        default="forward_left_up",
-        help="axes of the recorded body; the camera looks forward (default: %(default)s)",
-    )
-    group.add_argument(
-        "--knot-spacing",
-        type=number(0.0),
-        default=KNOT_SPACING,
-        metavar="S",
-        help="seconds between the knots of the spline through recorded poses; 0: through every "
-        "pose, shaking with its noise (default: %(default)s)",
-    )
-    group.add_argument(
-        "--angular-velocity",
-        type=number(),
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="rad/s in camera axes (x right, y down, z forward) "
-        f"(without any motion given: {_words(_ANGULAR_VELOCITY)})",
-    )
-    group.add_argument(
-        "--linear-velocity",
-        type=number(),
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="m/s along the camera axes at the start "
-        f"(without any motion given: {_words(_LINEAR_VELOCITY)})",
-    )
-    group.add_argument(
-        "--vibration",
-        type=number(0.0),
-        nargs=2,
-        metavar=("DEG", "HZ"),
-        action="append",
-        default=[],
-        help="shake the camera besides, to and fro by DEG about any axis; may be repeated",
-    )
-    option(group, "--start", number(0.0), 0.0, "S", "seconds to skip")
-    group.add_argument(
-        "--duration",
-        type=number(0.0, above=True),
-        metavar="S",
-        help=f"seconds (default: the whole trajectory; {_DURATION:g} at constant velocity)",
-    )
-
-
-def add_camera_arguments(group: argparse._ArgumentGroup) -> None:
-    """Options that :func:`camera_of` and :func:`stamps_of` read."""
-    option(group, "--width", integer(2), 640, "PX")
-    option(group, "--height", integer(2), 480, "PX")
-    option(group, "--focal", number(0.0, above=True), 500.0, "PX", "focal length")
-    group.add_argument(
-        "--distortion-model",
-        choices=[model.value for model in DistortionModel],
-        default=DistortionModel.PLUMB_BOB.value,
-        help="(default: %(default)s)",
-    )
-    group.add_argument(
-        "--distortion",
-        type=number(),
-        nargs="+",
-        default=[],
-        metavar="D",
-        help="coefficients in the order of CameraInfo (default: none)",
-    )
-    longest = settings()["readout_time"].maximum or 0.0
-    option(
-        group, "--readout-time", number(0.0, longest), 0.03, "S", "from the first row to the last"
-    )
-    group.add_argument(
-        "--scan-direction",
-        choices=[direction.value for direction in ScanDirection],
-        default=ScanDirection.TOP_TO_BOTTOM.value,
-        help="(default: %(default)s)",
-    )
-    option(
-        group, "--rate", number(0.0, above=True), FrameSettings().rate, "HZ", "frames per second"
-    )
-
-
-def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
-    """Options of a recording of several cameras."""
-    group.add_argument(
-        "--rig",
-        type=Path,
-        metavar="FILE",
-        help="several cameras in place of one: Kalibr's camchain, with readout_time (s) and "
-        "scan_direction of each camera besides",
-    )
-    group.add_argument(
-        "--triggered",
-        action="store_true",
-        help="the cameras of --rig begin their images at once, instead of by clocks of their own",
-    )
-
-
-def rig_of(args: argparse.Namespace) -> RigParts:
+def rig_of(args: Options) -> RigParts:
     """The rig of ``--rig``; UsageError for what it does not go with."""
     if args.imu:
         raise UsageError("--imu is for one camera: leave it out with --rig")
+    assert args.rig is not None
     parts = read_camchain(args.rig)
     if unknown := [name for name, camera in parts.cameras.items() if camera.readout_time == 0.0]:
         raise UsageError(f"--rig: {args.rig} has no readout_time of {', '.join(unknown)}")
     return parts
 
 
-def camera_of(args: argparse.Namespace) -> Camera:
+def camera_of(args: Options) -> Camera:
     """The camera; UsageError for a lens that cannot be."""
     K = np.array(
         [
@@ -220,13 +109,13 @@ def camera_of(args: argparse.Namespace) -> Camera:
         raise UsageError(f"--distortion: {error}") from error
 
 
-def motion_of(args: argparse.Namespace) -> TrueMotion:
+def motion_of(args: Options) -> TrueMotion:
     """The recorded motion, or one at constant velocity, with its vibrations."""
     rng = np.random.default_rng([args.seed, _VIBRATION_STREAM])
     return shaken(_unshaken(args), args.vibration, rng)
 
 
-def _unshaken(args: argparse.Namespace) -> TrueMotion:
+def _unshaken(args: Options) -> TrueMotion:
     velocities = (args.angular_velocity, args.linear_velocity)
     if args.trajectory is not None:
         if velocities != (None, None):
@@ -246,7 +135,7 @@ def _unshaken(args: argparse.Namespace) -> TrueMotion:
     )
 
 
-def stamps_of(args: argparse.Namespace, camera: Camera, motion: TrueMotion) -> list[int]:
+def stamps_of(args: Options, camera: Camera, motion: TrueMotion) -> list[int]:
     """When the frames begin, ns; ValueError when there are none."""
     start_ns = motion.intervals_ns[0][0] + round(args.start * 1e9)
     stamps = [stamp for stamp in frame_stamps(motion, camera, args.rate) if stamp >= start_ns]
@@ -255,10 +144,6 @@ def stamps_of(args: argparse.Namespace, camera: Camera, motion: TrueMotion) -> l
     if not stamps:
         raise ValueError("no frame lies within the motion, --start and --duration")
     return stamps
-
-
-def _words(numbers: tuple[float, ...]) -> str:
-    return " ".join(f"{number:g}" for number in numbers)
 
 
 # Its random numbers are its own: the frames are the same with and without it.
@@ -274,31 +159,7 @@ _OPTIONS = (
 )
 
 
-def add_imu_arguments(group: argparse._ArgumentGroup) -> None:
-    """Options that :func:`bag_of` reads."""
-    imu = ImuSettings()
-    group.add_argument(
-        "--imu", action="store_true", help="write an IMU, too, and its mounting on /tf_static"
-    )
-    option(group, "--imu-rate", number(0.0, above=True), imu.rate, "HZ")
-    option(group, "--gyroscope-noise", number(0.0), imu.gyroscope_noise, "N", "rad/s/sqrt(Hz)")
-    option(group, "--gyroscope-bias", number(0.0), imu.gyroscope_bias, "B", "rad/s, any direction")
-    option(
-        group, "--gyroscope-bias-walk", number(0.0), imu.gyroscope_bias_walk, "N",
-        "rad/s^2/sqrt(Hz)",
-    )  # fmt: skip
-    option(
-        group, "--accelerometer-noise", number(0.0), imu.accelerometer_noise, "N",
-        "m/s^2/sqrt(Hz)",
-    )  # fmt: skip
-    option(group, "--accelerometer-bias", number(0.0), imu.accelerometer_bias, "B", "m/s^2")
-    option(
-        group, "--imu-offset", number(), imu.time_offset, "S",
-        "to add to its stamps to get the camera's time",
-    )  # fmt: skip
-
-
-def bag_of(args: argparse.Namespace, out: Path, motion: TrueMotion) -> BagWriter:
+def bag_of(args: Options, out: Path, motion: TrueMotion) -> BagWriter:
     """The recording that is written; with ``--imu`` one that holds its readings besides."""
     defaults = ImuSettings()
     settings = ImuSettings(*(getattr(args, name) for name in _OPTIONS))
@@ -316,61 +177,136 @@ _OF_POINTS = ("points", "noise", "outliers", "keypoints")
 _OF_IMAGES = ("walls", "exposure", "grey_noise", "vignetting", "format", "quality")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("out", type=Path, metavar="OUT", help="bag directory to create")
-    add_overwrite(parser)
-    add_motion_arguments(parser.add_argument_group("motion"))
-    add_camera_arguments(parser.add_argument_group("camera"))
-    add_rig_arguments(parser.add_argument_group("rig"))
-    add_imu_arguments(parser.add_argument_group("IMU"))
-    frames = FrameSettings()
-    points = parser.add_argument_group("what it sees: points")
-    option(points, "--points", integer(1), frames.points, "N", "of a frame, if it sees so many")
-    option(points, "--noise", number(0.0), frames.noise, "PX", "deviation of each raw coordinate")
-    option(points, "--outliers", number(0.0, 1.0), frames.outliers, "SHARE", "of the points")
-    points.add_argument(
-        "--keypoints",
-        action="store_true",
-        help=f"pixels with binary descriptors, and the map beside them, {MAP}: for matching",
-    )
-    pictures, encoding = ImageSettings(), Encoding()
-    images = parser.add_argument_group("what it sees: images")
-    images.add_argument(
-        "--images", action="store_true", help="render camera images, instead of points"
-    )
-    images.add_argument(
-        "--walls",
-        choices=list(SCENES),
-        default=next(iter(SCENES)),
-        help="three: walls of markers at right angles, with their map; "
-        "poster, room: generated pictures; marked_room: with a few markers on its walls (default: "
-        "%(default)s)",
-    )
-    option(images, "--exposure", number(0.0), pictures.exposure, "S", "of a row: motion blur")
-    option(images, "--grey-noise", number(0.0), pictures.noise, "GREY", "deviation, of 255")
-    option(
-        images, "--vignetting", number(0.0, 1.0), pictures.vignetting, "SHARE",
-        "of the light that the corners lose",
+@dataclass(frozen=True, kw_only=True)
+class MotionOptions:
+    """motion."""
+
+    trajectory: Path | None = option(
+        "follow recorded poses: TUM text, also .gz; gaps are left out, never bridged "
+        f"({_BUNDLED}: the bundled motion of a hand-held rig)", "FILE",
     )  # fmt: skip
-    images.add_argument(
-        "--format", choices=list(FORMATS), default=encoding.format, help="(default: %(default)s)"
-    )
-    option(images, "--quality", number(1.0, 100.0), encoding.quality, "PERCENT", "of JPEG")
-    parser.add_argument(
-        "--seed", type=integer(0), default=0, metavar="N",
-        help="of all random numbers (default: %(default)s)",
+    axes: str = option(
+        "axes of the recorded body; the camera looks forward", default="forward_left_up",
+        choices=sorted(BODY_FROM_CAMERA),
     )  # fmt: skip
-    parser.add_argument(
-        "--storage", choices=list(STORAGES), default="mcap", help="(default: %(default)s)"
-    )
-    parser.set_defaults(defaults={
-        name: parser.get_default(name) for name in (*_OF_POINTS, *_OF_IMAGES)
-    })  # fmt: skip
+    knot_spacing: float = option(
+        "seconds between the knots of the spline through recorded poses; 0: through every pose, "
+        "shaking with its noise", "S", KNOT_SPACING, limits=_POSITIVE,
+    )  # fmt: skip
+    angular_velocity: tuple[float, float, float] | None = option(
+        "rad/s in camera axes (x right, y down, z forward) "
+        f"(without any motion given: {_words(_ANGULAR_VELOCITY)})", "X Y Z",
+    )  # fmt: skip
+    linear_velocity: tuple[float, float, float] | None = option(
+        "m/s along the camera axes at the start "
+        f"(without any motion given: {_words(_LINEAR_VELOCITY)})", "X Y Z",
+    )  # fmt: skip
+    vibration: list[tuple[float, float]] = option(
+        "shake the camera besides, to and fro by DEG about any axis; may be repeated", "DEG HZ",
+        list, limits=_POSITIVE,
+    )  # fmt: skip
+    start: float = option("seconds to skip", "S", 0.0, limits=_POSITIVE)
+    duration: float | None = option(
+        f"seconds (default: the whole trajectory; {_DURATION:g} at constant velocity)", "S",
+        limits=_POSITIVE, above=True,
+    )  # fmt: skip
 
 
-def run(args: argparse.Namespace) -> dict[str, object]:
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions:
+    """camera."""
+
+    width: int = option("of the image", "PX", 640, limits=(2, math.inf))
+    height: int = option("of the image", "PX", 480, limits=(2, math.inf))
+    focal: float = option("focal length", "PX", 500.0, limits=_POSITIVE, above=True)
+    distortion_model: str = option(
+        "of the lens", default=DistortionModel.PLUMB_BOB.value,
+        choices=[model.value for model in DistortionModel],
+    )  # fmt: skip
+    distortion: list[float] = option("coefficients in the order of CameraInfo", "D ...", list)
+    readout_time: float = option(
+        "from the first row to the last", "S", 0.03,
+        limits=(0.0, settings()["readout_time"].maximum or 0.0),
+    )  # fmt: skip
+    scan_direction: str = option(
+        "of the shutter", default=ScanDirection.TOP_TO_BOTTOM.value,
+        choices=[direction.value for direction in ScanDirection],
+    )  # fmt: skip
+    rate: float = option("frames per second", "HZ", _FRAMES.rate, limits=_POSITIVE, above=True)
+    rig: Path | None = option(
+        "several cameras in place of one: Kalibr's camchain, with readout_time (s) and "
+        "scan_direction of each camera besides", "FILE",
+    )  # fmt: skip
+    triggered: bool = option(
+        "the cameras of --rig begin their images at once, instead of by clocks of their own",
+        default=False,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuOptions:
+    """IMU."""
+
+    imu: bool = option("write an IMU, too, and its mounting on /tf_static", default=False)
+    imu_rate: float = option("of the IMU", "HZ", _IMU.rate, limits=_POSITIVE, above=True)
+    gyroscope_noise: float = option("rad/s/sqrt(Hz)", "N", _IMU.gyroscope_noise, limits=_POSITIVE)
+    gyroscope_bias: float = option(
+        "rad/s, in any direction", "B", _IMU.gyroscope_bias, limits=_POSITIVE
+    )
+    gyroscope_bias_walk: float = option(
+        "rad/s^2/sqrt(Hz)", "N", _IMU.gyroscope_bias_walk, limits=_POSITIVE
+    )
+    accelerometer_noise: float = option(
+        "m/s^2/sqrt(Hz)", "N", _IMU.accelerometer_noise, limits=_POSITIVE
+    )
+    accelerometer_bias: float = option(
+        "m/s^2, in any direction", "B", _IMU.accelerometer_bias, limits=_POSITIVE
+    )
+    imu_offset: float = option(
+        "to add to its stamps to get the camera's time", "S", _IMU.time_offset
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(MotionOptions, CameraOptions, ImuOptions):
+    out: Path = argument("bag directory to create", "OUT")
+    overwrite: bool = option("replace an earlier result", default=False)
+    points: int = option(
+        "of a frame, if it sees so many", "N", _FRAMES.points, limits=(1, math.inf)
+    )
+    noise: float = option("deviation of each raw coordinate", "PX", _FRAMES.noise, limits=_POSITIVE)
+    outliers: float = option("of the points", "SHARE", _FRAMES.outliers, limits=(0.0, 1.0))
+    keypoints: bool = option(
+        f"pixels with binary descriptors, and the map beside them, {MAP}: for matching",
+        default=False,
+    )
+    images: bool = option("render camera images, instead of points", default=False)
+    walls: str = option(
+        "of images; three: walls of markers at right angles, with their map; poster, room: "
+        "generated pictures; marked_room: with a few markers on its walls",
+        default=next(iter(SCENES)), choices=list(SCENES),
+    )  # fmt: skip
+    exposure: float = option(
+        "of a row: motion blur of images", "S", _IMAGES.exposure, limits=_POSITIVE
+    )
+    grey_noise: float = option(
+        "of images: deviation, of 255", "GREY", _IMAGES.noise, limits=_POSITIVE
+    )
+    vignetting: float = option(
+        "of the light that the corners lose", "SHARE", _IMAGES.vignetting, limits=(0.0, 1.0)
+    )
+    format: str = option("of images", default=_ENCODING.format, choices=list(FORMATS))
+    quality: float = option("of JPEG", "PERCENT", _ENCODING.quality, limits=(1.0, 100.0))
+    seed: int = option("of all random numbers", "N", 0, limits=(0, math.inf))
+    storage: str = option("of the bag", default="mcap", choices=list(STORAGES))
+
+
+_DEFAULTS = {item.name: item.default for item in fields(Options)}
+
+
+def run(args: Options) -> dict[str, object]:
     foreign = _OF_POINTS if args.images else _OF_IMAGES
-    foreign_options = [name for name in foreign if getattr(args, name) != args.defaults[name]]
+    foreign_options = [name for name in foreign if getattr(args, name) != _DEFAULTS[name]]
     if foreign_options:
         option = f"--{foreign_options[0].replace('_', '-')}"
         raise UsageError(
@@ -384,7 +320,7 @@ def run(args: argparse.Namespace) -> dict[str, object]:
     return {"recording": str(args.out), **write(args)}
 
 
-def _write_alone(args: argparse.Namespace) -> dict[str, object]:
+def _write_alone(args: Options) -> dict[str, object]:
     camera, motion = camera_of(args), motion_of(args)
     stamps, rng = stamps_of(args, camera, motion), np.random.default_rng(args.seed)
     world, counts = _world(args, motion, rng), list[int]()
@@ -404,7 +340,7 @@ def _write_alone(args: argparse.Namespace) -> dict[str, object]:
     return {"images": len(stamps)} | _tell(args, world, said, counts)
 
 
-def _write_rig(args: argparse.Namespace) -> dict[str, object]:
+def _write_rig(args: Options) -> dict[str, object]:
     parts, motion = rig_of(args), motion_of(args)
     some = stamps_of(args, next(iter(parts.cameras.values())), motion)
     stamps = {
@@ -433,7 +369,7 @@ def _write_rig(args: argparse.Namespace) -> dict[str, object]:
     return {"images": total, "cameras": list(parts.cameras)} | figures
 
 
-def _world(args: argparse.Namespace, motion: TrueMotion, rng: np.random.Generator) -> Scene | Map:
+def _world(args: Options, motion: TrueMotion, rng: np.random.Generator) -> Scene | Map:
     """What is around a motion: a scene to be rendered, or the landmarks of a room."""
     if args.images:
         return SCENES[args.walls](sampled_states(motion))
@@ -445,7 +381,7 @@ def _world(args: argparse.Namespace, motion: TrueMotion, rng: np.random.Generato
 
 
 def _see(
-    args: argparse.Namespace, world: Scene | Map, camera: Camera, motion: TrueMotion,
+    args: Options, world: Scene | Map, camera: Camera, motion: TrueMotion,
     stamps: list[int], place: int = 0,
 ) -> Iterator[Frame]:  # fmt: skip
     """What a camera sees; ``place`` is its own among the random numbers."""
@@ -460,7 +396,7 @@ def _see(
 
 
 def _keypoints(
-    args: argparse.Namespace, world: Scene | Map, frame: SimulatedFrame, rng: np.random.Generator
+    args: Options, world: Scene | Map, frame: SimulatedFrame, rng: np.random.Generator
 ) -> NDArray[Any] | None:
     """Rows in the place of correspondences, where they are wanted."""
     if args.keypoints and isinstance(world, Map):
@@ -469,7 +405,7 @@ def _keypoints(
 
 
 def _save(
-    args: argparse.Namespace, world: Scene | Map, folder: Path, shutter: Mapping[str, Any],
+    args: Options, world: Scene | Map, folder: Path, shutter: Mapping[str, Any],
     counts: list[int],
 ) -> None:  # fmt: skip
     """Write what a recording does not hold itself: the shutter, and the map."""
@@ -485,9 +421,7 @@ def _save(
         write_map_file(folder / MAP, world)
 
 
-def _tell(
-    args: argparse.Namespace, world: Scene | Map, said: str, counts: list[int]
-) -> dict[str, object]:
+def _tell(args: Options, world: Scene | Map, said: str, counts: list[int]) -> dict[str, object]:
     """Say what was written, and what comes next."""
     out = shlex.quote(str(args.out))
     if isinstance(world, Map):

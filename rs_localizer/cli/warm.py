@@ -4,13 +4,14 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from rs_localizer.cli import WORKING
+from rs_localizer.cli.options import option
 from rs_localizer.solvers.table import SOLVERS
 
 if WORKING:
@@ -25,17 +26,15 @@ if WORKING:
 _READOUT_TIME = 0.03
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--solver",
-        choices=SOLVERS,
-        action="append",
-        help="only what frames need with this one; may be repeated (default: all solvers, and what "
-        "calibrate and replay --smooth need)",
-    )
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    solver: list[str] = option(
+        "only what frames need with this one; may be repeated (default: all solvers, and what "
+        "calibrate and replay --smooth need)", "NAME", list, choices=list(SOLVERS),
+    )  # fmt: skip
 
 
-def run(arguments: argparse.Namespace) -> dict[str, object]:
+def run(options: Options) -> dict[str, object]:
     """Compile, and say where the machine code is, and the seconds of each step.
 
     Raises:
@@ -43,10 +42,10 @@ def run(arguments: argparse.Namespace) -> dict[str, object]:
     """
     steps: dict[str, Callable[[], None]] = {"markers": detection.warm_up}
     seconds = dict[str, float]()
-    for name in arguments.solver or SOLVERS:
+    for name in options.solver or SOLVERS:
         localizer = FrameLocalizer(NodeConfig(solver=name, readout_time=_READOUT_TIME))
         steps[f"solver {name}"] = localizer.warm_up_rest
-    if not arguments.solver:
+    if not options.solver:
         steps["with an IMU"] = FrameLocalizer(NodeConfig(readout_time=_READOUT_TIME)).warm_up_imu
         steps["calibrate, smooth"] = trajectory.warm_up
     with warnings.catch_warnings():

@@ -44,7 +44,7 @@ def test_the_webcam(tmp_path, capsys):
     assert "beside their stamps" in said.err
     assert "times less likely" not in said.out
     assert not out.exists()
-    assert main([*words, "--intrinsics", "--plots", str(plots), "--force"]) == 1
+    assert main([*words, "--intrinsics", "--plot", str(plots), "--force"]) == 1
     pictures = {"readout_time.png", "residuals.png", "coverage.png"}
     assert {file.name for file in plots.iterdir()} == pictures
     values = load_params_file(out)
@@ -69,7 +69,7 @@ def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path, caps
         monkeypatch.setattr(calibration_plots, name, drawn)
     words = ["-p", "scan_direction:=bottom_to_top", "--out", str(out)]
     share = ["--share", "Maker One", "--firmware", "2.10"]
-    pictures = ["--plots", str(tmp_path / "plots")]
+    pictures = ["--plot", str(tmp_path / "plots")]
     assert main(["calibrate", str(flight), *words, *share, *pictures]) == 0
     parts = re.findall(r" to +[\d.]+ s +([-+][\d.]+) \+- ", capsys.readouterr().out)
     assert parts
@@ -120,7 +120,7 @@ def test_an_imu(flight, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "imu: TF, or the axes of a video, has another rotation" in said
     assert "gyroscope bias" in said
-    assert main(["calibrate", str(off), "--imu", "/nothing"]) == 1
+    assert main(["calibrate", str(off), "--imu", "-r", "imu:=/nothing"]) == 1
     assert "has no topic /nothing" in capsys.readouterr().err
     assert main(["calibrate", str(flight), "--imu"]) == 1
     assert "has no topic of type sensor_msgs/msg/Imu" in capsys.readouterr().err

@@ -136,7 +136,7 @@ def settings(here: Any) -> dict[str, Any]:
 
 def test_video_of_a_board(here, capsys):
     words = [*here.calibration, *here.board, "--rate", "20", "--images"]
-    assert detect(here, here.video, *words, "--readout-time", "0.011") == 0
+    assert detect(here, here.video, *words, "-p", "readout_time:=0.011") == 0
     said = capsys.readouterr().out
     assert "4 of 6 images, 24 corners each" in said
     assert f"rs_localizer replay {here.out} --params {here.out}/parameters.yaml" in said
@@ -192,7 +192,7 @@ def test_keypoints_of_anything(here, kind, width, capsys):
     noise = np.random.default_rng(0).integers(0, 256, (4, 240, 320), np.uint8)
     images = [cv2.GaussianBlur(each, (0, 0), 2.0) for each in noise]
     messages = image_bag(here.path / "bag", [*images, np.zeros((240, 320), np.uint8)])
-    words = ["--features", kind, "--max-keypoints", "40", "--timing", "--readout-time", "0.02"]
+    words = ["--features", kind, "--max-keypoints", "40", "--timing", "-p", "readout_time:=0.02"]
     assert detect(here, here.path / "bag", *words) == 0
     said = capsys.readouterr().out
     assert re.search(rf"out: 3 of 5 images, \d\d keypoints \({kind}\) each \(median\)", said)
@@ -253,15 +253,15 @@ def test_settings_are_passed_on(here):
     assert (config.readout_time, config.readout_time_deviation) == (0.011, 0.0002)
     assert (config.scan_direction, config.stamp_offset) == ("bottom_to_top", 0.002)
     assert config.imu.time_offset == 0.004
-    # An option of its own counts more.
-    again = [*words, "--scan-direction", "top_to_bottom", "--overwrite"]
+    # A single one counts more.
+    again = [*words, "-p", "scan_direction:=top_to_bottom", "--overwrite"]
     assert detect(here, here.video, *again) == 0
     assert settings(here)["scan_direction"] == "top_to_bottom"
 
 
 def test_a_video_has_its_own_times(here, capsys):
     path = write_mp4(here.path / "a.mp4", [board(x=0.001 * k) for k in range(4)], 20.0)
-    words = [*here.calibration, *here.board, "--readout-time", "0.06", "--start", "7.5"]
+    words = [*here.calibration, *here.board, "-p", "readout_time:=0.06", "--start", "7.5"]
     assert detect(here, path, *words) == 0
     stamps = [cloud.stamp_ns for cloud in clouds(here.out)]
     assert stamps == [7_500_000_000 + 50_000_000 * k for k in range(4)]

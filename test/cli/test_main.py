@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line itself: help, version, exit codes, and what is imported for it."""
 
-import argparse
 import importlib
 import json
 import math
@@ -12,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import make_dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,9 +19,8 @@ from typing import Any
 import pytest
 
 import rs_localizer
-from rs_localizer.cli import UsageError
 from rs_localizer.cli.main import COMMANDS, main, parse
-from rs_localizer.cli.map import ACTIONS
+from rs_localizer.cli.options import UsageError
 from rs_localizer.core.simd.jit import cache_directory
 from rs_localizer.io.atomic_files import atomic_files
 
@@ -57,7 +56,7 @@ def test_help_names_every_command_with_an_example(capsys):
 
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_every_command_has_help_and_takes_its_example(name, capsys):
-    assert main([name, "--help"]) == 0
+    assert main([*name.split(), "--help"]) == 0
     text = capsys.readouterr().out
     assert f"usage: rs_localizer {name}" in text
     assert COMMANDS[name].example in text
@@ -66,13 +65,12 @@ def test_every_command_has_help_and_takes_its_example(name, capsys):
 
 
 def test_help_waits_for_nothing_that_only_work_needs():
-    actions = [["map", action] for action in ACTIONS]
     script = f"""
 import sys
 from rs_localizer import cli
 cli.WORKING = False
 from rs_localizer.cli.main import main
-for words in {[*([name] for name in COMMANDS), *actions]}:
+for words in {[name.split() for name in COMMANDS]}:
     assert main([*words, "--help"]) == 0, words
     assert {{"numba", "scipy", "matplotlib", "pyarrow"}}.isdisjoint(sys.modules), words
 """
@@ -86,6 +84,7 @@ for words in {[*([name] for name in COMMANDS), *actions]}:
 @pytest.mark.parametrize(
     ("words", "text"),
     [
+        (["map", "bild"], "there is no command 'map bild'; did you mean map build?"),
         (["fly"], "there is no command 'fly'; choose from demo, replay"),
         (["repaly"], "there is no command 'repaly'; did you mean replay?"),
         (["replay", "bag", "--smoth"], "unrecognized arguments: --smoth; did you mean --smooth?"),
@@ -109,13 +108,13 @@ def test_wrong_usage(words, text, capsys):
 @pytest.fixture
 def command(monkeypatch) -> SimpleNamespace:
     """What is run in the place of replay."""
-    fake = SimpleNamespace(add_arguments=lambda parser: None)
+    fake = SimpleNamespace(Options=make_dataclass("Options", []))
     monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, fake)
     return fake
 
 
 def raising(error: BaseException) -> Any:
-    def run(arguments: argparse.Namespace) -> None:
+    def run(options: Any) -> None:
         # Names in recordings cannot steer the terminal.
         sys.stdout.write("frame \x1b]0;title\x07 \x9b2J\n\tä\n")
         raise error
@@ -160,7 +159,7 @@ def test_a_signal_while_the_workplace_is_removed(tmp_path, monkeypatch, command)
         monkeypatch.setattr(shutil, "rmtree", remove)
         raise KeyboardInterrupt
 
-    def make(arguments: argparse.Namespace) -> None:
+    def make(options: Any) -> None:
         with atomic_files(tmp_path / "map.yaml") as (part,):
             part.write_text("whole")
             monkeypatch.setattr(shutil, "rmtree", interrupted)
@@ -181,7 +180,7 @@ def test_a_signal_while_the_workplace_is_removed(tmp_path, monkeypatch, command)
     ],
 )
 def test_what_a_command_prints_as_json(result, told, command, capsys):
-    def run(arguments: argparse.Namespace) -> object:
+    def run(options: Any) -> object:
         sys.stdout.write("a line\nnext: rs_localizer evaluate\n")
         return result
 
@@ -247,11 +246,13 @@ def test_ctrl_c_while_a_command_runs_leaves_nothing_in_the_way(tmp_path):
 def test_who_stops_reading_is_not_told_of_it():
     """As with ``| head -1``: more is written than the pipe holds."""
     code = (
-        "import sys; from types import SimpleNamespace as N; import rs_localizer.cli.main as c\n"
+        "import sys; from dataclasses import dataclass\n"
+        "from types import SimpleNamespace as N; import rs_localizer.cli.main as c\n"
         "def run(_):\n"
         "    for _ in range(100_000): print('a line of a long table')\n"
-        "sys.modules['rs_localizer.cli.map'] = N(add_arguments=lambda p: None, run=run)\n"
-        "sys.exit(c.main(['map']))"
+        "Options = dataclass(type('O', (), {}))\n"
+        "sys.modules['rs_localizer.cli.readout'] = N(Options=Options, run=run)\n"
+        "sys.exit(c.main(['readout']))"
     )
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

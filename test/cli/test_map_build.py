@@ -52,7 +52,7 @@ def test_what_makes_no_map_is_said_and_leaves_nothing(tmp_path, images, text, ca
     if not images:
         (tmp_path / "images" / "0.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
     given = ["--calibration", str(tmp_path / "camera.yaml"), "--rate", "15"]
-    words = ["map", "build", str(tmp_path / "images"), *given, "--readout-time", "0.03"]
+    words = ["map", "build", str(tmp_path / "images"), *given, "-p", "readout_time:=0.03"]
     assert main([*words, "--out", str(tmp_path / "map")]) == 1
     assert not (tmp_path / "map").exists()
     (line,) = capsys.readouterr().err.strip().splitlines()

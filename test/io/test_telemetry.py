@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import os
@@ -25,7 +24,7 @@ import telemetry_parser
 from recorded import field, insta360
 
 from rs_localizer.cli import image_input
-from rs_localizer.cli.main import main
+from rs_localizer.cli.main import main, parse
 from rs_localizer.cli.map import build
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
@@ -429,7 +428,7 @@ def test_a_lens_profile_takes_the_place_of_a_calibration_and_what_is_given_goes_
     with open_bag(out) as bag:
         info = next(message for _, _, message in bag.messages(["/camera_info"]))
     assert (info.distortion_model, info.k[0]) == ("equidistant", 140.0)
-    detect(video, "--readout-time", "0.03")
+    detect(video, "-p", "readout_time:=0.03")
     said = capsys.readouterr().out
     assert "140 px), not used;" in said
     assert "readout time 20.50 ms (not used: 30.00 ms was given)" in said
@@ -438,18 +437,14 @@ def test_a_lens_profile_takes_the_place_of_a_calibration_and_what_is_given_goes_
         assert next(m for _, _, m in bag.messages(["/camera_info"])).k[0] == 150.0
 
 
-def test_maps_take_the_gyroscope_of_a_video(video, telemetry):
-    found = telemetry()
-    parser = argparse.ArgumentParser()
-    build.add_arguments(parser)
-    given = parser.parse_args([str(video), "--out", "map"])
-    imu = build.imu_of(given)
-    assert not imu.asked
-    np.testing.assert_array_equal(imu.recording.camera_from_imu, np.eye(3))
-    np.testing.assert_array_equal(imu.recording.angular_velocities, found.rates)
-    assert imu.recording.stamps_ns[0] == 10**9
+def test_maps_take_the_readout_time_of_a_video(video, telemetry):
+    telemetry()
+    words = [str(video), "--out", "map"]
+    given = parse("map build", build, words)
     assert build.shutter_of(given).readout_time == pytest.approx(0.0205)
-    assert build.imu_of(parser.parse_args([str(video), "--out", "map", "--no-telemetry"])) is None
+    assert (
+        build.shutter_of(parse("map build", build, [*words, "--no-telemetry"])).readout_time is None
+    )
 
 
 @pytest.mark.parametrize(("focal", "doubted"), [(280.0, False), (300.0, True)])
@@ -458,7 +453,7 @@ def test_a_focal_length_that_disagrees_is_named(video, telemetry, capsys, focal,
     lens = Camera(160, 120, [[140.0, 0, 80], [0, 140, 60], [0, 0, 1]], np.zeros(4), "equidistant")
     telemetry(lens="lens profile", profile=lens)
     measured = Camera(320, 240, [[focal, 0, 160], [0, focal, 120], [0, 0, 1]])
-    args = argparse.Namespace(images=video, no_telemetry=False, calibration=None)
+    args = SimpleNamespace(images=video, no_telemetry=False, calibration=None)
     image_input.tell_telemetry(args, 0.0205, measured, lens=False)
     said = capsys.readouterr().out
     assert "lens profile, not used" in said

@@ -4,14 +4,15 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rs_localizer.cli import WORKING, UsageError, number
+from rs_localizer.cli import WORKING
 from rs_localizer.cli.map import either
+from rs_localizer.cli.options import UsageError, option
 from rs_localizer.core.arrays import Array
 
 if WORKING:
@@ -158,45 +159,26 @@ def _moved(marker: Marker, by: Similarity) -> Marker:
     return Marker(marker.family, marker.id, by(marker.corners), deviations)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = (
-        "Bring a map to metres, to z up and to an origin; what is not given stays as it is. IDs "
-        "are those of landmarks, or of markers, whose middles count."
-    )
-    either.add_input(parser)
-    either.add_output(parser)
-    size = parser.add_argument_group("size").add_mutually_exclusive_group()
-    size.add_argument("--scale", type=number(0.0, above=True), metavar="FACTOR")
-    size.add_argument(
-        "--distance", nargs=3, metavar=("ID", "ID", "M"), help="two ids and how far apart they are"
-    )
-    level = parser.add_argument_group("gravity: z of the new map")
-    level = level.add_mutually_exclusive_group()
-    level.add_argument(
-        "--up",
-        nargs=3,
-        type=number(),
-        metavar=("X", "Y", "Z"),
-        help="direction in the map as it is",
-    )
-    level.add_argument(
-        "--floor", nargs="+", type=int, metavar="ID", help="three or more in a level plane, at the "
-        "bottom of the map"
+@dataclass(frozen=True, kw_only=True)
+class Options(either.OtherFileOptions):
+    scale: float | None = option("factor", "FACTOR", limits=(0.0, math.inf), above=True)
+    distance: tuple[str, str, str] | None = option(
+        "instead: two ids (of landmarks, or of markers, whose middles count), and how far apart "
+        "they are", "ID ID M",
     )  # fmt: skip
-    level.add_argument(
-        "--upright", type=int, metavar="ID", help="marker that hangs upright: its y axis is up"
+    up: tuple[float, float, float] | None = option("z of the new map, in the map as it is", "X Y Z")
+    floor: list[int] = option(
+        "instead: three ids or more in a level plane at the bottom of the map", "ID ...", list
     )
-    origin = parser.add_argument_group("origin").add_mutually_exclusive_group()
-    origin.add_argument("--origin", type=int, metavar="ID")
-    origin.add_argument(
-        "--origin-at", nargs=3, type=number(), metavar=("X", "Y", "Z"), help="in the map as it is"
-    )
+    upright: int | None = option("instead: marker that hangs upright: its y axis is up", "ID")
+    origin: int | None = option("id at the origin", "ID")
+    origin_at: tuple[float, float, float] | None = option("instead: in the map as it is", "X Y Z")
 
 
-def run(args: argparse.Namespace) -> None:
-    either.check_output(args)
-    wishes = _wishes(args)
-    any_map, _ = either.read(args)
+def run(options: Options) -> None:
+    either.check_output(options)
+    wishes = _wishes(options)
+    any_map, _ = either.read(options)
     by = alignment(any_map, wishes)
     result = moved_markers(any_map, by) if isinstance(any_map, MarkerMap) else moved(any_map, by)
     turn = np.degrees(Rotation.from_matrix(by.rotation).magnitude())
@@ -204,28 +186,35 @@ def run(args: argparse.Namespace) -> None:
     print(f"scaled by {by.scale:.6g}, turned by {turn:.3f} deg, shifted by ({shift}) m")
     if isinstance(any_map, MarkerMap) and by.scale != 1.0:
         print("the sizes of the markers are scaled as well")
-    either.write(args, result)
+    either.write(options, result)
 
 
-def _wishes(args: argparse.Namespace) -> Wishes:
+def _wishes(options: Options) -> Wishes:
     names = ("scale", "distance", "up", "floor", "upright", "origin", "origin_at")
-    if all(getattr(args, name) is None for name in names):
+    if not any(getattr(options, name) not in (None, []) for name in names):
         raise UsageError("say what to align: --scale, --distance, --up, --floor, --upright, "
                          "--origin or --origin-at")  # fmt: skip
+    for group in (("scale", "distance"), ("up", "floor", "upright"), ("origin", "origin_at")):
+        given = [name for name in group if getattr(options, name) not in (None, [])]
+        if len(given) > 1:
+            raise UsageError(f"give one of {', '.join('--' + n.replace('_', '-') for n in given)}")
     distance = None
-    if args.distance is not None:
-        one, other, apart = args.distance
+    if options.distance is not None:
+        one, other, apart = options.distance
         try:
             distance = int(one), int(other), float(apart)
         except ValueError:
-            raise UsageError(f"--distance takes two ids and metres, got {args.distance}") from None
+            raise UsageError(
+                f"--distance takes two ids and metres, got {options.distance}"
+            ) from None
         if not 0.0 < distance[2] < np.inf:
             raise UsageError(f"--distance: {apart} is not a length")
     return Wishes(
-        args.scale, distance, _vector(args.up), tuple(args.floor or ()), args.upright, args.origin,
-        _vector(args.origin_at),
+        options.scale, distance, _vector(options.up), tuple(options.floor), options.upright,
+        options.origin,
+        _vector(options.origin_at),
     )  # fmt: skip
 
 
-def _vector(values: list[float] | None) -> Array | None:
+def _vector(values: tuple[float, float, float] | None) -> Array | None:
     return None if values is None else np.array(values)

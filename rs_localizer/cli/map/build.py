@@ -5,21 +5,24 @@
 from __future__ import annotations
 
 import argparse
+import math
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from rs_localizer.cli import WORKING, UsageError, add_overwrite, integer, number, replaced, stage
+from rs_localizer.cli import WORKING, replaced, stage, with_values
 from rs_localizer.cli.image_input import (
-    add_source_arguments,
+    ImageOptions,
     opened,
     shutter_values,
     tell_left_out,
     tell_telemetry,
     time_faults,
 )
+from rs_localizer.cli.options import UsageError, argument, number, option
 from rs_localizer.config import FeatureConfig
 
 if WORKING:
@@ -68,17 +71,18 @@ class Shutter:
     scan_direction: str | None
 
 
-def shutter_of(args: argparse.Namespace) -> Shutter:
+def shutter_of(args: Any) -> Shutter:
     """As given, or as it stands beside the images of a recording."""
     values = shutter_values(args)
     settings = build(values)
     # 0 is a global shutter where the user says so, and unknown in a file.
-    unknown = args.readout_time is None and not settings.readout_time
+    said = any(text.startswith("readout_time:=") for text in args.assignments)
+    unknown = not said and not settings.readout_time
     readout_time = None if unknown else settings.readout_time
     return Shutter(readout_time, settings.scan_direction if "scan_direction" in values else None)
 
 
-def look_at_images(args: argparse.Namespace, looker: Looker) -> Looked:
+def look_at_images(args: Any, looker: Looker) -> Looked:
     """Look at the images that are kept: so many a second, and those in which points are given."""
     wanted = sorted({seconds for _, seconds, _, _ in args.point})
     cameras, camera = Cameras(ScanDirection.TOP_TO_BOTTOM), None
@@ -131,60 +135,35 @@ COLMAP, POSES, REPORT = "colmap", "poses.txt", "report.md"
 _IMAGES_PER_SECOND = 15.0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = (
-        "A map of landmarks from images: structure by COLMAP, refined with the rolling shutter."
-    )
-    parser.add_argument(
-        "images", type=Path, metavar="VIDEO|BAG|FOLDER", help="images of one camera, as for detect"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="to create")
-    scale = parser.add_argument_group("scale and place")
-    scale.add_argument(
-        "--markers", type=Path, metavar="FILE", help="marker map; some of it is in the images"
-    )
-    scale.add_argument(
-        "--point",
-        nargs=4,
-        action=_Point,
-        default=[],
-        metavar=("NAME", "SECONDS", "U", "V"),
-        help="a point in the first image at or after SECONDS from the start, by its raw pixel; "
-        "each one in two images or more",
-    )
-    scale.add_argument(
-        "--distance",
-        nargs=3,
-        action=_Distance,
-        default=[],
-        metavar=("NAME", "NAME", "METRES"),
-        help="between two of these points",
-    )
-    add_source_arguments(parser)
-    add_overwrite(parser)
-    work = parser.add_argument_group("the work")
-    work.add_argument(
-        "--images-per-second",
-        type=number(0.0, above=True),
-        default=_IMAGES_PER_SECOND,
-        metavar="N",
-        help="of a video that are used, at most (default: %(default)g)",
-    )
-    work.add_argument(
-        "--max-keypoints",
-        type=integer(50),
-        default=FeatureConfig().max_keypoints,
-        metavar="N",
-        help="of an image (default: %(default)s)",
-    )
-    work.add_argument(
-        "--threads", type=integer(1), default=1, metavar="N",
-        help="of COLMAP; with more than one, the last digits vary (default: %(default)s)",
+@dataclass(frozen=True, kw_only=True)
+class Options(ImageOptions):
+    images: Path = argument("images of one camera, as for detect", "VIDEO|BAG|FOLDER")
+    out: Path = option("to create", "DIR", required=True)
+    overwrite: bool = option("replace an earlier result", default=False)
+    markers: Path | None = option("marker map; some of it is in the images", "FILE")
+    point: list[tuple[str, str, str, str]] = option(
+        "a point in the first image at or after SECONDS from the start, by its raw pixel; each "
+        "one in two images or more", "NAME SECONDS U V", list,
     )  # fmt: skip
-    work.add_argument("--seed", type=integer(0), default=0, metavar="N", help="(default: 0)")
+    distance: list[tuple[str, str, str]] = option(
+        "between two of these points", "NAME NAME METRES", list
+    )
+    images_per_second: float = option(
+        "of a video that are used, at most", "N", _IMAGES_PER_SECOND, limits=(0.0, math.inf),
+        above=True,
+    )  # fmt: skip
+    max_keypoints: int = option(
+        "of an image", "N", FeatureConfig().max_keypoints, limits=(50, math.inf)
+    )
+    threads: int = option(
+        "of COLMAP; with more than one, the last digits vary", "N", 1, limits=(1, math.inf)
+    )
+    seed: int = option("of COLMAP", "N", 0, limits=(0, math.inf))
 
 
-def run(args: argparse.Namespace) -> None:
+def run(options: Options) -> None:
+    points, distances = map(_point, options.point), map(_distance, options.distance)
+    args = with_values(options, point=list(points), distance=list(distances))
     if args.markers is not None and (args.point or args.distance):
         raise UsageError("give either --markers or --point and --distance")
     _check_points(args)
@@ -210,12 +189,12 @@ def run(args: argparse.Namespace) -> None:
     _tell(args, built, looked)
 
 
-def _effort(args: argparse.Namespace) -> Effort:
+def _effort(args: Any) -> Effort:
     features = max(args.max_keypoints, Effort().features)
     return Effort(args.threads, args.seed, features)
 
 
-def _check_points(args: argparse.Namespace) -> None:
+def _check_points(args: Any) -> None:
     """Before minutes of work: that each point of a distance is given in two images."""
     names = [name for name, *_ in args.point]
     if names and not args.distance:
@@ -245,7 +224,7 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")
 
 
-def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
+def _tell(args: Any, built: Built, looked: Looked) -> None:
     print(args.out / MAP)
     for name, text in rows(built, looked.images, len(looked.views)):
         print(f"  {name:30} {text}")
@@ -269,29 +248,24 @@ def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
     )
 
 
-class _Point(argparse.Action):
+def _point(words: Sequence[str]) -> tuple[str, float, float, float]:
     """NAME SECONDS U V."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, _: Any = None) -> None:
-        name, *numbers = values
-        point = (name, *(_number(self, text) for text in numbers))
-        setattr(namespace, self.dest, [*getattr(namespace, self.dest), point])
+    name, *numbers = words
+    seconds, u, v = (_number("--point", text) for text in numbers)
+    return name, seconds, u, v
 
 
-class _Distance(argparse.Action):
+def _distance(words: Sequence[str]) -> Distance:
     """NAME NAME METRES."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, _: Any = None) -> None:
-        one, other, text = values
-        metres = _number(self, text)
-        if not metres > 0.0 or one == other:
-            raise argparse.ArgumentError(self, f"must be two points and metres, got {values}")
-        distance = Distance(one, other, metres)
-        setattr(namespace, self.dest, [*getattr(namespace, self.dest), distance])
+    one, other, text = words
+    metres = _number("--distance", text)
+    if not metres > 0.0 or one == other:
+        raise UsageError(f"--distance: must be two points and metres, got {' '.join(words)}")
+    return Distance(one, other, metres)
 
 
-def _number(action: argparse.Action, text: str) -> float:
+def _number(option: str, text: str) -> float:
     try:
         return number()(text)
     except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentError(action, str(error)) from error
+        raise UsageError(f"{option}: {error}") from error

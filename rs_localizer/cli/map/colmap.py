@@ -4,11 +4,14 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from rs_localizer.cli import WORKING, UsageError, number, replaced
+from rs_localizer.cli import WORKING, replaced, with_values
+from rs_localizer.cli.options import UsageError, option
 from rs_localizer.cli.settings_args import given_values, row_time
 
 if WORKING:
@@ -32,47 +35,34 @@ _NUMBER = re.compile(r"\d+")
 _OF_RECORDINGS = ("recordings", "out", "map", "hold")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group(
-        "a model of COLMAP, for programs that know a global shutter only",
-        "Keypoints are moved to where a global shutter would have seen their points; poses are of "
-        "one row. All images are of one camera, and follow each other in time.",
+@dataclass(frozen=True, kw_only=True)
+class ColmapOptions:
+    """a model of COLMAP of one camera, for programs that know a global shutter only."""
+
+    colmap: tuple[Path, Path] | None = option(
+        "instead of RECORDING: folder of a sparse model, text or binary, and one to create",
+        "IN OUT",
     )
-    group.add_argument(
-        "--colmap",
-        nargs=2,
-        type=Path,
-        metavar=("IN", "OUT"),
-        help="instead of RECORDING: folder of a sparse model, text or binary, and one to create",
+    rate: float | None = option(
+        "images per second of the numbers in the images' names, which else are times in ns", "HZ",
+        limits=(0.0, math.inf), above=True,
+    )  # fmt: skip
+    row: str = option(
+        "of the poses: first, middle, last, or a row time from -0.5 to 0.5", "ROW", "middle"
     )
-    group.add_argument(
-        "--rate",
-        type=number(0.0, above=True),
-        metavar="HZ",
-        help="images per second of the numbers in the images' names, which else are times in ns",
-    )
-    group.add_argument(
-        "--row",
-        type=row_time,
-        default=0.0,
-        metavar="ROW",
-        help="of the poses: first, middle (default), last, or a row time from -0.5 to 0.5",
-    )
-    group.add_argument(
-        "--images",
-        type=Path,
-        metavar="FOLDER",
-        help=f"of the model: also write them as of a global shutter, to OUT/{_IMAGES}",
+    images: Path | None = option(
+        f"of the model: also write them as of a global shutter, to OUT/{_IMAGES}", "FOLDER"
     )
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: Any) -> None:
     for name in _OF_RECORDINGS:
         if getattr(args, name) not in (None, []):
             raise UsageError(f"--colmap goes without {'--' * (name != 'recordings')}{name}")
     if args.shutter == "global":
         raise UsageError("a model of a global shutter needs no refinement")
-    folder, args.out = args.colmap
+    folder, out = args.colmap
+    args = with_values(args, out=out, row=row_time(args.row))
     try:
         model = read_model(folder)
         images, camera = model.images, model.camera
@@ -85,18 +75,18 @@ def run(args: argparse.Namespace) -> None:
         missing = [name for name in images if not (args.images / name).is_file()]
         if missing:
             raise ValueError(f"{args.images} has no {missing[0]}, an image of the model")
-    with atomic_directory(args.out, replaced(args, _LIST)) as out:
+    with atomic_directory(args.out, replaced(args, _LIST)) as built:
         result = undo_shutter(camera, model, images, stamps, _known(args), print_step)
         check_readout(args, result.refined.readout_check, "see --shutter estimated")
-        out.mkdir()
-        write_model(out, result.camera, result.images, result.points)
-        share = None if args.images is None else _write_images(args, result, out / _IMAGES)
+        built.mkdir()
+        write_model(built, result.camera, result.images, result.points)
+        share = None if args.images is None else _write_images(args, result, built / _IMAGES)
     _tell(args, result, len(images), len(model.points))
     if share is not None:
         print(f"{args.out / _IMAGES}: {1 - share:.1%} of the pixels are left black: not known")
 
 
-def _known(args: argparse.Namespace) -> Shutter:
+def _known(args: Any) -> Shutter:
     values = given_values(args)
     config = build(values)
     readout = config.readout_time if args.shutter != "estimated" else 0.0
@@ -130,7 +120,7 @@ def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:
     return stamps
 
 
-def _write_images(args: argparse.Namespace, result: GlobalShutterModel, folder: Path) -> float:
+def _write_images(args: Any, result: GlobalShutterModel, folder: Path) -> float:
     """The images of the model; the share of their pixels that is known."""
     depths = map_depths(result.points.points)
     shares = []
@@ -153,7 +143,7 @@ def _write_images(args: argparse.Namespace, result: GlobalShutterModel, folder: 
     return float(np.mean(shares))
 
 
-def _tell(args: argparse.Namespace, result: GlobalShutterModel, images: int, points: int) -> None:
+def _tell(args: Any, result: GlobalShutterModel, images: int, points: int) -> None:
     kept = sum(len(image.points) for image in result.images.values())
     shutter = result.camera
     rows = [

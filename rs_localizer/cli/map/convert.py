@@ -4,19 +4,19 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 
 from rs_localizer.cli.map import either
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    either.add_input(parser)
-    either.add_output(parser)
+@dataclass(frozen=True, kw_only=True)
+class Options(either.OtherFileOptions):
+    pass
 
 
-def run(args: argparse.Namespace) -> dict[str, str]:
-    either.check_output(args)
-    any_map, kind = either.read(args)
-    table = either.describe(args.file, any_map, kind)
-    either.write(args, any_map)
-    return {**table, "written to": str(args.out)}
+def run(options: Options) -> dict[str, str]:
+    either.check_output(options)
+    any_map, kind = either.read(options)
+    table = either.describe(options.file, any_map, kind)
+    either.write(options, any_map)
+    return {**table, "written_to": str(options.out)}

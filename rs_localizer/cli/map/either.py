@@ -4,11 +4,13 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, number, refuse_existing
+from rs_localizer.cli import WORKING, refuse_existing
+from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.io.maps.files import SUFFIX, read_map_file
 from rs_localizer.markers.formats import (
     FORMATS,
@@ -37,69 +39,71 @@ _KINDS = (
 _OUTPUTS = (SUFFIX, *SUFFIXES)
 
 
-def add_input(parser: argparse.ArgumentParser) -> None:
-    """The file, and what it may not say itself."""
-    parser.add_argument("file", type=Path, metavar="FILE", help=_KINDS)
-    parser.add_argument(
-        "--database",
-        type=Path,
-        metavar="FILE",
-        help="COLMAP's, for the descriptors (default: database.db, or the only database of any "
-        "name, in the folder or one of the two above)",
+@dataclass(frozen=True, kw_only=True)
+class MapFileOptions:
+    """markers: what files of other programs omit."""
+
+    file: Path = argument(_KINDS, "FILE")
+    database: Path | None = option(
+        "COLMAP's, for the descriptors (default: database.db, or the only database of any name, "
+        "in the folder or one of the two above)", "FILE",
+    )  # fmt: skip
+    family: str | None = option(f"(default: that of the file, or {USUAL_FAMILY.name})", "NAME")
+    size: float | None = option("of all markers", "M", limits=(0.0, math.inf), above=True)
+    map_frame: str | None = option("(default: map)", "NAME")
+    part: str = option("of several bundles", "NAME", "")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OtherFileOptions(MapFileOptions):
+    """what is written."""
+
+    out: Path = argument(f"ends in {', '.join(_OUTPUTS)}", "OUT")
+    to: str | None = option(
+        "of markers (default: .json is of wpilib, .yaml our own)", choices=list(FORMATS)
     )
-    foreign = parser.add_argument_group("markers: what files of other programs omit")
-    foreign.add_argument("--family", help=f"(default: that of the file, or {USUAL_FAMILY.name})")
-    foreign.add_argument("--size", type=number(0.0, above=True), metavar="M", help="of all markers")
-    foreign.add_argument("--map-frame", metavar="NAME", help="(default: map)")
-    foreign.add_argument("--part", metavar="NAME", help="of several bundles")
+    overwrite: bool = option("replace OUT", default=False)
 
 
-def add_output(parser: argparse.ArgumentParser) -> None:
-    """Where to, and as what."""
-    parser.add_argument("out", type=Path, metavar="OUT", help=f"ends in {', '.join(_OUTPUTS)}")
-    parser.add_argument(
-        "--to", choices=FORMATS, help="of markers (default: .json is of wpilib, .yaml our own)"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace OUT")
-
-
-def read(args: argparse.Namespace) -> tuple[Map | MarkerMap, str]:
-    """The map that the arguments name, and the name of its format, empty for landmarks."""
-    if is_marker_file(args.file):
-        return read_any(args.file, _unsaid(args))
+def read(options: MapFileOptions) -> tuple[Map | MarkerMap, str]:
+    """The map that the options name, and the name of its format, empty for landmarks."""
+    if is_marker_file(options.file):
+        return read_any(options.file, _unsaid(options))
     # Frames are the localizer's business: files of landmarks do not name one.
-    return read_map_file(args.file, args.map_frame or "map", args.database), ""
+    return read_map_file(options.file, options.map_frame or "map", options.database), ""
 
 
-def _unsaid(args: argparse.Namespace) -> Unsaid:
+def _unsaid(options: MapFileOptions) -> Unsaid:
     defaults = Unsaid()
     try:
-        kind = None if args.family is None else family(args.family)
+        kind = None if options.family is None else family(options.family)
     except ValueError as error:
         raise UsageError(f"--family: {error}") from error
-    return Unsaid(kind, args.size, args.map_frame or defaults.map_frame, args.part or "")
+    return Unsaid(kind, options.size, options.map_frame or defaults.map_frame, options.part)
 
 
-def check_output(args: argparse.Namespace) -> None:
+def check_output(options: OtherFileOptions) -> None:
     """Refuse a name that says nothing, and to replace what is there."""
-    suffix = args.out.suffix
+    suffix = options.out.suffix
     if suffix not in _OUTPUTS:
-        raise UsageError(f"OUT must end in {' or '.join(_OUTPUTS)}, got {args.out}")
-    if args.to is not None and (suffix == ".json") != (args.to == "wpilib"):
-        raise UsageError(f"{args.to} is written to {'.json' if args.to == 'wpilib' else '.yaml'}")
-    if args.to is not None and suffix == SUFFIX:
+        raise UsageError(f"OUT must end in {' or '.join(_OUTPUTS)}, got {options.out}")
+    if options.to is not None and (suffix == ".json") != (options.to == "wpilib"):
+        raise UsageError(
+            f"{options.to} is written to {'.json' if options.to == 'wpilib' else '.yaml'}"
+        )
+    if options.to is not None and suffix == SUFFIX:
         raise UsageError("--to is for markers")
-    refuse_existing(args)
+    refuse_existing(options)
 
 
-def write(args: argparse.Namespace, any_map: Map | MarkerMap) -> None:
+def write(options: OtherFileOptions, any_map: Map | MarkerMap) -> None:
     """Write the map to OUT: markers as landmarks, their corners, with ids of ``detect``."""
-    path: Path = args.out
+    path: Path = options.out
     if isinstance(any_map, Map) and path.suffix != SUFFIX:
-        raise UsageError(f"{args.file} holds landmarks, which go to {SUFFIX}")
+        raise UsageError(f"{options.file} holds landmarks, which go to {SUFFIX}")
     with atomic_files(path) as (part,):
         if isinstance(any_map, MarkerMap) and path.suffix in SUFFIXES:
-            write_any(part, any_map, args.to or ("wpilib" if path.suffix == ".json" else OWN))
+            write_any(part, any_map, options.to or ("wpilib" if path.suffix == ".json" else OWN))
         else:
             landmarks = any_map
             if isinstance(landmarks, MarkerMap):  # corners, whose ids are rows of its points

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 
 from rs_localizer.cli import WORKING
 from rs_localizer.cli.map import either
@@ -14,13 +14,14 @@ if WORKING:
     from rs_localizer.markers.maps import MarkerMap
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    either.add_input(parser)
+@dataclass(frozen=True, kw_only=True)
+class Options(either.MapFileOptions):
+    pass
 
 
-def run(args: argparse.Namespace) -> dict[str, str]:
-    any_map, kind = either.read(args)
-    table = either.describe(args.file, any_map, kind)
+def run(options: Options) -> dict[str, str]:
+    any_map, kind = either.read(options)
+    table = either.describe(options.file, any_map, kind)
     if isinstance(any_map, MarkerMap) and (faults := list(other_units(any_map))):
-        raise ValueError(f"{args.file}: {'; '.join(faults)}")
+        raise ValueError(f"{options.file}: {'; '.join(faults)}")
     return table

@@ -4,21 +4,23 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, number, refuse_existing, write_all
-from rs_localizer.cli.map import add_readout_argument, check_readout, colmap, print_step
+from rs_localizer.cli import WORKING, refuse_existing, write_all
+from rs_localizer.cli.map import ReadoutOptions, check_readout, colmap, print_step
+from rs_localizer.cli.map.colmap import ColmapOptions
+from rs_localizer.cli.options import Inputs, Settings, UsageError, argument, option
 from rs_localizer.cli.rig_input import (
     MapCamera,
-    add_mounting_argument,
+    MountingOptions,
     map_cameras,
     mounting_lines,
 )
-from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
+from rs_localizer.cli.settings_args import given_settings, given_topics
 from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
 from rs_localizer.io.topics import IMU
 
@@ -40,61 +42,30 @@ _GIVEN, _ESTIMATED, _GLOBAL = "given", "estimated", "global"
 _HOLD = 0.001
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = (
-        "Bundle adjustment in continuous time: landmarks are free, the motion is a spline, each "
-        "keypoint is observed when its own row was exposed."
-    )
-    parser.add_argument(
-        "recordings",
-        type=Path,
-        nargs="*",
-        metavar="RECORDING",
-        help="a bag of correspondences or keypoints; several are those of cameras on one body",
-    )
-    parser.add_argument(
-        "--map", type=Path, metavar="MAP", help="the map (default: the points of the recording)"
-    )
-    parser.add_argument("--out", type=Path, metavar="OUT", help=f"ends in {SUFFIX}")
-    parser.add_argument("--overwrite", action="store_true", help="replace OUT")
-    parser.add_argument(
-        "--shutter",
+@dataclass(frozen=True, kw_only=True)
+class Options(ReadoutOptions, MountingOptions, ColmapOptions, Settings, Inputs):
+    recordings: list[Path] = argument("a bag of correspondences or keypoints", "RECORDING", list)
+    map: Path | None = option("the map (default: the points of the recording)", "MAP")
+    out: Path | None = option(f"ends in {SUFFIX}", "OUT")
+    overwrite: bool = option("replace OUT", default=False)
+    shutter: str | None = option(
+        "the readout time: as set, to be found, or none (default: as set, found if it is 0)",
         choices=(_GIVEN, _ESTIMATED, _GLOBAL),
-        help="the readout time: as set, to be found, or none (default: as set, found if it is 0)",
     )
-    parser.add_argument("--intrinsics", action="store_true", help="adjust the lens as well")
-    parser.add_argument(
-        "--hold",
-        type=int,
-        nargs="+",
-        metavar="ID",
-        help="landmarks of known place, three or more: they hold frame and size of the map "
-        "(default: the map as a whole stays where it is, with the size that it has)",
-    )
-    parser.add_argument(
-        "--hold-deviation",
-        type=number(0.0, above=True),
-        default=_HOLD,
-        metavar="M",
-        help="how well these are known (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--calibration", type=Path, metavar="FILE",
-        help="instead of camera_info; of a rig, a camchain as calibrate --rig writes it",
+    intrinsics: bool = option("adjust the lens as well", default=False)
+    hold: list[int] = option(
+        "landmarks of known place, three or more: they hold frame and size of the map (default: "
+        "the map as a whole stays where it is, with the size that it has)", "ID ...", list,
     )  # fmt: skip
-    add_mounting_argument(parser)
-    add_readout_argument(parser)
-    add_settings(
-        parser,
-        "readout_time, scan_direction, stamp_offset, matching.*; map_deviation: how well all "
-        "landmarks are known",
+    hold_deviation: float = option(
+        "how well these are known", "M", _HOLD, limits=(0.0, math.inf), above=True
     )
-    colmap.add_arguments(parser)
-    topics = parser.add_argument_group("topics of the bag (default: found by name and type)")
-    add_topics(topics, but=(IMU,))
+    calibration: Path | None = option(
+        "instead of camera_info; of a rig, a camchain as calibrate --rig writes it", "FILE"
+    )
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: Options) -> None:
     if args.colmap is not None:
         colmap.run(args)
         return
@@ -128,7 +99,7 @@ def _recorded(
     """A camera, and what it saw of the map."""
     config, args = of.config, of.args
     with open_bag(args.recording) as bag:
-        topics = find_topics(bag, given_topics(args, but=(IMU,))).without(IMU)
+        topics = find_topics(bag, given_topics(args)).without(IMU)
         recorded = read_recording(bag, topics, config.matching, landmarks)
     readout_time = 0.0 if shutter == _GLOBAL else config.readout_time
     camera = recorded.calibration.camera(readout_time, config.scan_direction)
@@ -138,10 +109,10 @@ def _recorded(
     return RigCamera(camera, config.stamp_offset, of.mounting), recorded.clouds
 
 
-def _deviations(args: argparse.Namespace, landmarks: Map, map_deviation: float) -> Array | None:
+def _deviations(args: Options, landmarks: Map, map_deviation: float) -> Array | None:
     """How well each landmark is known, m; None: not at all."""
     every = map_deviation if map_deviation > 0.0 else np.inf
-    if args.hold is None:
+    if not args.hold:
         return np.full(len(landmarks), every) if map_deviation > 0.0 else None
     if landmarks.ids is None:
         raise UsageError("--hold needs a map with ids")
@@ -181,12 +152,11 @@ def _tell(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> 
             print(f"{whose} is negative: the scan direction is the reverse of what was set")
 
 
-def _write(
-    args: argparse.Namespace, landmarks: Map, result: RefinedMap, names: Sequence[str]
-) -> None:
+def _write(args: Options, landmarks: Map, result: RefinedMap, names: Sequence[str]) -> None:
     refined = replace(
         landmarks, points=result.points, covariances=result.covariances, error_modes=None
     )
+    assert args.out is not None
     writers: dict[Path, Callable[[Path], object]] = {
         args.out: lambda part: write_npz(part, refined)
     }

@@ -4,28 +4,29 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, UsageError, number, refuse_existing, write_all
-from rs_localizer.cli.map import add_readout_argument, check_readout
+from rs_localizer.cli import WORKING, refuse_existing, write_all
+from rs_localizer.cli.image_input import ImageOptions, opened, tell_times
+from rs_localizer.cli.map import ReadoutOptions, check_readout
+from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.cli.rig_input import (
     MapCamera,
-    add_mounting_argument,
+    MountingOptions,
     map_cameras,
     mounting_lines,
 )
-from rs_localizer.cli.settings_args import add_settings, given_settings
+from rs_localizer.cli.settings_args import given_settings
 from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family, family
 
 if WORKING:
     import numpy as np
     from tqdm import tqdm
 
-    from rs_localizer.cli.image_input import opened, tell_times
     from rs_localizer.core.arrays import Array
     from rs_localizer.io.camera_info import Calibration, read_camera_info
     from rs_localizer.io.images import Image
@@ -41,67 +42,34 @@ _LISTED = 12
 _SHAPE, _ORIGIN = "shape", "origin"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = (
-        "Find the poses of all markers that a recording shows, each together with another one in "
-        "some images. The lens must be calibrated; sizes are taken as given: an error of theirs "
-        "is one of all distances."
+@dataclass(frozen=True, kw_only=True)
+class Options(ReadoutOptions, MountingOptions, ImageOptions):
+    recordings: list[Path] = argument("a video, a folder of images, or a bag", "RECORDING")
+    family: list[str] = option(
+        f"of the markers; may be repeated: {', '.join(FAMILIES)}", "NAME", list, required=True
     )
-    parser.add_argument(
-        "recordings",
-        type=Path,
-        nargs="+",
-        metavar="RECORDING",
-        help="a video, a folder of images, or a bag; several are those of cameras on one body, "
-        "named as their files",
+    size: list[str] = option(
+        "side of the black square, m: of all markers, and, repeated, of ids that differ",
+        "[ID[-ID]:]M", list, required=True,
+    )  # fmt: skip
+    origin: int | None = option(
+        "marker whose frame is that of the map (default: the lowest id of the most that hang "
+        "together)", "ID",
+    )  # fmt: skip
+    deviations: str = option(
+        "what is written of the errors: of the markers beside each other, wherever all of them "
+        "lie, or in the frame of the origin, whose own are 0", default=_SHAPE,
+        choices=(_SHAPE, _ORIGIN),
+    )  # fmt: skip
+    out: Path = option("map to write", "WALL.yaml", required=True)
+    overwrite: bool = option("replace WALL.yaml", default=False)
+    map_frame: str = option("of the map", "NAME", "map")
+    min_side: float = option(
+        "markers with a shorter side are left out", "PX", LEAST_SIDE, limits=(0.0, math.inf)
     )
-    parser.add_argument(
-        "--family",
-        action="append",
-        required=True,
-        help=f"of the markers; may be repeated: {', '.join(FAMILIES)}",
-    )
-    parser.add_argument(
-        "--size",
-        action="append",
-        required=True,
-        metavar="[ID[-ID]:]M",
-        help="side of the black square, m: of all markers, and of ids that differ",
-    )
-    parser.add_argument(
-        "--origin", type=int, metavar="ID",
-        help="marker whose frame is that of the map (default: the lowest id of the most that hang "
-        "together)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--deviations", choices=(_SHAPE, _ORIGIN), default=_SHAPE,
-        help="what is written of the errors: of the markers beside each other, wherever all of "
-        "them lie, or in the frame of the origin, whose own are 0 (default: %(default)s)",
-    )  # fmt: skip
-    parser.add_argument("--out", type=Path, required=True, metavar="WALL.yaml")
-    parser.add_argument("--overwrite", action="store_true", help="replace WALL.yaml")
-    parser.add_argument("--map-frame", default="map", help="(default: %(default)s)")
-    parser.add_argument(
-        "--calibration", type=Path, metavar="FILE",
-        help="the lens; of a rig, a camchain as calibrate --rig writes it",
-    )  # fmt: skip
-    add_mounting_argument(parser)
-    parser.add_argument(
-        "--min-side", type=number(0.0), default=LEAST_SIDE, metavar="PX",
-        help="markers with a shorter side are left out (default: %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--rate", type=number(0.0, above=True), metavar="HZ",
-        help="images per second of a video or of files",
-    )  # fmt: skip
-    add_readout_argument(parser)
-    add_settings(parser, "readout_time (0: it is found), scan_direction, stamp_offset")
-    topics = parser.add_argument_group("topics of a bag (default: the only ones of their types)")
-    topics.add_argument("--image", metavar="TOPIC")
-    topics.add_argument("--camera-info", metavar="TOPIC")
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: Options) -> None:
     if args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
     config, markers = given_settings(args), _markers(args)
@@ -127,7 +95,7 @@ def run(args: argparse.Namespace) -> None:
         print(f"warning: {text}")
 
 
-def _markers(args: argparse.Namespace) -> tuple[Marker, ...]:
+def _markers(args: Options) -> tuple[Marker, ...]:
     try:
         families: list[Family] = [family(name) for name in args.family]
     except ValueError as error:
