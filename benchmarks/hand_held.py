@@ -13,11 +13,11 @@ import numpy as np
 from benchmarks.data import HAND_MOTION
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.simulation.imu import Lever, make_imu, simulate_imu
-from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.settings import FrameSettings, ImuSettings
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
+from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.imu import Lever, make_imu, simulate_imu
+from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.settings import FrameSettings, ImuSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 
 _K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, _K, np.array([-0.2, 0.05, 0.0, 0.0, 0.0]), readout_time=0.02)

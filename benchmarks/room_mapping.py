@@ -16,16 +16,16 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.recording import CAMERA_FRAME
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
-from rs_localizer.simulation.frames import frame_stamps
-from rs_localizer.simulation.renderer import Renderer, in_order
-from rs_localizer.simulation.settings import ImageSettings
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
-from rs_localizer.simulation.walls import marked_room
 from rs_localizer.tools.mapping.anchors import Anchors
 from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map
 from rs_localizer.tools.mapping.colmap import Effort, Stage
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.views import Looker, View
+from rs_localizer.tools.simulation.frames import frame_stamps
+from rs_localizer.tools.simulation.renderer import Renderer, in_order
+from rs_localizer.tools.simulation.settings import ImageSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
+from rs_localizer.tools.simulation.walls import marked_room
 
 
 @dataclass(frozen=True, slots=True)

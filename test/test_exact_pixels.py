@@ -8,8 +8,8 @@ import pytest
 import rs_localizer as rsl
 from rs_localizer import data
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
-from rs_localizer.simulation.walls import three_walls
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
+from rs_localizer.tools.simulation.walls import three_walls
 from rs_localizer.tracking import Tracker
 
 READOUT, FOCAL, CENTRE, SIZE = 0.03, 500.0, np.array([319.5, 239.5]), np.array([640, 480])

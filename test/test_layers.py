@@ -29,11 +29,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "features": {"core", "config", "io"},
     "pipeline": {*METHOD, "io", "features", "markers", "matching"},
     "offline": {*(*METHOD, "io", "features", "markers", "matching", "pipeline", "settings")},
-    "simulation": {*(*METHOD, "io", "features", "markers", "matching", "pipeline", "settings")},
-    "evaluation": {
-        *(*METHOD, "io", "features", "markers", "matching", "pipeline", "settings"),
-        *("data", "simulation"),
-    },
 }
 # What makes a camera or a map known: nothing but the commands imports it.
 MAY_IMPORT["tools"] = {*MAY_IMPORT}

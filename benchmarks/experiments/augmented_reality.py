@@ -21,7 +21,10 @@ from benchmarks.experiments.results import Claim, Context, Result, Statement, Ta
 from benchmarks.experiments.uncertainty import Interval, bootstrap, share
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.evaluation.cube_clip import (
+from rs_localizer.io.trajectories import Trajectory, read_tum
+from rs_localizer.localizer import Localizer
+from rs_localizer.solvers.table import SOLVERS
+from rs_localizer.tools.evaluation.cube_clip import (
     CAMERA,
     CLIP_SENSOR,
     OURS,
@@ -33,10 +36,7 @@ from rs_localizer.evaluation.cube_clip import (
     clip_stamps,
     draw_clip,
 )
-from rs_localizer.io.trajectories import Trajectory, read_tum
-from rs_localizer.localizer import Localizer
-from rs_localizer.simulation.frames import true_poses_at
-from rs_localizer.solvers.table import SOLVERS
+from rs_localizer.tools.simulation.frames import true_poses_at
 from rs_localizer.tracking import Tracker
 
 QUANTILES = np.linspace(0.01, 0.99, 99)

@@ -19,8 +19,8 @@ from benchmarks.experiments.uncertainty import Interval, quantile, share
 from benchmarks.experiments.views import GROSS, Outcome, outcome, synthetic_views
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
-from rs_localizer.evaluation.plots import BLUE, ORANGE
 from rs_localizer.localizer import Localizer
+from rs_localizer.tools.evaluation.plots import BLUE, ORANGE
 
 _REGION = 0.95
 _COVERED = (0.93, 0.97)

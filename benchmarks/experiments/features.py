@@ -27,12 +27,12 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
-from rs_localizer.simulation.frames import frame_stamps
-from rs_localizer.simulation.planes import TexturedPlane
-from rs_localizer.simulation.renderer import Renderer
-from rs_localizer.simulation.settings import ImageSettings
-from rs_localizer.simulation.true_motion import RecordedMotion, TrueMotion, sampled_states
-from rs_localizer.simulation.walls import room
+from rs_localizer.tools.simulation.frames import frame_stamps
+from rs_localizer.tools.simulation.planes import TexturedPlane
+from rs_localizer.tools.simulation.renderer import Renderer
+from rs_localizer.tools.simulation.settings import ImageSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, TrueMotion, sampled_states
+from rs_localizer.tools.simulation.walls import room
 
 _READOUT_TIME, _RATE = 0.03, 30.0
 _K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])

@@ -31,7 +31,6 @@ from benchmarks.experiments.errors import angles
 from benchmarks.room_mapping import Piece, Room, without_refinement
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
-from rs_localizer.evaluation.cube_clip import CAMERA, SENSOR
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.maps.files import write_npz
 from rs_localizer.io.maps.landmarks import Map
@@ -39,9 +38,10 @@ from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.simulation.frames import middle_stamp
+from rs_localizer.tools.evaluation.cube_clip import CAMERA, SENSOR
 from rs_localizer.tools.mapping.pictures import save_pictures
 from rs_localizer.tools.mapping.report import rows
+from rs_localizer.tools.simulation.frames import middle_stamp
 
 _WALK = Piece(28.0, 11.8, 15.0)
 _FLIGHTS = {"another walk": Piece(40.0, 8.0), "quick turns": Piece(54.8, 6.0)}

@@ -26,10 +26,15 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
-from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room, seen_descriptors
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import RecordedMotion, TrueMotion
+from rs_localizer.tools.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
+from rs_localizer.tools.simulation.scene import (
+    keypoint_rows,
+    random_descriptors,
+    room,
+    seen_descriptors,
+)
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, TrueMotion
 
 _FRAMES = 12
 _WRONG = 0.9

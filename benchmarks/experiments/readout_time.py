@@ -18,13 +18,13 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.frames import frame_stamps, simulate_frames
-from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import RecordedMotion
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import Observed
 from rs_localizer.tools.calibration import Calibration, calibrate
+from rs_localizer.tools.simulation.frames import frame_stamps, simulate_frames
+from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion
 
 _SPECIFICATION = "our issue"
 _RATE = 30.0  # Hz

@@ -22,10 +22,10 @@ from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import load_params_file
-from rs_localizer.simulation.frames import frame_stamps, simulate_frames
-from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import RecordedMotion
+from rs_localizer.tools.simulation.frames import frame_stamps, simulate_frames
+from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion
 
 _POINTS = 150
 _OUTLIERS = 0.3

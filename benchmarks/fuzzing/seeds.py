@@ -24,10 +24,10 @@ from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.files import write_npz
 from rs_localizer.io.maps.landmarks import Map, map_rows
-from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import ConstantVelocity
+from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.scene import keypoint_rows, random_descriptors, room
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 _ROS = b"""
 image_width: 640

@@ -28,12 +28,12 @@ from rs_localizer.io.trajectories import read_motions, read_tum
 from rs_localizer.markers.detection import Detections, MarkerDetector
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.simulation.frames import frame_stamps, middle_stamp
-from rs_localizer.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC, write_truth
-from rs_localizer.simulation.renderer import Renderer, in_order
-from rs_localizer.simulation.settings import ImageSettings
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
-from rs_localizer.simulation.walls import three_walls
+from rs_localizer.tools.simulation.frames import frame_stamps, middle_stamp
+from rs_localizer.tools.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC, write_truth
+from rs_localizer.tools.simulation.renderer import Renderer, in_order
+from rs_localizer.tools.simulation.settings import ImageSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
+from rs_localizer.tools.simulation.walls import three_walls
 
 MOTIONS = {
     "tum_vi_room5": (HAND_MOTION, "forward_left_up"),

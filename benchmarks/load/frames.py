@@ -16,7 +16,7 @@ from benchmarks.hand_held import CAMERA, HandHeld
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.recording import CAMERA_FRAME, CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
 from rs_localizer.ros.node.conversion import copy_message
-from rs_localizer.simulation.recording import write_simulated
+from rs_localizer.tools.simulation.recording import write_simulated
 
 READOUT_TIME = CAMERA.readout_time
 """s of the simulated camera."""

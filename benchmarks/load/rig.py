@@ -40,11 +40,11 @@ from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.ros.node.conversion import copy_message, make_message, message_class
 from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.settings import NODE_NAME, write_parameters
-from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.simulation.rig import camera_stamps, rig_parameters, simulate_rig
-from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import TrueMotion, sampled_states
+from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.rig import camera_stamps, rig_parameters, simulate_rig
+from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import TrueMotion, sampled_states
 
 _UPSIDE_DOWN = np.diag([-1.0, -1.0, 1.0])
 _PARTS = RigParts(

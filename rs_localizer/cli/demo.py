@@ -20,8 +20,8 @@ from rs_localizer.cli import WORKING, import_ros, stage
 from rs_localizer.cli.options import option
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.simulation.settings import FrameSettings
 from rs_localizer.solvers.table import SOLVERS
+from rs_localizer.tools.simulation.settings import FrameSettings
 
 if WORKING:
     from scipy.spatial.transform import Rotation
@@ -30,15 +30,6 @@ if WORKING:
     from rs_localizer.core.shutter import Motion
     from rs_localizer.core.simd import compiler
     from rs_localizer.core.simd.jit import cache_directory
-    from rs_localizer.evaluation import cube_clip, plots
-    from rs_localizer.evaluation.comparison import (
-        Answer,
-        Recording,
-        Result,
-        compare,
-        load_recording,
-        table,
-    )
     from rs_localizer.io.bags import BagWriter
     from rs_localizer.io.camera_info import read_camera_info
     from rs_localizer.io.recording import write_frame
@@ -46,10 +37,19 @@ if WORKING:
     from rs_localizer.io.video import Image
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.settings import build, load_params_file
-    from rs_localizer.simulation.frames import frame_stamps, simulate_frames
-    from rs_localizer.simulation.recording import write_simulated, write_truth
-    from rs_localizer.simulation.scene import room
-    from rs_localizer.simulation.true_motion import RecordedMotion
+    from rs_localizer.tools.evaluation import cube_clip, plots
+    from rs_localizer.tools.evaluation.comparison import (
+        Answer,
+        Recording,
+        Result,
+        compare,
+        load_recording,
+        table,
+    )
+    from rs_localizer.tools.simulation.frames import frame_stamps, simulate_frames
+    from rs_localizer.tools.simulation.recording import write_simulated, write_truth
+    from rs_localizer.tools.simulation.scene import room
+    from rs_localizer.tools.simulation.true_motion import RecordedMotion
 
 # The part of the hand's motion that is flown (s): it begins slowly and ends in quick turns.
 _FLIGHT_START, _FLIGHT_DURATION = 8.0, 18.0

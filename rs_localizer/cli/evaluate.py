@@ -17,11 +17,11 @@ if WORKING:
     import numpy as np
     from scipy.spatial.transform import Rotation
 
-    from rs_localizer.evaluation import metrics
-    from rs_localizer.evaluation.metrics import associate
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.trajectories import Motions, Trajectory, Twists, read_motions, read_twists
     from rs_localizer.offline.fleet import Figures
+    from rs_localizer.tools.evaluation import metrics
+    from rs_localizer.tools.evaluation.metrics import associate
 
 _TOPICS = ("pose", "twist", "truth_pose", "truth_twist")
 # Deg: less is an error, not another frame. And what is left once a rotation explains the rest.
@@ -84,7 +84,7 @@ def run(options: Options) -> Figures:
     if options.ate:
         figures |= _by_evo(estimate.poses, truth.poses, tolerance_ns)
     if options.plot is not None:
-        from rs_localizer.evaluation import plots  # half a second
+        from rs_localizer.tools.evaluation import plots  # half a second
 
         of_twists = {"estimate": twists} if len(rows) > 2 else {}
         options.plot.parent.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ import numpy as np
 from rs_localizer.cli import WORKING, read_counts
 from rs_localizer.cli.options import Overwrite, UsageError, argument, option
 from rs_localizer.markers.families import FAMILIES, family
-from rs_localizer.markers.printing import PAGES, page_files, plan, write_pages
+from rs_localizer.tools.printing import PAGES, page_files, plan, write_pages
 
 if WORKING:
     from rs_localizer.io.atomic_files import atomic_files

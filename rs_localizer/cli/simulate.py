@@ -18,7 +18,7 @@ from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import STORAGES, BagWriter
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
 from rs_localizer.settings import settings, write_parameters
-from rs_localizer.simulation.settings import (
+from rs_localizer.tools.simulation.settings import (
     BODY_FROM_CAMERA,
     FORMATS,
     KNOT_SPACING,
@@ -27,7 +27,7 @@ from rs_localizer.simulation.settings import (
     ImageSettings,
     ImuSettings,
 )
-from rs_localizer.simulation.walls import SCENES, Scene
+from rs_localizer.tools.simulation.walls import SCENES, Scene
 
 if WORKING:
     import numpy as np
@@ -42,19 +42,19 @@ if WORKING:
     from rs_localizer.io.topics import TF_STATIC
     from rs_localizer.io.trajectories import read_tum
     from rs_localizer.markers.map_files import write_marker_map
-    from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
-    from rs_localizer.simulation.imu import ImuBagWriter, Lever, simulate_imu
-    from rs_localizer.simulation.recording import write_rendered, write_simulated
-    from rs_localizer.simulation.renderer import RenderedFrame, Renderer, rendered_frames
-    from rs_localizer.simulation.rig import (
+    from rs_localizer.tools.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
+    from rs_localizer.tools.simulation.imu import ImuBagWriter, Lever, simulate_imu
+    from rs_localizer.tools.simulation.recording import write_rendered, write_simulated
+    from rs_localizer.tools.simulation.renderer import RenderedFrame, Renderer, rendered_frames
+    from rs_localizer.tools.simulation.rig import (
         Frame,
         camera_stamps,
         rig_parameters,
         simulate_rig,
         write_rig_frame,
     )
-    from rs_localizer.simulation.scene import described, keypoint_rows, room
-    from rs_localizer.simulation.true_motion import (
+    from rs_localizer.tools.simulation.scene import described, keypoint_rows, room
+    from rs_localizer.tools.simulation.true_motion import (
         ConstantVelocity,
         RecordedMotion,
         TrueMotion,

@@ -17,10 +17,10 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.telemetry import CAMERA_FROM_SENSOR
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.simulation.imu import make_imu
-from rs_localizer.simulation.settings import FrameSettings, ImuSettings
-from rs_localizer.simulation.true_motion import ConstantVelocity
+from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.imu import make_imu
+from rs_localizer.tools.simulation.settings import FrameSettings, ImuSettings
+from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
 SHUTTER = ["-p", f"readout_time:={READOUT_TIME}"]

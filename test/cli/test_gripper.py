@@ -19,8 +19,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.offline.table import read_parquet
-from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.tools.mapping.gauge import through
+from rs_localizer.tools.simulation.settings import ImageSettings
 
 pytest.importorskip("pycolmap")
 pytest.importorskip("pyarrow", reason="needs pyarrow", exc_type=ImportError)

@@ -12,9 +12,9 @@ from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map, map_rows
 from rs_localizer.io.trajectories import read_motions, read_tum
-from rs_localizer.simulation.recording import write_simulated
-from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room
-from rs_localizer.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.recording import write_simulated
+from rs_localizer.tools.simulation.scene import keypoint_rows, random_descriptors, room
+from rs_localizer.tools.simulation.settings import FrameSettings
 
 FRAMES = 8
 POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=6000)

@@ -17,10 +17,10 @@ from benchmarks.independent.rigs import Mounted, Scene, views
 from rs_localizer import data
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.frames import frame_stamps, simulate_frames
-from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import RecordedMotion
+from rs_localizer.tools.simulation.frames import frame_stamps, simulate_frames
+from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion
 
 # The reference shows signatures, no examples.
 WITH_EXAMPLES = [p for p in pages.NAMES if pages.fenced(p, "python")]

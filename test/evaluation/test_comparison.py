@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.cli.main import main
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.evaluation.comparison import (
+from rs_localizer.io.trajectories import Trajectory, Twists
+from rs_localizer.tools.evaluation.comparison import (
     Answer,
     Recording,
     Result,
@@ -20,8 +21,7 @@ from rs_localizer.evaluation.comparison import (
     table,
     true_rates,
 )
-from rs_localizer.evaluation.metrics import associate, pose_errors, twist_errors
-from rs_localizer.io.trajectories import Trajectory, Twists
+from rs_localizer.tools.evaluation.metrics import associate, pose_errors, twist_errors
 
 MIDDLE_NS = 15_000_000
 

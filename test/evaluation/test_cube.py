@@ -12,8 +12,11 @@ from PIL import Image as Pillow
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.evaluation import cube_clip
-from rs_localizer.evaluation.cube_clip import (
+from rs_localizer.io.trajectories import read_tum
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Marker
+from rs_localizer.tools.evaluation import cube_clip
+from rs_localizer.tools.evaluation.cube_clip import (
     clip_cube,
     clip_stamps,
     cube_errors,
@@ -22,10 +25,7 @@ from rs_localizer.evaluation.cube_clip import (
     gif,
     side_by_side,
 )
-from rs_localizer.io.trajectories import read_tum
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Marker
-from rs_localizer.simulation.frames import middle_stamp
+from rs_localizer.tools.simulation.frames import middle_stamp
 
 CAMERA = Camera(
     640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]),

@@ -22,9 +22,6 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.frames import middle_stamp
-from rs_localizer.simulation.renderer import Renderer
-from rs_localizer.simulation.settings import ImageSettings
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.anchors import Anchors
 from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map, check_fit
@@ -32,6 +29,9 @@ from rs_localizer.tools.mapping.colmap import SPARSE, Effort
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.report import written
 from rs_localizer.tools.mapping.views import View
+from rs_localizer.tools.simulation.frames import middle_stamp
+from rs_localizer.tools.simulation.renderer import Renderer
+from rs_localizer.tools.simulation.settings import ImageSettings
 
 pytest.importorskip("pycolmap")
 

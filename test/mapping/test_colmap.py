@@ -13,9 +13,9 @@ import pytest
 
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.io.calibration import colmap_camera, colmap_parameters
-from rs_localizer.simulation.walls import collage
 from rs_localizer.tools.mapping import MappingError, colmap
 from rs_localizer.tools.mapping.colmap import Effort, build_structure, image_name, pairs_of
+from rs_localizer.tools.simulation.walls import collage
 
 K = np.array([[260.0, 0.0, 161.0], [0.0, 255.0, 118.0], [0.0, 0.0, 1.0]])
 

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.features.extraction import Features
 from rs_localizer.io.images import Image
-from rs_localizer.simulation.walls import collage
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.build import check_views, choose_keyframes
 from rs_localizer.tools.mapping.initial_trajectory import usual_accelerations
 from rs_localizer.tools.mapping.views import Looker, View, blurred, sharpness
+from rs_localizer.tools.simulation.walls import collage
 
 PICTURE = collage(900, 700, np.random.default_rng(0))
 

@@ -12,8 +12,8 @@ from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.printing import PAGES, PrintError, plan, write_pages
 from rs_localizer.markers.prints import Charuco, Chessboard
+from rs_localizer.tools.printing import PAGES, PrintError, plan, write_pages
 
 PIXEL = 0.0254 / 300  # m, of the PNG files
 

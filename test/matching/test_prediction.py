@@ -15,7 +15,7 @@ from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.clouds import Keypoints
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.matching import Matcher, find_view, predict
-from rs_localizer.simulation.scene import room
+from rs_localizer.tools.simulation.scene import room
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERAS: dict[str, dict[str, Any]] = {

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.offline.rectified import (
+from rs_localizer.tools.rectified import (
     FlatError,
     map_depths,
     motion_between,
     plane_depths,
     rectified,
 )
-from rs_localizer.simulation.frames import middle_stamp
-from rs_localizer.simulation.planes import TexturedPlane
-from rs_localizer.simulation.renderer import Renderer
-from rs_localizer.simulation.true_motion import ConstantVelocity
-from rs_localizer.simulation.walls import collage
+from rs_localizer.tools.simulation.frames import middle_stamp
+from rs_localizer.tools.simulation.planes import TexturedPlane
+from rs_localizer.tools.simulation.renderer import Renderer
+from rs_localizer.tools.simulation.true_motion import ConstantVelocity
+from rs_localizer.tools.simulation.walls import collage
 
 READOUT = 0.03
 K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])

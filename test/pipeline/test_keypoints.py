@@ -20,10 +20,10 @@ from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.landmarks import read_landmarks
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import ConstantVelocity
+from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.scene import keypoint_rows, random_descriptors, room
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
 POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=4000)

@@ -25,10 +25,10 @@ from rs_localizer.offline.replay import find_topics, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.simulation.frames import simulate_frames
-from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import RecordedMotion, TrueState, sampled_states
+from rs_localizer.tools.simulation.frames import simulate_frames
+from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, TrueState, sampled_states
 
 from .clouds import cloud_of
 

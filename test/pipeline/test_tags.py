@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import rs_localizer.simulation.walls
+import rs_localizer.tools.simulation.walls
 from rs_localizer.cli.main import main
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
@@ -72,7 +72,7 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("tags") / "walls"
     words = ["--images", "--duration", "0.2", "--readout-time", str(READOUT), "--format", "png"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rs_localizer.simulation.walls, "_FAMILY", "apriltag_36h11")
+        patch.setattr(rs_localizer.tools.simulation.walls, "_FAMILY", "apriltag_36h11")
         assert main(["simulate", str(path), *words, "--trajectory", "tum_vi_room5"]) == 0
     return path
 

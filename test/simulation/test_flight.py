@@ -5,9 +5,9 @@
 import numpy as np
 
 from rs_localizer.cli.main import main
-from rs_localizer.evaluation.metrics import pose_errors
 from rs_localizer.io.trajectories import read_motions
-from rs_localizer.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC
+from rs_localizer.tools.evaluation.metrics import pose_errors
+from rs_localizer.tools.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC
 
 # Two walls and the floor come by while the hand shakes the camera, at 60 deg/s and more.
 FLIGHT = "--images --trajectory tum_vi_room5 --start 21 --duration 0.8 --exposure 0.002".split()

@@ -13,8 +13,8 @@ from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.rigs import RigParts, write_camchain
 from rs_localizer.io.transforms import TransformTree
 from rs_localizer.settings import build, load_params_file
-from rs_localizer.simulation.rig import MountedMotion
-from rs_localizer.simulation.true_motion import ConstantVelocity
+from rs_localizer.tools.simulation.rig import MountedMotion
+from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 K = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 240.0], [0.0, 0.0, 1.0]])
 TURN = Rotation.from_euler("xyz", [0.1, -0.2, np.pi]).as_matrix()

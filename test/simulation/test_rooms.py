@@ -10,10 +10,10 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.detection import MarkerDetector
-from rs_localizer.simulation.frames import middle_stamp, true_poses_at
-from rs_localizer.simulation.renderer import Renderer
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
-from rs_localizer.simulation.walls import Scene, marked_room
+from rs_localizer.tools.simulation.frames import middle_stamp, true_poses_at
+from rs_localizer.tools.simulation.renderer import Renderer
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
+from rs_localizer.tools.simulation.walls import Scene, marked_room
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, K, readout_time=0.03)

@@ -9,10 +9,10 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import Trajectory
-from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
-from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
+from rs_localizer.tools.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
+from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
 MOTION = ConstantVelocity(np.array([0.6, -2.0, 1.5]), np.array([1.0, 0.5, 0.25]), 1.0)

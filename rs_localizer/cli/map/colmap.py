@@ -25,9 +25,9 @@ if WORKING:
     from rs_localizer.io.maps.colmap import read_model, write_model
     from rs_localizer.io.maps.landmarks import MapError
     from rs_localizer.offline.image_sources import have_times, name_time
-    from rs_localizer.offline.rectified import map_depths, motion_between, rectified
     from rs_localizer.settings import build
     from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, Shutter, undo_shutter
+    from rs_localizer.tools.rectified import map_depths, motion_between, rectified
 
 _LIST, _IMAGES = "images.txt", "images"
 _NUMBER = re.compile(r"\d+")

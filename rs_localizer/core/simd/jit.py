@@ -38,10 +38,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 if importlib.util.find_spec("scipy") is None:  # Numba would say so in the first kernel, and not why
     raise ModuleNotFoundError("No module named 'scipy', which compiled kernels need", name="scipy")
 
-PARTS = (
-    *("core", "solvers", "estimation", "inertial", "matching", "markers"),
-    *("simulation", "tools"),
-)
+PARTS = ("core", "solvers", "estimation", "inertial", "matching", "markers", "tools")
 """Folders of the package with kernels; a kernel calls those of its own and of earlier ones."""
 
 _PACKAGE = Path(__file__).resolve().parents[2]

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.evaluation.plots import BLUE, ORANGE
+from rs_localizer.tools.evaluation.plots import BLUE, ORANGE
 from rs_localizer.tools.mapping.build import Built
 
 _DPI = 110

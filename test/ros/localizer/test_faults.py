@@ -39,7 +39,7 @@ from rs_localizer.io.maps.landmarks import Map, map_rows
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.managed import spin
-from rs_localizer.simulation.scene import random_descriptors
+from rs_localizer.tools.simulation.scene import random_descriptors
 
 from .robot import READOUT_TIME, inputs, record, tf2_ros
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.maps.landmarks import Descriptors, Map
-from rs_localizer.simulation.frames import SimulatedFrame
+from rs_localizer.tools.simulation.frames import SimulatedFrame
 
 # Share of the bits that differ between two views of a landmark; ORB's median is about this.
 BIT_ERRORS = 0.1

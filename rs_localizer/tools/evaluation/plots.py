@@ -20,18 +20,18 @@ from scipy.ndimage import median_filter
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.evaluation.comparison import (
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.trajectories import Trajectory
+from rs_localizer.io.video import Image
+from rs_localizer.tools.evaluation.comparison import (
     Recording,
     Result,
     counts_at,
     predicted_pixels,
     true_rates,
 )
-from rs_localizer.evaluation.metrics import Errors, Stamps
-from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.io.trajectories import Trajectory
-from rs_localizer.io.video import Image
+from rs_localizer.tools.evaluation.metrics import Errors, Stamps
 
 BLUE = "#0b3c8c"
 ORANGE = "#b8540a"

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import Trajectory, split_at_gaps
-from rs_localizer.simulation.settings import BODY_FROM_CAMERA, KNOT_SPACING
+from rs_localizer.tools.simulation.settings import BODY_FROM_CAMERA, KNOT_SPACING
 
 # Fewer samples to a knot than this leave nothing to average: then every sample is a knot.
 _SAMPLES_PER_KNOT = 2.0

@@ -21,8 +21,8 @@ from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.imu import make_reading
 from rs_localizer.io.recording import CAMERA_FRAME
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.simulation.settings import BODY_FROM_CAMERA, ImuSettings
-from rs_localizer.simulation.true_motion import TrueMotion
+from rs_localizer.tools.simulation.settings import BODY_FROM_CAMERA, ImuSettings
+from rs_localizer.tools.simulation.true_motion import TrueMotion
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])  # m/s^2, in a map with z up
 _STEP = 1e-5  # s, of the difference that gives accelerations

@@ -20,11 +20,11 @@ from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.io.video import Image
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.prints import Marker
-from rs_localizer.simulation.frames import frame_stamps, middle_stamp, true_poses_at
-from rs_localizer.simulation.renderer import Renderer, in_order
-from rs_localizer.simulation.settings import ImageSettings
-from rs_localizer.simulation.true_motion import RecordedMotion, TrueMotion, sampled_states
-from rs_localizer.simulation.walls import three_walls
+from rs_localizer.tools.simulation.frames import frame_stamps, middle_stamp, true_poses_at
+from rs_localizer.tools.simulation.renderer import Renderer, in_order
+from rs_localizer.tools.simulation.settings import ImageSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, TrueMotion, sampled_states
+from rs_localizer.tools.simulation.walls import three_walls
 
 CAMERA = Camera(
     640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]),

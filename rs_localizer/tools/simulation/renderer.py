@@ -21,10 +21,10 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.io.video import Image
-from rs_localizer.simulation.frames import middle_stamp
-from rs_localizer.simulation.planes import TexturedPlane, pyramids
-from rs_localizer.simulation.settings import Encoding, ImageSettings
-from rs_localizer.simulation.true_motion import TrueMotion, TrueState
+from rs_localizer.tools.simulation.frames import middle_stamp
+from rs_localizer.tools.simulation.planes import TexturedPlane, pyramids
+from rs_localizer.tools.simulation.settings import Encoding, ImageSettings
+from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
 # Walls that meet in an edge overlap by this many texels, so that no ray slips between them.
 _OVERLAP = np.float32(0.02)

@@ -18,10 +18,10 @@ from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
-from rs_localizer.simulation.planes import TexturedPlane
+from rs_localizer.tools.simulation.planes import TexturedPlane
 
 if TYPE_CHECKING:
-    from rs_localizer.simulation.true_motion import TrueState
+    from rs_localizer.tools.simulation.true_motion import TrueState
 
 # Shapes per square of this many texels, of all sizes between a few texels and a few hundred.
 _SHAPES_PER = 9000
@@ -222,7 +222,7 @@ PAPER_AND_INK = (235, 26)
 
 
 def marked_room(path: TrueState) -> Scene:
-    """The room of :func:`rs_localizer.simulation.walls.room` with two markers on each wall.
+    """The room of :func:`rs_localizer.tools.simulation.walls.room` with two markers on each wall.
 
     Floor and ceiling have none.
     """

@@ -17,12 +17,18 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.evaluation.metrics import Errors, Stamps, associate, pose_errors, twist_errors
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC, IMAGE_TOPIC
 from rs_localizer.io.trajectories import Motions, Trajectory, Twists, read_motions
-from rs_localizer.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC
+from rs_localizer.tools.evaluation.metrics import (
+    Errors,
+    Stamps,
+    associate,
+    pose_errors,
+    twist_errors,
+)
+from rs_localizer.tools.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC
 
 # Truth and estimate are meant for the very same moment; a nanosecond may go in rounding.
 _TOLERANCE_NS = 1000

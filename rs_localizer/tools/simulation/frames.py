@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.simulation.settings import FrameSettings
-from rs_localizer.simulation.true_motion import TrueMotion, TrueState
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
 # No points closer than this (m): a lens sees them as a blur.
 _NEAREST = 0.3

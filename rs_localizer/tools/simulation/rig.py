@@ -24,10 +24,10 @@ from rs_localizer.io.recording import (
     make_image,
 )
 from rs_localizer.io.rigs import RIG_FRAME, RigParts, node_parameters, optical_frame
-from rs_localizer.simulation.frames import SimulatedFrame, frame_stamps
-from rs_localizer.simulation.recording import write_truth
-from rs_localizer.simulation.renderer import RenderedFrame
-from rs_localizer.simulation.true_motion import TrueMotion, TrueState
+from rs_localizer.tools.simulation.frames import SimulatedFrame, frame_stamps
+from rs_localizer.tools.simulation.recording import write_truth
+from rs_localizer.tools.simulation.renderer import RenderedFrame
+from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
 # How far the rates of cameras' oscillators are off, as a part of themselves: common quartz.
 _RATE_ERROR = 5e-5

@@ -20,9 +20,9 @@ from rs_localizer.io.recording import (
     make_image,
     write_frame,
 )
-from rs_localizer.simulation.frames import SimulatedFrame
-from rs_localizer.simulation.renderer import RenderedFrame
-from rs_localizer.simulation.true_motion import TrueState
+from rs_localizer.tools.simulation.frames import SimulatedFrame
+from rs_localizer.tools.simulation.renderer import RenderedFrame
+from rs_localizer.tools.simulation.true_motion import TrueState
 
 TRUE_POSE_TOPIC = "/truth/pose"
 TRUE_TWIST_TOPIC = "/truth/twist"
