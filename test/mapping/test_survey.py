@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Surveying markers of an own projector."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -113,14 +114,17 @@ def test_a_survey_that_few_corners_fit_is_refused(spotted):
         survey(camera(0.3 * READOUT), spotted, MARKERS)
 
 
-def test_a_marker_of_another_size_is_named_and_left_out(spotted, poses):
-    markers = every_marker([family("4x4_50")], SIZE, {4: 1.2 * SIZE})
-    found = survey(camera(), spotted, markers)
-    assert [marker.id for marker in found.misfits] == [4]
-    assert [marker.id for marker in found.markers] == [0, 1, 2, 3]
-    check(found, poses, 0.03)
-    with pytest.raises(ValueError, match=r"marker 4x4_50 4: .* do not fit .*is their size right"):
-        survey(camera(), spotted, markers, origin=4)
+@pytest.mark.parametrize("wrong", [{4: 1.04}, {2: 0.6}, {0: 1.5}])
+def test_markers_that_disagree_about_metres_are_named_with_the_sizes_that_fit(spotted, wrong):
+    """The origin's, too, and one that is off by a little."""
+    sizes = {id_: share * SIZE for id_, share in wrong.items()}
+    with pytest.raises(ValueError, match="disagree with the others about metres") as error:
+        survey(camera(), spotted, every_marker([family("4x4_50")], SIZE, sizes))
+    found = re.findall(r"marker 4x4_50 (\d+) ([\d.]+) m \(given ([\d.]+)\)", str(error.value))
+    assert [int(id_) for id_, _, _ in found] == list(wrong)
+    for id_, size, given in found:
+        assert float(size) == pytest.approx(SIZE, rel=0.01)
+        assert float(given) == pytest.approx(sizes[int(id_)], rel=1e-3)
 
 
 def turned_over(chained: Chained, marker: int) -> Chained:

@@ -38,6 +38,7 @@ FREEDOMS = {
     "board": Freedom(lens=True, landmarks=0.01, stamps=1e-3),
     "mounted": Freedom(lens=True, mounting=MOUNTED, fading=0.1),
     "bodies": Freedom(readout_time=False, mounting=MOUNTED),
+    "sizes": Freedom(sizes=0.1),
 }
 
 
@@ -59,7 +60,7 @@ def small(
         times=0.05 + 0.07 * frames, row_times=camera.row_time(pixels), pixels=pixels,
         landmarks=landmarks, points=rng.integers(0, 8, count), frames=frames,
         trusted=np.ones(count, bool),
-        bodies=np.repeat([-1, 0], 4) if of == "bodies" else None,
+        bodies=np.repeat([-1, 0], 4) if of in ("bodies", "sizes") else None,
     )  # fmt: skip
     state = start_state(camera, seen, spline, READOUT)
     extrinsics = MOUNTED.given if FREEDOMS[of].mounting else state.extrinsics

@@ -90,7 +90,8 @@ class Terms(NamedTuple):
     readout_free: bool
     lens_free: bool
     mount_free: bool
-    point_width: int  # 3 for the place of a landmark, 6 for a rigid body's turn as well, 0: known
+    # 3 for the place of a landmark, 6 for a rigid body's turn as well, 7 for its size; 0: known
+    point_width: int
     delay_free: bool  # each image has a time of its own
     variance: float  # px^2, of the noise of u and of v
     limit: float  # px^2, where Tukey's weight ends
@@ -207,13 +208,15 @@ def _of_camera(
 def _of_landmark(
     sights: Sights, terms: Terms, n: int, column: int, by_landmark: Array, row: Array
 ) -> None:
-    """Fill the derivatives by the landmark's place, and by its body's turn."""
+    """Fill the derivatives by the landmark's place, and by its body's turn and size."""
     arm = sights.arms[n]
     for i in range(3 if terms.point_width > 0 else 0):
         a, b = (i + 1) % 3, (i + 2) % 3
         row[column + i] = by_landmark[i]
         if terms.point_width > 3:
             row[column + 3 + i] = arm[a] * by_landmark[b] - arm[b] * by_landmark[a]
+        if terms.point_width > 6:
+            row[column + 6] += arm[i] * by_landmark[i]
 
 
 @kernel

@@ -12,7 +12,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.tools.adjust.bodies import Pieces, paper_covariance
+from rs_localizer.tools.adjust.bodies import BODY, Pieces, paper_covariance
 from rs_localizer.tools.adjust.gyro import Gyroscope
 from rs_localizer.tools.adjust.keypoints import LIMIT, Columns, Curve, Free, Keypoints, Sights
 from rs_localizer.tools.adjust.lens import lens_prior
@@ -214,8 +214,12 @@ class Problem:
             terms.append(mount_term(own.extrinsics, freedom.mounting, at["mount"]))
         if "points" in at and self.deviations is None and not (k and self._one_map):
             if pieces.rigid:  # a body none of whose landmarks fits stays where it is
-                information = np.full(pieces.columns, _LOOSE_BODY**-2)
-                offset = np.zeros(pieces.columns)
+                information = np.full((pieces.count, pieces.width), _LOOSE_BODY**-2)
+                offset = np.zeros((pieces.count, pieces.width))
+                if pieces.sized:
+                    information[:, BODY] = freedom.sizes**-2
+                    offset[:, BODY] = pieces.growth(own.landmarks, view.observations.landmarks)
+                information, offset = information.ravel(), offset.ravel()
             else:
                 free = pieces.slots >= 0
                 offset = (own.landmarks - view.observations.landmarks)[free].ravel()
@@ -332,7 +336,7 @@ def _pieces(observations: Observations, freedom: Freedom, every: bool) -> Pieces
     if every:
         return Pieces(np.arange(len(observations.landmarks)), rigid=False)
     if observations.bodies is not None:
-        return Pieces(observations.bodies, rigid=True)
+        return Pieces(observations.bodies, True, freedom.sizes > 0.0)
     slots = np.full(len(observations.landmarks), -1)
     if freedom.landmarks > 0.0:
         landmarks = np.unique(observations.points)

@@ -21,11 +21,11 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
-from rs_localizer.tools.adjust.bodies import BODY, PLACE
+from rs_localizer.tools.adjust.bodies import BODY, PLACE, SIZED
 from rs_localizer.tools.adjust.cluster_robust import cluster_robust
 from rs_localizer.tools.adjust.fit import Fit, solve
 from rs_localizer.tools.adjust.problem import LIMIT, Problem, View
@@ -45,6 +45,7 @@ from rs_localizer.tools.mapping.unknown_markers import (
     Filmed,
     Spotted,
     chain,
+    growth,
 )
 
 # Steps of Gauss and Newton, and the noise of each by what it is.
@@ -95,6 +96,7 @@ class Adjustable:
         for one, seen in zip(self.filmed, self.seen, strict=True):
             own = replace(
                 freedom,
+                sizes=0.0 if markers_only else freedom.sizes,
                 readout_time=not markers_only
                 and (readout_times or not one.camera.readout_time > 0.0),
                 mounting=None if markers_only else one.mounting,
@@ -179,6 +181,12 @@ def _at_the_origin(state: State, landmarks: Array) -> State:
     return replace(state, spline=back.moved(state.spline)).with_landmarks(moved)
 
 
+# Relative deviation of sizes until they are found to agree: as good as nothing is known of them.
+_ANY_SIZE = 0.5
+# Sizes are wrong beyond this and so many of their own deviations (printers stretch by up to three
+# parts in a thousand, rulers are read to half a millimetre); beyond the last one, a first guess
+# needs another size.
+_SIZES_DIFFER, _SIGMAS, _WRONG_SIZE = 0.015, 6.0, 0.1
 _LEAST_IMAGES = 5
 # Images that show a marker: fewer say hardly anything of it.
 _LEAST_SIGHTS = 3
@@ -267,6 +275,7 @@ def survey_rig(
     start_ns = min(image.stamp_ns for image in images)
     times = [one.times(start_ns) for one in filmed]
     frames = frames_of(times)
+    given, markers = markers, _resized(filmed, frames, markers)
     chained = chain(filmed, frames, markers, origin)
     if len(chained.markers) < 2:
         raise ValueError(
@@ -274,7 +283,7 @@ def survey_rig(
             "marker: there is nothing to survey"
         )
     try:
-        done = _adjusted(filmed, times, frames, markers, chained)
+        done = _adjusted(filmed, times, frames, (given, markers), chained)
     except Undetermined as error:
         raise ValueError(f"the images do not determine the markers' poses: {error}") from error
     if isinstance(done, Survey):
@@ -300,9 +309,14 @@ def _check(images: list[Spotted], markers: Sequence[Marker], origin: int | None)
 
 def _adjusted(
     filmed: Sequence[Filmed], times: Sequence[Array], frames: Sequence[Frame],
-    markers: Sequence[Marker], chained: Chained,
+    both: tuple[Sequence[Marker], Sequence[Marker]], chained: Chained,
 ) -> Survey | list[int]:  # fmt: skip
-    """The survey, or the markers that do not fit the others."""
+    """The survey, or the markers that do not fit the others.
+
+    Args:
+        both: the markers with the sizes that they are said to have, and to begin with.
+    """
+    said, markers = both
     posed = [frames[k] for k in chained.frames]
     shown = [sorted(image for frame in posed for camera, image in frame.images if camera == place)
              for place in range(len(filmed))]  # fmt: skip
@@ -314,6 +328,7 @@ def _adjusted(
         seen.append(found.subset(spline.layout.inside(found.times)))
     given = Adjustable(filmed, seen)
     freedom = Freedom(
+        sizes=_ANY_SIZE,
         angular_velocity=ANGULAR_VELOCITY,
         linear_velocity=LINEAR_VELOCITY,
         least_noise=_LEAST_NOISE,
@@ -322,9 +337,18 @@ def _adjusted(
     # Where a chain ends far off, its errors are large and no outliers.
     errors = np.sqrt(given.problem(start, freedom).errors(start))
     fitted = given.fit(start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE)))
-    calmer = acceleration_prior(fitted.state, freedom)
-    if calmer is not None:
-        fitted = given.fit(fitted.state, calmer, fitted.deviation)
+    own_said = [said[m] for m in own]
+    if _wrong_sizes(fitted, own_said):  # or the readout time is wrong
+        asked = given.fit(fitted.state, freedom, fitted.deviation, True)
+        if listed := _wrong_sizes(asked, own_said):
+            raise ValueError(
+                f"{len(listed)} of {len(own)} markers disagree with the others about metres; these "
+                f"sizes would fit: {', '.join(listed)}: measure them, and give --size ID:M for "
+                "those that differ"
+            )
+    freedom = replace(freedom, sizes=0.0)
+    calmer = acceleration_prior(fitted.state, freedom) or freedom
+    fitted = given.fit(_of_size(fitted.state, own_said), calmer, fitted.deviation)
     fitted, doubtful = _right_side_up(given, fitted)
     fitted = _less_noise(given, fitted)
     _check_fit(fitted)
@@ -401,11 +425,61 @@ def _less_noise(given: Adjustable, fitted: Fit) -> Fit:
 
 def _covariance(fitted: Fit, order: list[int]) -> Array:
     """Of the markers (6 m, 6 m) in an order whose first is the origin, number 0."""
-    shared = len(fitted.border_covariance) - BODY * (len(fitted.state.landmarks) // 4 - 1)
-    columns = shared + (BODY * (np.array(order[1:]) - 1)[:, None] + np.arange(BODY)).ravel()
+    columns = _columns(fitted, np.array(order[1:]), BODY).ravel()
     covariance = np.zeros((BODY * len(order),) * 2)
     covariance[BODY:, BODY:] = fitted.border_covariance[np.ix_(columns, columns)]
     return covariance
+
+
+def _columns(fitted: Fit, markers: IntArray, width: int) -> IntArray:
+    """The numbers (m,width) of markers (m,) in the border."""
+    shared = len(fitted.border_covariance) - width * (len(fitted.state.landmarks) // 4 - 1)
+    return np.asarray(shared + width * (markers - 1)[:, None] + np.arange(width), np.int64)
+
+
+def _resized(
+    filmed: Sequence[Filmed], frames: Sequence[Frame], markers: Sequence[Marker]
+) -> Sequence[Marker]:
+    """The markers, with sizes to begin with where those that are said cannot be."""
+    found = growth(filmed, frames, markers)
+    return [
+        replace(marker, corners=math.exp(found[k]) * marker.corners)
+        if abs(found.get(k, 0.0)) > _WRONG_SIZE
+        else marker
+        for k, marker in enumerate(markers)
+    ]
+
+
+def _sizes(state: State) -> Array:
+    """Sides of the markers (m,), m."""
+    corners = state.landmarks.reshape(-1, 4, 3)
+    sides = np.linalg.norm(np.roll(corners, 1, axis=1) - corners, axis=2)
+    return np.asarray(sides.mean(axis=1))
+
+
+def _of_size(state: State, said: Sequence[Marker]) -> State:
+    """With markers as large as they are said to be."""
+    corners = state.landmarks.reshape(-1, 4, 3)
+    middles = corners.mean(axis=1, keepdims=True)
+    share = np.array([one.size for one in said]) / _sizes(state)
+    return state.with_landmarks(
+        (middles + share[:, None, None] * (corners - middles)).reshape(-1, 3)
+    )
+
+
+def _wrong_sizes(fitted: Fit, said: Sequence[Marker]) -> list[str]:
+    """Markers that disagree with most about metres, and the sizes that would fit."""
+    sizes, found = np.array([one.size for one in said]), _sizes(fitted.state)
+    columns = _columns(fitted, np.arange(1, len(said)), SIZED)[:, -1]
+    errors = np.r_[0.0, np.sqrt(np.diag(fitted.border_covariance)[columns])]
+    grown = np.log(found / sizes)
+    known = errors < _WRONG_SIZE / _SIGMAS
+    apart = grown - np.median(grown[known])
+    wrong = known & (np.abs(apart) > np.maximum(_SIZES_DIFFER, _SIGMAS * errors))
+    return [
+        f"{said[k].name} {sizes[k] * np.exp(apart[k]):.4f} m (given {sizes[k]:.4g})"
+        for k in np.flatnonzero(wrong)
+    ]
 
 
 def _fitting(

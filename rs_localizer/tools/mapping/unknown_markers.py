@@ -147,8 +147,7 @@ def chain(
         origin: place of the one whose frame is that of the others; None: the first of the most
             that hang together.
     """
-    mounts = [Transform(m.axes, -m.axes @ m.centre) for m in (one.extrinsics for one in filmed)]
-    views = [_view(filmed, mounts, frame, markers) for frame in frames]
+    mounts, views = _views(filmed, frames, markers)
     seen = sorted({sight.marker for view in views for sight in view.sights})
     between, scores = _between(views, markers)
     parts = _parts(seen, scores)
@@ -157,6 +156,58 @@ def chain(
     placed = _placed(first, own, between, scores)
     own_frames, poses = _frame_poses(views, mounts, placed, markers)
     return Chained(placed, own_frames, poses, [part for part in parts if part is not own])
+
+
+# Of a pair of markers, so many images say how their sizes compare, if what they say agrees.
+_LEAST_SEEN, _AGREE = 6, 0.9
+_SIZE_ROUNDS = 10
+
+
+def growth(
+    filmed: Sequence[Filmed], frames: Sequence[Frame], markers: Sequence[Marker]
+) -> dict[int, float]:
+    """Logarithms of how much larger markers are than they are said to be, beside most others.
+
+    The camera's way about a marker of the wrong size is too long or too short by that: two markers
+    of one image are at the same place beside each other whatever the way, which tells the ratio of
+    both. Least absolute deviations over all pairs.
+    """
+    _, views = _views(filmed, frames, markers)
+    ways: dict[tuple[int, int], list[tuple[Array, Array]]] = {}
+    for view in views:
+        for one, other in combinations(sorted(view.sights, key=lambda of: of.marker), 2):
+            if one.camera != other.camera or one.marker == other.marker:
+                continue
+            first, second = (max(of.poses, key=lambda pose: pose[1])[0] for of in (one, other))
+            turn = first.rotation.T
+            way = turn @ first.translation, turn @ second.translation
+            ways.setdefault((one.marker, other.marker), []).append(way)
+    rows = []
+    for (a, b), every in ways.items():
+        x, y = (np.array(of) - np.mean(of, axis=0) for of in zip(*every, strict=True))
+        lengths = np.linalg.norm(x), np.linalg.norm(y)
+        if len(every) >= _LEAST_SEEN and np.sum(x * y) > _AGREE * lengths[0] * lengths[1]:
+            rows.append((a, b, np.log(lengths[0] / lengths[1])))
+    numbers = sorted({marker for row in rows for marker in row[:2]})
+    if not numbers:
+        return {}
+    design, ratios = np.zeros((len(rows), len(numbers))), np.array([row[2] for row in rows])
+    for k, (a, b, _) in enumerate(rows):
+        design[k, numbers.index(a)], design[k, numbers.index(b)] = -1.0, 1.0
+    found, weights = np.zeros(len(numbers)), np.ones(len(rows))
+    for _ in range(_SIZE_ROUNDS):
+        root = np.sqrt(weights)
+        found = np.linalg.lstsq(design * root[:, None], ratios * root, rcond=None)[0]
+        weights = 1.0 / np.maximum(np.abs(design @ found - ratios), 1e-2)
+    return dict(zip(numbers, (found - np.median(found)).tolist(), strict=True))
+
+
+def _views(
+    filmed: Sequence[Filmed], frames: Sequence[Frame], markers: Sequence[Marker]
+) -> tuple[list[Transform], list[_View]]:
+    """Where the cameras are, camera_from_rig, and what each frame shows."""
+    mounts = [Transform(m.axes, -m.axes @ m.centre) for m in (one.extrinsics for one in filmed)]
+    return mounts, [_view(filmed, mounts, frame, markers) for frame in frames]
 
 
 def _view(
