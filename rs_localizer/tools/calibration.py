@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtrc
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
@@ -34,6 +33,15 @@ from rs_localizer.tools.adjust.variables import (
 )
 from rs_localizer.tools.first_lens import as_fisheye
 from rs_localizer.tools.imu import MountFound, NoMount, gyro_samples, mount_of, with_gyro
+from rs_localizer.tools.readout_belief import (
+    Block,
+    Evidence,
+    Stamps,
+    apart_of,
+    disagreement,
+    discrepancy,
+    examine,
+)
 
 
 def likelihood(camera: Camera, result: Calibration, count: int = 9) -> tuple[Array, Array]:
@@ -68,60 +76,9 @@ def without_readout(camera: Camera, result: Calibration) -> tuple[Residuals, Res
     return before, after
 
 
-# A camera's own clock keeps its stamps within this (s) of even intervals.
-_MOST_JITTER = 5e-4
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Stamps:
-    """Images of a camera that should run evenly."""
-
-    interval: float  # s
-    jitter: float  # s rms, of the stamps about even intervals
-    missing: int  # images
-
-    @property
-    def irregular(self) -> bool:
-        return self.jitter > _MOST_JITTER
-
-
-def examine(times: Array) -> Stamps:
-    """Even intervals nearest to the stamps (f,), s, sorted.
-
-    The number of intervals is counted from stamp to stamp, so that images may be missing.
-    """
-    steps = np.diff(times)
-    interval = float(np.median(steps))
-    for _ in range(3):
-        counts = np.maximum(np.round(steps / interval), 1.0)
-        number = np.concatenate([[0.0], np.cumsum(counts)])
-        rate = np.polyfit(number, times, 1)
-        interval = float(rate[0])
-    even = np.polyval(rate, number)
-    off = times - even
-    jitter = float(np.sqrt(np.mean((off - np.median(off)) ** 2)))
-    return Stamps(interval, jitter, int(number[-1]) + 1 - len(times))
-
-
 # Parts of the recording that are calibrated on their own: three at least, for two that agree may do
 # so by chance, and more of a longer one.
 _BLOCK_SECONDS, _LEAST_BLOCKS, _MOST_BLOCKS = 3.0, 3, 8
-# Blocks that would differ this much by chance once in a hundred recordings disagree.
-_DISAGREEMENT = 0.01
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """A part of the recording on its own."""
-
-    start: float  # s
-    end: float  # s
-    readout_time: float  # s
-    deviation: float  # s
-    camera: Camera  # with the lens of this part
-    landmarks: Array  # (p,3) m, with the shape that this part finds
-    delay: float = math.nan  # s, of the gyroscope where there is one
-    delay_deviation: float = math.nan  # s
 
 
 def blocks_of(
@@ -174,35 +131,6 @@ def cut(state: State, start: float, end: float) -> State | None:
     return replace(state, spline=refined(state.spline, layout.spacing, kept))
 
 
-def disagreement(values: Array, deviations: Array) -> float:
-    """By how much deviations (b,) are too small (Birge's ratio), at least 1."""
-    if len(values) < 2:
-        return 1.0
-    weights = deviations**-2.0
-    total = float(np.sum(weights))
-    mean = np.sum(weights * values) / total
-    squared = float(np.sum(weights * (values - mean) ** 2))
-    freedoms = len(values) - 1
-    if chdtrc(freedoms, squared) > _DISAGREEMENT:
-        return 1.0
-    # What the blocks disagree in is not their noise: none of them is better than the others.
-    scatter = np.std(values, ddof=1) / math.sqrt(len(values))
-    return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))
-
-
-def discrepancy(value: float, values: Array, deviations: Array) -> float:
-    """By how much the whole's value differs from the mean of its parts (b,), beyond its noise.
-
-    Corners that are off in all images of a part alike bend its lens and shape. The shorter it is,
-    the more of the shutter is taken for those: then the whole lies beside all of its parts.
-    """
-    if len(values) == 0:
-        return 0.0
-    weights = deviations**-2.0
-    mean = weights @ values / weights.sum()
-    return math.sqrt(max(float((value - mean) ** 2 - 1.0 / weights.sum()), 0.0))
-
-
 _LEAST_IMAGES = 20
 # Where a plain lens leaves out more than this part of the keypoints, a fisheye is tried, and taken
 # if most of these fit by it: 0.88 of a fisheye's rim (rendered). Of nine real boards before plain
@@ -216,22 +144,9 @@ _MOST_SIGHTS = 40_000
 # quarter of a millimetre of an A4 sheet), beside what bends all of it.
 _MOST_BOARD_POINTS, _LEAST_SIGHTS, _BOARD_SHARE = 400, 30, 1e-3
 _GIVEN_LENS = (0.02, 0.1)  # deviations of a given one, see Freedom.lens_deviations
-# Parts that differ by this share of the value beyond chance, and by more than a value may be off:
-# the camera may turn its picture.
-_STABILISED = 0.1
-_HALVES_SIGMAS = 3.0
 # Images that were not taken at their even stamps may be missing others between them: the mean
 # interval, and with it the readout time, is off by about this part of what they are off.
 _INTERVAL_SHARE = 0.5
-# A readout time is determined to this part of the interval between images, 1.7 ms at 30 Hz: by the
-# estimate itself a slow motion, which makes it too long, would make it better known. Nor do slow
-# cameras have slow sensors.
-_DETERMINED_SHARE, _LONGEST_INTERVAL = 0.05, 1.0 / 30.0
-# So many parts have to determine it by themselves, or the recording has to be so long (s).
-_LEAST_TELLING, _LONG = 3, 9.0
-# A global shutter has 0 within so many deviations, and these within this (s): the fastest rolling
-# shutters take 4 ms.
-_GLOBAL_SIGMAS, _GLOBAL = 3.0, 2e-3
 # Standard deviations of the images' own times, by the interval, to begin with.
 _FIRST_JITTERS = (0.1, 0.3)
 # Less than this does no harm, and may be a motion that the knots do not follow.
@@ -242,76 +157,16 @@ _ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Calibration:
+class Calibration(Evidence):
     """What a recording says of its camera."""
 
-    readout_time: float  # s; negative: against the scan direction that was given
-    deviation: float  # s, with what blocks and halves disagree in, and doubts of the stamps
-    formal_deviation: float  # s, of the noise alone
-    blocks: tuple[Block, ...]
-    halves: tuple[Block, ...]
-    inflation: float  # of the deviation, because the blocks disagree; 1: they do not
-    reversed_cost: float  # by how much the reversed direction costs more, noise variances
-    stamps: Stamps
-    own_stamps: bool  # the images' own, not those of a rate
+    formal_deviation: float  # s, of the noise of the readout time alone
     fit: Fit
     posed: Posed
     images: int  # that show the map
     lens: LensErrors  # standard deviations of the lens that was found
     mount: MountFound | None = None  # of the IMU, where there is one
     no_mount: str = ""  # why there is none
-
-    @property
-    def jitter(self) -> float:
-        """By how much (s rms) images were exposed beside their stamps; 0: they were not."""
-        return self.fit.freedom.stamps
-
-    @property
-    def odds(self) -> float:
-        """Decimal logarithm of the odds for the direction of the sign."""
-        return 0.5 * self.reversed_cost / self.inflation**2 / math.log(10.0)
-
-    @property
-    def limit(self) -> float:
-        """Deviation (s) from which on a readout time is not determined."""
-        return _DETERMINED_SHARE * min(self.stamps.interval, _LONGEST_INTERVAL)
-
-    @property
-    def seconds(self) -> float:
-        """How long the images with a pose last."""
-        return float(np.ptp(self.posed.times))
-
-    @property
-    def telling(self) -> int:
-        """How many blocks determine it by themselves."""
-        return sum(block.deviation < self.limit for block in self.blocks)
-
-    @property
-    def long_enough(self) -> bool:
-        """Whether parts of it can speak against the whole."""
-        return self.telling >= _LEAST_TELLING or self.seconds >= _LONG
-
-    @property
-    def determined(self) -> bool:
-        """Whether the motion determines the readout time."""
-        return self.deviation < self.limit and self.long_enough
-
-    @property
-    def near_zero(self) -> bool:
-        """Whether 0 lies within the error."""
-        return abs(self.readout_time) < _GLOBAL_SIGMAS * self.deviation
-
-    @property
-    def global_shutter(self) -> bool:
-        """Whether nothing else than a global shutter is left."""
-        sure = _GLOBAL_SIGMAS * self.deviation < _GLOBAL and self.inflation == 1.0
-        return self.determined and self.near_zero and sure and self.own_stamps
-
-    @property
-    def too_fast(self) -> bool:
-        """Whether it is a readout that no sensor has, by stamps that a file was given."""
-        slowest = abs(self.readout_time) + _GLOBAL_SIGMAS * self.deviation
-        return not (self.near_zero or self.own_stamps) and slowest < _GLOBAL
 
     @property
     def held(self) -> int:
@@ -332,29 +187,6 @@ class Calibration:
             turn = Rotation.align_vectors(one, other)[0]
             apart = float(np.mean(np.sum((one - turn.apply(other)) ** 2, axis=1)))
         return math.sqrt(3.0 * self.inflation**2 * float(np.mean(variances)) + 0.25 * apart)
-
-    @property
-    def scatter(self) -> float:
-        """Standard deviation of the blocks' values, s."""
-        values = [block.readout_time for block in self.blocks]
-        return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
-
-    @property
-    def stabilised(self) -> bool:
-        """Whether the parts disagree as those of a camera that turns its picture do."""
-        least = max(_STABILISED * abs(self.readout_time), self.limit)
-        apart, noise = _apart(self.halves)
-        by_halves = apart > max(_HALVES_SIGMAS * noise, 2.0 * least)
-        return bool((self.inflation > 1.0 and self.scatter > least) or by_halves)
-
-
-def _apart(halves: tuple[Block, ...]) -> tuple[float, float]:
-    """By how much the readout times of two halves differ, and the deviation of that (s)."""
-    if len(halves) < 2:
-        return 0.0, math.inf
-    one, other = halves
-    noise = math.hypot(one.deviation, other.deviation)
-    return abs(one.readout_time - other.readout_time), noise
 
 
 def calibrate(
@@ -552,13 +384,15 @@ def _judged(
         deviation=math.hypot(
             formal * inflation,
             _interval_deviation(fitted, stamps),
-            0.5 * _apart(halves)[0],
+            0.5 * apart_of(halves)[0],
             discrepancy(fitted.state.readout_time, values, inflation * deviations),
         ),
         formal_deviation=formal,
         blocks=blocks,
         halves=halves,
         own_stamps=True,
+        jitter=fitted.freedom.stamps,
+        seconds=float(np.ptp(posed.times)),
         lens=lens,
         inflation=inflation,
         reversed_cost=opposite - fitted.cost,

@@ -29,8 +29,9 @@ from rs_localizer.tools.adjust.problem import Problem, View
 from rs_localizer.tools.adjust.spline import Spline, refined
 from rs_localizer.tools.adjust.system import Undetermined
 from rs_localizer.tools.adjust.variables import EXTRINSICS, Extrinsics, Freedom, Mounting, State
-from rs_localizer.tools.calibration import Calibration, cut, disagreement, discrepancy
+from rs_localizer.tools.calibration import Calibration, cut
 from rs_localizer.tools.imu import middle_row
+from rs_localizer.tools.readout_belief import disagreement, discrepancy
 
 # Turn rates are compared at this interval (s), over at least this time and this part of the shorter
 # recording; so many of the offsets at which they agree best are tried.

@@ -10,11 +10,8 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.tools.calibration import Calibration
 
-# Of the images' own times (s rms): beyond the first they are worth a word, beyond the second the
-# stamps are none that a camera gave.
-_WORTH_A_WORD, _MOST_JITTER = 5e-4, 1e-3
-# Readouts cannot take longer than this part of the interval between images.
-_LONGEST = 1.05
+# Beyond this (s rms) the images' own times are worth a word.
+_WORTH_A_WORD = 5e-4
 # A ninth of the image is not covered where no keypoint lies in more than this part of its cells,
 # of which there are so many along each side.
 _EMPTY, _CELLS = 0.5, 3
@@ -53,49 +50,7 @@ def lens_refusal(result: Calibration) -> str:
 
 def refusal(result: Calibration) -> str:
     """One line with the figure when lens or readout time is not determined; or ''."""
-    value = f"{1e3 * sense(result) * result.readout_time:.1f} +- {1e3 * result.deviation:.1f} ms"
-    if text := lens_refusal(result):
-        return text
-    if result.stabilised:
-        return (
-            f"not observable: {value}; parts of the recording disagree ({_parts(result)} ms): is "
-            "image stabilisation on, or was the video processed?"
-        )
-    if result.jitter > _MOST_JITTER:
-        return (
-            f"not observable: {value}; images were exposed {1e3 * result.jitter:.1f} ms rms beside "
-            "their stamps: record with the camera's own time stamps, without losing images or "
-            "encoding the video anew"
-        )
-    if abs(result.readout_time) > _LONGEST * result.stamps.interval:
-        return (
-            f"not observable: {value} is longer than the interval between images, "
-            f"{1e3 * result.stamps.interval:.1f} ms: are the stamps, or the frame rate, right?"
-        )
-    if not result.long_enough:
-        return (
-            f"not observable: {value}; {result.telling} of {len(result.blocks)} parts of the "
-            f"{result.seconds:.1f} s determine it on their own, three have to, or 9 s: move the "
-            "camera faster and for longer"
-        )
-    if not result.determined:
-        return (
-            f"not observable: {value}, known to less than {1e3 * result.limit:.1f} ms it would be; "
-            "move the camera faster, turn it to and fro about all axes, and for longer"
-        )
-    if result.too_fast:
-        return (
-            f"not observable: {value}; no rolling shutter is that fast: was the video stabilised "
-            "or processed?"
-        )
-    if result.near_zero and not result.global_shutter:
-        reason = (
-            "three deviations are more than 2 ms" if result.inflation == 1.0 and result.own_stamps
-            else "its parts differ" if result.own_stamps
-            else "the stamps are those of a constant rate, as of a video that was processed"
-        )  # fmt: skip
-        return f"not observable: {value}; that is no proof of a global shutter: {reason}"
-    return ""
+    return lens_refusal(result) or result.disbelief(sense(result))
 
 
 def shape_is_free(result: Calibration) -> bool:
@@ -136,7 +91,8 @@ def remarks(result: Calibration) -> list[str]:
         said.append(f"{result.stamps.missing} images are missing between the others")
     if result.inflation > 1.0:
         said.append(
-            f"parts of the recording differ ({_parts(result)} ms) by more than their noise: the "
+            f"parts of the recording differ ({result.parts(sense(result))} ms) by more than their "
+            "noise: the "
             f"deviation is {result.inflation:.1f} times that of the noise alone"
         )
     if result.held:
@@ -167,7 +123,3 @@ def uncovered(result: Calibration) -> list[str]:
         if share > _EMPTY
     ]
     return [f"{empty.mean():.0%}", *names] if names else []
-
-
-def _parts(result: Calibration) -> str:
-    return ", ".join(f"{1e3 * sense(result) * one.readout_time:.2f}" for one in result.blocks)

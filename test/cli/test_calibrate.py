@@ -22,7 +22,7 @@ from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.calibration import read_calibration
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import load_params_file
-from rs_localizer.tools.evaluation import calibration_plots
+from rs_localizer.tools import calibration_plots
 
 MOVING = "--trajectory tum_vi_room5 --duration 3 --points 60 --noise 0.5 --readout-time 0.02"
 

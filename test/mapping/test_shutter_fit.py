@@ -11,7 +11,8 @@ from scenes import READOUT, camera, walk
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.tools.mapping.observations import MapFreedom
 from rs_localizer.tools.mapping.refine import RefinedMap, refine
-from rs_localizer.tools.mapping.shutter_fit import ShutterFit, fit_shutter, likely_axes
+from rs_localizer.tools.mapping.shutter_fit import fit_shutter, likely_axes
+from rs_localizer.tools.readout_belief import ShutterFit
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
 # The wrong axis first.

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.camera import Camera
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import Observed
-from rs_localizer.tools.calibration import Calibration, calibrate, discrepancy, examine
+from rs_localizer.tools.calibration import Calibration, calibrate
 from rs_localizer.tools.first_lens import first_lens
+from rs_localizer.tools.readout_belief import discrepancy, examine
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 
@@ -146,8 +147,7 @@ def test_what_nothing_can_contradict_or_no_camera_has_is_refused(board):
     fit = found.fit
     off = replace(fit.camera, K=fit.camera.K + np.outer([1.0, 0.0, 0.0], [0.0, 0.0, 5e3]))
     assert "outside the image" in verdict.refusal(replace(found, fit=replace(fit, camera=off)))
-    moved = replace(fit, freedom=replace(fit.freedom, stamps=1.1e-3))
-    assert "beside their stamps" in verdict.refusal(replace(found, fit=moved))
+    assert "beside their stamps" in verdict.refusal(replace(found, jitter=1.1e-3))
     # No rolling shutter takes a millisecond; a camera that stamps its images is to be believed.
     fast = replace(found, readout_time=1e-3, deviation=1e-4)
     assert verdict.refusal(fast) == ""

@@ -12,7 +12,7 @@ from rs_localizer.cli import WORKING
 from rs_localizer.cli.options import option
 
 if WORKING:
-    from rs_localizer.tools.mapping.observations import ReadoutCheck
+    from rs_localizer.tools.readout_belief import ReadoutCheck
 
 print_step = partial(print, "adjusted:", flush=True)
 """What an adjustment calls after each of its steps."""

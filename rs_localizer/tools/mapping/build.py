@@ -38,14 +38,12 @@ from rs_localizer.tools.mapping.colmap import Effort, Stage, Structure, build_st
 from rs_localizer.tools.mapping.gauge import Similarity, laid_on_held, scaled
 from rs_localizer.tools.mapping.observations import (
     MapObservations,
-    ReadoutCheck,
     Start,
     most_observed,
 )
 from rs_localizer.tools.mapping.refine import DRIFT, RefinedMap, refine
 from rs_localizer.tools.mapping.shutter_fit import (
     LEAST_FIT,
-    ShutterFit,
     colmap_freedom,
     fit_shutter,
     likely_axes,
@@ -53,6 +51,7 @@ from rs_localizer.tools.mapping.shutter_fit import (
 from rs_localizer.tools.mapping.track_on_map import Tracked, track_on_map
 from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, moves, triangulate
 from rs_localizer.tools.mapping.views import View, blurred
+from rs_localizer.tools.readout_belief import ReadoutCheck, ShutterFit
 
 # Settings of the localizer are in metres: so far (m) is the median landmark taken to be from where
 # it is seen, until it is known how far it is.

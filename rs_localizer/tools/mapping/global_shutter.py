@@ -30,12 +30,12 @@ from rs_localizer.tools.mapping.observations import (
 )
 from rs_localizer.tools.mapping.refine import RefinedMap, refine
 from rs_localizer.tools.mapping.shutter_fit import (
-    ShutterFit,
     colmap_freedom,
     fit_shutter,
     likely_axes,
 )
 from rs_localizer.tools.mapping.triangulation import triangulate
+from rs_localizer.tools.readout_belief import ShutterFit
 
 Pose = tuple[Array, Array]
 """Rotation (3,3) map_from_camera and position (3,) of the camera."""

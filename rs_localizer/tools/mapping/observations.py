@@ -20,6 +20,7 @@ from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.maps.landmarks import Map, make_map
 from rs_localizer.tools.adjust.observe import Observed, localize_each
 from rs_localizer.tools.adjust.variables import Extrinsics, Mounting
+from rs_localizer.tools.readout_belief import ReadoutCheck
 
 # A part of the map hangs together with another by at least so many landmarks.
 _LEAST_IMAGES, _LEAST_SHARED = 3, 3
@@ -49,34 +50,6 @@ class RigCamera:
     def delay(self) -> float:
         """Seconds from a stamp to the middle row's exposure."""
         return self.stamp_offset - self.camera.readout_time * self.camera.first_row_time
-
-
-# So far from what was given is another time: in its own deviations, and s.
-_CHECK_DEVIATIONS, _CHECK_LEAST = 6.0, 0.001
-
-
-@dataclass(frozen=True, slots=True)
-class ReadoutCheck:
-    """The readout time that keypoints show: a wrong one bends a map that still fits them."""
-
-    given: float  # s
-    estimated: float  # s; negative: against the scan direction
-    deviation: float  # s
-
-    @property
-    def differs(self) -> bool:
-        """Whether noise does not explain the difference."""
-        apart = abs(self.estimated - self.given)
-        return apart > max(_CHECK_DEVIATIONS * self.deviation, _CHECK_LEAST)
-
-    @property
-    def message(self) -> str:
-        """What to say of it."""
-        reverse = " in the reverse direction" if self.estimated < 0.0 else ""
-        return (
-            f"estimated readout time is {1e3 * abs(self.estimated):.1f} ms{reverse}, but "
-            f"{1e3 * self.given:.1f} ms was given; a wrong value distorts the map"
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

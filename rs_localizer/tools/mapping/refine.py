@@ -39,13 +39,13 @@ from rs_localizer.tools.mapping.observations import (
     Adjusted,
     MapFreedom,
     MapObservations,
-    ReadoutCheck,
     RigCamera,
     Start,
     check,
     frame_numbers,
     shared_landmarks,
 )
+from rs_localizer.tools.readout_belief import ReadoutCheck
 
 # Beyond so many unknowns of the motion its matrix takes more than 2 GB.
 _MOST_UNKNOWNS = 15000

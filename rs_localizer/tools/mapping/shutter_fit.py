@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,47 +17,10 @@ from rs_localizer.tools.adjust.problem import LIMIT, noise_of
 from rs_localizer.tools.mapping.initial_trajectory import usual_accelerations
 from rs_localizer.tools.mapping.observations import MapFreedom, MapObservations, Start
 from rs_localizer.tools.mapping.refine import RefinedMap, refine
+from rs_localizer.tools.readout_belief import CHANCE, ShutterFit
 
-# A readout time is believed beyond so many deviations: two axes with two directions each are tried,
-# four chances together one in 8,000, and deviations, which few seconds tell, may be too small by a
-# third.
-_SIGNIFICANT = 4.0
-# And where the images' gains are so by chance less often than this: a wrong model that absorbs
-# something else helps some images and harms others.
-_CHANCE = 0.01
 LEAST_FIT = 0.8
 """Share of the keypoints that fit a good map: nine in ten do."""
-
-
-@dataclass(frozen=True, slots=True)
-class ShutterFit:
-    """What an unknown shutter was found to be."""
-
-    readout_time: float  # s, of the rolling shutter that fits best
-    deviation: float  # s
-    direction: ScanDirection
-    noise: float  # px, that it leaves
-    global_noise: float  # px, that the global shutter leaves which fits best
-    better_images: float  # share of the images that fit it better than a global shutter
-    chance: float  # that the images' gains over a global shutter are so by chance
-    axis_chance: float  # likewise, over a shutter along the other axis; 0: not tried
-    interval: float  # s, between the images
-
-    @property
-    def possible(self) -> bool:
-        """Whether a camera can read an image out so slowly."""
-        return self.readout_time < self.interval
-
-    @property
-    def visible(self) -> bool:
-        """Whether the images show a rolling shutter."""
-        significant = self.readout_time > _SIGNIFICANT * self.deviation
-        return significant and self.chance < _CHANCE and self.possible
-
-    @property
-    def axis_known(self) -> bool:
-        """Whether they show along which axis it goes."""
-        return self.axis_chance < _CHANCE
 
 
 def likely_axes(size: tuple[int, int], given: str | None) -> list[ScanDirection]:
@@ -166,7 +129,7 @@ def _of_one_motion(
     best, axis_chance = 0, 0.0
     if len(fits) > 1:
         first, second = (_chance(costs[3 - k] - costs[k]) for k in (1, 2))
-        best, axis_chance = int(second < _CHANCE), min(first, second)
+        best, axis_chance = int(second < CHANCE), min(first, second)
     gains, chosen = costs[0] - costs[1 + best], fits[best]
     shutter = ShutterFit(
         readout_time=chosen.camera_as_found.readout_time,

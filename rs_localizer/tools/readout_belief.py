@@ -1,0 +1,327 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""When a readout time is believed: deviations, parts, direction and stamps, in one place.
+
+By :class:`Evidence` of a calibration, by :class:`ShutterFit` of a map whose shutter nobody knows,
+and by :class:`ReadoutCheck` where one was given.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtrc
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
+
+# A camera's own clock keeps its stamps within this (s) of even intervals.
+_MOST_JITTER = 5e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stamps:
+    """Images of a camera that should run evenly."""
+
+    interval: float  # s
+    jitter: float  # s rms, of the stamps about even intervals
+    missing: int  # images
+
+    @property
+    def irregular(self) -> bool:
+        return self.jitter > _MOST_JITTER
+
+
+def examine(times: Array) -> Stamps:
+    """Even intervals nearest to the stamps (f,), s, sorted.
+
+    The number of intervals is counted from stamp to stamp, so that images may be missing.
+    """
+    steps = np.diff(times)
+    interval = float(np.median(steps))
+    for _ in range(3):
+        counts = np.maximum(np.round(steps / interval), 1.0)
+        number = np.concatenate([[0.0], np.cumsum(counts)])
+        rate = np.polyfit(number, times, 1)
+        interval = float(rate[0])
+    even = np.polyval(rate, number)
+    off = times - even
+    jitter = float(np.sqrt(np.mean((off - np.median(off)) ** 2)))
+    return Stamps(interval, jitter, int(number[-1]) + 1 - len(times))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """A part of the recording on its own."""
+
+    start: float  # s
+    end: float  # s
+    readout_time: float  # s
+    deviation: float  # s
+    camera: Camera  # with the lens of this part
+    landmarks: Array  # (p,3) m, with the shape that this part finds
+    delay: float = math.nan  # s, of the gyroscope where there is one
+    delay_deviation: float = math.nan  # s
+
+
+# Blocks that would differ this much by chance once in a hundred recordings disagree.
+_DISAGREEMENT = 0.01
+
+
+def disagreement(values: Array, deviations: Array) -> float:
+    """By how much deviations (b,) are too small (Birge's ratio), at least 1."""
+    if len(values) < 2:
+        return 1.0
+    weights = deviations**-2.0
+    total = float(np.sum(weights))
+    mean = np.sum(weights * values) / total
+    squared = float(np.sum(weights * (values - mean) ** 2))
+    freedoms = len(values) - 1
+    if chdtrc(freedoms, squared) > _DISAGREEMENT:
+        return 1.0
+    # What the blocks disagree in is not their noise: none of them is better than the others.
+    scatter = np.std(values, ddof=1) / math.sqrt(len(values))
+    return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))
+
+
+def discrepancy(value: float, values: Array, deviations: Array) -> float:
+    """By how much the whole's value differs from the mean of its parts (b,), beyond its noise.
+
+    Corners that are off in all images of a part alike bend its lens and shape. The shorter it is,
+    the more of the shutter is taken for those: then the whole lies beside all of its parts.
+    """
+    if len(values) == 0:
+        return 0.0
+    weights = deviations**-2.0
+    mean = weights @ values / weights.sum()
+    return math.sqrt(max(float((value - mean) ** 2 - 1.0 / weights.sum()), 0.0))
+
+
+# Parts that differ by this share of the value beyond chance, and by more than a value may be off:
+# the camera may turn its picture.
+_STABILISED = 0.1
+_HALVES_SIGMAS = 3.0
+# A readout time is determined to this part of the interval between images, 1.7 ms at 30 Hz: by the
+# estimate itself a slow motion, which makes it too long, would make it better known. Nor do slow
+# cameras have slow sensors.
+_DETERMINED_SHARE, _LONGEST_INTERVAL = 0.05, 1.0 / 30.0
+# So many parts have to determine it by themselves, or the recording has to be so long (s).
+_LEAST_TELLING, _LONG = 3, 9.0
+# A global shutter has 0 within so many deviations, and these within this (s): the fastest rolling
+# shutters take 4 ms.
+_GLOBAL_SIGMAS, _GLOBAL = 3.0, 2e-3
+# Images that were exposed so far (s rms) beside their stamps have stamps that no camera gave.
+_MOST_JITTER = 1e-3
+# Readouts cannot take longer than this part of the interval between images.
+_LONGEST = 1.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What a recording says of a readout time."""
+
+    readout_time: float  # s; negative: against the scan direction that was given
+    deviation: float  # s, with what blocks and halves disagree in, and doubts of the stamps
+    blocks: tuple[Block, ...]
+    halves: tuple[Block, ...]
+    inflation: float  # of the deviation, because the blocks disagree; 1: they do not
+    reversed_cost: float  # by how much the reversed direction costs more, noise variances
+    stamps: Stamps
+    own_stamps: bool  # the images' own, not those of a rate
+    jitter: float  # s rms, by how much images were exposed beside their stamps; 0: they were not
+    seconds: float  # how long the images with a pose last
+
+    @property
+    def odds(self) -> float:
+        """Decimal logarithm of the odds for the direction of the sign."""
+        return 0.5 * self.reversed_cost / self.inflation**2 / math.log(10.0)
+
+    @property
+    def limit(self) -> float:
+        """Deviation (s) from which on a readout time is not determined."""
+        return _DETERMINED_SHARE * min(self.stamps.interval, _LONGEST_INTERVAL)
+
+    @property
+    def telling(self) -> int:
+        """How many blocks determine it by themselves."""
+        return sum(block.deviation < self.limit for block in self.blocks)
+
+    @property
+    def long_enough(self) -> bool:
+        """Whether parts of it can speak against the whole."""
+        return self.telling >= _LEAST_TELLING or self.seconds >= _LONG
+
+    @property
+    def determined(self) -> bool:
+        """Whether the motion determines the readout time."""
+        return self.deviation < self.limit and self.long_enough
+
+    @property
+    def near_zero(self) -> bool:
+        """Whether 0 lies within the error."""
+        return abs(self.readout_time) < _GLOBAL_SIGMAS * self.deviation
+
+    @property
+    def global_shutter(self) -> bool:
+        """Whether nothing else than a global shutter is left."""
+        sure = _GLOBAL_SIGMAS * self.deviation < _GLOBAL and self.inflation == 1.0
+        return self.determined and self.near_zero and sure and self.own_stamps
+
+    @property
+    def too_fast(self) -> bool:
+        """Whether it is a readout that no sensor has, by stamps that a file was given."""
+        slowest = abs(self.readout_time) + _GLOBAL_SIGMAS * self.deviation
+        return not (self.near_zero or self.own_stamps) and slowest < _GLOBAL
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation of the blocks' values, s."""
+        values = [block.readout_time for block in self.blocks]
+        return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+    @property
+    def stabilised(self) -> bool:
+        """Whether the parts disagree as those of a camera that turns its picture do."""
+        least = max(_STABILISED * abs(self.readout_time), self.limit)
+        apart, noise = apart_of(self.halves)
+        by_halves = apart > max(_HALVES_SIGMAS * noise, 2.0 * least)
+        return bool((self.inflation > 1.0 and self.scatter > least) or by_halves)
+
+    @property
+    def apart(self) -> float:
+        """By how much (s) the two halves differ."""
+        return apart_of(self.halves)[0]
+
+    def parts(self, sign: float) -> str:
+        """The values of the blocks, ms, along a direction."""
+        return ", ".join(f"{1e3 * sign * one.readout_time:.2f}" for one in self.blocks)
+
+    def disbelief(self, sign: float) -> str:
+        """One line with the figure when the readout time is not determined; or ''.
+
+        Args:
+            sign: of the value along the direction that was found.
+        """
+        value = f"{1e3 * sign * self.readout_time:.1f} +- {1e3 * self.deviation:.1f} ms"
+        why = self._why_not(sign)
+        return f"not observable: {value}{why}" if why else ""
+
+    def _why_not(self, sign: float) -> str:
+        """What speaks against it, beginning with how that goes on from the value."""
+        if self.stabilised:
+            return (
+                f"; parts of the recording disagree ({self.parts(sign)} ms): is "
+                "image stabilisation on, or was the video processed?"
+            )
+        if self.jitter > _MOST_JITTER:
+            return (
+                f"; images were exposed {1e3 * self.jitter:.1f} ms rms beside "
+                "their stamps: record with the camera's own time stamps, without losing images or "
+                "encoding the video anew"
+            )
+        if abs(self.readout_time) > _LONGEST * self.stamps.interval:
+            return (
+                f" is longer than the interval between images, "
+                f"{1e3 * self.stamps.interval:.1f} ms: are the stamps, or the frame rate, right?"
+            )
+        if not self.long_enough:
+            return (
+                f"; {self.telling} of {len(self.blocks)} parts of the "
+                f"{self.seconds:.1f} s determine it on their own, three have to, or 9 s: move the "
+                "camera faster and for longer"
+            )
+        if not self.determined:
+            return (
+                f", known to less than {1e3 * self.limit:.1f} ms it would be; "
+                "move the camera faster, turn it to and fro about all axes, and for longer"
+            )
+        if self.too_fast:
+            return "; no rolling shutter is that fast: was the video stabilised or processed?"
+        if self.near_zero and not self.global_shutter:
+            reason = (
+                "three deviations are more than 2 ms" if self.inflation == 1.0 and self.own_stamps
+                else "its parts differ" if self.own_stamps
+                else "the stamps are those of a constant rate, as of a video that was processed"
+            )  # fmt: skip
+            return f"; that is no proof of a global shutter: {reason}"
+        return ""
+
+
+def apart_of(halves: tuple[Block, ...]) -> tuple[float, float]:
+    """By how much the readout times of two halves differ, and the deviation of that (s)."""
+    if len(halves) < 2:
+        return 0.0, math.inf
+    one, other = halves
+    noise = math.hypot(one.deviation, other.deviation)
+    return abs(one.readout_time - other.readout_time), noise
+
+
+# A readout time is believed beyond so many deviations: two axes with two directions each are tried,
+# four chances together one in 8,000, and deviations, which few seconds tell, may be too small by a
+# third.
+_SIGNIFICANT = 4.0
+# And where the images' gains are so by chance less often than this: a wrong model that absorbs
+# something else helps some images and harms others.
+CHANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class ShutterFit:
+    """What an unknown shutter was found to be."""
+
+    readout_time: float  # s, of the rolling shutter that fits best
+    deviation: float  # s
+    direction: ScanDirection
+    noise: float  # px, that it leaves
+    global_noise: float  # px, that the global shutter leaves which fits best
+    better_images: float  # share of the images that fit it better than a global shutter
+    chance: float  # that the images' gains over a global shutter are so by chance
+    axis_chance: float  # likewise, over a shutter along the other axis; 0: not tried
+    interval: float  # s, between the images
+
+    @property
+    def possible(self) -> bool:
+        """Whether a camera can read an image out so slowly."""
+        return self.readout_time < self.interval
+
+    @property
+    def visible(self) -> bool:
+        """Whether the images show a rolling shutter."""
+        significant = self.readout_time > _SIGNIFICANT * self.deviation
+        return significant and self.chance < CHANCE and self.possible
+
+    @property
+    def axis_known(self) -> bool:
+        """Whether they show along which axis it goes."""
+        return self.axis_chance < CHANCE
+
+
+# So far from what was given is another time: in its own deviations, and s.
+_CHECK_DEVIATIONS, _CHECK_LEAST = 6.0, 0.001
+
+
+@dataclass(frozen=True, slots=True)
+class ReadoutCheck:
+    """The readout time that keypoints show: a wrong one bends a map that still fits them."""
+
+    given: float  # s
+    estimated: float  # s; negative: against the scan direction
+    deviation: float  # s
+
+    @property
+    def differs(self) -> bool:
+        """Whether noise does not explain the difference."""
+        apart = abs(self.estimated - self.given)
+        return apart > max(_CHECK_DEVIATIONS * self.deviation, _CHECK_LEAST)
+
+    @property
+    def message(self) -> str:
+        """What to say of it."""
+        reverse = " in the reverse direction" if self.estimated < 0.0 else ""
+        return (
+            f"estimated readout time is {1e3 * abs(self.estimated):.1f} ms{reverse}, but "
+            f"{1e3 * self.given:.1f} ms was given; a wrong value distorts the map"
+        )
