@@ -214,12 +214,12 @@ class Problem:
             terms.append(mount_term(own.extrinsics, freedom.mounting, at["mount"]))
         if "points" in at and self.deviations is None and not (k and self._one_map):
             if pieces.rigid:  # a body none of whose landmarks fits stays where it is
-                information = np.full((pieces.count, pieces.width), _LOOSE_BODY**-2)
-                offset = np.zeros((pieces.count, pieces.width))
+                information = np.full(pieces.columns, _LOOSE_BODY**-2)
+                offset = np.zeros(pieces.columns)
                 if pieces.sized:
-                    information[:, BODY] = freedom.sizes**-2
-                    offset[:, BODY] = pieces.growth(own.landmarks, view.observations.landmarks)
-                information, offset = information.ravel(), offset.ravel()
+                    information[BODY :: pieces.width] = freedom.sizes**-2
+                    grown = pieces.growth(own.landmarks, view.observations.landmarks)
+                    offset[BODY :: pieces.width] = grown
             else:
                 free = pieces.slots >= 0
                 offset = (own.landmarks - view.observations.landmarks)[free].ravel()

@@ -39,7 +39,7 @@ from rs_localizer.tools.mapping.initial_trajectory import (
     acceleration_prior,
     initial_trajectory,
 )
-from rs_localizer.tools.mapping.observations import Adjusted, Frame, ReadoutCheck, frames_of
+from rs_localizer.tools.mapping.observations import Adjusted, Frame, frames_of
 from rs_localizer.tools.mapping.unknown_markers import (
     Chained,
     Filmed,
@@ -47,6 +47,7 @@ from rs_localizer.tools.mapping.unknown_markers import (
     chain,
     growth,
 )
+from rs_localizer.tools.readout_belief import ReadoutCheck
 
 # Steps of Gauss and Newton, and the noise of each by what it is.
 _NOISES = (10.0,) * 6 + (1.0,) * 4
@@ -104,6 +105,11 @@ class Adjustable:
             seen = seen if bodies is None else replace(seen, bodies=bodies)
             views.append(View(one.camera, seen, own))
         return Problem(views, start, one_map=True)
+
+    def fit_roughly(self, start: State, freedom: Freedom, *free: bool) -> Fit:
+        """The same from far off, as at the end of a chain, where large errors are no outliers."""
+        errors = np.sqrt(self.problem(start, freedom, *free).errors(start))
+        return self.fit(start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE)), *free)
 
     def fit(self, start: State, freedom: Freedom, deviation: float, *free: bool) -> Fit:
         """The minimum of a problem."""
@@ -333,13 +339,13 @@ def _adjusted(
         linear_velocity=LINEAR_VELOCITY,
         least_noise=_LEAST_NOISE,
     )
-    start = given.start(spline)
-    # Where a chain ends far off, its errors are large and no outliers.
-    errors = np.sqrt(given.problem(start, freedom).errors(start))
-    fitted = given.fit(start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE)))
+    fitted = given.fit_roughly(given.start(spline), freedom)
     own_said = [said[m] for m in own]
-    if _wrong_sizes(fitted, own_said):  # or the readout time is wrong
-        asked = given.fit(fitted.state, freedom, fitted.deviation, True)
+    if _wrong_sizes(fitted, own_said):  # or the readout time is wrong, or a marker turned over
+        start = _of_size(fitted.state, [markers[m] for m in own])
+        asked = given.fit_roughly(start, replace(freedom, sizes=0.0), True)
+        asked = _right_side_up(given, asked)[0]
+        asked = given.fit_roughly(asked.state, freedom, True)
         if listed := _wrong_sizes(asked, own_said):
             raise ValueError(
                 f"{len(listed)} of {len(own)} markers disagree with the others about metres; these "
@@ -347,8 +353,10 @@ def _adjusted(
                 "those that differ"
             )
     freedom = replace(freedom, sizes=0.0)
-    calmer = acceleration_prior(fitted.state, freedom) or freedom
-    fitted = given.fit(_of_size(fitted.state, own_said), calmer, fitted.deviation)
+    fitted = given.fit_roughly(_of_size(given.start(spline), own_said), freedom)
+    calmer = acceleration_prior(fitted.state, freedom)
+    if calmer is not None:
+        fitted = given.fit(fitted.state, calmer, fitted.deviation)
     fitted, doubtful = _right_side_up(given, fitted)
     fitted = _less_noise(given, fitted)
     _check_fit(fitted)
@@ -478,7 +486,7 @@ def _wrong_sizes(fitted: Fit, said: Sequence[Marker]) -> list[str]:
     wrong = known & (np.abs(apart) > np.maximum(_SIZES_DIFFER, _SIGMAS * errors))
     return [
         f"{said[k].name} {sizes[k] * np.exp(apart[k]):.4f} m (given {sizes[k]:.4g})"
-        for k in np.flatnonzero(wrong)
+        for k in np.flatnonzero(wrong).tolist()
     ]
 
 
