@@ -8,6 +8,8 @@
 #                without what runs in processes of its own (nodes, some commands); COVERAGE is
 #                what pytest is told instead, as by .ci/run
 # make docs   the pages as a site, in out/docs; a link that leads nowhere is an error
+# make ros    the package as a workspace of an installed ROS 2 has it: launch files, tf2, life cycle,
+#             bags; fetches nothing, and says so where there is no ROS
 # make clean  removes everything that make has made
 #
 # Both prepare a virtual environment first (once). PYTHON chooses the interpreter, VENV the place.
@@ -37,7 +39,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ready := $(VENV)/.ready-$(subst /,_,$(PYTHON))
 python := $(VENV)/bin/python
 
-.PHONY: demo test bench coverage docs collect warm lint clean
+.PHONY: demo test bench ros coverage docs collect warm lint clean
 .DELETE_ON_ERROR:
 
 demo: $(ready)
@@ -57,6 +59,13 @@ coverage: $(ready) warm
 	@$(python) -m pip install -qq --disable-pip-version-check --no-input --upgrade --no-deps --target $(VENV)/coverage coverage pytest-cov
 	@PYTHONPATH="$$(cd $(VENV) && pwd)/coverage" OPENBLAS_NUM_THREADS=1 \
 	    $(python) -m pytest -q -n 2 --dist loadfile --timeout 900 --cov-report term:skip-covered $(COVERAGE)
+
+# In the environment of ROS, which the line above has taken away.
+ros:
+	@[ -n "$$ROS_DISTRO" ] || { echo "make ros: skipped, ROS 2 is not installed here (source its setup.sh)"; exit 0; }; \
+	. "/opt/ros/$$ROS_DISTRO/setup.sh" && colcon --log-base $(OUT)/ros/log build \
+	    --packages-select rs_localizer --build-base $(OUT)/ros/build --install-base $(OUT)/ros/install && \
+	. $(OUT)/ros/install/setup.sh && ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST python3 -m pytest -q -rs test/real_ros
 
 docs: $(ready)
 	@$(python) -m pip install -qq --disable-pip-version-check --no-input --editable '.[docs]'

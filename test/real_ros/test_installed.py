@@ -1,0 +1,132 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The package as it is installed in a workspace of ROS 2: `make ros`, every night in containers.
+
+Everything here needs the tools of a ROS machine, and says so where there is none.
+"""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+if shutil.which("ros2") is None or "ROS_DISTRO" not in os.environ:
+    pytest.skip("ROS 2 is not installed here: source its setup.sh", allow_module_level=True)
+
+TIMEOUT = 240.0  # s; the first start compiles kernels
+LAUNCHES = sorted(path.name for path in (Path(__file__).parents[2] / "launch").glob("*.launch.py"))
+
+
+def ros2(*words: str, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["ros2", *words], capture_output=True, text=True, timeout=timeout, check=False
+    )
+
+
+def until(text: str, *words: str) -> str:
+    """What a command says, once it has said this."""
+    deadline = time.monotonic() + TIMEOUT
+    while text not in (said := ros2(*words).stdout):
+        assert time.monotonic() < deadline, f"ros2 {' '.join(words)} never said {text!r}: {said}"
+        time.sleep(1.0)
+    return said
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: Any) -> Path:
+    """A simulated recording, as the installed command writes it."""
+    folder: Path = tmp_path_factory.mktemp("flight")
+    run = ["run", "rs_localizer", "rs_localizer", "simulate", str(folder / "flight")]
+    done = ros2(*run, timeout=TIMEOUT)
+    assert done.returncode == 0, done.stderr
+    return folder / "flight"
+
+
+@pytest.fixture
+def launched(flight: Path) -> Iterator[subprocess.Popen[str]]:
+    """localizer.launch.py with the recording's parameters, in a process group of its own."""
+    command = ["ros2", "launch", "rs_localizer", "localizer.launch.py"]
+    process = subprocess.Popen(
+        [*command, f"params_file:={flight / 'parameters.yaml'}", "use_sim_time:=true"],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGINT)
+        process.communicate(timeout=30.0)
+
+
+@pytest.mark.parametrize("file", LAUNCHES)
+def test_each_launch_file_says_its_arguments(file: str) -> None:
+    done = ros2("launch", "rs_localizer", file, "--show-args")
+    assert done.returncode == 0, done.stderr
+    assert "'readout_time'" in done.stdout
+
+
+@pytest.mark.parametrize("file", ["localizer.launch.py", "markers.launch.py"])
+def test_a_value_that_no_setting_has_makes_the_launch_fail(file: str) -> None:
+    done = ros2("launch", "rs_localizer", file, "readout_time:=abc")
+    assert done.returncode != 0
+    assert "readout_time must be of type float, got 'abc'" in done.stdout + done.stderr
+
+
+def test_a_bag_is_played_to_the_node(launched: Any, flight: Path) -> None:
+    until("active", "lifecycle", "get", "/rs_localizer")
+    # ros2 topic echo ends after one message.
+    echo = subprocess.Popen(
+        ["ros2", "topic", "echo", "--once", "/rs_localizer/pose"],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    time.sleep(3.0)
+    played = ros2("bag", "play", str(flight), "--clock", timeout=TIMEOUT)
+    assert played.returncode == 0, played.stderr
+    said, _ = echo.communicate(timeout=30.0)
+    assert "orientation:" in said
+    assert launched.poll() is None
+
+
+def test_the_life_cycle_goes_round(launched: Any) -> None:
+    until("active", "lifecycle", "get", "/rs_localizer")
+    for change in ("deactivate", "cleanup", "configure", "activate"):
+        done = ros2("lifecycle", "set", "/rs_localizer", change, timeout=TIMEOUT)
+        assert "successful" in done.stdout, done.stdout + done.stderr
+
+
+def test_our_transforms_are_those_of_tf2() -> None:
+    code = """
+import numpy as np, tf2_ros
+from geometry_msgs.msg import TransformStamped
+from rclpy.time import Time
+from types import SimpleNamespace
+from rs_localizer.io.transforms import TransformTree, read_transform
+rng = np.random.default_rng(0)
+tree, buffer = TransformTree(), tf2_ros.Buffer()
+for parent, child in (("map", "odom"), ("odom", "base"), ("base", "camera")):
+    for second in (1, 2, 3):
+        item = TransformStamped(child_frame_id=child)
+        item.header.frame_id, item.header.stamp.sec = parent, second
+        q = rng.normal(size=4)
+        q /= np.linalg.norm(q)
+        t, r = item.transform.translation, item.transform.rotation
+        t.x, t.y, t.z = rng.normal(size=3)
+        r.x, r.y, r.z, r.w = q
+        buffer.set_transform(item, "test")
+        tree.add(SimpleNamespace(transforms=[item]), static=False)
+for ns in (1_000_000_000, 1_234_567_890, 2_900_000_000):
+    for target, source in (("map", "camera"), ("camera", "odom")):
+        theirs = buffer.lookup_transform(target, source, Time(nanoseconds=ns)).transform
+        theirs, ours = read_transform(theirs), tree.lookup(target, source, ns)
+        assert np.allclose(theirs.rotation, ours.rotation, rtol=0, atol=1e-12)
+        assert np.allclose(theirs.translation, ours.translation, rtol=0, atol=1e-12)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
