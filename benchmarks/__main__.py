@@ -61,6 +61,7 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
 _TRIALS = 2000
 _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   frames                           regions, errors and times of frames; two versions compared
+  integrity                        the chance of a wrong pose or map: reliability, ROC
   rigs                             several cameras, against their bounds
   real                             videos of real cameras
   honesty                          against P3P, a real global shutter, rendered walls

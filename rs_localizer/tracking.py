@@ -40,6 +40,7 @@ from rs_localizer.estimation.motion_model import (
     with_mean_turn,
 )
 from rs_localizer.estimation.prior import Prior, offset_between, pivot_of, state_in
+from rs_localizer.integrity import Integrity
 from rs_localizer.localizer import Localizer
 from rs_localizer.solvers.table import find_solver
 
@@ -143,6 +144,7 @@ class Tracker:
         self.localizer, self._memory = localizer, memory
         self._track: _Track | None = None
         self._given: tuple[int, Prior] | None = None
+        self._integrity = Integrity()
         self._last_ns, self._too_close = 0, 0
         self._aid: GyroscopeAid | None = None
         if inertial is not None:
@@ -154,6 +156,7 @@ class Tracker:
     def reset(self) -> None:
         """Forget all frames so far."""
         self._track = self._given = None
+        self._integrity.reset()
         if self._aid is not None:
             self._aid.reset()
 
@@ -303,6 +306,7 @@ class Tracker:
                 imu, time_ns, lambda: self._before(time_ns), localized
             )
         if result:
+            result = self._judged(result, points, pixels, prior)
             self._remember(time_ns, prior, result, context)
             if self._aid is not None and imu is not None:
                 lens, camera = result.lens, self.localizer.camera
@@ -314,6 +318,19 @@ class Tracker:
             if self._track.failures >= _MOST_FAILURES:
                 self._track = None
         return self.localizer.accepted(result)
+
+    def _judged(
+        self,
+        result: Estimate,
+        points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
+        pixels: ArrayLike | None,
+        prior: Prior | None,
+    ) -> Estimate:
+        """The same with its integrity; of a rig, it has none."""
+        if isinstance(points, Mapping) or pixels is None:
+            return result
+        numbers = self._integrity.numbers(result, points, pixels, prior)
+        return replace(result, integrity=self._integrity.add(numbers))
 
     def _prior(
         self, time_ns: int, turn: GyroRotation | None, span: float | None, context: FrameContext

@@ -10,7 +10,9 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1] / "rs_localizer"
 
 # What each part may import besides itself; every part has a row.
-METHOD = {"core", "config", "solvers", "estimation", "inertial", "localizer", "tracking"}
+METHOD = {
+    *("core", "config", "solvers", "estimation", "inertial", "integrity", "localizer", "tracking"),
+}
 MAY_IMPORT: dict[str, set[str]] = {
     "process": set(),
     "data": set(),
@@ -19,7 +21,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "solvers": {"core"},
     "estimation": {"core", "config", "solvers"},
     "inertial": {"core", "estimation"},
-    "localizer": METHOD - {"inertial", "localizer", "tracking"},
+    "localizer": METHOD - {"inertial", "integrity", "localizer", "tracking"},
+    "integrity": {"core", "estimation"},
     "tracking": METHOD - {"tracking"},
     "io": {"core"},
     "settings": {"config", "io"},

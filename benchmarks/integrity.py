@@ -1,0 +1,274 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``Estimate.integrity`` in right maps and in wrong ones: is one per cent one in a hundred?
+
+Simulated rooms, half a metre and half a radian per second, 15 frames at 15 Hz each, seen by plain
+matches, features (250) and markers, 5 to 60 % of the matches wrong by chance, and in four of ten
+sequences a person who walks through, or a marker that is misread. A frame counts as wrong if its
+pose lies outside the region of 99.9 %, or more than a tenth of what it shows has changed in the
+map. Views in which all has moved together are left out: nothing in them tells.
+
+    python -m benchmarks.integrity --out out/integrity          # weights as they are
+    python -m benchmarks.integrity --fit                         # prints new ones
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+from tqdm import tqdm
+
+from rs_localizer import integrity
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.integrity import Integrity
+from rs_localizer.localizer import Localizer
+from rs_localizer.tools.simulation.frames import simulate_frames
+from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import ConstantVelocity
+from rs_localizer.tracking import Tracker
+
+KINDS = ("right", "right", "right", "moved", "swapped", "mirrored", "another", "stale")
+MATCHERS = ("plain", "features", "markers")
+RIGID = ("moved", "swapped")  # parts that a view may show alone
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera(640, 480, K, readout_time=0.03)
+FRAMES, RATE, SQUARES = 15, 15.0, 260
+OUTSIDE = 22.46  # chi-squared of six numbers, 99.9 %
+BASE = 0.02  # share of wrong frames for which it is calibrated
+BINS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 0.7, 1.0)
+
+
+class Row(NamedTuple):
+    """One frame with a pose."""
+
+    sequence: int
+    kind: str
+    matcher: str
+    wrong: bool
+    numbers: Array
+
+
+def changed(kind: str, world: Array, rng: np.random.Generator) -> Array:
+    """The map (m,3) of a room as somebody has it who comes later, or to another place."""
+    found, middle = world.copy(), 0.5 * (world.min(axis=0) + world.max(axis=0))
+    centre = world[rng.integers(len(world))]
+    far = np.linalg.norm(world - centre, axis=1)
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    if kind == "moved":  # a part of the room, as furniture is
+        part = far < np.quantile(far, rng.uniform(0.2, 0.6))
+        turn = so3.exp(np.array([0.0, 0.0, rng.normal(0.0, 0.15)]))
+        found[part] = (world[part] - centre) @ turn.T + centre + rng.normal(0, 0.4, 3) * [1, 1, 0.3]
+    elif kind == "swapped":  # opposite walls
+        axis = rng.integers(2)
+        off = np.abs(world - middle)[:, axis]
+        part = off > 0.6 * off.max()
+        found[part] = (world[part] - middle) @ half_turn.T + middle
+    elif kind == "mirrored":
+        found[:, 0] = 2.0 * middle[0] - world[:, 0]
+    elif kind == "another":  # matches by chance, and one structure that both rooms have
+        found = world[rng.permutation(len(world))]
+        part = far < np.quantile(far, rng.uniform(0.1, 0.35))
+        turn = so3.exp(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
+        found[part] = (world[part] - centre) @ turn.T + centre + rng.normal(0.0, 2.0, 3)
+    elif kind == "stale":
+        gone = rng.random(len(world)) < rng.uniform(0.2, 0.7)
+        found[gone] += rng.normal(0.0, 0.5, (gone.sum(), 3))
+    return found
+
+
+def squares(world: Array, rng: np.random.Generator) -> Array:
+    """Corners (4 m,3) of markers of 20 cm at some of the points; a marker's lie m apart."""
+    base = world[rng.choice(len(world), SQUARES, replace=False)]
+    x = rng.normal(size=base.shape)
+    x /= np.linalg.norm(x, axis=1)[:, None]
+    y = np.cross(x, rng.normal(size=base.shape))
+    y /= np.linalg.norm(y, axis=1)[:, None]
+    return np.concatenate([base + 0.1 * (a * x + b * y)
+                           for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])  # fmt: skip
+
+
+def sequence(number: int) -> list[Row]:
+    """The frames of one sequence that have a pose."""
+    kind = KINDS[number % len(KINDS)]
+    matcher = MATCHERS[(number // len(KINDS)) % len(MATCHERS)]
+    rng = np.random.default_rng([7, number])
+    motion = ConstantVelocity(rng.normal(0, 0.6, 3), rng.normal(0, 0.5, 3), 3.0)
+    world = room(motion.state(0, np.linspace(0.0, 2.0, 9)).positions, rng, count=4000)
+    points, noise, outliers = {
+        "plain": (int(rng.integers(40, 160)), rng.uniform(0.3, 1.2), rng.uniform(0.05, 0.5)),
+        "features": (250, rng.uniform(0.6, 1.2), rng.uniform(0.1, 0.6)),
+        "markers": (4 * int(rng.integers(5, 14)), rng.uniform(0.1, 0.4), 0.0),
+    }[matcher]
+    if matcher == "markers":
+        world = squares(world, rng)
+    later = changed(kind, world, rng)
+    if matcher == "markers" and kind in ("moved", "stale", "another"):  # whole ones
+        later = world + np.tile((later - world).reshape(4, -1, 3).mean(axis=0), (4, 1))
+    tracker, judge = Tracker(Localizer(CAMERA)), Integrity()
+    person = rng.random() < 0.4
+    centre, size = rng.uniform([0.0, 0.0], [640.0, 480.0]), rng.uniform(50.0, 170.0)
+    drift = rng.normal(0.0, 25.0, 2)
+    stamps = [round(1e9 + 1e9 * i / RATE) for i in range(FRAMES)]
+    settings, rows = FrameSettings(points, noise, outliers), []
+    for frame in simulate_frames(CAMERA, motion, world, settings, stamps_ns=stamps, seed=number):
+        pixels, seen = frame.pixels.copy(), later[frame.ids]
+        if person and matcher == "markers":
+            marker = frame.ids % SQUARES
+            hit = marker == rng.choice(np.unique(marker)) if len(marker) else marker > 0
+            pixels[hit] += rng.normal(0.0, 15.0, 2)
+        elif person:
+            hit = np.linalg.norm(pixels - centre, axis=1) < size
+            pixels[hit] += drift + rng.normal(0.0, 3.0, (hit.sum(), 2))
+            centre = centre + drift
+        prior = tracker.prediction(frame.middle_ns)
+        result = tracker.localize(frame.middle_ns, seen, pixels)
+        if not result:
+            continue
+        numbers = judge.numbers(result, seen, pixels, prior)
+        true = frame.motion
+        turn = so3.log(np.ascontiguousarray(true.rotation @ result.rotation.T))
+        way = true.rotation @ (result.position + true.rotation.T @ true.translation)
+        off = np.r_[turn, way]
+        outside = off @ np.linalg.solve(result.covariance[:6, :6], off) > OUTSIDE
+        share = float(np.mean(np.any(np.abs(seen - world[frame.ids]) > 1e-9, axis=1)))
+        if kind in RIGID and share > 0.95:
+            continue
+        rows.append(Row(number, kind, matcher, bool(outside or share > 0.1), numbers))
+    return rows
+
+
+def recursive(rows: list[Row]) -> Array:
+    """The integrity of each frame."""
+    found, judge, last = [], Integrity(), -1
+    for row in rows:
+        if row.sequence != last:
+            judge.reset()
+            last = row.sequence
+        found.append(judge.add(row.numbers))
+    return np.array(found)
+
+
+def weights_of(wrong: Array) -> Array:
+    """Of each frame, so that the share of wrong ones is that of the calibration."""
+    share = wrong.mean()
+    weights: Array = np.where(wrong, BASE / share, (1.0 - BASE) / (1.0 - share))
+    return weights
+
+
+def fit(rows: list[Row]) -> None:
+    """Print new weights and a new calibration."""
+    numbers, wrong = np.array([row.numbers for row in rows]), np.array([row.wrong for row in rows])
+    mean, spread = numbers.mean(axis=0), numbers.std(axis=0) + 1e-9
+    scaled = (numbers - mean) / spread
+    half = np.where(wrong, 0.5 / wrong.mean(), 0.5 / (1.0 - wrong.mean()))
+
+    def loss(w: Array) -> float:
+        odds = w[0] + scaled @ w[1:]
+        ridge = 1e-3 * float(w[1:] @ w[1:])
+        return float(np.mean(half * (np.logaddexp(0.0, odds) - wrong * odds))) + ridge
+
+    w = minimize(loss, np.zeros(1 + scaled.shape[1])).x
+    integrity.WEIGHTS = np.r_[w[0] - np.sum(w[1:] * mean / spread), w[1:] / spread]
+    integrity.CALIBRATION = (0.0, 1.0)
+    best: tuple[float, ...] = (np.inf,)
+    share = weights_of(wrong)
+    for temper in (0.1, 0.2, 0.3, 0.4, 0.6, 0.8):
+        for goes in (1e-4, 1e-3):
+            for recovers in (0.005, 0.02, 0.1, 0.3):
+                integrity.TEMPER, integrity.GOES_WRONG = temper, goes
+                integrity.RECOVERS = recovers
+                said = np.clip(recursive(rows), 1e-9, 1.0 - 1e-9)
+                cost = float(np.mean(share * -np.log(np.where(wrong, said, 1.0 - said))))
+                best = min(best, (cost, temper, goes, recovers))
+    _, integrity.TEMPER, integrity.GOES_WRONG, integrity.RECOVERS = best
+    said = np.clip(recursive(rows), 1e-9, 1.0 - 1e-9)
+    odds = np.log(said / (1.0 - said))
+    platt = minimize(
+        lambda v: np.mean(share * (np.logaddexp(0, v[0] + v[1] * odds)
+                                   - wrong * (v[0] + v[1] * odds))), [0.0, 1.0],
+    ).x  # fmt: skip
+    print("WEIGHTS", np.round(integrity.WEIGHTS, 3).tolist())
+    print("TEMPER, GOES_WRONG, RECOVERS", best[1:], "CALIBRATION", np.round(platt, 3).tolist())
+
+
+def report(rows: list[Row], out: Path | None) -> None:
+    """Reliability, ROC and detection, as text and pictures."""
+    said, wrong = recursive(rows), np.array([row.wrong for row in rows])
+    share = weights_of(wrong)
+    print(f"{len(rows)} frames, {wrong.sum()} wrong, weighted to {BASE:.0%}")
+    table = []
+    for low, high in itertools.pairwise(BINS):
+        here = (said >= low) & (said < high)
+        if here.any():
+            pair = [np.average(each[here], weights=share[here]) for each in (said, wrong)]
+            table.append(pair)
+            print(f"  {low:5.3f} to {high:5.3f}: {here.sum():5} frames, said {pair[0]:.4f}, "
+                  f"found {pair[1]:.4f}")  # fmt: skip
+    order = np.argsort(-said)
+    hits, alarms = np.cumsum(wrong[order]) / wrong.sum(), np.cumsum(~wrong[order]) / (~wrong).sum()
+    print(f"area below the ROC {np.trapezoid(hits, alarms):.3f}")
+    for limit in (0.5, 0.9):
+        right = [p > limit for p, row in zip(said, rows, strict=True) if row.kind == "right"]
+        print(f"above {limit}: {sum(right)} of {len(right)} frames in right maps")
+        for kind in dict.fromkeys(KINDS[3:]):
+            print(f"  {kind}: {_detected(rows, said, kind, limit)}")
+    if out is not None:
+        _draw(out, table, hits, alarms)
+
+
+def _detected(rows: list[Row], said: Array, kind: str, limit: float) -> str:
+    first, count = [], 0
+    for number in dict.fromkeys(row.sequence for row in rows if row.kind == kind):
+        own = [(p, row.wrong) for p, row in zip(said, rows, strict=True) if row.sequence == number]
+        if 2 * sum(wrong for _, wrong in own) <= len(own):
+            continue
+        count += 1
+        above = [i for i, (p, _) in enumerate(own, 1) if p > limit]
+        first += above[:1]
+    middle = f", after {np.median(first):.0f} frames" if first else ""
+    return f"{len(first)} of {count} sequences found{middle}"
+
+
+def _draw(out: Path, table: list[Any], hits: Array, alarms: Array) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    out.mkdir(parents=True, exist_ok=True)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4))
+    said, found = np.array(table).T
+    left.loglog(said, np.maximum(found, 1e-4), "o-")
+    left.loglog([1e-3, 1], [1e-3, 1], "k:")
+    left.set(xlabel="said", ylabel="found", title="Reliability")
+    right.plot(alarms, hits)
+    right.set(xlabel="right frames above", ylabel="wrong frames above", title="ROC")
+    figure.tight_layout()
+    figure.savefig(out / "integrity.png")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sequences", type=int, default=240)
+    parser.add_argument("--first", type=int, default=480, help="below 480 are those of the fit")
+    parser.add_argument("--fit", action="store_true", help="print new weights, of the first ones")
+    parser.add_argument("--out", type=Path, help="folder of the picture")
+    chosen = parser.parse_args()
+    first = 0 if chosen.fit else chosen.first
+    numbers = range(first, first + chosen.sequences)
+    rows = [row for number in tqdm(numbers, disable=None) for row in sequence(number)]
+    if chosen.fit:
+        fit(rows)
+    report(rows, chosen.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Am I lost? The probability that a pose lies outside its region, or the map is another one.
+
+A frame shows it by what a right pose in the right map does not leave: outliers that lie together
+instead of everywhere, and are the same landmarks in the next frame, inliers in a part of what is
+seen only, a place that the frames before did not predict. Each is a number; the logarithm of their
+odds is a logistic regression's over sequences in right maps and in wrong ones
+(``python -m benchmarks.integrity --fit``), tempered, as successive frames err together, added up by
+a hidden Markov chain of two states, and calibrated (Platt, "Probabilistic outputs for support
+vector machines", 1999) where two frames in a hundred are wrong.
+
+What no image shows it does not know: a room that has been moved as a whole, or a wall that is
+another one's copy while nothing else is seen.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.state import TURN
+from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.prior import Prior
+
+NAMES = (
+    "share", "together", "apart", "persists", "spread", "filled", "count", "innovation", "searched",
+)  # fmt: skip
+"""Of the numbers of a frame."""
+# Of the regression: constant, then those of NAMES.
+WEIGHTS = np.array([1.363, -0.855, 0.011, 0.365, 0.845, -4.351, -0.551, -0.653, 0.781, 1.253])
+# How much of a frame's odds count beside those of the frames before; chances per frame that a right
+# track goes wrong, and that a wrong one is right again; of a first pose. By likelihood, as WEIGHTS.
+TEMPER, GOES_WRONG, RECOVERS, FIRST = 0.4, 0.001, 0.3, 0.02
+# Of the logarithmic odds that come of it: constant and factor.
+CALIBRATION = (-0.128, 0.788)
+# Neighbours of a point in the map, and how many points are looked at.
+_NEIGHBOURS, _MOST = 4, 200
+# What the least certain number may say, in odds.
+_MOST_ODDS = 8.0
+
+
+def _together(points: Array, kept: BoolArray) -> float:
+    """How much inliers and outliers keep to themselves in the map, in deviations of chance."""
+    if len(points) > _MOST:
+        chosen = np.linspace(0, len(points) - 1, _MOST).astype(int)
+        points, kept = points[chosen], kept[chosen]
+    count, share = len(points), float(np.mean(kept)) if len(points) else 1.0
+    if count <= 2 * _NEIGHBOURS or not 0.0 < share < 1.0:
+        return 0.0
+    far = np.sum((points[:, None] - points[None]) ** 2, axis=2)
+    np.fill_diagonal(far, np.inf)
+    near = np.argpartition(far, _NEIGHBOURS, axis=1)[:, :_NEIGHBOURS]
+    off = kept.astype(float) - share
+    alike = float(np.mean(off[:, None] * off[near])) / (share * (1.0 - share))  # Moran's I
+    expected, deviation = -1.0 / (count - 1.0), math.sqrt(1.5 / (count * _NEIGHBOURS))
+    return min(max((alike - expected) / deviation, -3.0), 15.0)
+
+
+def _spread(kept: Array, seen: Array) -> float:
+    """Logarithm of the part of the points' area in the image that the inliers take."""
+    if len(kept) < 3:
+        return -3.0
+    areas = [math.sqrt(max(np.linalg.det(np.cov(each.T)), 1e-6)) for each in (kept, seen)]
+    return min(max(math.log(areas[0] / areas[1]), -3.0), 1.0)
+
+
+def _innovation(estimate: Estimate, prior: Prior) -> float:
+    """Logarithm of one and the squared distance of the pose from the predicted one, a sixth."""
+    if prior.motion is None or prior.covariance is None:
+        return 0.0
+    spread = np.asarray(prior.covariance)[:6, :6] + estimate.covariance[:6, :6]
+    if not np.isfinite(spread).all():
+        return 0.0
+    turn = so3.log(np.ascontiguousarray(prior.motion.rotation @ estimate.rotation.T))
+    centre = -prior.motion.rotation.T @ prior.motion.translation
+    off = np.zeros(6)
+    off[TURN] = turn
+    off[3:] = prior.motion.rotation @ (estimate.position - centre)
+    return min(math.log1p(float(off @ np.linalg.solve(spread, off)) / 6.0), 6.0)
+
+
+class Integrity:
+    """The chance that a track is wrong, frame by frame."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """The next frame is the first."""
+        self._wrong = FIRST
+        self._kept: dict[bytes, bool] = {}  # whether landmarks were inliers, of the last frame
+
+    def numbers(
+        self, estimate: Estimate, points: ArrayLike, pixels: ArrayLike, prior: Prior | None
+    ) -> Array:
+        """The numbers (9,) of the next frame, in the order of ``NAMES``.
+
+        Args:
+            estimate: of the frame.
+            points, pixels: (n,3) m and (n,2) px that it was found by.
+            prior: what the frames before predicted; None: nothing.
+        """
+        residuals = np.asarray(estimate.residuals)
+        usable = np.isfinite(residuals)
+        every, seen = np.asarray(points, float)[usable], np.asarray(pixels, float)[usable]
+        kept, residuals = np.asarray(estimate.inliers)[usable], residuals[usable]
+        inliers = int(kept.sum())
+        share = math.log((inliers + 1.0) / (len(kept) - inliers + 1.0))
+        own = residuals[kept]
+        filled = float(np.mean(own > 0.5 * max(own.max(), 1e-9))) if inliers else 1.0
+        together = _together(every, kept)
+        return np.array(
+            [
+                share,
+                together,
+                together / (1.0 + math.exp(share)),  # of few outliers, as of a person, less
+                self._persists(every, kept),
+                _spread(seen[kept], seen),
+                filled,
+                math.log(max(inliers - 6.0, 1.0)),
+                0.0 if prior is None else _innovation(estimate, prior),
+                0.0 if estimate.tracked else 1.0,
+            ]
+        )
+
+    def _persists(self, points: Array, kept: BoolArray) -> float:
+        """Logarithm of the odds that a landmark is what it was in the last frame, against chance.
+
+        Chance matches are others in each frame; landmarks that have been moved are always off.
+        """
+        before = self._kept
+        self._kept = dict(zip((row.tobytes() for row in points), kept.tolist(), strict=True))
+        counts = np.ones((2, 2))  # before, now
+        for landmark, now in self._kept.items():
+            if landmark in before:
+                counts[int(before[landmark]), int(now)] += 1.0
+        return float(np.log(counts[0, 0] * counts[1, 1] / (counts[0, 1] * counts[1, 0])))
+
+    def add(self, numbers: Array) -> float:
+        """The probability after a frame of these numbers."""
+        said = min(max(float(WEIGHTS[0] + WEIGHTS[1:] @ numbers), -_MOST_ODDS), _MOST_ODDS)
+        wrong = self._wrong * (1.0 - RECOVERS) + (1.0 - self._wrong) * GOES_WRONG
+        odds = TEMPER * said + math.log(wrong / (1.0 - wrong))
+        self._wrong = 1.0 / (1.0 + math.exp(-odds))
+        return 1.0 / (1.0 + math.exp(-CALIBRATION[0] - CALIBRATION[1] * odds))

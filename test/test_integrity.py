@@ -1,0 +1,77 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The chance of a wrong pose or map rises by what only those leave, and falls again."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.integrity import NAMES, Integrity
+
+RNG = np.random.default_rng(0)
+POINTS = RNG.uniform([-3.0, -3.0, 3.0], [3.0, 3.0, 9.0], (120, 3))
+PIXELS = 400.0 * POINTS[:, :2] / POINTS[:, 2:] + [320.0, 240.0]
+
+
+def estimate(kept: Any, tracked: bool = True) -> Estimate:
+    residuals = np.where(kept, np.abs(RNG.normal(0.0, 0.5, len(kept))), 9.0)
+    return Estimate(
+        rotation=np.eye(3), translation=np.zeros(3), angular_velocity=np.zeros(3),
+        linear_velocity=np.zeros(3), inliers=np.asarray(kept), residuals=residuals,
+        joint_covariance=1e-4 * np.eye(18), global_shutter_inliers=0, iterations=0, tracked=tracked,
+    )  # fmt: skip
+
+
+def run(frames: int, kept: Any, prior: Prior | None = None) -> list[float]:
+    judge = Integrity()
+    return [
+        judge.add(judge.numbers(estimate(kept(), i > 0), POINTS, PIXELS, prior))
+        for i in range(frames)
+    ]
+
+
+def anywhere() -> Any:
+    return RNG.random(120) < 0.8
+
+
+def moved() -> Any:
+    """All landmarks of one half of the room are off, always the same ones."""
+    return POINTS[:, 0] > 0.0
+
+
+def test_chance_outliers_are_no_doubt_and_moved_landmarks_are():
+    right, wrong = run(15, anywhere), run(15, moved)
+    assert max(right[5:]) < 0.02
+    assert min(wrong[3:]) > 0.5
+    assert wrong[0] < wrong[-1]
+
+
+def test_doubt_falls_again():
+    judge = Integrity()
+    doubts = [
+        judge.add(judge.numbers(estimate(kept), POINTS, PIXELS, None))
+        for kept in (*(moved() for _ in range(10)), *(anywhere() for _ in range(15)))
+    ]
+    assert doubts[9] > 0.5
+    assert doubts[-1] < 0.05
+    judge.reset()
+    assert judge.add(judge.numbers(estimate(anywhere()), POINTS, PIXELS, None)) < 0.1
+
+
+@pytest.mark.parametrize(("off", "expected"), [(0.0, 0.0), (0.1, np.log1p(50.0 / 6.0))])
+def test_a_place_that_nobody_predicted(off, expected):
+    motion = Motion(np.eye(3), np.array([off, 0.0, 0.0]), np.zeros(3), np.zeros(3))
+    prior = Prior(motion=motion, covariance=1e-4 * np.eye(12))
+    numbers = Integrity().numbers(estimate(anywhere()), POINTS, PIXELS, prior)
+    assert numbers[NAMES.index("innovation")] == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 4, 8])
+def test_few_points_give_a_number(count):
+    kept = np.ones(count, bool)
+    numbers = Integrity().numbers(estimate(kept), POINTS[:count], PIXELS[:count], None)
+    assert np.isfinite(numbers).all()
