@@ -48,7 +48,7 @@ if TYPE_CHECKING:  # without a gyroscope nobody needs them
     from rs_localizer.inertial.aiding import Before, Found, GyroPrediction, GyroscopeAid
     from rs_localizer.inertial.samples import ImuSamples
     from rs_localizer.inertial.settings import InertialSettings
-    from rs_localizer.inertial.watch import InertialStatus
+    from rs_localizer.inertial.status import InertialStatus
 
 
 class Memory(Enum):

@@ -18,7 +18,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NoReturn
 
-from rs_localizer.cli import WORKING, detect
+from rs_localizer.cli import WORKING
 from rs_localizer.cli.options import Inputs, Many, Settings, UsageError, argument, option
 from rs_localizer.cli.replay_result import (
     BRIDGED,
@@ -68,8 +68,6 @@ if WORKING:
     )
     from rs_localizer.offline.table import FrameTable, read_parquet, schema, write_parquet
     from rs_localizer.pipeline.frames import FrameLocalizer
-    from rs_localizer.tools.smoothed import smooth_frames
-    from rs_localizer.tools.warm_up import warm_up
 
 if TYPE_CHECKING:  # an extra
     from pyarrow import Table
@@ -173,6 +171,8 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
         return _replay_matches(options, recording, recording, out, timed)
     if options.map is None:
         raise ValueError(f"{recording} {pictures}, not matches: first {_detect_command(recording)}")
+    from rs_localizer.cli import detect  # of images only
+
     with TemporaryDirectory() as place:
         matches = Path(place) / "matches"
         of_images = _detection(options, recording, matches)
@@ -320,6 +320,8 @@ def _replay(
     ):
         frames = _localized(bag, topics, localizer, tally, refused, bar)
         if options.smooth:
+            from rs_localizer.tools.smoothed import smooth_frames
+
             stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
             parts = smooth_frames(localizer, (frame for _, frame in frames), stamps, options.rate)
             frames = (
@@ -457,4 +459,6 @@ def _replay_of_many(options: Options, recording: Path, out: Path) -> Figures:
 def _warm(options: Options) -> None:
     FrameLocalizer(_settings(options)).warm_up()
     if options.smooth:
+        from rs_localizer.tools.warm_up import warm_up
+
         warm_up()

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -40,6 +41,8 @@ if WORKING:
     from rs_localizer.pipeline.refusal import Refusal, explained
     from rs_localizer.settings import NODE_NAME
     from rs_localizer.solvers.table import find_solver
+
+if TYPE_CHECKING:  # of --smooth
     from rs_localizer.tools.smoothed import SmoothedFrames
 
 POSES, TWISTS = "poses.txt", "twists.txt"

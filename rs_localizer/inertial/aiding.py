@@ -25,8 +25,9 @@ from rs_localizer.inertial.offset_search import OffsetSearch, Orientation
 from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.samples import ImuSamples, span_of
 from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.inertial.turning import TurnBetween, TurnWithin
-from rs_localizer.inertial.watch import Alone, GyroscopeWatch, InertialStatus, contradicts
+from rs_localizer.inertial.watch import GyroscopeWatch, contradicts
 
 # Of a step: what a gyroscope contradicts.
 _SEEN = np.r_[TURN, ANGULAR]

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.io.bags import make_message
 from rs_localizer.io.messages import MessageError, frame_id, make_header, make_vector, stamp_ns
 
 Vector = tuple[float, float, float]
@@ -95,6 +94,8 @@ def make_reading(
     Of a rate (3,) in rad/s and a force (3,) in m/s^2 (NaN: not measured), with their variances (0:
     not known).
     """
+    from rs_localizer.io.bags import make_message  # who reads messages needs no bags
+
     absent = np.array([_ABSENT, *[0.0] * 8])
     known = [np.eye(3).ravel() * variance for variance in variances]
     if not np.isfinite(force).all():

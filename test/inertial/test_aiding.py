@@ -14,7 +14,7 @@ from benchmarks.independent.motions import hand, shaken_hand
 from benchmarks.independent.scenes import Rich
 from benchmarks.inertial.recordings import follow, record
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.watch import Alone
+from rs_localizer.inertial.status import Alone
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.reasons import ImuReason
-from rs_localizer.inertial.watch import Alone, InertialStatus
+from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.io.outputs import CameraShare
 from rs_localizer.pipeline.imu import ImuState, Unused
 from rs_localizer.pipeline.readout_estimate import MeasuredReadout
