@@ -295,7 +295,7 @@ class FrameLocalizer:
     @property
     def view_corners(self) -> Array | None:
         """Bearings (4,3) of the image's corners, in camera axes; None: no camera is known."""
-        if self._calibration is None:
+        if not (self._alone and self.calibrations):
             return None
         width, height = np.array(self._camera.size) - 1.0
         corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
