@@ -69,8 +69,10 @@ if WORKING:
     from rs_localizer.offline.table import FrameTable, read_parquet, schema, write_parquet
     from rs_localizer.pipeline.frames import FrameLocalizer
 
-if TYPE_CHECKING:  # an extra
-    from pyarrow import Table
+if TYPE_CHECKING:
+    from pyarrow import Table  # an extra
+
+    from rs_localizer.cli import detect  # of images only
 
 _ORB_BYTES = 32  # of a descriptor; AKAZE's has 61
 # Of each of many recordings, and of all.
@@ -171,7 +173,7 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
         return _replay_matches(options, recording, recording, out, timed)
     if options.map is None:
         raise ValueError(f"{recording} {pictures}, not matches: first {_detect_command(recording)}")
-    from rs_localizer.cli import detect  # of images only
+    from rs_localizer.cli import detect
 
     with TemporaryDirectory() as place:
         matches = Path(place) / "matches"
@@ -194,6 +196,8 @@ def _map_file(place: Path) -> Path:
 
 def _detection(options: Options, recording: Path, out: Path) -> detect.Options:
     """What finds the matches of images."""
+    from rs_localizer.cli import detect
+
     place = options.map
     assert place is not None
     by_markers = is_marker_file(place)
