@@ -31,7 +31,7 @@ def read(folder: str) -> dict[str, Any]:
     pycolmap.logging.minloglevel = 3
     model = pycolmap.Reconstruction(folder)
     points = sorted(model.points3D.items())
-    images = sorted(model.images.items())
+    images = [item for item in sorted(model.images.items()) if _called(item[1].has_pose)]
     tracks = [[(e.image_id, e.point2D_idx) for e in point.track.elements] for _, point in points]
     poses = [_pose(image) for _, image in images]
     features = [image.points2D for _, image in images]
@@ -55,8 +55,12 @@ def read(folder: str) -> dict[str, Any]:
 
 
 def _pose(image: Any) -> Any:
-    pose = image.cam_from_world
-    return (pose() if callable(pose) else pose).matrix()
+    return _called(image.cam_from_world).matrix()
+
+
+def _called(member: Any) -> Any:
+    """What is a property in some versions and a method in others."""
+    return member() if callable(member) else member
 
 
 def _camera(number: int, camera: Any) -> str:
