@@ -244,6 +244,8 @@ def _equidistant(K: Array, D: Array, radius: float) -> tuple[Array, Array]:
     angles, radii = angles[inside], radii[inside]
     powers = angles[:, None] ** np.arange(1, 10, 2)
     focal, *rest = np.linalg.lstsq(powers, radii, rcond=None)[0]
+    if not focal > 0.0:
+        raise ValueError("the lens has no image")
     scaled = K.copy()
     scaled[[0, 1], [0, 1]] *= focal
     return scaled, np.array(rest) / focal

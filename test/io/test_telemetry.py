@@ -132,6 +132,8 @@ def test_numbers_that_no_gyroscope_gives():
     [
         {"fisheye_params": 3}, {"fisheye_params": {"camera_matrix": "x"}},
         {"fisheye_params": {"camera_matrix": [[1e400]]}}, {"distortion_model": "insta360"},
+        {"distortion_model": "insta360", "calib_dimension": {"w": 0, "h": 0},
+         "fisheye_params": {"camera_matrix": np.eye(3).tolist(), "distortion_coeffs": [0.0] * 6}},
         PROFILE | {"calib_dimension": None}, PROFILE | {"distortion_model": 7},
     ],
 )  # fmt: skip
