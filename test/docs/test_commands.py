@@ -14,6 +14,7 @@ import pytest
 from benchmarks.__main__ import EXPERIMENTS
 from rs_localizer.cli.main import COMMANDS, parse
 from rs_localizer.config import DetectorConfig, FeatureConfig
+from rs_localizer.io.topics import GIVEN_POSES
 from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.settings import parse_assignment, settings
 
@@ -69,7 +70,13 @@ def test_launch_files_exist(page, line):
         return
     code = (pages.ROOT / "launch" / file).read_text()
     code += (pages.ROOT / "rs_localizer" / "ros" / "launching.py").read_text()
-    known = {*settings(), *settings(DetectorConfig), *settings(FeatureConfig), *INPUTS}
+    known = {
+        *settings(),
+        *settings(DetectorConfig),
+        *settings(FeatureConfig),
+        *INPUTS,
+        *GIVEN_POSES,
+    }
     known |= set(re.findall(r"\"(\w+)\"", code))
     given = {word.partition(":=")[0] for word in arguments if not word.startswith("--")}
     assert given <= known, page
