@@ -13,13 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from rs_localizer.core.arrays import Array
 
 # OpenCV's own default of five iterations leaves errors of pixels at the rim of wide lenses.
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+_CRITERIA = (3, 50, 1e-10)  # by count (1) and by tolerance (2)
 
 
 class Projection(NamedTuple):
@@ -95,6 +94,8 @@ class LensLaw(NamedTuple):
 
 
 def _project(rays: Array, K: Array, D: Array) -> Projection:
+    import cv2  # 16 MB, which a camera without distortion does not need
+
     # Of a point at depth 1 the derivative by its place is that by the ray.
     bearings, zero = np.column_stack([rays, np.ones(len(rays))])[:, None], np.zeros(3)
     projected: Any = cv2.projectPoints(bearings, zero, zero, K, D)
@@ -106,6 +107,8 @@ def _project(rays: Array, K: Array, D: Array) -> Projection:
 
 
 def _undistort(pixels: Array, K: Array, D: Array) -> Array:
+    import cv2
+
     points = pixels[:, None]
     rays: Any
     if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4

@@ -38,7 +38,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.pipeline.frames import FrameLocalizer
 FrameLocalizer(NodeConfig(solver=sys.argv[1], readout_time=0.03)).warm_up_rest()
 """
-_LAST = "matching"  # folder with kernels of frames: others come before it
+_LAST = "markers"  # last folder with kernels of frames
 _READOUT_TIME, _PERIOD_NS = 0.03, 33_000_000
 _POINTS, _FRAMES = 60, 3  # beside fewer than min_inliers
 _TURN_RATE = 1.0  # rad/s: faster than rest, and slow enough for all points to be found

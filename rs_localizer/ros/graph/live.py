@@ -27,6 +27,7 @@ from rs_localizer.settings import NODE_NAME
 # The installed executable may not be on the path; this starts the same node.
 _NODE = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+_MANY = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 # Frames that will never be answered, by the node's diagnostics.
 _UNANSWERED = ("Frames refused", "Frames replaced", "Frames dropped")
 # s without a word on topics and in the log: a node says how it is once a second. A busy machine
@@ -60,6 +61,7 @@ class LiveNode:
         self.namespace = f"/demo_{os.getpid()}"
         self._poses: dict[int, PoseStamped] = {}
         self._status: dict[str, str] = {}
+        self._others: dict[str, Any] = {}
         self._words = 0  # of the diagnostics
         self._heard = time.monotonic()
         self._logged = 0
@@ -102,6 +104,18 @@ class LiveNode:
         if error is not None and self._signals.requested:
             # A signal also ends the context, and with it whatever call is under way.
             raise KeyboardInterrupt from error
+
+    @property
+    def pid(self) -> int:
+        """Of the node's process."""
+        return self._process.pid
+
+    def publisher(self, kind: type, topic: str) -> Any:
+        """A publisher on another of the node's inputs, made when it is first asked for."""
+        if topic not in self._others:
+            name = f"{self.namespace}/{topic}"
+            self._others[topic] = self._node.create_publisher(kind, name, _MANY)
+        return self._others[topic]
 
     def wait(self, tell: Callable[[str], object]) -> None:
         """Until the node is active and heard; ``tell`` is told its last line meanwhile.
