@@ -68,6 +68,7 @@ class _Compiler:
         self._lock = threading.Lock()
         self._orders: SimpleQueue[Request] | None = None
         self._ordered: set[Request] = set()
+        self._failed: set[Request] = set()
         self.count = 0
         self.listeners: list[Callable[[int, str], object]] = []
 
@@ -82,19 +83,22 @@ class _Compiler:
                 self._end()
         return False
 
-    def order(self, request: Request) -> None:
+    def order(self, request: Request) -> bool:
         if request in self._ordered:
-            return
+            return request not in self._failed
         self._ordered.add(request)
         if self._orders is None:
             self._orders = SimpleQueue()
             # Of an executor the end of the program would wait for what it is at.
             threading.Thread(target=self._follow, args=(self._orders,), daemon=True).start()
         self._orders.put(request)
+        return True
 
     def _follow(self, orders: SimpleQueue[Request]) -> NoReturn:
         while True:
-            self.obtain(orders.get())
+            request = orders.get()
+            if not self.obtain(request):
+                self._failed.add(request)
 
     def _ask(self, request: Request) -> bool:
         from numba.core import serialize
@@ -148,9 +152,9 @@ def obtain(request: Request) -> bool:
     return _compiler.obtain(request)
 
 
-def order(request: Request) -> None:
-    """The same without waiting for it; once."""
-    _compiler.order(request)
+def order(request: Request) -> bool:
+    """The same without waiting for it, once; False when it could not be had so."""
+    return _compiler.order(request)
 
 
 @contextlib.contextmanager

@@ -185,10 +185,10 @@ def _obtained(compiled: Any, compile_or_load: Callable[..., Any], signature: Any
         _thread.asks = before
     request = Request(compiled.__module__, compiled.__qualname__, tuple(signature))
     # Not within Numba's lock, which other threads need to load what they have.
-    if not _thread.waits:
-        compiler.order(request)
+    if _thread.waits:
+        compiler.obtain(request)
+    elif compiler.order(request):
         raise NotCompiled(compiled.__qualname__)
-    compiler.obtain(request)
     return compile_or_load(signature)  # or compiled here: which says what is wrong
 
 
