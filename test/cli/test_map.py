@@ -51,7 +51,7 @@ def test_a_model_of_colmap_becomes_a_file(tmp_path, capsys):
     assert main([*words, "--overwrite", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)["result"]
     assert result["landmarks"] == str(len(read_map_file(out, "map")))
-    assert result["written to"] == str(out)
+    assert result["written_to"] == str(out)
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_problems_of_a_map_are_named(tmp_path, capsys):
     capsys.readouterr()
     assert main(["map", "info", str(path)]) == 1
     text_of = "markers of 50 m: are sizes and positions, given in metres, in another unit?"
-    assert capsys.readouterr().err == f"rs_localizer map: {path}: {text_of}\n"
+    assert capsys.readouterr().err == f"rs_localizer map info: {path}: {text_of}\n"
     path.write_text(text.replace("id: 1", "id: 0"))
     assert main(["map", "info", str(path)]) == 1
     assert "marker 4x4_50 0 is there twice" in capsys.readouterr().err

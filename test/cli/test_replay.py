@@ -167,8 +167,8 @@ def test_notices_stand_in_the_summary(recording, tmp_path, monkeypatch, capsys):
     assert f"readout_time: estimated readout time {FRAMES - 1} ms differs" in said
     columns = figures(tallies[0])
     assert columns["noticed"] == f"readout_time {FRAMES}"
-    assert columns["readout time seen (ms)"] == pytest.approx(21.1)
-    assert columns["its deviation (ms)"] == pytest.approx(0.2)
+    assert columns["readout_time_seen_ms"] == pytest.approx(21.1)
+    assert columns["readout_time_seen_deviation_ms"] == pytest.approx(0.2)
 
 
 def both(kept: list[Tally], function: Any) -> Any:
