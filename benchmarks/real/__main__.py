@@ -21,12 +21,12 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from benchmarks.real import gyro
+from benchmarks.real import gyro, solvers
 from benchmarks.real.calibrations import report
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
+from benchmarks.real.options import add_settings, settings_of
 from benchmarks.real.peers import PEERS
-from rs_localizer.cli.settings_args import add_settings, given_settings
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
@@ -73,7 +73,7 @@ _PARTS = {
 }  # fmt: skip
 
 
-JUDGES = {"gyro": gyro.main}
+JUDGES = {"gyro": gyro.main, "solvers": solvers.main}
 """Beside the boards, by the first argument."""
 
 
@@ -94,7 +94,7 @@ def main(argv: Sequence[str]) -> None:
     add_settings(parser)
     args = parser.parse_args(argv)
     cache = args.cache or args.out / "cache"
-    config = given_settings(args)
+    config = settings_of(args)
     if args.calibrations:
         text = report(clips_of(args.folder, cache, args.images, args.only), cache)
         args.out.mkdir(parents=True, exist_ok=True)

@@ -20,9 +20,9 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
+from benchmarks.real.options import add_settings, settings_of
 from benchmarks.real.peers import PEERS, GlobalPose, solve_pnp_ransac
 from benchmarks.real.recordings import Recording, read_bag
-from rs_localizer.cli.settings_args import add_settings, given_settings
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
@@ -253,7 +253,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--out", type=Path, default=Path("real"), help="table and picture")
     add_settings(parser)
     args = parser.parse_args(argv)
-    config = given_settings(args)
+    config = settings_of(args)
     recording = read_bag(args.recording, config)
     gyroscope = Gyroscope.read(args.gyroscope)
     judged = judge(recording, gyroscope, config)
