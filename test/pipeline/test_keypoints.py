@@ -233,7 +233,7 @@ def test_settings_of_matching(frames, make_camera_info):
     assert notices == [("too_many_keypoints", text)]
     assert refused(node.localize_keypoints(keypoints(frames[1], "id")))[0] == "bad_keypoints"
     node.config = NodeConfig(readout_time=READOUT_TIME)
-    localized(node.localize_keypoints(keypoints(frames[1], "id")), frames[1])
+    localized(node.localize_keypoints(keypoints(frames[2], "id")), frames[2])
 
 
 def test_coordinates_far_from_the_origin_keep_their_digits(frames, make_camera_info):
