@@ -197,7 +197,7 @@ class LocalizerConfig:
         "Probability of having drawn an all-inlier sample at which the search stops",
         (0.0, 0.999999),
     )
-    min_inliers: int = setting(12, "Fewest inliers of a pose that is accepted", (7, 1_000_000))
+    min_inliers: int = setting(8, "Fewest inliers of a pose that is accepted", (7, 1_000_000))
     max_orientation_deviation: float = setting(
         0.07,
         "Largest standard deviation of the orientation of a pose that is accepted, in rad, about "

@@ -17,7 +17,6 @@ from rs_localizer.config import LocalizerConfig, localizer_config
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.gyro_rotation import GyroRotation
-from rs_localizer.core.lens import LensError, with_lens
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.shutter import Motion
@@ -27,14 +26,6 @@ from rs_localizer.estimation import motion_model, observations, ransac
 from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
-from rs_localizer.estimation.lens import (
-    decided,
-    find_lens,
-    may_be_lens,
-    refuted,
-    shakes,
-    told_of_lens,
-)
 from rs_localizer.estimation.observations import (
     NEAREST,
     Observed,
@@ -46,7 +37,7 @@ from rs_localizer.estimation.observations import (
     relinearized,
     unfit,
 )
-from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
+from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import (
     Prior,
     PriorTerms,
@@ -154,9 +145,6 @@ class Localizer:
         self.localize(points, pixels + np.outer(swing, self.camera.row_time_gradient[::-1] != 0.0))
         # Errors that are smooth over the image.
         self.localize(points, pixels + 2.0 * np.outer((rays**2).sum(axis=1), [1.0, 1.0]))
-        # And through a lens that is off.
-        bent = with_lens(self.camera, np.array([-0.02, 0.0]))
-        self.localize(points, bent.distort(rays)[0], prior=Prior(asks_lens=True))
         # And before a plane whose points agree with nothing.
         flat = points * (2.0 / points @ [0.1, 0.0, 1.0])[:, None]
         strewn = np.random.default_rng(1).normal(size=(count, 2))
@@ -229,17 +217,11 @@ class Localizer:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
         sights = self._sights(points, pixels, scores, stamps)
         given = _Given(*sights, prior, expected_share, turn, error_modes)
-        lens = None if prior is None else prior.lens
-        if (turn is not None or lens is not None) and not given.exposure.alone:
-            raise ValueError("a known turn, or a lens, is that of a camera alone, not of a rig")
+        if turn is not None and not given.exposure.alone:
+            raise ValueError("a known turn is that of a camera alone, not of a rig")
         if turn is not None:
             given = given._replace(exposure=given.exposure.ahead())
-        found = self._found(given, lens)
-        if lens is not None:
-            plain = self._found(given, None)
-            threshold = self.config.inlier_threshold
-            if not found or (plain and refuted(found.residuals, plain.residuals, threshold)):
-                found = plain
+        found = self._found(given)
         if self._alone or not found:
             return found
         return RigEstimate.of(found, given.exposure, given.counts)
@@ -261,14 +243,11 @@ class Localizer:
             )
         return checked_of_rig(self.rig, points, stamps)
 
-    def _found(self, given: _Given, lens: LensError | None) -> Estimate | Failure:
-        """What there is to find by a lens that other frames tell of, or by the calibration's."""
+    def _found(self, given: _Given) -> Estimate | Failure:
         exposure, counts, points, pixels, scores, prior, expected_share, turn, modes = given
         terms, assumed = self._assume(exposure.span)
         if prior is not None or turn is not None:
             terms, assumed, prior = of_frame(terms, assumed, prior, turn)
-        if lens is not None:
-            exposure = exposure.by(lens.mended(*exposure.cameras))
         # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
         usable = find_usable(exposure, points, pixels, counts, turn)
         failure = unfit(exposure, pixels, usable, self.config.min_inliers)
@@ -281,8 +260,6 @@ class Localizer:
             generator(self.config.seed),
             assumed,
             Sighted(exposure, points, pixels, usable, turn),
-            lens,
-            prior is not None and prior.asks_lens,
             modes,
         )
         # 2. Near the predicted motion, if the points agree with it (tracking).
@@ -297,39 +274,7 @@ class Localizer:
         # 4. Maximum a posteriori on the inliers; rest or motion; the mirrored pose of a plane.
         posterior = self._settle(observed, best, observed.terms)
         # 5. Nothing rather than a wrong pose.
-        found = self._accept(observed, start, best, posterior, observed.terms)
-        return self._by_lens(observed, start, best, posterior, found)
-
-    def _by_lens(
-        self, observed: Observed, start: Candidate, best: Candidate, posterior: Posterior,
-        found: Estimate | Failure,
-    ) -> Estimate | Failure:  # fmt: skip
-        """The same, or if a lens that is off explains the points decidedly better, by that lens."""
-        threshold = self.config.inlier_threshold
-        if (
-            observed.lens is not None
-            or not self._solver.rolling_shutter
-            or not observed.sighted.exposure.alone
-            or not may_be_lens(found, posterior, threshold)
-        ):
-            return found
-        mended = find_lens(observed, posterior, threshold)
-        if mended is None:
-            return found
-        again = replace(
-            observed, observations=mended.observations, sighted=mended.sighted, lens=mended.lens
-        )
-        settled = self._settle(again, Candidate(mended.state, 0.0), observed.terms)
-        if shakes(again, settled):  # which explains what the plain motion beside it does not
-            return found
-        # Beside a motion alone: a smooth error explains what a lens that is off leaves, too.
-        plain = maximum_a_posteriori(
-            observed.observations, posterior.state, observed.terms, threshold
-        )
-        if not decided(plain, settled, mended.lens, threshold):
-            return found
-        result = self._accept(again, start, best, settled, observed.terms)
-        return result or found
+        return self._accept(observed, start, best, posterior, observed.terms)
 
     def _track(self, observed: Observed, prior: Prior, expected_share: float) -> Estimate | Failure:
         """The motion nearest to the prior one, if the points agree with it."""
@@ -404,8 +349,9 @@ class Localizer:
         enough = np.count_nonzero(posterior.inliers) >= self.config.min_inliers
         if enough and posterior.determined and np.all(np.isfinite(posterior.state)):
             effect = calibration_effect(
-                observed, posterior, own_terms, self.config.calibration, observed.error_modes
-            )
+                observed, posterior, own_terms, self.config.calibration,
+                own_terms is not observed.terms, observed.error_modes,
+            )  # fmt: skip
         known = math.hypot(posterior.declared, effect.residual)  # px, of map and calibration
         failure = refusal(
             observed.observations,
@@ -418,8 +364,4 @@ class Localizer:
         if failure is not None:
             return failure
         still = self._search.global_shutter_inliers(observed, start)
-        lens = None
-        asked = observed.lens is not None or observed.asks_lens
-        if asked and observed.sighted.exposure.alone:
-            posterior, lens = told_of_lens(observed, posterior)
-        return estimate_of(observed, posterior, still, best.samples, effect, lens)
+        return estimate_of(observed, posterior, still, best.samples, effect)

@@ -169,6 +169,11 @@ class Tracker:
         """Localize with the same cameras where they are now; the rig's axes stay the same."""
         self.localizer = Localizer(rig, self.localizer.config)
 
+    @property
+    def smooth_error(self) -> float:
+        """Size (px) of what map or lens are surely off by, as the frames so far tell; else 0."""
+        return 0.0 if self._track is None else self._track.experience.smooth_error
+
     def _trusts_motion(self, context: FrameContext) -> bool:
         """Whether how far the camera goes from frame to frame tells how it moves within one."""
         least = min(camera.readout_time for camera in self.localizer.rig.cameras.values())
@@ -285,8 +290,6 @@ class Tracker:
             prior = None if predicted is None else predicted.prior
             if prior is None:
                 prior = self._prior(time_ns, turn, span, context)
-            if self._track is not None and prior is not None:
-                prior = self._track.experience.with_lens(prior)
             found = self.localizer.find(
                 points, pixels, scores, prior, share, turn, stamps, context.error_modes
             )
@@ -309,8 +312,7 @@ class Tracker:
             result = self._judged(result, points, pixels, prior)
             self._remember(time_ns, prior, result, context)
             if self._aid is not None and imu is not None:
-                lens, camera = result.lens, self.localizer.camera
-                camera = camera if lens is None else lens.mended(camera)
+                camera = self.localizer.camera
                 assert pixels is not None and not isinstance(points, Mapping)  # noqa: PT018
                 self._aid.seek(camera, points, pixels, result, time_ns)
         elif self._track is not None and self._memory is Memory.MOTION:

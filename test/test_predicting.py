@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer.config import Acceleration
-from rs_localizer.core.scales import SCALES, Scales
+from rs_localizer.core.scales import Scales
 from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.experience import Experience
@@ -200,7 +200,7 @@ def test_without_its_shaking_the_covariance_knows_of_it():
     )
 
 
-SCALES_SAID = Scales.nothing()._replace(means=np.full(SCALES, -6.0), precisions=np.ones(SCALES))
+SCALES_SAID = Scales.nothing()._replace(size=np.array([-6.0, 1.0]))
 # Radians, metres, per readout and per readout squared.
 UNITS = np.repeat([1e-2, 3e-2, 1e-3, 2e-3, 1e-4, 3e-4], 3)
 START = Rotation.from_rotvec([0.4, -1.0, 0.2]).as_matrix()

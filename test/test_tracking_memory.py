@@ -11,12 +11,12 @@ import pytest
 import rs_localizer as rsl
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.scales import SCALES, Scales
+from rs_localizer.core.scales import Scales
 from rs_localizer.core.types import Failure
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.tracking import Memory, Tracker
 
-SAID = Scales.nothing()._replace(means=np.full(SCALES, -6.0), precisions=np.ones(SCALES))
+SAID = Scales.nothing()._replace(size=np.array([-6.0, 1.0]))
 CAMERA = rsl.Camera(width=640, height=480, K=np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
 
 
@@ -35,7 +35,7 @@ class Answering(rsl.Localizer):
         return result
 
 
-LOCALIZED = SimpleNamespace(scales=SAID, lens=None, of_lens=None)
+LOCALIZED = SimpleNamespace(scales=SAID)
 REFUSED = Failure(Reason.NO_HYPOTHESIS, "")
 
 
@@ -48,8 +48,8 @@ def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset():
     assert [prior is None for prior in localizer.priors] == [True, False, True, False]
     for prior in localizer.priors[1::2]:
         assert prior.motion is None
-        np.testing.assert_allclose(prior.scales.means, -6.0)
-        assert prior.scales.precisions.min() >= 1.0
+        assert prior.scales.size[0] == pytest.approx(-6.0)
+        assert prior.scales.size[1] >= 1.0
     frames.reset()
     frames.localize(0, [], [])
     assert localizer.priors[4] is None
@@ -57,11 +57,11 @@ def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset():
 
 def test_what_was_learned_is_forgotten_where_a_frame_fits_only_without():
     """A hand bends a board, and lets it go: no frame after it may be refused for that."""
-    other = SimpleNamespace(**vars(LOCALIZED) | {"scales": SAID._replace(means=0.0 * SAID.means)})
+    other = SimpleNamespace(**vars(LOCALIZED) | {"scales": Scales.nothing()})
     localizer = Answering([LOCALIZED, REFUSED, other, LOCALIZED])
     frames = Tracker(localizer, memory=Memory.MAP_AND_LENS)
     assert all(frames.localize(0, [], []) for _ in range(3))
-    np.testing.assert_allclose(localizer.priors[-1].scales.means, 0.0)
+    np.testing.assert_allclose(localizer.priors[-1].scales.size, 0.0)
 
 
 @pytest.mark.parametrize(

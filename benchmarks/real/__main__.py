@@ -64,10 +64,9 @@ _PARTS = {
         "found_ms", "motion_held", "motion_held_low", "motion_held_high",
         "backward_held", "backward_held_low", "backward_held_high",
     ),
-    "readout, twists (deg/s), lens notices, time": (
+    "readout, twists (deg/s), time": (
         "readout_ms",
         *(f"{name}_twist_{what}" for name in METHODS[1:] for what in ("size", "error", "inside")),
-        "lens_notices",
         *(f"{name}_ms" for name in METHODS),
     ),
 }  # fmt: skip

@@ -63,8 +63,6 @@ def judged(clip: Clip, lens: Camera, shutter: Shutter, config: NodeConfig) -> di
         row[f"{name}_ms"] = 1e3 * (time.process_time() - begin) / len(whole)
         reasons = [str(one.reason) for one in poses[name] if isinstance(one, Failure)]
         row |= {f"{name}_{reason}": count for reason, count in Counter(reasons).items()}
-    found = [one for name in METHODS for one in poses[name] if isinstance(one, Estimate)]
-    row["lens_notices"] = float(np.mean([one.lens is not None for one in found] or [False]))
     for name in (*METHODS, "poselib"):
         of_name = _jitter(clip, poses[name], poses[PEER])
         row |= {f"{name}_{key}": x for key, x in of_name.items()}
@@ -297,9 +295,7 @@ def _errors(camera: Camera, poses: Poses, held_out: Sequence[Observed]) -> Array
     errors = np.full(len(poses), np.nan)
     for k, (pose, image) in enumerate(zip(poses, held_out, strict=True)):
         if pose:
-            lens = pose.lens if isinstance(pose, Estimate) else None
-            by = camera if lens is None else lens.mended(camera)
-            pixels = project_rolling(by, pose.at_rows, image.points)[0]
+            pixels = project_rolling(camera, pose.at_rows, image.points)[0]
             errors[k] = np.mean(np.sum((pixels - image.pixels) ** 2, axis=1))
     return errors
 

@@ -12,7 +12,7 @@ coefficients of all cameras are of one size.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -26,35 +26,6 @@ _FEWEST = 4
 _OF_MATRIX = 4  # focal lengths and centre
 # What is the same for all frames of a camera; of the cameras of a rig, and lenses that are tried.
 _remembered = lru_cache(64)
-_RADII = np.linspace(0.0, 1.0, 21)
-_ANGLES = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LensError:
-    """What a calibration lacks: a Gaussian of its coefficients, six or eight."""
-
-    mean: Array  # (k,) of a, b, (c, d,) and what focal lengths and centre are off
-    covariance: Array  # (k,k)
-    corner: float  # px, distance of the image's corners, see corner_of
-
-    def mended(self, camera: Camera) -> Camera:
-        """The camera with what it lacks."""
-        return with_lens(camera, self.mean)
-
-    @property
-    def pixels(self) -> float:
-        """How far (px) it moves the image points that it moves farthest."""
-        distorting = 2 if len(self.mean) % _OF_MATRIX == 2 else 4
-        a, b, c, d = np.r_[self.mean[:distorting], np.zeros(4 - distorting)]
-        matrix = self.mean[distorting:]
-        focal, centre = (matrix[:2], matrix[2:]) if len(matrix) else np.zeros((2, 2))
-        x, y = (np.outer(_RADII, turn) for turn in (np.cos(_ANGLES), np.sin(_ANGLES)))
-        squared = x**2 + y**2
-        radial = a * squared + b * squared**2
-        along = x * (radial + focal[0]) + 2.0 * c * x * y + d * (squared + 2.0 * x**2) + centre[0]
-        down = y * (radial + focal[1]) + 2.0 * d * x * y + c * (squared + 2.0 * y**2) + centre[1]
-        return float(self.corner * np.hypot(along, down).max())
 
 
 @_remembered

@@ -25,20 +25,20 @@ MIDDLE_VALUES, MIDDLE_RATES = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
 MIDDLE_VALUES[::2], MIDDLE_RATES[1::2] = 1.0, RATES
 TYPICAL_SIZES = 3e-4 / np.sqrt(CYCLES)
 """rad, of an ordinary vibration: 0.02 deg at a cycle per readout, less the faster."""
-RESOLVED = 16
-"""Combinations of the functions that one readout tells from each other: all others are smaller than
-1e-4 of their squares."""
+RESOLVED = 18
+"""Combinations of whole cosines and sines that one readout tells from each other: all others are
+smaller than 1e-4 of their squares, and turn the middle row as little."""
 
 
 def _resolved() -> tuple[Array, Array]:
-    """Combinations (28,16) of the functions, and each function as a sum of them (16,28).
+    """Combinations (28,18) of the functions, and each function as a sum of them (18,28).
 
     Those of an ordinary vibration are independent of each other, and of size 1.
     """
     tau, sizes = np.linspace(-0.5, 0.5, 401)[:, None], np.repeat(TYPICAL_SIZES, 2)
     shown = np.empty((len(tau), FUNCTIONS))
-    shown[:, ::2] = (np.cos(RATES * tau) - 1.0) * sizes[::2]
-    shown[:, 1::2] = (np.sin(RATES * tau) - RATES * tau) * sizes[1::2]
+    shown[:, ::2] = np.cos(RATES * tau) * sizes[::2]
+    shown[:, 1::2] = np.sin(RATES * tau) * sizes[1::2]
     _, _, parts = np.linalg.svd(shown)
     return np.ascontiguousarray(sizes[:, None] * parts[:RESOLVED].T), parts[:RESOLVED] / sizes
 

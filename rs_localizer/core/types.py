@@ -13,7 +13,6 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.gyro_rotation import GyroRotation
-from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scales import Scales
 from rs_localizer.core.shake import shake_at, within_rows
@@ -57,9 +56,6 @@ class Estimate(Motion):
     turn: GyroRotation | None = None
     # By how many readouts the points would delay the known turn, and the variance of that
     delay: tuple[float, float] = (0.0, math.inf)
-    # What the calibration lacks, if the motion was found with it: project with lens.mended(camera)
-    lens: LensError | None = None
-    of_lens: LensError | None = None  # what the frame says of that; None: not asked
     span: float = 0.0  # s of a readout, as which row times count; 0: unknown
     # Probability that the pose lies outside its region or the map is another one; NaN: not judged
     integrity: float = math.nan

@@ -26,7 +26,7 @@ from rs_localizer.core.scales import SPEEDS
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, rotation_of
-from rs_localizer.estimation.frame_fit import SMOOTH_TERMS, smooth_terms
+from rs_localizer.estimation.correlated import smooth_columns
 from rs_localizer.estimation.mirror import longest_axis
 from rs_localizer.estimation.observations import Observed, rays_of_lens
 from rs_localizer.estimation.posterior import Posterior
@@ -80,12 +80,14 @@ NO_EFFECT = CalibrationEffect(np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)), 
 
 def calibration_effect(
     observed: Observed, posterior: Posterior, terms: PriorTerms, deviation: CalibrationErrors,
-    of_map: ErrorModes | None = None,
+    tracked: bool, of_map: ErrorModes | None = None,
 ) -> CalibrationEffect:  # fmt: skip
     """The effect on the motion of a frame.
 
     Args:
         terms: what is known of the motion but for poses of other frames, which are off by as much.
+        tracked: poses of other frames are known, so that the covariance has no longer all of what
+            the smooth error does.
         of_map: errors of the points; None: they have none.
     """
     observations, chosen = observed.observations, posterior.inliers
@@ -117,9 +119,9 @@ def calibration_effect(
     bend = posterior.bend[chosen] if posterior.bend.shape[1] else np.zeros((len(rays), 0))
     parts = posterior.speeds if len(posterior.speeds) else _CONFIGURED
     effect: CalibrationEffect = _effect(
-        by_motion, _smooth_columns(by_motion, image, bend, posterior.shared), columns,
+        by_motion, posterior.shared * smooth_columns(by_motion, image, bend), columns,
         posterior.state, terms, parts, turn is not None, posterior.noise**2,
-        posterior.inflation,
+        posterior.inflation, tracked,
     )  # fmt: skip
     return effect
 
@@ -136,7 +138,7 @@ def _lines(
 @kernel
 def _effect(
     by_motion: Array, smooth: Array, columns: Array, state: Array, terms: PriorTerms,
-    parts: Array, turn_known: bool, variance: float, inflation: float,
+    parts: Array, turn_known: bool, variance: float, inflation: float, tracked: bool,
 ) -> CalibrationEffect:  # fmt: skip
     """How errors move motion and smooth error.
 
@@ -158,8 +160,9 @@ def _effect(
     products = every[:size, :size].copy()
     crossed = np.zeros((size, errors + q))
     crossed[:, :errors] = every[:size, size:]
-    for k in range(q):
-        crossed[PARAMETERS + k, errors + k] = variance
+    if tracked:
+        for k in range(q):
+            crossed[PARAMETERS + k, errors + k] = variance
     pull, taken = np.zeros((MOTION_PARAMETERS, errors + q)), np.zeros((PARAMETERS, errors))
     of_errors = crossed[:PARAMETERS, :errors].copy()
     for k in range(len(parts)):
@@ -184,34 +187,6 @@ def _effect(
     left += np.sum(taken * beside)
     residual = np.sqrt(max(left, 0.0) / max(count, 1))
     return CalibrationEffect(pull @ pull.T, residual, still)
-
-
-@kernel
-def _smooth_columns(by_motion: Array, rays: Array, bend: Array, scale: float) -> Array:
-    """By how many pixels a deviation of each coefficient of the smooth error moves (n,2,q)."""
-    count = len(rays)
-    if not scale > 0.0:
-        return np.zeros((count, 2, 0))
-    if bend.shape[1] > 0:
-        bent = np.empty((count, 2, 3 * bend.shape[1]))
-        for i in range(count):
-            for side in range(2):
-                for k in range(bend.shape[1]):
-                    for axis in range(3):
-                        moved = -scale * by_motion[i, side, MOVE.start + axis]
-                        bent[i, side, 3 * k + axis] = moved * bend[i, k]
-        return bent
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for i in range(count):
-        for axis in range(2):
-            low[axis] = min(low[axis], rays[i, axis])
-            high[axis] = max(high[axis], rays[i, axis])
-    columns, each = np.zeros((count, 2, 2 * SMOOTH_TERMS)), np.zeros(SMOOTH_TERMS)
-    for i in range(count):
-        smooth_terms(rays[i], low, high, each)
-        for k in range(SMOOTH_TERMS):
-            columns[i, 0, k] = columns[i, 1, SMOOTH_TERMS + k] = scale * each[k]
-    return columns
 
 
 def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Array:

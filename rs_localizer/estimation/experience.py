@@ -1,9 +1,10 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the frames so far say of shaking and of errors of map and lens: the next ones share them."""
+"""What the frames so far say of shaking, speed and errors of map and lens: the next share them."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -12,52 +13,38 @@ import numpy as np
 from rs_localizer.config import VelocityPrior
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lens import LensError
-from rs_localizer.core.scales import INDEPENDENT, SPEED_MEMORY, SPEEDS, Scales
-from rs_localizer.core.scales import joined as joined_scales
+from rs_localizer.core.scales import INDEPENDENT, SPEED_MEMORY, SPEEDS, Scales, joined
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.lens import DECIDED, credible, joined, odds_of
 from rs_localizer.estimation.modes import FAR_LESS_PROBABLE
-from rs_localizer.estimation.prior import WALKING, Prior
+from rs_localizer.estimation.prior import WALKING
 
-# A lens stays what it is, but its coefficients are not all of it: it is never known better than
-# fifty frames tell.
-_LENS_MEMORY = 0.98
-# Before a lens is known to be off, one frame in so many is asked for it, and all where that is
-# probable.
-_EVERY = 16
-# Smooth errors in excess (standard normal) that ask for it, too. With that of a frame that may be a
-# lens's, 3 % of missing distortion were not found in 24 frames (test_lens).
-_SUSPECTED = 2.0
+# Smooth errors (px, root mean square) that nobody has who calibrated well: surveyed tags before a
+# calibrated lens have 0.2; and the deviations of the logarithm that make it sure.
+_MUCH, _SURELY = 0.3, 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Experience:
-    """Scales of shaking, smooth errors and speed; and the lens."""
+    """Scales of shaking, smooth errors and speed."""
 
     scales: Scales
-    lens: LensError | None = None  # as it seems; None: nobody asked
-    frames: int = 1
-
-    @property
-    def odds(self) -> float:
-        """Logarithm of those for a lens that is off."""
-        return 0.0 if self.lens is None else odds_of(self.lens)
 
     @classmethod
     def of(cls, first: Estimate) -> Self:
         """That of one frame."""
-        return cls(first.scales, first.of_lens)
+        return cls(first.scales)
 
     def and_of(self, newest: Estimate) -> Experience:
         """The experience after one more frame."""
-        lens, seen = self.lens, newest.of_lens
-        if seen is not None:
-            lens = seen if lens is None else joined(lens, seen, _LENS_MEMORY)
-        elif self.odds > DECIDED and newest.lens is None:  # the frame did without
-            lens = None
-        return Experience(joined_scales(self.scales, newest.scales), lens, self.frames + 1)
+        return Experience(joined(self.scales, newest.scales))
+
+    @property
+    def smooth_error(self) -> float:
+        """Size (px) of what map or lens are surely off by; 0: perhaps of nothing."""
+        mean, precision = self.scales.size.tolist()
+        surely = precision > 0.0 and mean - _SURELY / math.sqrt(precision) > math.log(_MUCH)
+        return math.exp(mean) if surely else 0.0
 
     def moving(
         self, remembered: Array, before: Estimate, after: Estimate, seconds: float,
@@ -84,17 +71,3 @@ class Experience:
         # A camera may start to move.
         odds = np.maximum(odds - odds.max(), -FAR_LESS_PROBABLE)
         return replace(self, scales=self.scales._replace(speeds=odds))
-
-    @property
-    def prior(self) -> Prior:
-        """For the next frame, of whose motion nothing is known."""
-        return self.with_lens(Prior(scales=self.scales))
-
-    def with_lens(self, prior: Prior) -> Prior:
-        """What is known of the next frame, and the lens if it is off."""
-        if self.lens is not None and self.odds > DECIDED and credible(self.lens):
-            return replace(prior, lens=self.lens)
-        probable = self.odds > 0.0 or self.scales.excess[-1] > _SUSPECTED
-        if probable or self.frames % _EVERY == 0:
-            return replace(prior, asks_lens=True)
-        return prior

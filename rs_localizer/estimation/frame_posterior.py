@@ -3,8 +3,8 @@
 """The posterior of a frame: one model, its modes, and one Gaussian of them all.
 
 docs/estimator.md is the page. The discrete alternatives of a frame, {rest, typical speeds} x {this
-lean of a plane, the mirrored one}, are starts of one fit (:mod:`.frame_fit`); each becomes a
-Gaussian (Laplace approximation) with its evidence; the mixture's mean and covariance go out.
+lean of a plane, the mirrored one} and {steady, vibrating}, become Gaussians with their evidence
+(:mod:`.modes`, :mod:`.turn`); the mixture's mean and covariance go out.
 """
 
 from __future__ import annotations
@@ -13,68 +13,72 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
 
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.scales import SPEEDS
-from rs_localizer.core.shake import CYCLES
-from rs_localizer.core.state import PARAMETERS
-from rs_localizer.estimation.first_look import Hyperprior, first_look, near_outliers
-from rs_localizer.estimation.frame_fit import FrameFit, at_speed, bend_of, fit_frame
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.scales import SPEEDS, VIBRATIONS
+from rs_localizer.core.shake import MIDDLE_RATES, shake_at
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, POSE, POSE_SIZE
+from rs_localizer.estimation.correlated import (
+    ORDINARY,
+    Noise,
+    SmoothError,
+    bend_of,
+    nothing_shared,
+    smooth_error,
+)
+from rs_localizer.estimation.first_look import Look, first_look, near_outliers, neighbours_agree
 from rs_localizer.estimation.mirror import farthest
 from rs_localizer.estimation.modes import (
-    FAR_LESS_PROBABLE,
     LEAST_LIKELY,
     REST_ODDS,
-    STEPS,
     TEMPER,
-    Inliers,
-    SmoothError,
-    log_evidence,
+    Frame,
+    Mixture,
     mixed,
     mixture_of,
 )
 from rs_localizer.estimation.observations import MOST_POINTS, NEAREST, Observations
-from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior
-from rs_localizer.estimation.prior import Assumed, PriorTerms
+from rs_localizer.estimation.posterior import (
+    GATE,
+    WIDEST_GATE,
+    Posterior,
+    maximum_a_posteriori,
+)
+from rs_localizer.estimation.prior import Assumed, PriorTerms, terms_at
+from rs_localizer.estimation.refine import LEAST_NOISE, apply_step
+from rs_localizer.estimation.residuals import Lines, linearized
+from rs_localizer.estimation.turn import TurnFit, fit_turn, hidden_turn
 
-# An in-frame turn is fitted where chance explains as much in three frames of ten, because one that
-# hides in the noise spoils regions and a fit from near by is cheap; a smooth error in one of
-# twenty. Standard normal, of 14 frequencies and of the smooth error.
-_ASKS_TURNS, _ASKS_SMOOTH = float(-ndtri(0.3 / len(CYCLES))), float(-ndtri(0.05))
-# What chance explains in one frame of ten thousand may have moved points out of the gate.
-_WIDENS = float(-ndtri(1e-4 / len(CYCLES)))
-# Likewise of the frames before (standard normal): one track in a thousand.
-_ASKS_REMEMBERED = 3.3
 # Of the typical speeds.
 _RESTS, _NOTHING = np.array([speed == 0.0 for speed in SPEEDS], float), np.zeros(len(SPEEDS))
+# Gates have room for so many declared deviations of the map: a curled corner is no outlier.
+_ROOM = 3.0
 # Shaking of up to this (rad, 2 deg) moves points out of the gate of a motion without it.
 _LARGEST_SHAKE = 0.035
-# A mode that loses more inliers than this part leaves is another group of points.
+# A fit that loses more inliers than this part leaves is another group of points.
 _KEPT = 0.9
 # Probability that does not count.
 _NO_PART = 1e-4
 # Logarithm of the odds of none against an in-frame turn, before any frame: as for rest.
 _STEADY_ODDS = REST_ODDS
-# Of the cameras that do not show it, one in ten shakes: with one in three, in ten, and in twenty
-# the turn rates of hands are claimed to be 1.9, 1.5 and 1.35 times their actual deviation, 93.4,
-# 92.3 and 90.8 % of the twists under one sine are inside, and 0.9, 1.4 and 1.7 % of the poses under
-# bands are beyond five deviations (benchmarks.frames, hand, sine, bands, 24 frames each, seed 1).
+# Of the cameras that do not show it, one in ten shakes.
 _HIDDEN_ODDS = math.log(10.0)
+# Logarithm of the evidence of an ordinary vibration against none from which it is fitted.
+_ASKS = -0.5
+_FEWEST = 6
+# A smooth error that is found so many times larger than it was known to be.
+_LARGER = 1.5
 
 
-class _Frame(NamedTuple):
-    """The inliers of a frame and what is the same for all modes."""
+class _Given(NamedTuple):
+    """The points of a frame, and what is known of it."""
 
     observations: Observations
-    best: Posterior
     terms: PriorTerms
-    threshold: float
+    threshold: float  # px, of inliers
     assumed: Assumed
-    hyper: Hyperprior
-    smooth: bool  # beside a smooth error
-    planar: bool
-    bend: Array  # (n,b) of a smooth error of the map (see frame_fit); (n,0): of the image
+    slowest: int  # index of the first typical speed that is weighed
 
 
 def frame_posterior(
@@ -100,8 +104,7 @@ def frame_posterior(
         bend = part.bend
         if bend.shape[1]:
             depth = max(observations.median_depth(part.state, inliers), NEAREST)
-            size = depth / assumed.focal_length
-            bend = bend_of(observations.points, inliers, part.declared, size)
+            bend = bend_of(observations.points, inliers, depth / assumed.focal_length)
         return part._replace(squared_errors=errors, inliers=inliers, bend=bend)
     return _of_points(observations, start, terms, threshold, assumed, one_lens)
 
@@ -110,229 +113,244 @@ def _of_points(
     observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed,
     one_lens: bool,
 ) -> Posterior:  # fmt: skip
+    declares, turn_known = assumed.map_deviation > 0.0, assumed.turn is not None
+    wide = (_ROOM if declares and assumed.rolling else 1.0) * threshold
     look = first_look(
-        observations.packed, observations.points, start, terms, threshold, assumed.map_deviation,
-        assumed.focal_length, assumed.rolling, assumed.turn is not None, assumed.scales,
-    )  # fmt: skip
-    best = Posterior(*look.best)
-    if not best.determined:
-        return best
-    declared, excess, remembered = look.declared, look.excess, assumed.scales
-    near, vibration = look.near_outliers, look.vibration
-    best = best._replace(agreement=look.agreement, near_outliers=near, declared=declared)
-    most = excess[:-1].max()
-    known = remembered.excess[:-1].max() > _ASKS_REMEMBERED
-    wide = assumed.rolling and bool(most > _WIDENS or near > 0)
-    # What a gyroscope leaves of the turn tells the offset of its stamps.
-    hidden = assumed.turn is None and bool(most > _ASKS_TURNS or known)
-    turns = assumed.rolling and (wide or hidden)
-    # What a gyroscope that comes too late leaves is smooth, too.
-    shows = one_lens and (excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED)
-    smooth = bool(best.inliers.any() and (declared > 0.0 or (assumed.turn is None and shows)))
-    # What turns within the frame would explain, errors of map and lens may explain as well.
-    frame = _Frame(
-        observations, best, terms, threshold, assumed, look.hyper, smooth, look.planar,
-        np.zeros((observations.count, 0)),
-    )  # fmt: skip
-    if smooth:
-        bend = bend_of(
-            observations.points, best.inliers, declared, look.depth / assumed.focal_length
-        )
-        of_map = frame._replace(bend=bend)
-        # Before a plane both explain alike. In depth a bent map leaves more open: it is left out
-        # only where it is far less probable.
-        if declared > 0.0 or (
-            not frame.planar and _evidence_of(of_map) > _evidence_of(frame) - FAR_LESS_PROBABLE
-        ):
-            frame = of_map
-    # A map that is known to be bent may look like motion.
-    moving = declared == 0.0 and not frame.planar and look.moving
-    slowest = 0 if assumed.may_rest and not moving else len(SPEEDS) - 1
-    other = look.mirrored if look.is_mirrored else None
-    shaken = _shaken(frame, wide, other, slowest) if turns else None
-    if frame.smooth or frame.planar or slowest == 0:
-        posterior, evidence = _merged(frame, slowest)
-    else:
-        posterior, evidence = best, -math.inf
-        if shaken is not None:
-            evidence = _evidence_of(frame)
-    # A smooth error that is fitted explains the same errors: both together would count them twice.
-    of_vibration = min(vibration.log_evidence, 0.0 if smooth else math.inf)
-    if shaken is not None:
-        fitted, evidence_of_shaking = shaken
-        # Scales at their most probable values say less than those that are integrated.
-        of_one = -math.inf if smooth else evidence + of_vibration
-        posterior = _either(posterior, evidence, fitted, max(evidence_of_shaking, of_one))
-    elif assumed.rolling and assumed.turn is None:
-        odds = TEMPER * of_vibration - _HIDDEN_ODDS
-        may_shake = 1.0 / (1.0 + math.exp(-min(odds, 700.0)))
-        posterior = posterior._replace(undetected=may_shake * vibration.covariance)
-    return posterior._replace(scales=posterior.scales._replace(excess=excess))
-
-
-def _evidence_of(frame: _Frame) -> float:
-    """Of the fastest motion."""
-    return mixture_of(
-        _inliers(frame), frame.best.state, frame.terms, _NOTHING, _NOTHING, len(SPEEDS) - 1, False,
-        False, _smooth(frame),
-    ).evidence  # fmt: skip
-
-
-def _shaken(
-    frame: _Frame, wide: bool, other: Array | None, slowest: int
-) -> tuple[Posterior, float] | None:
-    """The posterior of a camera that turns within the frame, and its evidence; None: no such.
-
-    ``wide``: from a gate that is as wide as shaking moves points.
-    """
-    best, threshold, assumed = frame.best, frame.threshold, frame.assumed
-    gate, noise = min(max(threshold, GATE * best.noise), WIDEST_GATE * threshold), best.noise
-    if wide:
-        gate = max(2.0 * WIDEST_GATE * threshold, _LARGEST_SHAKE * assumed.focal_length)
-        noise = threshold
-    starts = (best.state,) if other is None else (best.state, other)
-    fits = [fit for one in starts if (fit := _fit(frame, one, gate, noise)).finite]
-    if not fits:
-        return None
-    most = max(np.count_nonzero(fit.inliers) for fit in fits)
-    fits = [fit for fit in fits if np.count_nonzero(fit.inliers) >= _KEPT * most]
-    fit = max(fits, key=lambda one: one.evidence)
-    inliers = np.count_nonzero(fit.inliers)
-    if inliers < _KEPT * np.count_nonzero(best.inliers):
-        return None
-    if wide and fit.freedom < inliers:
-        return None  # every second equation went into coefficients: wrong points would, too
-    return _at_any_speed(frame, fit, slowest)
-
-
-def _fit(frame: _Frame, start: Array, gate: float, noise: float) -> FrameFit:
-    """Motion and in-frame turn, from a state (24,) and a gate and noise (px)."""
-    return fit_frame(
-        frame.observations.packed, frame.observations.count, start, frame.terms, frame.threshold,
-        gate, noise, *frame.hyper, True, frame.smooth, frame.bend, STEPS,
-    )  # fmt: skip
-
-
-def _at_any_speed(frame: _Frame, fit: FrameFit, slowest: int) -> tuple[Posterior, float]:
-    """The mixture of all typical speeds of a camera that turns within the frame; its evidence."""
-    (odds, by_turn), last = _odds_of_speeds(frame), len(SPEEDS) - 1
-    weighed = slowest < last or frame.smooth or frame.planar  # as those without a turn
-    if not weighed:
-        odds, by_turn = _NOTHING, _NOTHING
-    evidence = log_evidence(
-        fit.log_determinant, fit.left + fit.prior_cost, frame.terms, _inliers(frame), fit.inliers,
-        fit.noise,
-    )  # fmt: skip
-    parts = [(fit.state, fit.turns, fit.covariance)]
-    own = [odds[last] + by_turn[last] + evidence]
-    turn_known = frame.assumed.turn is not None
-    for speed in range(last - 1, slowest - 1, -1):
-        if own[-1] < max(own) - FAR_LESS_PROBABLE / TEMPER:
-            break
-        state, turns, covariance, ratio = at_speed(
-            *parts[0], fit.by_smooth, fit.freedom, frame.terms, SPEEDS[speed], turn_known
-        )
-        parts.append((state, turns, covariance))
-        own.append(odds[speed] + by_turn[speed] + evidence + ratio)
-    posterior, total = _of_fit(frame, fit), float(np.logaddexp.reduce(own))
-    if weighed:
-        total -= math.log(len(SPEEDS))
-    if len(parts) == 1:
-        return posterior, total
-    evidences = np.full(len(SPEEDS), -math.inf)
-    evidences[::-1][: len(own)] = own
-    probable = np.exp(evidences + REST_ODDS * _RESTS - evidences.max())
-    possible = np.exp(TEMPER * (evidences - evidences.max()))
-    probable, possible = probable / probable.sum(), possible / possible.sum()
-    used = slice(last, last - len(parts) if len(parts) <= last else None, -1)
-    state, turns, covariance = mixed(parts, probable[used], possible[used])
-    likelihoods = evidences - odds
-    posterior = posterior._replace(
-        state=state,
-        covariance=covariance,
-        shake=turns,
-        speeds=possible,
-        scales=posterior.scales._replace(
-            speeds=np.maximum(likelihoods - likelihoods.max(), LEAST_LIKELY)
-        ),
+        observations.packed, observations.points, start, terms, wide, assumed.rolling, turn_known
     )
-    return posterior, total
-
-
-def _of_fit(frame: _Frame, fit: FrameFit) -> Posterior:
-    """The posterior of one fit with an in-frame turn."""
-    _, mean, precision = frame.hyper
-    own = 2.0 * fit.decided  # precision of the frame alone
-    total = fit.log_scales * (own + precision)
-    said = np.where(own > 0.1, (total - precision * mean) / np.maximum(own, 0.1), 0.0)
-    near = near_outliers(fit.squared_errors, fit.inliers, frame.threshold)
-    return frame.best._replace(
-        state=fit.state, covariance=fit.covariance, noise=fit.noise,
-        freedom=fit.freedom, inliers=fit.inliers, squared_errors=fit.squared_errors,
-        shake=fit.turns, model_error=fit.smooth, shared=fit.smooth, bend=frame.bend,
-        agreement=fit.agreement, near_outliers=near,
-        scales=frame.best.scales._replace(means=said, precisions=np.where(own > 0.1, own, 0.0)),
-    )  # fmt: skip
-
-
-def _odds_of_speeds(frame: _Frame) -> tuple[Array, Array]:
-    """Logarithms of the odds (5,) of the typical speeds, and of the likelihood by a gyroscope."""
-    assumed, by_turn = frame.assumed, _NOTHING
+    best = Posterior(*look.best)
+    if not best.determined or np.count_nonzero(best.inliers) < _FEWEST:
+        return best
+    declared = assumed.map_deviation * assumed.focal_length / look.depth
+    best = best._replace(
+        agreement=look.agreement, near_outliers=look.near_outliers, declared=declared
+    )
+    moving = look.moving and not declares and not look.planar
+    slowest = 0 if assumed.may_rest and not moving else len(SPEEDS) - 1
+    first = best.state
+    if declares and slowest == 0:  # a bend is not taken for a motion from the start
+        still = start.copy()
+        still[12:] = 0.0
+        rest = maximum_a_posteriori(observations, still, terms_at(terms, 0.0, turn_known), wide)
+        if np.count_nonzero(rest.inliers) >= _FEWEST:
+            first = rest.state
+            best = best._replace(inliers=best.inliers | rest.inliers)
+    bend = np.zeros((observations.count, 0))
+    if declares and assumed.rolling:
+        bend = bend_of(observations.points, best.inliers, look.depth / assumed.focal_length)
+    size = _size_of(declared, assumed) if assumed.rolling and one_lens else (0.0, 0.0)
+    odds = assumed.scales.speeds + assumed.of_rest * _RESTS
+    by_turn = _NOTHING
     if assumed.turn is not None:
         by_turn = np.array([assumed.turn.evidence(speed) for speed in SPEEDS])
-    return assumed.scales.speeds + assumed.of_rest * _RESTS, by_turn
-
-
-def _merged(frame: _Frame, slowest: int) -> tuple[Posterior, float]:
-    """The mixture of all modes as one Gaussian, and its evidence.
-
-    ``slowest``: index of the first typical speed that is weighed.
-    """
-    best, assumed = frame.best, frame.assumed
-    odds, by_turn = _odds_of_speeds(frame)
-    found = mixture_of(
-        _inliers(frame), best.state, frame.terms, odds, by_turn, slowest,
-        assumed.turn is not None, frame.planar, _smooth(frame),
+    smooth = _smooth_of(look.lines, best.inliers, bend, *size)
+    found = _steady(
+        observations.packed, observations.points, look, best.inliers, smooth, first, terms, odds,
+        by_turn, slowest, turn_known, assumed.focal_length, declares,
     )  # fmt: skip
     if found.evidence == -math.inf:
-        return best._replace(smallest_eigenvalue=0.0), -math.inf
-    posterior = best._replace(
+        return best._replace(smallest_eigenvalue=0.0)
+    noise, shared, freedom, log_size, spread = found.errors.tolist()
+    told = max(1.0 / max(spread, 1e-3) - size[1], 0.0) if size[1] > 0.0 else 0.0
+    of_size = np.zeros(2)
+    if told > 0.0:
+        of_size[:] = (log_size * (told + size[1]) - size[0] * size[1]) / told, told
+    steady = best._replace(
         state=found.state,
         covariance=found.covariance,
         arched=found.arched,
-        squared_errors=frame.observations.squared_errors(found.state),
-        model_error=found.smooth,
-        shared=found.shared,
-        bend=frame.bend,
+        squared_errors=observations.squared_errors(found.state),
+        noise=noise,
+        freedom=freedom,
+        model_error=shared,
+        shared=shared,
+        bend=bend,
         speeds=found.speeds,
-        scales=best.scales._replace(speeds=found.log_likelihoods),
+        scales=best.scales._replace(size=of_size, speeds=found.log_likelihoods),
         mirror=(
             farthest(found.costs, found.evidences, found.steps, found.covariance)
-            if frame.planar
+            if look.planar
             else None
         ),
     )
-    if best.declared > 0.0:  # points that a known bend moves out of the gate are no outliers
-        near = near_outliers(found.squared_errors, found.chosen, frame.threshold)
-        posterior = posterior._replace(inliers=found.chosen, near_outliers=near)
-    return posterior, found.evidence - math.log(len(SPEEDS))
+    if not assumed.rolling:
+        return steady
+    evidence = found.evidence - math.log(len(SPEEDS) - slowest)
+    # Points that are no inliers are anywhere in an image of a focal length squared.
+    outside = observations.count - np.count_nonzero(best.inliers)
+    evidence -= 2.0 * outside * math.log(assumed.focal_length)
+    if not assumed.rolling or (declares and look.planar):
+        # What looks like vibration before a board that is bent is more of its bend.
+        return steady
+    return _with_turn(
+        _Given(observations, terms, threshold, assumed, slowest), look, smooth, steady, evidence
+    )
 
 
-def _smooth(frame: _Frame) -> SmoothError:
-    return SmoothError(frame.smooth, *frame.hyper, frame.bend)
+def _size_of(declared: float, assumed: Assumed) -> tuple[float, float]:
+    """What is known of the logarithm of the size of the smooth error: mean and precision."""
+    mean, precision = assumed.scales.size.tolist()
+    own = math.log(declared if declared > 0.0 else ORDINARY)
+    return (own + precision * mean) / (1.0 + precision), 1.0 + precision
 
 
-def _inliers(frame: _Frame) -> Inliers:
-    observations, best = frame.observations, frame.best
-    return Inliers(
-        observations.packed, observations.points, best.inliers,
-        best.noise, best.freedom, best.cost / best.noise**2,
-        frame.assumed.focal_length, frame.threshold,
+@kernel
+def _smooth_of(
+    lines: Lines, inliers: BoolArray, bend: Array, log_size: float, precision: float
+) -> SmoothError:
+    """The smooth error of the inliers; ``precision`` 0: there is none."""
+    if precision > 0.0:
+        return smooth_error(lines, inliers, bend, log_size, precision)
+    return nothing_shared(int(np.count_nonzero(inliers)))
+
+
+@kernel
+def _steady(
+    data: Array, points: Array, look: Look, inliers: BoolArray, smooth: SmoothError, first: Array,
+    terms: PriorTerms, odds: Array, by_turn: Array, slowest: int, turn_known: bool,
+    focal_length: float, declares: bool,
+) -> Mixture:  # fmt: skip
+    """The mixture of all modes of a camera that does not turn within its frame."""
+    best = look.best
+    raw = 0.0
+    for i in range(len(best.inliers)):
+        if best.inliers[i]:
+            raw += best.squared_errors[i]
+    equations = 2.0 * np.count_nonzero(best.inliers)
+    raw = raw / max(best.freedom, 1.0)
+    noise = Noise(
+        best.noise, max(best.noise**2 / max(raw, LEAST_NOISE**2), 1.0),
+        max(equations - best.freedom, 0.0),
+    )  # fmt: skip
+    frame = Frame(data, points, inliers, smooth, noise, focal_length, look.depth, declares)
+    return mixture_of(frame, first, terms, odds, by_turn, slowest, turn_known, look.planar)
+
+
+def _with_turn(
+    given: _Given, look: Look, smooth: SmoothError, steady: Posterior, evidence: float
+) -> Posterior:
+    """The posterior of a camera that may turn within the frame."""
+    observations, terms, threshold, assumed, slowest = given
+    best, odds = look.best, assumed.scales.vibrations
+    wide = look.near_outliers > 0
+    if assumed.turn is not None and not wide:  # what a gyroscope leaves tells its offset
+        return steady
+    gain, moments = hidden_turn(
+        look.lines, best.state, steady.inliers, smooth, steady.shared, terms, steady.noise,
+        steady.freedom, odds,
+    )  # fmt: skip
+    if wide or gain > _ASKS or odds[1:].max() > odds[0]:
+        gate, noise = min(max(threshold, GATE * best.noise), WIDEST_GATE * threshold), best.noise
+        if wide:
+            gate = max(2.0 * WIDEST_GATE * threshold, _LARGEST_SHAKE * assumed.focal_length)
+            noise = threshold
+        # What is smooth over the image may be what looks like vibration, or vibration what looked
+        # smooth.
+        log_sizes = [smooth.log_size]
+        if steady.shared > _LARGER * math.exp(smooth.log_size):
+            log_sizes.append(math.log(steady.shared))
+        fits = [
+            fit_turn(
+                observations.packed,
+                observations.count,
+                best.state,
+                terms,
+                threshold,
+                gate,
+                noise,
+                odds,
+                steady.bend,
+                log_size,
+                smooth.log_size,
+                smooth.precision,
+                assumed.focal_length,
+            )
+            for log_size in log_sizes
+        ]
+        fit = max(fits, key=lambda one: one.evidence if one.finite else -math.inf)
+        kept, had = np.count_nonzero(fit.inliers), np.count_nonzero(best.inliers)
+        if fit.finite and kept >= _KEPT * had and not (wide and fit.freedom < kept):
+            shaken = _of_fit(observations, steady, fit, threshold)
+            shaken, ratio = _at_any_speed(shaken, fit, terms, assumed, slowest)
+            # As if any speed left it, where vibration hardly shows.
+            return _either(steady, evidence, max(fit.evidence + ratio, evidence + gain), shaken)
+    weight = 1.0 / (1.0 + math.exp(min(_HIDDEN_ODDS - TEMPER * gain, 700.0)))
+    undetected = weight * moments[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
+    told = np.append(0.0, np.full(VIBRATIONS - 1, max(gain, LEAST_LIKELY)))
+    return steady._replace(undetected=undetected, scales=steady.scales._replace(vibrations=told))
+
+
+def _of_fit(
+    observations: Observations, steady: Posterior, fit: TurnFit, threshold: float
+) -> Posterior:
+    """The posterior of a camera that turns within the frame."""
+    lines = linearized(
+        observations.packed, observations.count, fit.state,
+        shake_at(observations.tau, fit.turns),
+    )  # fmt: skip
+    told = np.maximum(fit.vibrations - fit.vibrations.max(), LEAST_LIKELY)
+    return steady._replace(
+        state=fit.state, covariance=fit.covariance, noise=fit.noise, freedom=fit.freedom,
+        inliers=fit.inliers, squared_errors=fit.squared_errors, shake=fit.turns, arched=None,
+        agreement=neighbours_agree(lines.errors, lines.tau, lines.image, fit.inliers),
+        near_outliers=near_outliers(lines, fit.squared_errors, fit.inliers, threshold),
+        speeds=np.zeros(0), mirror=None,
+        scales=steady.scales._replace(vibrations=told, speeds=_NOTHING),
     )  # fmt: skip
 
 
+def _at_any_speed(
+    shaken: Posterior, fit: TurnFit, terms: PriorTerms, assumed: Assumed, slowest: int
+) -> tuple[Posterior, float]:
+    """The mixture of all typical speeds, and by how much the logarithm of the evidence changes.
+
+    Near the fit all is linear: of a slower motion without its vibration velocities and
+    accelerations are known better to be zero (Kalman 1960), at unknown noise (Student's form).
+    """
+    last, turn_known = len(SPEEDS) - 1, assumed.turn is not None
+    odds = assumed.scales.speeds + assumed.of_rest * _RESTS
+    rates = np.zeros((PARAMETERS, len(fit.covariance)))
+    rates[:, :PARAMETERS] = np.eye(PARAMETERS)
+    for axis in range(3):
+        rates[ANGULAR.start + axis, PARAMETERS + axis :: 3] = -MIDDLE_RATES
+    moving = rates[POSE.stop :]
+    spread, turned = moving @ fit.covariance, fit.turns.ravel()
+    values = fit.state[POSE_SIZE:] + moving[:, PARAMETERS:] @ turned
+    before = np.diagonal(terms.informations[0])[POSE.stop :]
+    parts, own = [(fit.state, fit.turns, fit.covariance)], [odds[last]]
+    for speed in range(last - 1, slowest - 1, -1):
+        after = np.diagonal(terms_at(terms, SPEEDS[speed], turn_known).informations[0])[POSE.stop :]
+        known = np.flatnonzero((before > 0.0) & (after > before))
+        more = after[known] - before[known]
+        within = spread[known] @ moving[known].T + np.diag(1.0 / more)
+        gain = np.linalg.solve(within, spread[known]).T
+        step = -gain @ values[known]
+        squared = values[known] @ np.linalg.solve(within, values[known])
+        volume = np.linalg.slogdet(within)[1] + np.log(more * before[known] / after[known]).sum()
+        ratio = -0.5 * (fit.freedom * math.log1p(squared / fit.freedom) + volume)
+        parts.append((
+            apply_step(fit.state, step[:PARAMETERS]),
+            fit.turns + step[PARAMETERS:].reshape(fit.turns.shape),
+            fit.covariance - gain @ spread[known],
+        ))  # fmt: skip
+        own.append(odds[speed] + ratio)
+    evidences = np.array(own)
+    total = float(np.logaddexp.reduce(evidences)) - math.log(len(own))
+    rests = _RESTS[::-1][: len(own)]
+    probable = np.exp(evidences + REST_ODDS * rests - (evidences + REST_ODDS * rests).max())
+    possible = np.exp(TEMPER * (evidences - evidences.max()))
+    state, turns, covariance = mixed(parts, probable / probable.sum(), possible / possible.sum())
+    likelihoods = np.full(len(SPEEDS), LEAST_LIKELY)
+    likelihoods[::-1][: len(own)] = evidences - odds[::-1][: len(own)]
+    likelihoods = np.maximum(likelihoods - likelihoods.max(), LEAST_LIKELY)
+    return shaken._replace(
+        state=state, shake=turns, covariance=covariance,
+        scales=shaken.scales._replace(speeds=likelihoods),
+    ), total  # fmt: skip
+
+
 def _either(
-    steady: Posterior, evidence: float, shaken: Posterior, evidence_of_shaking: float
+    steady: Posterior, evidence: float, evidence_of_shaking: float, shaken: Posterior
 ) -> Posterior:
     """The mixture of a camera that does not turn within its frame, and of one that does."""
     better = evidence - evidence_of_shaking
@@ -340,8 +358,9 @@ def _either(
     weight = 1.0 / (1.0 + math.exp(min(-TEMPER * better, 700.0)))
     if weight < _NO_PART:
         return shaken
+    vibrations = shaken.scales.vibrations
     if weight > 1.0 - _NO_PART:
-        return steady
+        return steady._replace(scales=steady.scales._replace(vibrations=vibrations))
     whole = np.zeros_like(shaken.covariance)
     whole[:PARAMETERS, :PARAMETERS] = steady.covariance
     state, turns, covariance = mixed(
@@ -353,14 +372,10 @@ def _either(
         np.array([weight, 1.0 - weight]),
     )
     likely = steady if probable > 0.5 else shaken
-    shared = math.sqrt(weight * steady.shared**2 + (1.0 - weight) * shaken.shared**2)
     return likely._replace(
         state=state,
         covariance=covariance,
         arched=None,
         shake=turns,
-        shared=shared,
-        scales=shaken.scales._replace(
-            speeds=weight * steady.scales.speeds + (1.0 - weight) * shaken.scales.speeds
-        ),
+        scales=steady.scales._replace(vibrations=vibrations, speeds=weight * steady.scales.speeds),
     )

@@ -32,29 +32,22 @@ from rs_localizer.core.scales import SPEEDS
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import PARAMETERS, STATE_SIZE, TURN, step_between
-from rs_localizer.estimation.frame_fit import (
-    fit_frame,
-    log_determinant_of_inverse,
-    products_of,
-    smooth_at,
+from rs_localizer.estimation.correlated import (
+    Noise,
+    Products,
+    SmoothError,
+    over_sizes,
+    products_at,
+    taken_by,
+    volume_of,
+    weighed,
 )
 from rs_localizer.estimation.mirror import leaning_less, plane_of
 from rs_localizer.estimation.observations import weighted
-from rs_localizer.estimation.posterior import ITERATIONS, NO_SCALE, WIDEST_GATE
+from rs_localizer.estimation.posterior import ITERATIONS, NO_SCALE
 from rs_localizer.estimation.prior import PriorTerms, add_prior, offset_between, terms_at
-from rs_localizer.estimation.refine import (
-    TINY,
-    apply_step,
-    half_inverse,
-    inverted,
-    refine,
-    solve_positive,
-    squared,
-)
-from rs_localizer.estimation.residuals import linearized, normal_equations, squared_errors
+from rs_localizer.estimation.refine import TINY, apply_step, inverted, refine, solve_positive
 
-# More steps of Gauss-Newton than any fit needs that ends.
-STEPS = 25
 # Logarithm of the odds of rest against each typical speed before any frame: errors of maps that no
 # polynomial of the image follows look like motion, and a hundred to one is what surveyed tags ask
 # for (benchmarks.honesty tags).
@@ -66,16 +59,21 @@ FAR_LESS_PROBABLE = 9.0
 # probable (1 would hold on average over all cameras, and not for that one). The odds for rest and
 # those against an in-frame turn, which are choices, have no part in it.
 TEMPER = 0.25
+# A mirrored lean that fits worse by so many variances is none: odds of e^20.
+_WORSE, _FINE = 40.0, 1e-2
 # Optima nearer than this part of a deviation are one.
 _SAME = 1e-2
 # Part of the squared errors that is left at least: of a camera that shakes, noise is a tenth.
 _MOST_BETTER = 0.01
 # No frame says more than this against a typical speed.
 LEAST_LIKELY = -10.0
-# Gate from which a smooth error is fitted, in thresholds: what it will explain stands outside of
-# the widest one, and would stay there.
-_FIRST_GATE = 2.0 * WIDEST_GATE
-_FITS, _FINE = 4, 1e-6
+# Linearizations of a mode, at most; and the last one is where the step to the optimum leaves its
+# tangent by less than this part of the noise.
+_LOOKS, _STRAIGHT = 8, 0.1
+# How far each pair of a step (turn and move, velocities, accelerations) reaches in the first row.
+_REACH = (1.0, 0.5, 0.125)
+# A step that raises the cost by more than this is halved: in valleys that bend it would leave them.
+_SHORT, _HALVINGS = 1e-3, 6
 # Deviation of a lean (rad, 2 deg) up to which one Gaussian will do.
 _KNOWN_LEAN = 0.035
 # Steps of the grid of leans in deviations: the trapezoid rule is right to 3e-4 of a Gaussian, and
@@ -205,15 +203,26 @@ def _about_pivot(covariance: Array, by_turn: Array) -> Array:
     return by_step @ covariance @ by_step.T
 
 
+class Frame(NamedTuple):
+    """The points of a frame that its best motion leaves, and what is the same for all modes."""
+
+    data: Array  # packed, all points
+    points: Array  # (n,3)
+    chosen: BoolArray  # (n,) inliers
+    smooth: SmoothError
+    noise: Noise
+    focal_length: float  # px
+    depth: float  # m
+    declares: bool  # the map is known to be off, by more than an ordinary one
+
+
 class _Held(NamedTuple):
     """What does not change with the lean of a mode."""
 
-    chosen: BoolArray  # (n,) inliers
+    taken: Array  # (q,) by the smooth error
     noise: float  # px
-    cost: float  # noise variances, the least; NaN: that of the mode
+    cost: float  # noise variances, the least
     freedom: float
-    field: Array  # (n,2,q) px, columns of the smooth error; their products leave the motion's
-    pulls: Array  # (q,18) by how much it moves the motion, over the covariance
 
 
 class Mode(NamedTuple):
@@ -223,9 +232,11 @@ class Mode(NamedTuple):
     covariance: Array  # (18,18)
     evidence: float  # logarithm; minus infinity: nothing was found
     cost: float  # noise variances
-    smooth: float  # px, scale of the smooth error
-    held: _Held
-    squared_errors: Array  # (n,) px^2, beside the smooth error
+    noise: float  # px
+    size: float  # px, of the smooth error
+    freedom: float
+    log_size: float  # mean
+    spread: float  # variance of the logarithm of the size
 
 
 class _Modes(NamedTuple):
@@ -234,9 +245,7 @@ class _Modes(NamedTuple):
     evidences: Array  # (k,)
     costs: Array  # (k,)
     speeds: IntArray  # (k,) indices of SPEEDS
-    smooths: Array  # (k,) px
-    chosen: BoolArray  # (k,n) inliers
-    squared_errors: Array  # (k,n) px^2
+    errors: Array  # (k,5) noise, size, freedom, mean and variance of the size's logarithm
 
 
 class Mixture(NamedTuple):
@@ -248,43 +257,16 @@ class Mixture(NamedTuple):
     evidence: float  # logarithm of the sum
     speeds: Array  # (5,) weights of the typical speeds in the covariance
     log_likelihoods: Array  # (5,) of the typical speeds
-    smooth: float  # px, of the fastest: at rest, what moves looks like an error of the map
-    shared: float  # px, of all: root mean square by their weights in the covariance
+    errors: Array  # (5,) of the most probable mode; the size is the root mean square of all
     evidences: Array  # (k,) of the modes
     costs: Array  # (k,) noise variances
     steps: Array  # (k,18) to them from the most probable one
-    # Of the most probable one, beside the smooth error: where that is fitted, others are inliers
-    chosen: BoolArray  # (n,)
-    squared_errors: Array  # (n,) px^2
-
-
-class Inliers(NamedTuple):
-    """The points of a frame that its best motion leaves, and what it says of their noise."""
-
-    data: Array  # packed, all points
-    points: Array  # (n,3)
-    chosen: BoolArray  # (n,)
-    noise: float  # px
-    freedom: float
-    cost: float  # noise variances
-    focal_length: float  # px
-    threshold: float  # px
-
-
-class SmoothError(NamedTuple):
-    """Whether a smooth error is fitted, and what is known of the scales (15,), see `fit_frame`."""
-
-    fitted: bool
-    first: Array
-    mean: Array
-    precision: Array
-    bend: Array  # (n,b), or (n,0)
 
 
 @kernel
 def mixture_of(
-    inliers: Inliers, start: Array, terms: PriorTerms, odds: Array, by_turn: Array, slowest: int,
-    turn_known: bool, planar: bool, smooth: SmoothError,
+    frame: Frame, start: Array, terms: PriorTerms, odds: Array, by_turn: Array, slowest: int,
+    turn_known: bool, planar: bool,
 ) -> Mixture:  # fmt: skip
     """The modes of typical speeds and leans near a motion, and their mixture.
 
@@ -297,9 +279,7 @@ def mixture_of(
         turn_known: whether a gyroscope knows the turn.
         planar: whether the mirrored lean is a start, too.
     """
-    modes = _modes(
-        inliers, start, terms, odds + by_turn, slowest, turn_known, planar, smooth
-    )  # fmt: skip
+    modes = _modes(frame, start, terms, odds + by_turn, slowest, turn_known, planar)
     count, evidences = len(modes.speeds), modes.evidences
     log_likelihoods, weights = np.full(len(SPEEDS), -np.inf), np.zeros(len(SPEEDS))
     total, probable = -np.inf, evidences.copy()
@@ -312,9 +292,8 @@ def mixture_of(
         total = _log_sum(total, evidences[k])
     if total == -np.inf:
         return Mixture(
-            start, modes.covariances[0], modes.covariances[0], total, weights, weights, 0.0, 0.0,
-            evidences, modes.costs, np.zeros((count, PARAMETERS)), inliers.chosen,
-            modes.squared_errors[0],
+            start, modes.covariances[0], modes.covariances[0], total, weights, weights,
+            modes.errors[0], evidences, modes.costs, np.zeros((count, PARAMETERS)),
         )  # fmt: skip
     first = int(np.argmax(probable))
     probable = np.exp(probable - probable[first])
@@ -324,16 +303,15 @@ def mixture_of(
         modes.states, modes.covariances, first, probable, possible
     )
     arched = along_arcs(covariance, state[9:12], possible, offsets, abouts)
+    errors, shared = modes.errors[first].copy(), 0.0
     for k in range(count):
         weights[modes.speeds[k]] += possible[k]
-    shared = 0.0
-    for k in range(count):
-        shared += possible[k] * modes.smooths[k] ** 2
+        shared += possible[k] * modes.errors[k, 1] ** 2
+    errors[1] = math.sqrt(shared)
     log_likelihoods = np.maximum(log_likelihoods - np.max(log_likelihoods), LEAST_LIKELY)
     return Mixture(
-        state, covariance, arched, total, weights, log_likelihoods, modes.smooths[count - 1],
-        math.sqrt(shared), evidences, modes.costs, steps, modes.chosen[first],
-        modes.squared_errors[first],
+        state, covariance, arched, total, weights, log_likelihoods, errors, evidences,
+        modes.costs, steps,
     )  # fmt: skip
 
 
@@ -346,8 +324,8 @@ def _log_sum(one: float, other: float) -> float:
 
 @inlined
 def _modes(
-    inliers: Inliers, start: Array, terms: PriorTerms, odds: Array, slowest: int, turn_known: bool,
-    planar: bool, smooth: SmoothError,
+    frame: Frame, start: Array, terms: PriorTerms, odds: Array, slowest: int, turn_known: bool,
+    planar: bool,
 ) -> _Modes:  # fmt: skip
     """A Gaussian for each typical speed and each lean of a plane.
 
@@ -355,40 +333,44 @@ def _modes(
     back to the other lean would do so at every higher speed (so it did in 217 of 217 cases of
     benchmarks.frames planes).
     """
-    data, most = weighted(inliers.data, inliers.chosen), 2 * len(SPEEDS)
-    points = len(inliers.chosen)
+    most = 2 * len(SPEEDS)
     modes = _Modes(
         np.empty((most, STATE_SIZE)), np.empty((most, PARAMETERS, PARAMETERS)), np.empty(most),
-        np.empty(most), np.empty(most, np.int64), np.empty(most),
-        np.empty((most, points), np.bool_), np.empty((most, points)),
+        np.empty(most), np.empty(most, np.int64), np.empty((most, 5)),
     )  # fmt: skip
     near, count, best = start.copy(), 0, -np.inf
     if slowest == 0:
         near[12:] = 0.0
-    leans, twin, has_twin = planar, start, False
+    points = len(frame.chosen)
+    products = products_at(frame.data, points, near, frame.chosen, frame.smooth.rows)
+    leans, twin, has_twin = planar, near, False
+    of_twin = products
     for speed in range(slowest, len(SPEEDS)):
         prior = terms_at(terms, SPEEDS[speed], turn_known)
-        mode = _mode(data, inliers, near, prior, odds[speed], smooth)
-        near, other = mode.state, has_twin
+        mode, near, products = _mode(frame, near, products, prior, odds[speed])
+        other = has_twin
         if leans and not has_twin:
-            other, twin = leaning_less(inliers.points, inliers.chosen, near, 2.0)
+            other, twin = leaning_less(frame.points, frame.chosen, mode.state, 2.0)
+            if other and frame.declares:
+                other, twin = _contends(frame, mode, twin, prior)
+            if other:
+                of_twin = products_at(frame.data, points, twin, frame.chosen, frame.smooth.rows)
         whole, open_ = mode, False
         if planar:
-            whole, open_ = _over_leans(inliers, mode, twin if other else near, prior, smooth)
+            whole, open_ = _over_leans(frame, mode, twin if other else mode.state, prior)
         count, here = _keep(modes, count, speed, whole), whole.evidence
         if other and not open_:
-            second = _mode(data, inliers, twin, prior, odds[speed], smooth)
+            second, twin, of_twin = _mode(frame, twin, of_twin, prior, odds[speed])
             leans = has_twin = _apart(mode, second)
             if has_twin:
                 count = _keep(modes, count, speed, second)
-                twin, here = second.state, max(here, second.evidence)
+                here = max(here, second.evidence)
         best = max(best, here)
         if here < best - FAR_LESS_PROBABLE / TEMPER:
             break
     return _Modes(
         modes.states[:count], modes.covariances[:count], modes.evidences[:count],
-        modes.costs[:count], modes.speeds[:count], modes.smooths[:count],
-        modes.chosen[:count], modes.squared_errors[:count],
+        modes.costs[:count], modes.speeds[:count], modes.errors[:count],
     )  # fmt: skip
 
 
@@ -398,10 +380,26 @@ def _keep(modes: _Modes, count: int, speed: int, mode: Mode) -> int:
     write(modes.states[count], mode.state)
     modes.covariances[count] = mode.covariance
     modes.evidences[count], modes.costs[count] = mode.evidence, mode.cost
-    modes.speeds[count], modes.smooths[count] = speed, mode.smooth
-    modes.chosen[count] = mode.held.chosen
-    modes.squared_errors[count] = mode.squared_errors
+    modes.speeds[count] = speed
+    errors = modes.errors[count]
+    errors[0], errors[1], errors[2] = mode.noise, mode.size, mode.freedom
+    errors[3], errors[4] = mode.log_size, mode.spread
     return count + 1
+
+
+@kernel
+def _contends(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tuple[bool, Array]:
+    """Whether the optimum near a mirrored lean fits nearly as well beside noise alone, and its
+    state (24,).
+
+    Beside a smooth error a lean that is wrong looks like a board that is bent.
+    """
+    data = weighted(frame.data, frame.chosen)
+    variance = mode.noise * mode.noise + mode.size * mode.size
+    noise = math.sqrt(variance)
+    _, _, own, _ = refine(data, mode.state, NO_SCALE, 0.0, terms, noise, 2, ITERATIONS, _FINE)
+    state, _, cost, _ = refine(data, twin, NO_SCALE, 0.0, terms, noise, 2, ITERATIONS, _FINE)
+    return cost < own + _WORSE * variance, state
 
 
 @inlined
@@ -419,46 +417,53 @@ def _apart(mode: Mode, other: Mode) -> bool:
 
 @kernel
 def _mode(
-    data: Array, inliers: Inliers, start: Array, terms: PriorTerms, odds: float,
-    smooth: SmoothError,
-) -> Mode:  # fmt: skip
-    """The Gaussian about the optimum near a state (24,)."""
-    noise, variance = inliers.noise, inliers.noise * inliers.noise
-    state, information, cost = start, np.empty((PARAMETERS, PARAMETERS)), 0.0
-    for _ in range(_FITS):
-        state, information, cost, converged = refine(
-            data, state, NO_SCALE, 0.0, terms, noise, 2, ITERATIONS, _FINE
-        )
-        if converged:
+    frame: Frame, start: Array, products: Products, terms: PriorTerms, odds: float
+) -> tuple[Mode, Array, Products]:
+    """The Gaussian about the optimum near a state (24,), at which the products are.
+
+    And the state and the products of the last linearization: the next one may begin there.
+    """
+    origin, points, smooth = start, len(frame.chosen), frame.smooth
+    volume, slope = volume_of(terms), np.empty(PARAMETERS)
+    matrix = np.empty((PARAMETERS, PARAMETERS))
+    for look in range(_LOOKS):
+        information, along = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+        prior_cost = add_prior(terms, origin, 1.0, information, along)
+        found = over_sizes(products, smooth, information, along, prior_cost, volume, frame.noise)
+        if not found.evidence > -np.inf:
             break
-    covariance, cost, scale = variance * inverted(information), cost / variance, 0.0
-    beside = squared_errors(inliers.data, len(inliers.chosen), state)
-    held = _Held(
-        inliers.chosen, noise, inliers.cost, inliers.freedom, np.zeros((0, 2, 0)),
-        np.zeros((0, PARAMETERS)),
-    )  # fmt: skip
-    evidence = log_evidence(
-        log_determinant_of_inverse(covariance), _of_unknown_noise(cost, held), terms, inliers,
-        inliers.chosen, noise,
-    )  # fmt: skip
-    if smooth.fitted and np.isfinite(evidence):
-        fit = fit_frame(
-            inliers.data, len(inliers.chosen), state, terms, inliers.threshold,
-            _FIRST_GATE * inliers.threshold, noise, smooth.first, smooth.mean, smooth.precision,
-            False, True, smooth.bend, STEPS,
-        )  # fmt: skip
-        if fit.finite:
-            state, covariance, scale = fit.state, fit.covariance, fit.smooth
-            cost = fit.left + fit.prior_cost
-            evidence = log_evidence(
-                fit.log_determinant, cost, terms, inliers, fit.inliers, fit.noise
-            )
-            held = _Held(fit.inliers, fit.noise, np.nan, fit.freedom, held.field, held.pulls)
-            beside = fit.squared_errors
-    if not (np.isfinite(evidence) and np.all(np.isfinite(covariance))):
-        nothing = np.zeros((PARAMETERS, PARAMETERS))
-        return Mode(start, nothing, -np.inf, np.inf, 0.0, held, beside)
-    return Mode(state, covariance, evidence + odds, cost, scale, held, beside)
+        if look == _LOOKS - 1 or _bent(found.step, frame) < _STRAIGHT * found.noise:
+            break
+        variance = found.noise * found.noise
+        taken = taken_by(smooth.squares, found.size, found.noise)
+        most = weighed(products, taken, matrix, slope) / variance + prior_cost + _SHORT
+        step, trial = found.step.copy(), origin
+        for _ in range(_HALVINGS):
+            trial = apply_step(origin, step)
+            products = products_at(frame.data, points, trial, frame.chosen, smooth.rows)
+            cost = weighed(products, taken, matrix, slope) / variance
+            if cost + add_prior(terms, trial, 1.0, information, along) <= most:
+                break
+            step *= 0.5
+        origin = trial
+    finite = found.evidence > -np.inf and np.all(np.isfinite(found.covariance))
+    state = apply_step(origin, found.step) if finite else origin
+    return Mode(
+        state, found.covariance if finite else np.zeros((PARAMETERS, PARAMETERS)),
+        found.evidence + odds if finite else -np.inf, found.cost, found.noise, found.size,
+        found.freedom, found.log_size, found.spread,
+    ), origin, products  # fmt: skip
+
+
+@inlined
+def _bent(step: Array, frame: Frame) -> float:
+    """How far (px) a step leaves its tangent: the square of all that it turns."""
+    total = 0.0
+    for k in range(0, PARAMETERS, 3):
+        length = math.sqrt(step[k] ** 2 + step[k + 1] ** 2 + step[k + 2] ** 2)
+        # Rows are up to half a readout from the middle one.
+        total += length * _REACH[k // 6] / (1.0 if k % 6 == 0 else frame.depth)
+    return 0.5 * frame.focal_length * total * total
 
 
 @inlined
@@ -472,84 +477,39 @@ def _of_unknown_noise(cost: float, held: _Held) -> float:
     return held.cost + freedom * math.log1p(beyond)
 
 
-@inlined
-def _marginal(inliers: Inliers, mode: Mode, smooth: SmoothError) -> _Held:
-    """What is held of a mode, and its smooth error, of which the scale is held, too.
-
-    With columns ``F`` of the smooth error and ``L L^T = F^T F + (sigma/s)^2``: ``F L^-T`` and
-    ``(L L^T)^-1 F^T A / s``.
-    """
-    held, count = mode.held, len(inliers.chosen)
-    lines = linearized(inliers.data, count, mode.state, np.zeros((count, 6)))
-    products = products_of(lines, held.chosen, lines.errors, False, True, smooth.bend).products
-    own = products[PARAMETERS:, PARAMETERS:].copy()
-    size = len(own)
-    for k in range(size):
-        own[k, k] += (held.noise / mode.smooth) ** 2
-    half, scale, _ = half_inverse(own)
-    field, column = np.zeros((count, 2, size)), np.zeros(size)
-    for k in range(size):
-        for j in range(k + 1):
-            column[j] = half[k, j] * scale[j]
-        field[:, :, k] = smooth_at(lines, held.chosen, column, smooth.bend)
-    pulls = squared(half, scale) @ products[PARAMETERS:, :PARAMETERS].copy() / mode.smooth
-    return _Held(held.chosen, held.noise, held.cost, held.freedom, field, pulls)
-
-
 @kernel
 def _equations(
-    data: Array, state: Array, terms: PriorTerms, held: _Held, information: Array, slope: Array
+    frame: Frame, state: Array, terms: PriorTerms, held: _Held, information: Array, slope: Array
 ) -> float:
-    """Fill in the normal equations, the smooth error marginalized; the cost, noise variances."""
-    variance, size = held.noise * held.noise, held.field.shape[2]
-    cost = normal_equations(data, state, NO_SCALE, 0.0, 2, information, slope)
-    if size > 0:
-        count = len(held.field)
-        lines = linearized(data, count, state, np.zeros((count, 6)))
-        shared, along = np.zeros((size, PARAMETERS)), np.zeros(size)
-        for i in range(count):
-            if not held.chosen[i]:
-                continue
-            for side in range(2):
-                row, error = lines.by_motion[i, side], lines.errors[i, side]
-                for k in range(size):
-                    factor, products = held.field[i, side, k], shared[k]
-                    along[k] += factor * error
-                    for a in range(PARAMETERS):
-                        products[a] += factor * row[a]
-        cost -= np.sum(along * along)
-        slope -= shared.T @ along
-        information -= shared.T @ shared
+    """Fill in the normal equations, times the noise variance; the cost, noise variances."""
+    variance = held.noise * held.noise
+    products = products_at(frame.data, len(frame.chosen), state, frame.chosen, frame.smooth.rows)
+    cost = weighed(products, held.taken, information, slope)
     return (cost + add_prior(terms, state, variance, information, slope)) / variance
 
 
 @kernel
 def _at_lean(
-    data: Array, start: Array, terms: PriorTerms, held: _Held
-) -> tuple[Array, Array, float]:
-    """State (24,) and covariance (18,18) beside a lean, and logarithm of their probability."""
+    frame: Frame, start: Array, terms: PriorTerms, held: _Held
+) -> tuple[Array, Array, float, float]:
+    """State (24,) and covariance (18,18) beside a lean; logarithm of half the volume, and cost."""
     variance = held.noise * held.noise
     information, slope = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
     state = start
     for _ in range(_PINNED_STEPS):
-        cost = _equations(data, state, terms, held, information, slope)
+        cost = _equations(frame, state, terms, held, information, slope)
         step, solved = solve_positive(information, -slope)
         if not solved:
             break
         state, gain = apply_step(state, step), -np.sum(step * slope) / variance
         if gain < _PINNED_GAIN:
             covariance = variance * inverted(information)
-            evidence = 0.5 * log_determinant_of_inverse(covariance)
-            evidence -= 0.5 * _of_unknown_noise(cost - gain, held)
-            pulled = held.pulls @ covariance
-            return state, covariance - pulled.T @ pulled, evidence
-    return state, information, -np.inf
+            return state, covariance, 0.5 * log_determinant_of_inverse(covariance), cost - gain
+    return state, information, -np.inf, np.inf
 
 
 @kernel
-def _over_leans(
-    inliers: Inliers, mode: Mode, twin: Array, terms: PriorTerms, smooth: SmoothError
-) -> tuple[Mode, bool]:
+def _over_leans(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tuple[Mode, bool]:
     """The mode of a plane, integrated over its leans where they are hardly known; whether they are.
 
     Nested Laplace approximation: a Gaussian about the optimum beside each lean of a grid, along the
@@ -559,7 +519,7 @@ def _over_leans(
         twin: state (24,) of the mirrored lean, where the parts may be others; or that of the mode.
     """
     rotation, count = mode.state[:9].copy().reshape(3, 3), len(terms.informations)
-    plane, centre, normal = plane_of(inliers.points, inliers.chosen)
+    plane, centre, normal = plane_of(frame.points, frame.chosen)
     normal = rotation @ normal
     flat = np.eye(3) - normal * normal.reshape(3, 1)
     sizes, axes = np.linalg.eigh(flat @ mode.covariance[TURN, TURN].copy() @ flat)
@@ -569,15 +529,12 @@ def _over_leans(
     used = 2 if max(sizes[1], away[1] ** 2) > _KNOWN_LEAN**2 else 1
     axes, away = axes.T[::-1][:used].copy(), away[::-1][:used].copy()
     steps = _SPACING * np.sqrt(np.maximum(sizes[::-1][:used], TINY))
-    held, data = mode.held, weighted(inliers.data, mode.held.chosen)
-    if mode.smooth > 0.0:
-        held = _marginal(inliers, mode, smooth)
-    information, slope = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
-    cost = _equations(data, mode.state, terms, held, information, slope)
-    least = cost if np.isnan(held.cost) else held.cost
-    held = _Held(held.chosen, held.noise, least, held.freedom, held.field, held.pulls)
-    volume = log_determinant_of_inverse(held.noise * held.noise * inverted(information))
-    whole = 0.5 * (volume - _of_unknown_noise(cost, held))
+    taken = taken_by(frame.smooth.squares, mode.size, mode.noise)
+    held = _Held(taken, mode.noise, 0.0, mode.freedom)
+    # By its own noise and smooth error, no mixture of sizes.
+    origin, _, volume, least = _at_lean(frame, mode.state, terms, held)
+    held = _Held(taken, mode.noise, least, mode.freedom)
+    whole = volume - 0.5 * least
     informations = np.zeros((count + 1, PARAMETERS, PARAMETERS))
     references, pivots = np.empty((count + 1, STATE_SIZE)), np.zeros((count + 1, 3))
     informations[:count], references[:count] = terms.informations, terms.references
@@ -586,15 +543,16 @@ def _over_leans(
     places, starts = np.zeros((_MOST_PARTS, used), np.int64), np.empty((_MOST_PARTS, STATE_SIZE))
     states, evidences = np.empty((_MOST_PARTS, STATE_SIZE)), np.empty(_MOST_PARTS)
     covariances = np.empty((_MOST_PARTS, PARAMETERS, PARAMETERS))
-    starts[0], first, last, best, measured = mode.state, 0, 1, -np.inf, False
+    starts[0], first, last, best, measured = origin, 0, 1, -np.inf, False
     while first < last:
         turn = exp(-(places[first] * steps) @ axes)
         references[count], references[count, :9] = starts[first], (turn @ rotation).ravel()
         across = axes @ turn.T / (_PIN * steps[used - 1])
         informations[count, TURN, TURN] = across.T @ across
-        states[first], covariances[first], evidences[first] = _at_lean(
-            data, starts[first], pinned, held
+        states[first], covariances[first], volume, cost = _at_lean(
+            frame, starts[first], pinned, held
         )
+        evidences[first] = volume - 0.5 * _of_unknown_noise(cost, held)
         best, first = max(best, evidences[first]), first + 1
         if first == 2 * used + 1:  # the lean of the mode, and those beside it
             shrunk = False
@@ -632,7 +590,15 @@ def _over_leans(
     area = np.prod(steps / (_PIN * steps[used - 1] * math.sqrt(2.0 * math.pi)))
     evidence = mode.evidence - whole + best + math.log(area * total)
     return Mode(
-        state, covariance, evidence, mode.cost, mode.smooth, held, mode.squared_errors
+        state,
+        covariance,
+        evidence,
+        mode.cost,
+        mode.noise,
+        mode.size,
+        mode.freedom,
+        mode.log_size,
+        mode.spread,
     ), True
 
 
@@ -649,25 +615,19 @@ def _queue(places: IntArray, starts: Array, last: int, place: IntArray, start: A
 
 
 @kernel
-def log_evidence(
-    log_determinant: float, cost: float, terms: PriorTerms, inliers: Inliers, chosen: BoolArray,
-    noise: float,
-) -> float:  # fmt: skip
-    """Logarithm of the probability of all pixels, but for a constant of the frame (Laplace).
-
-    Args:
-        log_determinant: of the covariance, over that of the prior of what stands behind the motion.
-        cost: noise variances.
-        terms: of the motion.
-        chosen: (n,) inliers, about the motion at their best; others are anywhere in an image of a
-            focal length squared.
-        noise: px.
-    """
-    volume = 0.5 * log_determinant
-    for k in range(PARAMETERS):
-        if terms.informations[0, k, k] > 0.0:
-            volume += 0.5 * math.log(terms.informations[0, k, k])
-    count = np.count_nonzero(chosen)
-    others = len(chosen) - count
-    density = count * math.log(2.0 * math.pi * noise * noise)
-    return volume - 0.5 * cost - density - 2.0 * others * math.log(inliers.focal_length)
+def log_determinant_of_inverse(matrix: Array) -> float:
+    """Logarithm of the determinant of a covariance."""
+    size = len(matrix)
+    factor, total = np.zeros((size, size)), 0.0
+    for i in range(size):
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest -= factor[i, k] * factor[j, k]
+            if i == j:
+                rest = max(rest, 1e-15 * matrix[i, i])
+                total += math.log(rest)
+                factor[i, i] = math.sqrt(rest)
+            else:
+                factor[i, j] = rest / factor[j, j]
+    return total

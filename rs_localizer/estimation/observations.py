@@ -14,9 +14,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray, Random
 from rs_localizer.core.blocks import median
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
-from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Mounts, Rig
 from rs_localizer.core.simd.jit import kernel
@@ -360,23 +358,6 @@ class Sighted:
     usable: Usable
     turn: GyroRotation | None  # what the rays are compensated by
 
-    @property
-    def camera(self) -> Camera:
-        """The only camera of the frame."""
-        (camera,) = self.exposure.cameras
-        return camera
-
-    def by(self, camera: Camera) -> Observations | None:
-        """The same points of a camera alone through another lens; None where it has no bearing for
-        one.
-        """
-        exposure = self.exposure.by(camera)
-        rays, by_ray, side = _rays(exposure, 0, self.pixels, self.usable.tau, self.turn)
-        if not np.all(np.isfinite(rays[self.usable.indices])):
-            return None
-        usable = self.usable._replace(rays=rays, by_ray=by_ray, camera=side)
-        return packed(exposure, self.points, usable)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
@@ -388,8 +369,6 @@ class Observed:
     random: Random
     assumed: Assumed
     sighted: Sighted
-    lens: LensError | None = None  # what its camera lacked
-    asks_lens: bool = False  # what the frame says of that
     error_modes: ErrorModes | None = None  # of the map
 
     @property

@@ -20,7 +20,6 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.gyro_rotation import GyroRotation
-from rs_localizer.core.lens import LensError
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.scales import SPEEDS, Scales
 from rs_localizer.core.shutter import Motion, numbers_of
@@ -134,8 +133,6 @@ class Prior:
         scales: what the frames before say of shaking, smooth errors and speed.
         of_rest: logarithm of the odds that the camera does not move within the image, beside
             those of any camera.
-        lens: what the calibration lacks, by other frames; None: nothing.
-        asks_lens: whether the frame shall say what it lacks.
         gravity, gravity_deviation: a vector (3,) in camera axes at the middle row that points
             along ``gravity_in_map``, of any length, and the standard deviation of its direction
             in rad.
@@ -153,8 +150,6 @@ class Prior:
     gravity_in_map: ArrayLike = (0.0, 0.0, -1.0)
     scales: Scales | None = None
     of_rest: float = 0.0
-    lens: LensError | None = None
-    asks_lens: bool = False
 
     def __post_init__(self) -> None:
         if (self.motion is None) != (self.covariance is None):

@@ -22,7 +22,6 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.gyro_rotation import GyroRotation
-from rs_localizer.core.lens import LensError
 from rs_localizer.core.rate_spline import multiplied
 from rs_localizer.core.scales import Scales
 from rs_localizer.core.simd.jit import kernel
@@ -132,16 +131,14 @@ def _turned(errors: Array, by_turn: Array, shown: Array, rotations: Array, middl
 
 
 def estimate_of(
-    observed: Observed, posterior: Posterior, still: int, samples: int, effect: CalibrationEffect,
-    of_lens: LensError | None,
-) -> Estimate:  # fmt: skip
+    observed: Observed, posterior: Posterior, still: int, samples: int, effect: CalibrationEffect
+) -> Estimate:
     """The estimate of an accepted posterior, in the map frame and for all given points.
 
     Args:
         still: how many points a global shutter would explain.
         samples: minimal samples drawn.
         effect: of what map and calibration are off.
-        of_lens: what the frame says of its lens.
     """
     state, turn = posterior.state, observed.sighted.turn
     rotation = rotation_of(state)
@@ -183,6 +180,4 @@ def estimate_of(
         span=observed.sighted.exposure.span,
         calibration_covariance=effect.covariance,
         still_deviation=effect.still_deviation,
-        lens=observed.lens,
-        of_lens=of_lens,
     )

@@ -22,7 +22,6 @@ from rs_localizer.config import CameraSettings, MatchBy, NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
 from rs_localizer.core.simd.jit import NotCompiled
@@ -103,11 +102,11 @@ def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[
     return notices
 
 
-def lens_is_off(lens: LensError) -> str:
-    """What to say of a calibration that lacks distortion."""
+def lens_is_off(pixels: float) -> str:
+    """What to say of a lens or a map that is off by so much, root mean square."""
     return (
-        f"residuals vary smoothly over the image (up to {lens.pixels:.1f} px): recalibrate the "
-        "lens; until then poses allow for it"
+        f"residuals vary smoothly over the image ({pixels:.1f} px rms): recalibrate the lens, or "
+        "survey the map again; until then poses allow for it"
     )
 
 
@@ -554,8 +553,8 @@ class FrameLocalizer:
         if result.integrity > _DOUBTFUL:
             text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
             self._notice(Notice.DOUBTFUL, text)
-        if result.lens is not None and not watch.axis_in_doubt:
-            self._notice(Notice.LENS, lens_is_off(result.lens))
+        if (off := self._tracker.smooth_error) > 0.0 and not watch.axis_in_doubt:
+            self._notice(Notice.LENS, lens_is_off(off))
         readout = ReadoutKnown(
             deviation, watch.may_be_reversed, watch.surely_global, watch.other_axis
         )

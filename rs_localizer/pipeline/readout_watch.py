@@ -55,9 +55,6 @@ _LEAST_NOISE = 0.1  # px
 # Without it the wrong axis, which always needs one, won by 4 to 22 for half a second of a hand's
 # motion (frames 617 to 631 of the bundled one).
 _OF_TURNS = float(FUNCTIONS)
-# A lens other than the calibration's has to explain points better than a motion alone by as much
-# (rs_localizer.estimation.lens): the wrong axis bends images.
-_OF_LENS = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,10 +168,9 @@ class ScanAxis:
 
 
 def _look(estimate: ReadoutEstimate, frame: Watched, found: Estimate) -> None:
-    """Let an estimate take a frame, with the lens that explains it best."""
-    lens, cloud = found.lens, frame.cloud
-    camera = frame.camera if lens is None else lens.mended(frame.camera)
-    estimate.add(frame.time_ns, camera, found, cloud.points, cloud.pixels)
+    """Let an estimate take a frame."""
+    cloud = frame.cloud
+    estimate.add(frame.time_ns, frame.camera, found, cloud.points, cloud.pixels)
 
 
 def _costs(frames: Sequence[Watched], most: float) -> list[float]:
@@ -195,8 +191,7 @@ def _costs(frames: Sequence[Watched], most: float) -> list[float]:
         cut = np.fmin(result.residuals, most)  # NaN: unusable by either
         turns = shake_at(frame.camera.row_time(pixels[result.inliers]), result.shake)[:, :2]
         moved = float(np.sum((frame.camera.focal_length * turns) ** 2)) / (2.0 * noise**2)
-        of_lens = 0.0 if result.lens is None else _OF_LENS
-        return float(cut @ cut) / (2.0 * noise**2) + min(moved, _OF_TURNS) + of_lens
+        return float(cut @ cut) / (2.0 * noise**2) + min(moved, _OF_TURNS)
 
     return [cost(frame) for frame in frames]
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.camera import Camera, DistortionModel, Roi
-from rs_localizer.core.lens import LensError, by_lens, coefficients_of, corner_of
+from rs_localizer.core.lens import by_lens, coefficients_of, corner_of, with_lens
 
 K = np.array([[520.0, 0.0, 310.0], [0.0, 500.0, 250.0], [0.0, 0.0, 1.0]])
 RAYS = np.random.default_rng(3).uniform(-0.5, 0.5, (40, 2))
@@ -146,9 +146,9 @@ def test_closed_formulas_have_limits_and_corrections_keep_them(model):
     np.testing.assert_allclose(moved, 520.0 * corner_of(camera), rtol=1e-9)
     small = np.zeros(count)
     small[:2] = 1e-5, -2e-5
-    mended = LensError(small, np.eye(count), 400.0).mended(camera)
+    mended = with_lens(camera, small)
     np.testing.assert_allclose(
         mended.distort(RAYS)[0] - camera.distort(RAYS)[0], by_lens(camera, RAYS) @ small, atol=1e-5
     )
-    LensError(1e3 * small, np.eye(count), 400.0).mended(camera)
-    LensError(1e6 * small, np.eye(count), 400.0).mended(camera)
+    with_lens(camera, 1e3 * small)
+    with_lens(camera, 1e6 * small)

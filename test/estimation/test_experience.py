@@ -5,35 +5,17 @@
 from itertools import pairwise
 
 import numpy as np
+import pytest
 
 from rs_localizer.config import LocalizerConfig, VelocityPrior
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Rig
-from rs_localizer.core.scales import SCALES, SPEEDS, Scales
+from rs_localizer.core.scales import Scales
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.prior import Prior, assumptions, told_speed
 from rs_localizer.solvers.table import find_solver
-
-
-def says(mean, excess=0.0):
-    every = np.ones(SCALES)
-    return Scales(mean * every, 2.0 * every, excess * every, np.zeros(len(SPEEDS)))
-
-
-def seen(scales):
-    """An estimate of a frame that says so much."""
-    return Estimate(
-        rotation=np.eye(3), translation=np.zeros(3), angular_velocity=np.zeros(3),
-        linear_velocity=np.zeros(3), inliers=np.ones(12, bool), residuals=np.zeros(12),
-        joint_covariance=np.eye(18), global_shutter_inliers=12, iterations=0, scales=scales,
-    )  # fmt: skip
-
-
-def test_smooth_errors_in_excess_ask_for_the_lens():
-    asked = [Experience.of(seen(says(-6.0, excess))).prior.asks_lens for excess in (0.0, 3.0)]
-    assert asked == [False, True]
 
 
 def estimate_at(position, deviation=1e-3, turn=0.0):
@@ -69,7 +51,6 @@ def test_images_tell_how_fast_cameras_move_within_them():
     # A shutter may be a global one, and poses that are hardly known tell nothing.
     assert calm.scales.speeds[0] == calm.scales.speeds[1]
     assert np.abs(speeds_after(0.003, 0.005, 1.0).scales.speeds).max() < 0.3
-    np.testing.assert_array_equal(calm.prior.scales.speeds, calm.scales.speeds)
 
 
 def test_they_forget_it():
@@ -86,7 +67,7 @@ def test_what_frames_deny_is_no_prior_of_the_next():
     terms, _ = assumptions(
         camera.readout_time, Rig.of(camera), LocalizerConfig(), find_solver("r6p_vcwt")
     )
-    calm = speeds_after(0.003, 0.005).prior
+    calm = Prior(scales=speeds_after(0.003, 0.005).scales)
     slow, prior = told_speed(terms, calm)
     own, told = (one.informations[0].diagonal()[6:12] for one in (terms, slow))
     np.testing.assert_allclose(np.sqrt(told / own), 10.0)
@@ -94,5 +75,16 @@ def test_what_frames_deny_is_no_prior_of_the_next():
     # Of a tenth of the speed: what the frames say of 0, 0.03 and 0.1 stands at 0, 0.3 and 1.
     np.testing.assert_allclose(prior.scales.speeds[[0, 3, 4]], calm.scales.speeds[:3], atol=1e-9)
     assert prior.scales.speeds[4] < -4.0
-    for same in (speeds_after(0.1, 0.2).prior, Prior(), None):
+    for same in (Prior(scales=speeds_after(0.1, 0.2).scales), Prior(), None):
         assert told_speed(terms, same) == (terms, same)
+
+
+def test_a_map_or_a_lens_is_said_to_be_off_where_many_frames_agree():
+    nothing = Scales.nothing()
+    said = {
+        (size, precision): Experience(
+            nothing._replace(size=np.array([np.log(size), precision]))
+        ).smooth_error
+        for size, precision in ((0.2, 100.0), (1.5, 100.0), (1.5, 1.0))
+    }
+    assert list(said.values()) == [0.0, pytest.approx(1.5), 0.0]

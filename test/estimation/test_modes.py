@@ -8,18 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.frames.conditions import named
 from benchmarks.frames.judged import judge
-from rs_localizer.core.scales import SCALES
 from rs_localizer.core.state import PARAMETERS, step_between
+from rs_localizer.estimation.correlated import Noise, nothing_shared, products_at
 from rs_localizer.estimation.mirror import leaning_less
 from rs_localizer.estimation.modes import (
-    Inliers,
-    SmoothError,
+    Frame,
     _mode,
     _over_leans,
     along_arcs,
     averaged,
 )
-from rs_localizer.estimation.observations import weighted
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import held_terms
 from rs_localizer.estimation.refine import apply_step
@@ -73,16 +71,13 @@ def test_leans_are_integrated_as_on_a_fine_grid(tilt, noise):
     terms = held_terms()
     best = maximum_a_posteriori(observations, truth, terms, 4.0)
     assert np.all(best.inliers)
-    inliers = Inliers(
-        observations.packed, points, best.inliers, best.noise, best.freedom,
-        best.cost / best.noise**2, 590.0, 4.0,
-    )  # fmt: skip
-    nothing = np.zeros(SCALES)
-    smooth = SmoothError(False, nothing, nothing, nothing + 1.0, np.zeros((COUNT, 0)))
-    data = weighted(observations.packed, best.inliers)
-    mode = _mode(data, inliers, best.state, terms, 0.0, smooth)
+    smooth = nothing_shared(COUNT)
+    noise = Noise(best.noise, 1.0, 2.0 * COUNT - best.freedom)
+    seen = Frame(observations.packed, points, best.inliers, smooth, noise, 590.0, 1.6, False)
+    products = products_at(observations.packed, COUNT, best.state, best.inliers, smooth.rows)
+    mode, _, _ = _mode(seen, best.state, products, terms, 0.0)
     _, twin = leaning_less(points, best.inliers, mode.state, 2.0)
-    found, many = _over_leans(inliers, mode, twin, terms, smooth)
+    found, many = _over_leans(seen, mode, twin, terms)
     assert many
     rotation, translation = mode.state[:9].reshape(3, 3), mode.state[9:12]
     normal = rotation[:, 2]

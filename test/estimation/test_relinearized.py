@@ -10,10 +10,8 @@ from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Motion
-from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.observations import find_usable, packed, relinearized
-from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.localizer import Localizer
+from rs_localizer.estimation.prior import state_in
 
 K = np.array([[250.0, 0.0, 319.5], [0.0, 250.0, 239.5], [0.0, 0.0, 1.0]])
 FISHEYE = Camera(
@@ -76,16 +74,3 @@ def test_few_points_and_lost_ones_keep_their_derivatives():
     observations = packed(EXPOSURE, points, usable)
     found = relinearized(EXPOSURE, observations, state_in(far, usable.centre), None)
     np.testing.assert_allclose(by_ray(found), by_ray(observations), rtol=1e-6)
-
-
-def test_the_noise_of_a_fisheyes_points_is_no_lens_that_is_off():
-    """By derivatives where the points were measured, eight frames made odds of e^20 for one."""
-    points, pixels = seen(2500)
-    rng, experience, localizer = np.random.default_rng(2), None, Localizer(FISHEYE)
-    for _ in range(8):
-        noisy = pixels + rng.normal(size=pixels.shape)
-        found = localizer.localize(points, noisy, prior=Prior(asks_lens=True))
-        assert found, found
-        experience = Experience.of(found) if experience is None else experience.and_of(found)
-    assert experience.lens is not None
-    assert experience.odds < -1.0

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.camera import Camera, Roi
-from rs_localizer.core.lens import LensError
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.pipeline.frames import lens_is_off, oddities
 
@@ -62,6 +61,6 @@ def test_pixels_of_another_resolution():
 
 
 def test_a_lens_that_is_off_is_said_in_pixels():
-    text = lens_is_off(LensError(np.array([-0.02, 0.0]), np.eye(2), 400.0))
+    text = lens_is_off(1.23)
     assert "recalibrate the lens" in text
-    assert "up to 8.0 px" in text
+    assert "1.2 px rms" in text

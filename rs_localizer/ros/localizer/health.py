@@ -38,7 +38,6 @@ class Answer:
     model_error: float  # px, root mean square of what map, lens and motion leave beside the noise
     iterations: int
     tracked: bool
-    lens: float = 0.0  # px, how far the distortion that the calibration lacks moves image points
     cameras: tuple[CameraShare, ...] = ()  # of a rig, those that had a part
 
 
@@ -54,7 +53,6 @@ def tell(frame: Localized) -> tuple[int, Answer]:
         model_error=estimate.model_error,
         iterations=estimate.iterations,
         tracked=estimate.tracked,
-        lens=0.0 if estimate.lens is None else estimate.lens.pixels,
         cameras=frame.cameras,
     )
     return frame.input_stamp_ns, answer
@@ -227,7 +225,6 @@ def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
             "Inliers with global shutter": str(summary.last.global_shutter_inliers),
             "Residual RMS (px)": f"{summary.last.residual:.3f}",
             "Model error (px)": f"{summary.last.model_error:.3f}",
-            "Lens error (px)": f"{summary.last.lens:.2f}",
             "Iterations": str(summary.last.iterations),
         }
         for camera in summary.last.cameras:

@@ -108,7 +108,6 @@ def test_numbers_of_a_working_node(world):
         "Inliers with global shutter": "2",
         "Residual RMS (px)": f"{np.sqrt(25.0 / 3.0):.3f}",
         "Model error (px)": "0.000",
-        "Lens error (px)": "0.00",
         "Iterations": "64",
         "Frames received": "100",
         "Frames answered": "100",

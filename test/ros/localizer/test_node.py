@@ -38,7 +38,7 @@ def test_node_and_replay_say_the_same_to_the_last_byte(recording, tmp_path, star
     robot.connect()
     for info, cloud in inputs(recording):
         robot.localize(info, cloud)
-    assert peer.spin_until(lambda: float(robot.values.get("Lens error (px)", "0")) > 1.0)
+    assert peer.spin_until(lambda: float(robot.values.get("Model error (px)", "0")) > 1.0)
     for name in TYPES:
         assert len(offline[name]) == 12
         assert robot.answered(name) == offline[name]
