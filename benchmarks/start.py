@@ -120,10 +120,9 @@ def plain() -> Start:
 
 def measure(settings: Mapping[str, Any], imu: bool) -> Start:
     """Start the localizer and send it frames until it has a pose."""
-    from rs_localizer.evaluation.comparison import load_recording
-
     from rs_localizer import data
     from rs_localizer.ros.graph.live import LiveNode
+    from rs_localizer.tools.evaluation.comparison import load_recording
 
     recording = load_recording(data.path(data.WEBCAM))
     with tempfile.TemporaryDirectory() as place:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.honesty.benches import Bench, benches, heading, line
-from rs_localizer.cli import integer
+from rs_localizer.cli.options import integer
 
 _NAMES = ("p3p", "tags", "rendered")
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.load.frames import simulated
 from benchmarks.load.measuring import Result, fastest, steady
-from rs_localizer.cli import integer, number
+from rs_localizer.cli.options import integer, number
 
 _MOST_REPLACED = 0.001  # share of the frames
 _MOST_P50, _MOST_P99 = 4.0, 12.0  # ms

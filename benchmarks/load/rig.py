@@ -30,7 +30,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from benchmarks.hand_held import CAMERA, hand_motion
 from benchmarks.load.measuring import cpu_time, running
-from rs_localizer.cli import integer, number
+from rs_localizer.cli.options import integer, number
 from rs_localizer.core.arrays import Array
 from rs_localizer.io import topics
 from rs_localizer.io.messages import stamp_ns

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from benchmarks.load.frames import READOUT_TIME, simulated
 from benchmarks.load.measuring import NODE_PROGRAM
-from rs_localizer.cli import integer, number
+from rs_localizer.cli.options import integer, number
 
 _TIME_LIMIT = 2.0  # s
 _PATIENCE = 60.0  # s, before it is killed

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 
 from benchmarks.mapping.refining import bend, bound, large, regions
 from benchmarks.mapping.surveying import coverage, rendered, rigs, surveys
-from rs_localizer.cli import integer
+from rs_localizer.cli.options import integer
 
 _PARTS: dict[str, Callable[[int], Iterator[str]]] = {
     "bend": bend, "bound": bound, "large": large, "regions": regions, "surveys": surveys,

@@ -29,7 +29,7 @@ from rs_localizer.settings import NODE_NAME
 _PERIOD_NS = 33_333_333  # between the end of the recording and its next beginning
 
 
-class ExampleMatcher(Node):  # type: ignore[misc]
+class ExampleMatcher(Node):
     """Publishes each image's matches when it is due, with stamps of now."""
 
     def __init__(self, **options: Any) -> None:

@@ -121,7 +121,8 @@ def _marker(marker: Marker) -> Array:
     """Rectangles around the middle of a marker."""
     side = marker.size * _MM
     black = _rectangles(pattern(marker.family, marker.id), side / marker.family.cells)
-    return black - np.array([0.5 * side, 0.5 * side, 0.0, 0.0])
+    centred: Array = black - np.array([0.5 * side, 0.5 * side, 0.0, 0.0])
+    return centred
 
 
 def _board(board: Board) -> tuple[Array, str]:
