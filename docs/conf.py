@@ -23,8 +23,8 @@ by_rosdoc2 = "confpy_succeeded" in globals()  # which runs this file inside its 
 # The pages, in the order of the site's contents; rosdoc2 makes a front page of its own.
 PAGES = {
     "Start": "concepts install camera cameras/index",
-    "Use": "node reasons detector features imu rigs recordings calibration mapping map_build maps "
-    "simulation viewing integrations examples library policy",
+    "Use": "node robot reasons detector features imu rigs recordings calibration mapping "
+    "map_build maps simulation viewing integrations examples library policy",
     "Understand": "limits solvers estimator honesty benchmarks architecture api",
 }
 OTHERS = (
