@@ -3,7 +3,7 @@
 """Pose and velocity of one image, from points of a map and where the image shows them."""
 
 import numpy as np
-from projector import HEIGHT, READOUT, WIDTH, K, Moving, matches, scene
+from moving_camera import HEIGHT, READOUT, WIDTH, K, Moving, matches, scene
 
 import rs_localizer as rsl
 

@@ -3,7 +3,7 @@
 """A video: each frame begins from the one before, which makes it faster and surer."""
 
 import numpy as np
-from projector import HEIGHT, READOUT, WIDTH, K, Moving, matches, scene
+from moving_camera import HEIGHT, READOUT, WIDTH, K, Moving, matches, scene
 
 import rs_localizer as rsl
 

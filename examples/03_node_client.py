@@ -9,7 +9,7 @@ python examples/03_node_client.py
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped, TwistStamped
-from projector import HEIGHT, WIDTH, K, Moving, matches, scene
+from moving_camera import HEIGHT, WIDTH, K, Moving, matches, scene
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 

@@ -3,7 +3,7 @@
 """Two cameras on one body, the second upside down: their shutters run against each other."""
 
 import numpy as np
-from projector import HEIGHT, READOUT, WIDTH, K, Moving, matches, scene
+from moving_camera import HEIGHT, READOUT, WIDTH, K, Moving, matches, scene
 
 import rs_localizer as rsl
 
