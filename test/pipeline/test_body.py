@@ -96,6 +96,7 @@ def estimate() -> Estimate:
         joint_covariance=root @ root.T,
         global_shutter_inliers=4,
         iterations=10,
+        span=READOUT_TIME,
     )
 
 
