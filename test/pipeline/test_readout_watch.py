@@ -86,7 +86,7 @@ class Watched:
 
 @pytest.mark.parametrize(("factor", "tracking"), [(0.8, True), (1.2, False)])
 def test_a_wrong_readout_time_is_said_once(factor, tracking):
-    seen = Watched(readout_time=factor * READOUT, tracking=tracking)
+    seen = Watched(FRAMES - 1, readout_time=factor * READOUT, tracking=tracking)
     (text,) = seen.notices
     assert text.startswith("estimated readout time ")
     assert text.endswith(f" ms differs from readout_time = {1e3 * factor * READOUT:g} ms")
@@ -234,9 +234,9 @@ def test_the_wrong_axis_is_named_and_no_pose_comes_of_it(tracking, start):
     # Before: 7 to 26 frames had poses 0.5 to 3.5 degrees off, at most one in five inside its 95 %
     # region, and the advice was to calibrate again, or that the shutter is a global one.
     sideways = frames_with_truth("left_to_right", FRAMES, start)
-    seen = Watched(seen=sideways, readout_time=READOUT, tracking=tracking)
+    seen = Watched(FRAMES - 1, sideways, readout_time=READOUT, tracking=tracking)
     assert not any(seen.results[20:])
-    for result, (_, truth) in zip(seen.results, sideways, strict=True):
+    for result, (_, truth) in zip(seen.results, sideways[:-1], strict=True):
         if result:
             turn = logarithm(result.pose.rotation @ truth.rotations[0].T)
             off = np.r_[result.pose.position - truth.positions[0], turn]
