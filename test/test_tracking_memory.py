@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What frames tell the next ones, by the settings."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import rs_localizer as rsl
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scales import Scales
-from rs_localizer.core.types import Failure
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.tracking import Memory, Tracker
 
@@ -35,7 +35,20 @@ class Answering(rsl.Localizer):
         return result
 
 
-LOCALIZED = SimpleNamespace(scales=SAID)
+RNG = np.random.default_rng(0)
+POINTS, PIXELS = RNG.uniform(1.0, 3.0, (8, 3)), RNG.uniform(0.0, 480.0, (8, 2))
+LOCALIZED = Estimate(
+    rotation=np.eye(3),
+    translation=np.zeros(3),
+    angular_velocity=np.zeros(3),
+    linear_velocity=np.zeros(3),
+    inliers=np.ones(8, dtype=bool),
+    residuals=np.ones(8),
+    joint_covariance=1e-4 * np.eye(18),
+    global_shutter_inliers=8,
+    iterations=10,
+    scales=SAID,
+)
 REFUSED = Failure(Reason.NO_HYPOTHESIS, "")
 
 
@@ -44,23 +57,23 @@ def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset():
     localizer = Answering([LOCALIZED, REFUSED, REFUSED, LOCALIZED, LOCALIZED])
     frames = Tracker(localizer, memory=Memory.MAP_AND_LENS)
     for _ in range(3):
-        frames.localize(0, [], [])
+        frames.localize(0, POINTS, PIXELS)
     assert [prior is None for prior in localizer.priors] == [True, False, True, False]
     for prior in localizer.priors[1::2]:
         assert prior.motion is None
         assert prior.scales.size[0] == pytest.approx(-6.0)
         assert prior.scales.size[1] >= 1.0
     frames.reset()
-    frames.localize(0, [], [])
+    frames.localize(0, POINTS, PIXELS)
     assert localizer.priors[4] is None
 
 
 def test_what_was_learned_is_forgotten_where_a_frame_fits_only_without():
     """A hand bends a board, and lets it go: no frame after it may be refused for that."""
-    other = SimpleNamespace(**vars(LOCALIZED) | {"scales": Scales.nothing()})
+    other = replace(LOCALIZED, scales=Scales.nothing())
     localizer = Answering([LOCALIZED, REFUSED, other, LOCALIZED])
     frames = Tracker(localizer, memory=Memory.MAP_AND_LENS)
-    assert all(frames.localize(0, [], []) for _ in range(3))
+    assert all(frames.localize(0, POINTS, PIXELS) for _ in range(3))
     np.testing.assert_allclose(localizer.priors[-1].scales.size, 0.0)
 
 
