@@ -2,11 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """``rs_localizer calibrate``, ``readout`` and ``replay --smooth``: the real recording, faults."""
 
-import argparse
 import csv
 import json
 import re
-import shutil
 from pathlib import Path
 
 import cv2
@@ -16,7 +14,6 @@ from recorded import tf
 from scipy.spatial.transform import Rotation
 
 from rs_localizer import data
-from rs_localizer.cli.calibrate import share_all
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.calibration import read_calibration
@@ -88,17 +85,6 @@ def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path, caps
     assert told["median"] == pytest.approx(values["readout_time"], rel=1e-5)
     assert told["gyroflow"] == pytest.approx(1e3 * told["median"] * 480 / 479, rel=1e-5)
     assert told["scan_direction"] == "top_to_bottom"
-    # Of many recordings, what they say together: of a copy nothing but how many there are.
-    folders = [tmp_path / name for name in "ab"]
-    for folder in folders:
-        folder.mkdir()
-        shutil.copy(tmp_path / "camera_share.json", folder / "shutter_share.json")
-    args = argparse.Namespace(share="Maker One", firmware="2.10", out=tmp_path)
-    share_all(args, folders)
-    (both,) = json.loads((tmp_path / "share.json").read_text())
-    assert (both["number"], both["mode"]) == (2, told["mode"])
-    assert both["median"] == pytest.approx(told["median"], rel=1e-5)
-    assert (tmp_path / "share.csv").read_text().count("\n") == 2
 
 
 def test_an_imu(flight, tmp_path, capsys):

@@ -149,10 +149,11 @@ def test_smoothed_frames_are_nearer_to_the_truth(pair, pose_time, tmp_path, caps
         errors.append(json.loads(capsys.readouterr().out)["result"])
     plain, smooth = errors
     assert plain["poses"] == smooth["poses"]
-    limits = {"position (m)": 0.9, "orientation (deg)": 0.9, "linear velocity (m/s)": 0.6,
-              "angular velocity (deg/s)": 0.6}  # fmt: skip
+    limits = {"position_median_m": 0.9, "orientation_median_deg": 0.9,
+              "linear_velocity_median_m_per_s": 0.6,
+              "angular_velocity_median_deg_per_s": 0.6}  # fmt: skip
     for quantity, limit in limits.items():
-        assert smooth[f"{quantity} median"] < limit * plain[f"{quantity} median"]
+        assert smooth[quantity] < limit * plain[quantity]
 
 
 def test_samples_of_the_motion(pair, tmp_path):
