@@ -85,7 +85,6 @@ CHECKS: dict[str, list[Callable[[Any], None]]] = {
         lambda it: _near([it.result.time, it.result.span], [0.0175, 0.035], 1e-12),
         lambda it: _near(np.linalg.norm(it.state.angular_velocity), 1.0, 0.02),
     ],
-    "docs/calibration.md": [lambda it: _near(it.found.readout_time, 0.03, 2e-3)],
 }
 
 
