@@ -152,7 +152,7 @@ def perform(task: Task) -> Outcome:
     if (figures := finished(task)) is not None:
         return Outcome(figures)
     # A folder of its own: a worker that is taken for lost may still be at it.
-    partial = task.folder.with_name(f".unfinished-{uuid.uuid4().hex}")
+    partial = task.folder.with_name(f"{_unfinished(task)}{uuid.uuid4().hex}")
     inner = partial / task.folder.name  # under its final name, which some files repeat
     said = io.StringIO()
     try:
@@ -178,6 +178,11 @@ def perform(task: Task) -> Outcome:
     return Outcome(figures)
 
 
+def _unfinished(task: Task) -> str:
+    """How the names of folders begin in which this task is worked on."""
+    return f".unfinished-{task.identity[:16]}-"
+
+
 def perform_all(
     tasks: Sequence[Task], scheduler: str | None, workers: int | None
 ) -> Iterator[tuple[Task, Outcome]]:
@@ -198,6 +203,7 @@ def perform_all(
     with contextlib.ExitStack() as stack:
         where: Any = scheduler
         if scheduler is None:
+            stack.callback(_clear, tasks)  # once the workers have ended
             cores = len(os.sched_getaffinity(0))
             where = stack.enter_context(_local(max(1, min(len(tasks), workers or cores))))
         try:
@@ -213,6 +219,13 @@ def perform_all(
             except Exception as error:  # with its worker, or the scheduler: Dask says which
                 outcome = Outcome(None, f"lost: {' '.join(str(error).split())[:200]}")
             yield futures[future], outcome
+
+
+def _clear(tasks: Sequence[Task]) -> None:
+    """Remove what workers that were killed have left of these tasks."""
+    for task in tasks:
+        for rest in task.folder.parent.glob(f"{_unfinished(task)}*"):
+            shutil.rmtree(rest, ignore_errors=True)
 
 
 @contextlib.contextmanager
