@@ -17,6 +17,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.reasons import ImuReason, Reason
 from rs_localizer.io.bags import BagError
 from rs_localizer.io.clouds import Correspondences, EmptyCloudError
+from rs_localizer.io.topics import GIVEN_POSES
 from rs_localizer.offline.replay import NO_FRAMES, find_topics
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import INPUTS, Input, Role
@@ -32,11 +33,12 @@ def bag(**topics: str) -> Any:
 
 def test_the_page_of_the_node_has_every_input_with_its_type():
     rows = re.findall(
-        r"^\| in \| `(\w+)`.*? \| (.*?) \|", (ROOT / "docs" / "node.md").read_text(), re.M
+        r"^\| in \| `([\w/~]+)`.*? \| (.*?) \|", (ROOT / "docs" / "node.md").read_text(), re.M
     )
-    assert {name for name, _ in rows} == set(INPUTS)
+    types = {name: item.type for name, item in INPUTS.items()} | GIVEN_POSES
+    assert {name for name, _ in rows} == set(types)
     for name, kind in rows:
-        assert kind.startswith(INPUTS[name].type.replace("/msg/", "/"))
+        assert kind.startswith(types[name].replace("/msg/", "/"))
 
 
 def test_launch_files_read_the_list_without_the_kernels():
