@@ -116,7 +116,8 @@ class Feed:
             load_kernels(FrameLocalizer(config))
             if self._wanted is config:
                 self._wanted = None
-                self._worker.update("settings", lambda frames: self._change(frames, config))
+                # Bound now: the worker may come to it after this loop has ended with None.
+                self._worker.update("settings", functools.partial(self._change, config=config))
 
     def reset(self) -> None:
         """Forget the previous frames."""
