@@ -15,6 +15,7 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
 
 from rs_localizer.io.outputs import TYPES
+from rs_localizer.io.topics import CAMERA_MARKER, INTEGRITY
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node import managed
 from rs_localizer.ros.node.inputs import Inputs
@@ -60,7 +61,7 @@ def test_publishers_are_active_before_a_frame_can_come(monkeypatch):
     finally:
         node.destroy_node()
         rclpy.shutdown(context=context)
-    assert active == [True] * len(TYPES)
+    assert active == [True] * len([*TYPES, INTEGRITY, CAMERA_MARKER])
 
 
 def test_what_it_says_at_start_and_an_end_by_signals(start_node, tmp_path):
