@@ -211,17 +211,20 @@ class Evidence:
 
     def _why_not(self, sign: float) -> str:
         """What speaks against it, beginning with how that goes on from the value."""
-        if self.stabilised:
-            return (
-                f"; parts of the recording disagree ({self.parts(sign)} ms): is "
-                "image stabilisation on, or was the video processed?"
-            )
+        why = ""
         if self.jitter > _MOST_JITTER:
-            return (
+            why += (
                 f"; images were exposed {1e3 * self.jitter:.1f} ms rms beside "
                 "their stamps: record with the camera's own time stamps, without losing images or "
                 "encoding the video anew"
             )
+        if self.stabilised:
+            why += (
+                f"; parts of the recording disagree ({self.parts(sign)} ms): is "
+                "image stabilisation on, or was the video processed?"
+            )
+        if why:
+            return why
         if abs(self.readout_time) > _LONGEST * self.stamps.interval:
             return (
                 f" is longer than the interval between images, "
