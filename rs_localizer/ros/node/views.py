@@ -3,6 +3,7 @@
 """What RViz and Foxglove show beside the messages of a frame: the map, and the camera in it."""
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from geometry_msgs.msg import Point
@@ -13,9 +14,11 @@ from visualization_msgs.msg import Marker, MarkerArray  # type: ignore[import-un
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.messages import make_header, make_quaternion, make_vector
-from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import MAP_MARKERS
 from rs_localizer.ros.node.conversion import make_message
+
+if TYPE_CHECKING:  # the detectors need no estimates
+    from rs_localizer.io.outputs import Localized
 
 # More points of a map than an eye tells apart only take time.
 _MOST_POINTS = 20_000
@@ -59,7 +62,7 @@ def map_marker(frame: str, points: Array) -> Marker:
     return marker
 
 
-def camera_marker(frame: Localized, corners: Array) -> Marker:
+def camera_marker(frame: "Localized", corners: Array) -> Marker:
     """The camera's view at the middle row: its colour says how far the pose is to be trusted.
 
     Args:
