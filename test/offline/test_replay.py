@@ -32,7 +32,7 @@ class Localizer(SimpleNamespace):
     def awaits_imu(self, *_: object) -> bool:
         return False
 
-    def finish(self) -> list[Any]:
+    def flush(self) -> list[Any]:
         return []
 
 
