@@ -306,6 +306,7 @@ def mixture_of(
     errors, shared = modes.errors[first].copy(), 0.0
     for k in range(count):
         weights[modes.speeds[k]] += possible[k]
+    for k in range(count):  # apart from the stores: see test_kernels_round_in_one_way
         shared += possible[k] * modes.errors[k, 1] ** 2
     errors[1] = math.sqrt(shared)
     log_likelihoods = np.maximum(log_likelihoods - np.max(log_likelihoods), LEAST_LIKELY)
