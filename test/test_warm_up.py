@@ -25,7 +25,7 @@ def compiled():
     ours = [k for k in gc.get_objects() if isinstance(k, CPUDispatcher)]
     return {(k.__module__, k.__name__, str(s)) for k in ours for s in k.signatures}
 
-FrameLocalizer(NodeConfig()).warm_up()
+FrameLocalizer(NodeConfig()).warm_up_rest()
 before = compiled()
 for condition in [one for one in conditions() if one.bench != "axis"][::6]:
     judge(condition, 1, 3, {})
