@@ -126,7 +126,7 @@ def _check_binned(K: tuple[float, ...], size: tuple[int, int], image: Calibratio
     centre = np.array([K[2], K[5]])
 
     def central(extent: tuple[int, int]) -> bool:
-        return bool(np.all(np.abs(centre / extent - 0.5) < _CENTRAL))
+        return bool(np.all(np.abs(centre - 0.5 * np.array(extent)) < _CENTRAL * np.array(extent)))
 
     if camera.size != size and central(camera.size) and not central(size):
         raise MessageError(

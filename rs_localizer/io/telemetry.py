@@ -39,9 +39,9 @@ _SECONDS, _BYTES_A_SECOND = 5, 50_000_000
 # Gyroscopes end at 70 rad/s (4000 deg/s); readout times of cameras at 0.2 s.
 _FASTEST, _LONGEST_READOUT = 100.0, 200.0  # rad/s, ms
 _KEPT = 0.9  # least share of readings that can be used
-# Readout times in ms: of GoPro (SROT; of HERO7 for each image), Sony and Canon, and those that add
-# it themselves.
-_READOUT_NAMES = ("0x53524f54", "FrameReadoutTime", "frame_readout_time")
+# Readout times in ms: of GoPro (SROT; of HERO7 for each image), Sony and Canon, those that add it
+# themselves, and Insta360.
+_READOUT_NAMES = ("0x53524f54", "FrameReadoutTime", "frame_readout_time", "rolling_shutter_time")
 _STABILIZED, _STABILIZER = "0x45495345", "0x45495341"  # GoPro: EISE, whether, and EISA, how
 _OFF = ("", "N", "N/A", "OFF")
 _MEI = "insta360"

@@ -123,7 +123,7 @@ def test_the_model_is_that_of_a_global_shutter(scene, model, shutter, row, tau, 
 def test_what_cannot_be_used_is_named(model, tmp_path, capsys):
     out = tmp_path / "out"
     for words, code, text in (
-        ((), 2, "are not times in ns (such as frame_0000.png): give --rate"),
+        ((), 2, "are not times (such as frame_0000.png): give --rate"),
         (("--rate", "30", "--shutter", "global"), 2, "of a global shutter needs no refinement"),
         (("--rate", "30", "--map", "map.npz"), 2, "--colmap goes without --map"),
         (("--rate", "30", "--images", str(tmp_path)), 1, "has no frame_0000.png"),
@@ -134,4 +134,4 @@ def test_what_cannot_be_used_is_named(model, tmp_path, capsys):
         assert not out.exists()
     assert main(["map", "refine", "--out", str(out)]) == 2
     assert main(["map", "refine", "--colmap", str(tmp_path), str(out)]) == 1
-    assert f"{tmp_path}: the folder has neither points3D.bin" in capsys.readouterr().err
+    assert f"{tmp_path} is no model of COLMAP" in capsys.readouterr().err
