@@ -4,6 +4,7 @@
 
 import struct
 from collections.abc import Iterable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -89,9 +90,14 @@ def insta360(readings: bytes, *about: bytes) -> bytes:
     return records + end + b"8db42d694ccc418790edff439fe026bf"
 
 
+# telemetry-parser turns the axes of a GO 3 by a quarter since 0.3.
+_NEW_AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
 def add_telemetry(path: Path, seconds: Any, rates: Any, readout: float) -> None:
     """Append the gyroscope, rates (n,3) in the camera's axes at times (n,), to a video."""
-    sensor = np.asarray(rates) @ CAMERA_FROM_SENSOR
+    new = metadata.version("telemetry-parser") >= "0.3"
+    sensor = np.asarray(rates) @ (_NEW_AXES if new else np.eye(3)) @ CAMERA_FROM_SENSOR
     milliseconds = np.round(1e3 * np.asarray(seconds) + 1000).astype(int).tolist()
     rows = zip(milliseconds, sensor.tolist(), strict=True)
     readings = b"".join(struct.pack("<Q6d", t, 1.0, 0.0, 0.0, *rate) for t, rate in rows)
