@@ -24,7 +24,7 @@ from rs_localizer.inertial.gravity import gravity_seen
 from rs_localizer.inertial.offset_search import OffsetSearch, Orientation
 from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.samples import ImuSamples, span_of
-from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.settings import OFFSET_DEVIATION, InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.inertial.turning import TurnBetween, TurnWithin
 from rs_localizer.inertial.watch import GyroscopeWatch, contradicts
@@ -37,6 +37,8 @@ _FIRST = np.arange(3)
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
 # Deviations of an offset that was found at once, as the filter takes them.
 _WIDER = 3.0
+# An offset is hardly known whose deviation is this part of what it is at first.
+_HARDLY = 0.25
 
 Found = tuple[Estimate | Failure, Prior | None]
 # What a gyroscope measures.
@@ -168,7 +170,11 @@ class GyroscopeAid:
         if foreseen is None:
             self.filter.forget_motion()
             alone = localized(None)
-            self._compare(middle_ns, alone[0])
+            if self._state is Alone.NOT_COVERED and self._strayed(samples, middle_ns):
+                self.filter.reset()
+                self._contradicted(middle_ns, alone[0])
+            else:
+                self._compare(middle_ns, alone[0])
             return alone
         found = localized(foreseen)
         step = _step(foreseen, found[0])
@@ -208,6 +214,17 @@ class GyroscopeAid:
         self.filter.forget_motion()
         return GyroPrediction(middle_ns, turn, self._gravity(samples, middle_ns), None)
 
+    def _strayed(self, samples: ImuSamples | None, middle_ns: int) -> bool:
+        """Whether samples do not cover a frame for an offset that is hardly known.
+
+        Such a one would never be tried again: a gyroscope that shows something else leads there.
+        """
+        errors = self.filter.errors
+        if samples is None or errors.covariance[3, 3] < (_HARDLY * OFFSET_DEVIATION) ** 2:
+            return False
+        fresh = GyroscopeFilter(self._settings).errors
+        return turning.turn_within(samples, middle_ns, self._readout_time, fresh) is not None
+
     def _gravity(self, samples: ImuSamples, middle_ns: int) -> Prior | None:
         up = self._settings.gravity_in_map
         seen = None if up is None else gravity_seen(samples, middle_ns, self.filter.errors)
@@ -234,9 +251,9 @@ class GyroscopeAid:
         """Take in a frame that agrees with the gyroscope; whether the time offset does, too."""
         assert found
         self._state = Alone.NONE
-        self._watch.judge(False, None)
         if self._shaken and self._stepped and self._search is not None and self._search.hopes:
             return False  # of a vibration whose phase nobody knows, turns say nothing
+        self._watch.judge(False, None)
         posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
         possible = True
         if foreseen.predicted is not None:
@@ -265,7 +282,9 @@ class GyroscopeAid:
         self.filter.forget_motion()
         if alone:
             self._doubt()
-        self._watch.judge(bool(alone), _oriented(middle_ns, alone) if alone else None)
+        searching = self._shaken and self._search is not None and self._search.is_young
+        if not searching:  # else the offset may be all that is wrong
+            self._watch.judge(bool(alone), _oriented(middle_ns, alone) if alone else None)
         self._state = Alone.NONE
         if alone:
             dropped = self._watch.dropped
