@@ -66,7 +66,7 @@ class NodeProcess:
                 [sys.executable, "-c", run, "--ros-args", *arguments],
                 stdout=file,
                 stderr=file,
-                env={**os.environ, "RCUTILS_LOGGING_BUFFERED_STREAM": "0", **environment},
+                env={**os.environ, "RCUTILS_LOGGING_BUFFERED_STREAM": "0", "PYTHONFAULTHANDLER": "1", **environment},
             )
 
     @property
@@ -85,7 +85,12 @@ class NodeProcess:
         for number in signals or (signal.SIGINT,):
             self.process.send_signal(number)
             time.sleep(0.05)
-        return self.process.wait(TIMEOUT)
+        try:
+            return self.process.wait(TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self.process.send_signal(signal.SIGABRT)  # has all stacks written to the log
+            self.process.wait()
+            raise AssertionError(f"the node does not end:\n{self.log}") from None
 
 
 class Peer:
