@@ -6,13 +6,16 @@ Three threads: the executor's answers services, changes parameters and the life 
 diagnostics; that of the inputs takes messages; the worker's does the work and publishes.
 """
 
+import contextlib
+import faulthandler
 import functools
 import gc
 import os
 import sys
+import threading
 import traceback
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
 import rclpy
@@ -302,6 +305,8 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
 _SIGNAL_LATENCY = 0.1
 # How long the end waits for the frame that is worked on, in s.
 _LAST_FRAME_TIMEOUT = 0.5
+# How long the end may take in all, in s: 5 after SIGINT a launch file sends SIGTERM, then SIGKILL.
+_LONGEST_END = 4.0
 # How long a thread waits for the GIL before it asks for it, in s.
 _SWITCH_INTERVAL = 0.001
 
@@ -335,14 +340,31 @@ def run(
     except ExternalShutdownException:
         code = 0
     finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
+        with _ends_within(_LONGEST_END):
+            node.destroy_node()
+            rclpy.try_shutdown()
     if not wait_for_workers(_LAST_FRAME_TIMEOUT):
         # The interpreter's own end would stop a thread inside compiled code, which may crash.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
     return code
+
+
+@contextlib.contextmanager
+def _ends_within(seconds: float) -> Iterator[None]:
+    """An end that the middleware holds up (once in some hundred runs) is cut short, and says so."""
+
+    def leave() -> None:
+        sys.stderr.write(f"the node did not end within {seconds:g} s, and stands here:\n")
+        faulthandler.dump_traceback(all_threads=True)
+        os._exit(0)
+
+    timer = threading.Timer(seconds, leave)
+    timer.daemon = True
+    timer.start()
+    yield
+    timer.cancel()
 
 
 def _start(node: Any, stop: StopRequest) -> int:

@@ -43,6 +43,20 @@ def test_started_with_bad_parameters(start_node):
     assert "Traceback" not in node.log
 
 
+def test_an_end_that_the_middleware_holds_up_is_cut_short(start_node):
+    """In CI a node once stood for more than 60 s after SIGTERM."""
+    node = start_node(
+        run="import rclpy, sys, time; rclpy.try_shutdown = lambda: time.sleep(60);"
+        "from rs_localizer.ros.main import main; sys.exit(main())",
+    )
+    node.wait_for_log("loading kernels")
+    begin = time.monotonic()
+    assert node.stop(signal.SIGTERM) == 0
+    assert time.monotonic() - begin < 15.0
+    assert "did not end within 4 s" in node.log
+    assert "in run" in node.log
+
+
 def test_publishers_are_active_before_a_frame_can_come(monkeypatch):
     active: list[bool] = []
 
