@@ -56,6 +56,10 @@ def domain() -> Iterator[None]:
         yield
 
 
+# What a node writes comes at once, and stacks where it is aborted.
+LOGGED = {"RCUTILS_LOGGING_BUFFERED_STREAM": "0", "PYTHONFAULTHANDLER": "1"}
+
+
 class NodeProcess:
     """The node, started as a user starts it."""
 
@@ -66,7 +70,7 @@ class NodeProcess:
                 [sys.executable, "-c", run, "--ros-args", *arguments],
                 stdout=file,
                 stderr=file,
-                env={**os.environ, "RCUTILS_LOGGING_BUFFERED_STREAM": "0", "PYTHONFAULTHANDLER": "1", **environment},
+                env=os.environ | LOGGED | environment,
             )
 
     @property
