@@ -194,14 +194,14 @@ class LocalizerConfig:
     )
     confidence: float = setting(
         0.99,
-        "Probability of having drawn an all-inlier sample at which the search stops",
+        "Probability of an all-inlier sample at which the search stops",
         (0.0, 0.999999),
     )
-    min_inliers: int = setting(8, "Fewest inliers of a pose that is accepted", (7, 1_000_000))
+    min_inliers: int = setting(8, "Fewest inliers of an accepted pose", (7, 1_000_000))
     max_orientation_deviation: float = setting(
         0.07,
-        "Largest standard deviation of the orientation of a pose that is accepted, in rad, about "
-        "the axis known worst, of a camera at rest; three times as much of one that may move",
+        "Largest accepted standard deviation of the orientation about its worst axis, in rad, of "
+        "a stationary camera; three times as much where only unknown motion causes it",
         (0.001, 10.0),
     )
     seed: int = setting(0, "Seed of the random samples; every frame starts from it", (0, 2**31 - 1))
@@ -210,8 +210,8 @@ class LocalizerConfig:
     calibration: CalibrationErrors = field(default_factory=CalibrationErrors)
     map_deviation: float = setting(
         0.0,
-        "How well the points of the map are known, in m (one standard deviation; neighbours are "
-        "assumed to be off together); it widens covariances and gates",
+        "Standard deviation of the map's points, in m ( neighbours share "
+        "their errors); it widens covariances and gates",
         (0.0, 1000.0),
     )
 
@@ -318,14 +318,14 @@ class Imu:
 
     use: str = setting(
         ImuUse.AUTO,
-        "auto: use the IMU if messages come on imu and TF knows how it is turned against the "
-        "camera; none: never",
+        "auto: use the IMU if messages arrive on imu and TF has its transform to the camera; "
+        "none: never",
     )
     time_offset: float = setting(
         0.0, "Time to add to the stamps of the IMU to get the camera's time, in s", (-10.0, 10.0)
     )
     estimate_time_offset: bool = setting(
-        True, "Estimate what is left of the time offset, from the camera's motion"
+        True, "Estimate the remaining time offset from the camera's motion"
     )
     gyroscope_noise: float = setting(
         2e-4, "Noise density of the gyroscope, in rad/s/sqrt(Hz)", (1e-7, 1.0)
@@ -359,8 +359,8 @@ class Rig:
     )
     estimate_time_offsets: bool = setting(
         False,
-        "Estimate what is to be added to the stamps of each camera but the first, from the motion, "
-        "and follow clocks that drift or jump",
+        "Estimate the clock offset of each camera against the first from the motion, and follow "
+        "clocks that drift or jump",
     )
 
     def __post_init__(self) -> None:
@@ -420,12 +420,12 @@ class NodeConfig(LocalizerConfig):
     tracking: bool = setting(
         True,
         "Use the previous pose and twist as first guess and prior, with a rolling-shutter solver; "
-        "without a readout_time only what frames say of map and lens is remembered",
+        "without a readout_time only errors of map and lens are tracked",
     )
     max_points: int = setting(
         20_000,
         "Most points of a frame that are used: those with the best scores, or without scores "
-        "some of all parts of the image",
+        "evenly over the image",
         (7, 1_000_000),
     )
     base_frame: str = setting(
@@ -458,8 +458,8 @@ class NodeConfig(LocalizerConfig):
     )
     orientation_covariance: str = setting(
         OrientationCovariance.FIXED_AXES,
-        "What covariances of poses are about; fixed_axes: rotations about those of the map, as "
-        "REP-103 has it; roll_pitch_yaw: these angles, as robot_localization reads them",
+        "Convention of the orientation covariance; fixed_axes: rotations about the map's axes "
+        "(REP-103); roll_pitch_yaw: these angles, as robot_localization reads them",
     )
     transform_tolerance: float = setting(
         0.2,
@@ -476,7 +476,7 @@ class NodeConfig(LocalizerConfig):
     map_frame: str = setting("map", "Frame of the points in map_file", fixed=True)
     marker_map: str = setting(
         "",
-        "Map file of the markers on the topic detections, as of the marker detector; empty: none",
+        "Marker map for the topic detections, in the marker detector's format; empty: none",
         fixed=True,
     )
     matching: Matching = field(default_factory=Matching)

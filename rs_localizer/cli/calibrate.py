@@ -121,7 +121,7 @@ def _remarks(found: MountFound, imu: ImuRecording) -> list[str]:
             f"{found.inflation:.1f} times that of the noise alone"
         )
     if imu.camera_from_imu is None:
-        said.append("imu: TF does not say how it hangs on the camera; the rotation is not checked")
+        said.append("imu: TF has no transform from it to the camera; its rotation is not checked")
     elif found.rotation_determined:
         off = np.degrees(found.mount.turned_from(imu.camera_from_imu))
         error = float(np.degrees(np.linalg.norm(found.rotation_deviations)))

@@ -249,7 +249,7 @@ def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:
     rows = [("frames", str(tally.total)), ("localized", str(tally.localized))]
     rows += [(f"  refused: {reason}", str(n)) for reason, n in tally.refused.most_common()]
     for name, (count, _) in sorted(tally.notices.items(), key=lambda item: -item[1][0]):
-        kind = "started afresh" if name in _RESTARTS else "noticed"
+        kind = "restarted" if name in _RESTARTS else "noticed"
         rows.append((f"{kind}: {name}", str(count)))
     dropped = int(tally.column("dropped").sum())
     for name, count in (

@@ -84,12 +84,12 @@ REASONS: dict[str, Meaning] = {
         f"calibration, map, or a too small inlier_threshold; {_TURNED}",
     ),
     Reason.DEGENERATE: Meaning(
-        "the points do not determine the motion, as on a plane seen straight on",
+        "the points do not determine the motion, e.g. a frontoparallel plane",
         "look at it from an angle, show points at other depths, leave tracking and velocity_prior "
         "on",
     ),
     Reason.IMPLAUSIBLE: Meaning(
-        "the motion would be faster than a camera moves", f"mostly chance matches; {_TURNED}"
+        "the motion exceeds what a camera can do", f"mostly chance matches; {_TURNED}"
     ),
     Reason.MIRRORED: Meaning(
         "planar pose ambiguity: two poses, mirrored about the line of sight, fit equally well",
@@ -97,8 +97,8 @@ REASONS: dict[str, Meaning] = {
     ),
     Reason.MODEL_ERROR: Meaning(
         "neighbouring rows share errors, many points lie just beyond the inlier gate, or errors "
-        "are large and smooth over the image: vibration that the rows cannot resolve, or a map or "
-        "calibration that is too far off for any pose",
+        "are large and smooth over the image: vibration that the rows cannot resolve, or a map "
+        "or calibration too wrong for any pose",
         f"a stiffer mounting, the calibration (before a plane a wrong lens looks like a bent "
         f"map: show points at several depths), the map; {_TURNED}",
     ),
@@ -109,7 +109,7 @@ REASONS: dict[str, Meaning] = {
         "velocity_prior of a slow camera, or raise the limit where a filter weighs each pose",
     ),
     Reason.SCAN_AXIS: Meaning(
-        "the shutter moves over the columns, not the rows, or the other way about: scan_direction "
+        "the shutter scans columns instead of rows, or rows instead of columns: scan_direction "
         "names the wrong axis",
         "set scan_direction to the direction that the message names; a driver that rotates images "
         "rotates the scan, too",
@@ -166,7 +166,7 @@ REASONS: dict[str, Meaning] = {
         "nothing, if it is rare; otherwise, do two senders use this topic?",
     ),
     Reason.COMPILING: Meaning(
-        "what this frame takes is being compiled, at the first start on a machine",
+        "kernels of this frame are being compiled, at the first start on a machine",
         "it ends within minutes; `rs_localizer warm` beforehand",
     ),
     Reason.NO_TRANSFORM: Meaning(
@@ -200,7 +200,7 @@ IMU_REASONS: dict[str, Meaning] = {
         "the camera turns faster than the gyroscope can measure", "a larger range of the gyroscope"
     ),
     ImuReason.TWO_FRAMES: Meaning(
-        "messages on imu come with two frame_ids in turns",
+        "messages on imu alternate between two frame_ids",
         "two IMUs, or two drivers, publish on one topic: remap one of them",
     ),
     ImuReason.NO_TRANSFORM: Meaning(
@@ -225,7 +225,7 @@ IMU_REASONS: dict[str, Meaning] = {
         "the transform between the two frame_ids; the angle is in the diagnostics",
     ),
     ImuReason.COMPILING: Meaning(
-        "what an IMU takes is being compiled, at the first start on a machine",
+        "kernels for an IMU are being compiled, at the first start on a machine",
         "it ends within minutes; `rs_localizer warm` beforehand",
     ),
 }

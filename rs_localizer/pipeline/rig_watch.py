@@ -273,8 +273,8 @@ class RigWatch:
             self._said = {said for said in self._said if said[1] != name}
             self._say(
                 Notice.CLOCK, name,
-                f"what {name} sees has ceased to agree with its mounting and clock: both are "
-                "estimated afresh",
+                f"observations of {name} no longer agree with its extrinsics and clock: both are "
+                "estimated again",
             )  # fmt: skip
 
     def _conclude(self, name: str, fit: _Fit) -> None:

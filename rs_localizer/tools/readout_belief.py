@@ -239,7 +239,7 @@ class Evidence:
         if not self.determined:
             return (
                 f", known to less than {1e3 * self.limit:.1f} ms it would be; "
-                "move the camera faster, turn it to and fro about all axes, and for longer"
+                "move the camera faster, rotate it about all axes, and for longer"
             )
         if self.too_fast:
             return "; no rolling shutter is that fast: was the video stabilised or processed?"

@@ -164,7 +164,7 @@ def first_extrinsics(rig: Spline, own: Spline, shift: float) -> Extrinsics:
     best, turned = min(guesses, key=lambda guess: guess[1], default=(None, math.inf))
     if best is None or not turned < _MOST_TURNED:
         raise Undetermined(
-            "it does not turn as the first camera does"
+            "its rotation does not match that of the first camera"
             + (f" (to {math.degrees(turned):.1f} deg at best)" if guesses else "")
             + f": do both move as one, unevenly, and for {least * _STEP:.0f} s at the same time?"
         )

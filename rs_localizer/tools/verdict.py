@@ -85,7 +85,7 @@ def remarks(result: Calibration) -> list[str]:
     if result.jitter > _WORTH_A_WORD:
         said.append(
             f"images were exposed {1e3 * result.jitter:.1f} ms rms beside their stamps, each at a "
-            "time of its own, which was estimated: the value leans on the mean interval"
+            "time of its own, which was estimated: the value depends on the mean interval"
         )
     if result.stamps.missing:
         said.append(f"{result.stamps.missing} images are missing between the others")

@@ -83,7 +83,9 @@ def test_motions_that_are_not_one_are_refused():
     back = replace(spline, rotations=np.roll(spline.rotations[::-1], 20, axis=0))
     fit = replace(fit, state=replace(fit.state, spline=back))
     rear = front._replace(calibration=replace(front.calibration, fit=fit))
-    with pytest.raises(ValueError, match=r"rear: it does not turn as the first camera does \(to"):
+    with pytest.raises(
+        ValueError, match=r"rear: its rotation does not match that of the first camera \(to"
+    ):
         calibrate_rig({"front": front, "rear": rear})
     with pytest.raises(ValueError, match="several cameras, not 1"):
         calibrate_rig({"front": front})

@@ -170,7 +170,7 @@ class Options(either.OtherFileOptions):
     floor: list[int] = option(
         "instead: three ids or more in a level plane at the bottom of the map", "ID ...", list
     )
-    upright: int | None = option("instead: marker that hangs upright: its y axis is up", "ID")
+    upright: int | None = option("instead: an upright marker: its y axis is up", "ID")
     origin: int | None = option("id at the origin", "ID")
     origin_at: tuple[float, float, float] | None = option("instead: in the map as it is", "X Y Z")
 

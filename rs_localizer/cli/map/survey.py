@@ -53,12 +53,12 @@ class Options(ReadoutOptions, MountingOptions, ImageOptions):
         "[ID[-ID]:]M", list, required=True,
     )  # fmt: skip
     origin: int | None = option(
-        "marker whose frame is that of the map (default: the lowest id of the most that hang "
-        "together)", "ID",
+        "marker whose frame is that of the map (default: the lowest id of the largest connected "
+        "group)", "ID",
     )  # fmt: skip
     deviations: str = option(
-        "what is written of the errors: of the markers beside each other, wherever all of them "
-        "lie, or in the frame of the origin, whose own are 0", default=_SHAPE,
+        "covariances to write: of the markers relative to each other, or in the frame of the "
+        "origin, whose own are 0", default=_SHAPE,
         choices=(_SHAPE, _ORIGIN),
     )  # fmt: skip
     out: Path = option("map to write", "WALL.yaml", required=True)

@@ -223,7 +223,7 @@ class ImageNode(
         summary = self.statistics.summary()
         judgement = out_of_service(self.state)
         if judgement is None and not self._listening:
-            message = f"nobody subscribes to the {self.output} or the debug image"
+            message = f"no subscription to the {self.output} or the debug image"
             judgement = Health(Level.OK, State.IDLE, message)
         if judgement is None:
             silence = {name: item for name, item in self.silence.items() if name in _IMAGES}

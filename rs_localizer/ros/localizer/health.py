@@ -242,7 +242,7 @@ def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
     if condition.imu is not None:
         values |= imu_values(condition.imu)
     values |= {f"Topic {item.topic}": _heard(item) for item in condition.silence.values()}
-    return values | {f"Odd: {name}": text for name, text in condition.oddities.items()}
+    return values | {f"Notice: {name}": text for name, text in condition.oddities.items()}
 
 
 def _heard(item: Silence) -> str:

@@ -71,7 +71,7 @@ def advice(built: Built, views: Sequence[View]) -> list[str]:
     if not known:
         said.append(
             "for the readout time, film at the camera's own rate (no time lapse, no stabilisation) "
-            "and turn the camera briskly, sideways and up and down, for some seconds"
+            "and rotate the camera quickly, sideways and up and down, for some seconds"
         )
     return said
 
@@ -93,7 +93,7 @@ def _of_shutter(built: Built) -> list[tuple[str, str]]:
             text = "invisible: no smooth motion joins the images, each has a pose of its own"
         return [("readout time", text)]
     best = f"{1e3 * fit.readout_time:.2f} +- {1e3 * fit.deviation:.2f} ms, {fit.direction}"
-    axis = "" if fit.axis_known else ", or along the other axis: the images fit both alike"
+    axis = "" if fit.axis_known else ", or along the other axis, which fits equally well"
     why = "" if fit.possible else f", longer than {1e3 * fit.interval:.1f} ms between images"
     noises = (
         f"{fit.noise:.3f} px, with a global shutter {fit.global_noise:.3f} px; "

@@ -119,7 +119,7 @@ class Robot:
         for status in message.status:
             if status.name.endswith(": localizer"):
                 self.values = {item.key: item.value for item in status.values}
-                self.odd |= {name for name in self.values if name.startswith("Odd: ")}
+                self.odd |= {name for name in self.values if name.startswith("Notice: ")}
 
     def connect(self) -> None:
         def connected() -> bool:

@@ -169,7 +169,7 @@ def test_what_is_odd_is_a_warning(world):
     health = world.diagnose(odd)
     assert (health.level, health.state) == (Level.WARN, "localized")
     assert health.message == "pixels_outside: 7 of 100 pixels"
-    assert health.values["Odd: pixels_outside"] == "7 of 100 pixels"
+    assert health.values["Notice: pixels_outside"] == "7 of 100 pixels"
     world.refuse(5)
     health = world.diagnose(odd)
     assert health.level == Level.ERROR

@@ -89,6 +89,6 @@ def test_node_and_replay_say_the_same_of_a_pair(recording, tmp_path, start_node,
             assert len(answered) >= expected
             assert answered.items() <= offline[name].items()
         assert peer.spin_until(lambda: "Inliers of right" in robot.values)
-        assert "Odd: no_images" in robot.odd
+        assert "Notice: no_images" in robot.odd
     assert "right is left out: no image in the last 3 frames" in node.log
     assert node.stop() == 0
