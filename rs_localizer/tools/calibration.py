@@ -369,8 +369,10 @@ def _judged(
         blocks_of(camera, observations, fitted),
         blocks_of(camera, observations, fitted, 2),
     )
-    formal = fitted.readout_time_deviation
-    values, deviations = _of(blocks, "readout_time"), _of(blocks, "deviation")
+    formal, doubt = fitted.readout_time_deviation, _interval_share(fitted, stamps)
+    values = _of(blocks, "readout_time")
+    # Of images that are missing where stamps are even, each part has a share of its own.
+    deviations = np.hypot(_of(blocks, "deviation"), doubt * values)
     inflation, mount = disagreement(values, deviations), None
     if observations.gyro is not None:
         doubt = disagreement(_of(blocks, "delay"), _of(blocks, "delay_deviation"))
@@ -383,7 +385,7 @@ def _judged(
         readout_time=fitted.state.readout_time,
         deviation=math.hypot(
             formal * inflation,
-            _interval_deviation(fitted, stamps),
+            doubt * fitted.state.readout_time,
             0.5 * apart_of(halves)[0],
             discrepancy(fitted.state.readout_time, values, inflation * deviations),
         ),
@@ -408,10 +410,9 @@ def _of(blocks: tuple[Block, ...], name: str) -> Array:
     return np.array([getattr(block, name) for block in blocks])
 
 
-def _interval_deviation(fitted: Fit, stamps: Stamps) -> float:
-    """Of the readout time (s), where stamps are even and the images were not."""
+def _interval_share(fitted: Fit, stamps: Stamps) -> float:
+    """Deviation of the interval, as a share, where stamps are even and the images were not."""
     # So many images know a variance no better than that.
     chance = 1.0 + 2.0 * math.sqrt(2.0 / len(fitted.state.delays))
     unsaid = fitted.freedom.stamps**2 - chance * stamps.jitter**2
-    share = math.sqrt(max(unsaid, 0.0)) / stamps.interval
-    return _INTERVAL_SHARE * share * abs(fitted.state.readout_time)
+    return _INTERVAL_SHARE * math.sqrt(max(unsaid, 0.0)) / stamps.interval
