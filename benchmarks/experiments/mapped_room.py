@@ -39,7 +39,6 @@ from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.tools.evaluation.cube_clip import CAMERA, SENSOR
-from rs_localizer.tools.mapping.pictures import save_pictures
 from rs_localizer.tools.mapping.report import rows
 from rs_localizer.tools.simulation.frames import middle_stamp
 
@@ -70,7 +69,6 @@ def main(arguments: list[str] | None = None) -> int:
     for name, text in rows(built, len(views), len(views)):
         sys.stdout.write(f"{name:32} {text}\n")
     write_npz(options.out / "map.npz", built.landmarks)
-    save_pictures(built, options.out)
     ours, theirs = built.landmarks, without_refinement(built)
     kept = True
     for name, piece in _FLIGHTS.items():

@@ -454,7 +454,7 @@ def _summarize(tasks: list[Task], outcomes: dict[Path, Outcome]) -> None:
 
 
 def _replay_of_many(options: Options, recording: Path, out: Path) -> Figures:
-    kernels = f"replay {_settings(options).solver}{' smooth' if options.smooth else ''}"
+    kernels = f"replay {_settings(options).solver}"
     compiled_elsewhere(kernels, _warm, options)
     alone = options if options.parquet is None else replace(options, parquet=out / TABLE)
     return figures(_replay_one(alone, recording, out, timed=False))
@@ -462,7 +462,3 @@ def _replay_of_many(options: Options, recording: Path, out: Path) -> Figures:
 
 def _warm(options: Options) -> None:
     FrameLocalizer(_settings(options)).warm_up()
-    if options.smooth:
-        from rs_localizer.tools.warm_up import warm_up
-
-        warm_up()

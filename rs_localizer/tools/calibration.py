@@ -9,7 +9,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -50,30 +49,6 @@ def likelihood(camera: Camera, result: Calibration, count: int = 9) -> tuple[Arr
     values = result.readout_time + np.linspace(-4.0, 4.0, count) * result.formal_deviation
     costs = np.array([cost_at(camera, observations, result.fit, float(value)) for value in values])
     return values, costs - result.fit.cost
-
-
-class Residuals(NamedTuple):
-    """Of the keypoints that fit."""
-
-    row_times: Array  # (n,)
-    speeds: Array  # (n,) px/s, in the image
-    squared_errors: Array  # (n,) px^2
-
-
-def without_readout(camera: Camera, result: Calibration) -> tuple[Residuals, Residuals]:
-    """What a global shutter would leave, and what the readout time leaves."""
-    observations = within(result.posed.observations, result.fit.state.spline).subset(
-        result.fit.inliers
-    )
-    observations = replace(observations, trusted=np.ones_like(observations.trusted))
-    held = replace(result.fit.freedom, readout_time=False)
-    both = []
-    for value in (0.0, result.readout_time):
-        start = replace(result.fit.state, readout_time=value)
-        both.append(fit(camera, observations, start, held).squared_errors)
-    speeds = image_speeds(camera, observations, result.fit.state)
-    before, after = (Residuals(observations.row_times, speeds, errors) for errors in both)
-    return before, after
 
 
 # Parts of the recording that are calibrated on their own: three at least, for two that agree may do

@@ -13,7 +13,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
-from rs_localizer.tools.adjust.lens import lens_prior, lens_values
+from rs_localizer.tools.adjust.lens import lens_prior, lens_values, project
 from rs_localizer.tools.adjust.observe import Observed
 
 _MOST_IMAGES, _LEAST_IMAGES = 30, 4
@@ -192,7 +192,7 @@ def _fisheye(size: tuple[int, int], images: list[Observed], K: Array) -> tuple[f
             linear = _linear(camera, image, *pose)
             assert linear is not None
             errors, by_pose, rays = linear
-            by_lens = _by_fisheye(numbers, rays)
+            by_lens = _by_lens(camera, rays)
             own = by_pose.T @ by_pose
             own[np.diag_indices(6)] *= 1.0 + damping
             mixed = np.linalg.solve(own, np.column_stack([by_pose.T @ by_lens, by_pose.T @ errors]))
@@ -229,7 +229,7 @@ def as_fisheye(lens: Camera, pixels: Array) -> Camera:
     for _ in range(_POSE_STEPS):
         fisheye = _equidistant(lens.size, numbers)
         off = (pixels - fisheye.distort(rays)[0]).ravel()
-        numbers = numbers + np.linalg.lstsq(_by_fisheye(numbers, rays), off, rcond=None)[0]
+        numbers = numbers + np.linalg.lstsq(_by_lens(fisheye, rays), off, rcond=None)[0]
     return _equidistant(lens.size, numbers)
 
 
@@ -239,18 +239,10 @@ def _equidistant(size: tuple[int, int], numbers: Array) -> Camera:
     return Camera(*size, K=K, D=numbers[4:], distortion_model=DistortionModel.EQUIDISTANT)
 
 
-def _by_fisheye(numbers: Array, rays: Array) -> Array:
-    """Pixels (2n,) by focal lengths, centre and distortion (8) of an equidistant lens."""
-    radius = np.hypot(*rays.T)
-    angle = np.arctan(radius)
-    powers = angle[:, None] ** np.arange(1.0, 10.0, 2.0)
-    unit = rays / np.maximum(radius, 1e-12)[:, None]
-    by_lens = np.zeros((len(rays), 2, 8))
-    for k in range(2):
-        by_lens[:, k, k] = unit[:, k] * (powers @ np.r_[1.0, numbers[4:]])
-        by_lens[:, k, 2 + k] = 1.0
-        by_lens[:, k, 4:] = numbers[k] * unit[:, k, None] * powers[:, 1:]
-    return by_lens.reshape(-1, 8)
+def _by_lens(camera: Camera, rays: Array) -> Array:
+    """Pixels (2n,m) of rays (n,2) by the numbers of a lens."""
+    points = np.column_stack([rays, np.ones(len(rays))])
+    return project(camera, lens_values(camera), points, True).by_lens.reshape(2 * len(rays), -1)
 
 
 def _calibrated(

@@ -42,13 +42,11 @@ def test_the_webcam(tmp_path, capsys):
     assert "times less likely" not in said.out
     assert not out.exists()
     assert main([*words, "--intrinsics", "--plot", str(plots), "--force"]) == 1
-    pictures = {"readout_time.png", "residuals.png", "coverage.png"}
-    assert {file.name for file in plots.iterdir()} == pictures
+    assert [file.name for file in plots.iterdir()] == ["readout_time.png"]
     values = load_params_file(out)
     # A third of the interval, by single poses (see ATTRIBUTION.md).
     assert 0.010 < values["readout_time"] < 0.015
-    # Its last third says 18.7 +- 2.3 ms, the first 11.3: the deviation has room for both.
-    assert 0.0 < values["readout_time_deviation"] < 3e-3
+    assert 0.0 < values["readout_time_deviation"] < 2e-3
     assert values["scan_direction"] == "top_to_bottom"
     camera = read_calibration(tmp_path / "webcam_camera_info.yaml")
     assert camera.K[0, 0] == pytest.approx(529.0, rel=0.02)

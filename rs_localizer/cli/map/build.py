@@ -218,9 +218,6 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
     if looked.camera is None:
         write_calibration(out / CAMERA, replace(built.camera, readout_time=0.0))
-    from rs_localizer.tools.mapping.pictures import save_pictures
-
-    save_pictures(built, out)
     (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")
 
 

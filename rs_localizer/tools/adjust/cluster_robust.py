@@ -17,12 +17,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.tools.adjust.fit import Fit, steepness
 from rs_localizer.tools.adjust.problem import Problem
-from rs_localizer.tools.adjust.system import Rows
 
 SECONDS = 1.0
 """Errors farther apart than this are taken for independent."""
@@ -71,30 +69,11 @@ def _pull(problem: Problem, fitted: Fit) -> Pull:
     every = problem.keypoint_rows(fitted.state, fitted.deviation)
     for rows, view in zip(every, problem.views, strict=True):
         for first, end in _seconds(view.observations.times):
-            own = _times(rows, slice(first, end), following)
+            own = rows.times(slice(first, end), following)
             total += float(np.sum((own.T @ rows.errors[first:end].ravel()) ** 2))
             share = own.T @ own if own.shape[0] > own.shape[1] else own @ own.T
             expected += float(np.trace(share) - np.sum(share**2))
     return Pull(total, expected)
-
-
-def _times(rows: Rows, part: slice, by: Array) -> Array:
-    """Rows (m,k) of a part times what all unknowns are by others (N,k)."""
-    others, first = rows.others[part], rows.first[part]
-    run = rows.values.shape[2] - others.shape[1]
-    values = rows.values[part]
-    columns = np.concatenate([first[:, None] + np.arange(run), others], axis=1)
-    values = np.where((columns >= 0)[:, None], values, 0.0)
-    numbers, width = values.shape[1], values.shape[2]
-    sparse = csr_array(
-        (
-            values.ravel(),
-            np.repeat(np.maximum(columns, 0), numbers, axis=0).ravel(),
-            width * np.arange(numbers * len(values) + 1),
-        ),
-        shape=(numbers * len(values), len(by)),
-    )
-    return np.asarray(sparse @ by)
 
 
 def _seconds(times: Array) -> list[tuple[int, int]]:

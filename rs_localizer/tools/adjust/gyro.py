@@ -12,6 +12,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.tools.adjust.priors import known
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import Quadratic, Rows
 from rs_localizer.tools.adjust.variables import DELAY, MOUNT, GyroSamples, State
@@ -77,12 +78,10 @@ class Gyroscope:
         columns = np.tile(np.arange(column, column + MOUNT), (len(first), 1))
         cost = float(np.sum(1.0 - rest**3)) * _LIMIT**2 / 3.0
         assert state.mount is not None
-        offset = state.mount.beside(self.start)
         information = np.diag(MOUNT_DEVIATIONS**-2.0)
-        slope = information @ offset
         return [
             Rows(weights[:, :, None] * values, CONTROL * first, columns, weights * errors, cost),
-            Quadratic(np.arange(column, column + MOUNT), information, slope, float(offset @ slope)),
+            known(state.mount.beside(self.start), information, column),
         ]
 
 

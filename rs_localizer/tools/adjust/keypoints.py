@@ -10,12 +10,12 @@ Errors and derivatives are multiplied by the inverse of ``A`` and weighted by Tu
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.tools.adjust.bodies import Pieces
 from rs_localizer.tools.adjust.lens import project
@@ -29,7 +29,7 @@ from rs_localizer.tools.adjust.spline_kernels import (
     rates,
 )
 from rs_localizer.tools.adjust.system import Rows
-from rs_localizer.tools.adjust.variables import EXTRINSICS, Observations, State
+from rs_localizer.tools.adjust.variables import EXTRINSICS, State, View
 
 LIMIT = 6.0
 """Tukey's limit in standard deviations: 97 % efficient on Gaussian noise in two dimensions."""
@@ -46,23 +46,6 @@ class Curve(NamedTuple):
     vectors: Array  # (n,3) from control to control
     inverses: Array  # (n,3,3)
     spacing: float
-
-
-class Free(NamedTuple):
-    """What of a camera is estimated."""
-
-    readout_time: bool
-    lens: bool
-    mount: bool
-    delays: bool
-
-
-class Columns(NamedTuple):
-    """Where the unknowns of a camera stand among all."""
-
-    shared: list[tuple[int, int]]  # first and number of readout time, lens and mount, if free
-    points: int  # first of the landmarks or bodies
-    delays: int  # first of the images' own times
 
 
 class Sights(NamedTuple):
@@ -283,16 +266,13 @@ class Keypoints:
     """The keypoints of one camera: a factor.
 
     Args:
-        camera: lens model, size and scan direction.
-        observations: what it saw.
+        view: what the camera saw, and what of it is free.
         pieces: what of the map is free.
-        free: of readout time, lens, mount and the images' own times.
     """
 
-    def __init__(
-        self, camera: Camera, observations: Observations, pieces: Pieces, free: Free
-    ) -> None:
-        self.camera, self.observations, self.pieces, self.free = camera, observations, pieces, free
+    def __init__(self, view: View, pieces: Pieces) -> None:
+        self.camera, self.observations, self.pieces = view.camera, view.observations, pieces
+        self.free = view.freedom
         self._last: tuple[State, Sights] | None = None
 
     def look(self, curve: Curve, own: State) -> Sights:
@@ -321,7 +301,8 @@ class Keypoints:
         free, width = self.free, self.pieces.width if self.pieces.count else 0
         return Terms(
             float(own.readout_time), self.camera.row_time_gradient, free.readout_time, free.lens,
-            free.mount, width, free.delays, deviation**2, (LIMIT * deviation) ** 2,
+            free.mounting is not None, width, free.stamps > 0.0, deviation**2,
+            (LIMIT * deviation) ** 2,
         )  # fmt: skip
 
     def squared_errors(self, curve: Curve, own: State) -> Array:
@@ -331,23 +312,24 @@ class Keypoints:
         squared_errors(sights, self.terms(own, 1.0), squared)
         return squared
 
-    def rows(self, curve: Curve, own: State, at: Columns, deviation: float) -> Rows:
+    def rows(self, curve: Curve, own: State, at: Mapping[str, int], deviation: float) -> Rows:
         """Whitened rows.
 
         Args:
-            at: where the camera's unknowns stand.
+            at: where the camera's unknowns begin among all.
             deviation: px, of the noise.
         """
         sights, seen = self.look(curve, own), self.observations
         terms, count = self.terms(own, deviation), len(sights.first)
-        shared = [np.arange(first, first + size) for first, size in at.shared]
+        sizes = {"readout": 1, "lens": len(own.lens), "mount": EXTRINSICS}
+        shared = [at[name] + np.arange(size) for name, size in sizes.items() if name in at]
         others = [np.tile(np.concatenate([*shared, np.zeros(0, int)]), (count, 1))]
         if terms.point_width:
             slots = self.pieces.slots[seen.points][:, None]
-            places = at.points + terms.point_width * slots + np.arange(terms.point_width)
+            places = at["points"] + terms.point_width * slots + np.arange(terms.point_width)
             others.append(np.where(slots < 0, -1, places))
         if terms.delay_free:
-            others.append(at.delays + seen.frames[:, None])
+            others.append(at["delays"] + seen.frames[:, None])
         columns = np.ascontiguousarray(np.concatenate(others, axis=1), np.int64)
         values = np.empty((count, 2, LOCAL + columns.shape[1]))
         errors = np.empty((count, 2))

@@ -6,15 +6,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.camera import Camera
 from rs_localizer.tools.adjust.bodies import BODY, Pieces, paper_covariance
 from rs_localizer.tools.adjust.gyro import Gyroscope
-from rs_localizer.tools.adjust.keypoints import LIMIT, Columns, Curve, Free, Keypoints, Sights
+from rs_localizer.tools.adjust.keypoints import LIMIT, Curve, Keypoints, Sights
 from rs_localizer.tools.adjust.lens import lens_prior
 from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
 from rs_localizer.tools.adjust.priors import Floating, block_rows, known, lens_term, mount_term
@@ -27,7 +26,7 @@ from rs_localizer.tools.adjust.system import (
     System,
     Undetermined,
 )
-from rs_localizer.tools.adjust.variables import EXTRINSICS, MOUNT, Freedom, Observations, State
+from rs_localizer.tools.adjust.variables import EXTRINSICS, MOUNT, State, View
 
 # Errors beyond so many standard deviations do not count for the scale of the noise.
 _SCALE_LIMIT = 4.0
@@ -40,19 +39,6 @@ _LEAST_GAIN, _LEAST_SHARE = 0.02, 1e-6
 _FIRST_DAMPING = 1e-8
 # The rounds end when the noise settles to this part of it.
 _ROUNDS, _SETTLED = 8, 0.01
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """What one camera sees, and what of it is free."""
-
-    camera: Camera
-    observations: Observations
-    freedom: Freedom
-
-    def subset(self, chosen: BoolArray) -> View:
-        """With the chosen keypoints (n,)."""
-        return replace(self, observations=self.observations.subset(chosen))
 
 
 class Problem:
@@ -77,24 +63,12 @@ class Problem:
         noises = np.ones(len(self.views)) if noises is None else noises
         self.noises, self.ratios = noises, noises / noises[0]
         self._lens_priors = [lens_prior(v.camera, v.freedom.lens_deviations) for v in self.views]
-        every = deviations is not None
-        self.pieces = [_pieces(v.observations, v.freedom, every) for v in self.views]
-        self.lens_count = len(start.lens)
+        self.pieces = [_pieces(view, deviations is not None) for view in self.views]
         self._columns(start)
-        self.keypoints = [
-            Keypoints(
-                v.camera, v.observations, pieces,
-                Free(
-                    v.freedom.readout_time, v.freedom.lens, v.freedom.mounting is not None,
-                    v.freedom.stamps > 0.0,
-                ),
-            )
-            for v, pieces in zip(self.views, self.pieces, strict=True)
-        ]  # fmt: skip
+        pairs = list(zip(self.views, self.pieces, strict=True))
+        self.keypoints = [Keypoints(*pair) for pair in pairs]
+        self._shapes = [_shape_information(*pair) for pair in pairs]
         self.floating = Floating(start.spline) if floating else None
-        self._shapes = [
-            _shape_information(v, pieces) for v, pieces in zip(self.views, self.pieces, strict=True)
-        ]
         self._last: tuple[State, Curve, list[State]] | None = None
 
     def _columns(self, start: State) -> None:
@@ -167,15 +141,8 @@ class Problem:
     def keypoint_rows(self, state: State, deviation: float) -> list[Rows]:
         """Of each camera, at a standard deviation of the noise (px)."""
         curve, states = self._look(state)
-        rows = []
-        for keypoints, own, at, ratio in zip(
-            self.keypoints, states, self.at, self.ratios, strict=True
-        ):
-            sizes = {"readout": 1, "lens": len(own.lens), "mount": EXTRINSICS}
-            shared = [(at[name], size) for name, size in sizes.items() if name in at]
-            columns = Columns(shared, at.get("points", -1), at.get("delays", -1))
-            rows.append(keypoints.rows(curve, own, columns, deviation * float(ratio)))
-        return rows
+        parts = zip(self.keypoints, states, self.at, self.ratios.tolist(), strict=True)
+        return [of.rows(curve, own, at, deviation * ratio) for of, own, at, ratio in parts]
 
     def system(self, state: State, deviation: float) -> System:
         """Cost and normal equations at a standard deviation of the noise (px)."""
@@ -331,8 +298,9 @@ def noise_of(squared: Array, deviation: float) -> float:
     return float(np.sqrt(np.median(near) / _MEDIAN))
 
 
-def _pieces(observations: Observations, freedom: Freedom, every: bool) -> Pieces:
+def _pieces(view: View, every: bool) -> Pieces:
     """What is free of the map: all of it, bodies, or the landmarks that are seen."""
+    observations, freedom = view.observations, view.freedom
     if every:
         return Pieces(np.arange(len(observations.landmarks)), rigid=False)
     if observations.bodies is not None:

@@ -55,6 +55,12 @@ class Rows(NamedTuple):
     errors: Array  # (n,r)
     cost: float  # sum of squares, or of what a robust loss makes of them
 
+    def times(self, part: slice, by: Array) -> Array:
+        """A part of the rows (m r,k) times what all unknowns are by others (N,k)."""
+        others, first = self.others[part], self.first[part]
+        columns = np.concatenate([first[:, None] + np.arange(_run(self)), others], axis=1)
+        return np.asarray(_sparse(self.values[part], columns, len(by)) @ by)
+
 
 class Quadratic(NamedTuple):
     """What is known of a few unknowns of the border together: ``cost = e^T information e``."""
@@ -255,6 +261,15 @@ def _run(rows: Rows) -> int:
     return int(rows.values.shape[2] - rows.others.shape[1])
 
 
+def _sparse(values: Array, columns: IntArray, width: int) -> csr_array:
+    """Rows (n r,width) of derivatives (n,r,k) by unknowns (n,k); negative: there is none."""
+    absent = columns < 0
+    values = np.where(absent[:, None], 0.0, values)
+    columns = np.repeat(np.where(absent, columns[:, :1], columns), values.shape[1], axis=0)
+    starts = columns.shape[1] * np.arange(len(columns) + 1)
+    return csr_array((values.ravel(), columns.ravel(), starts), shape=(len(columns), width))
+
+
 def _eliminated(groups: Groups, rows: Sequence[Rows]) -> _Blocks:
     """Blocks of the rows that have one each, or none."""
     count, width, kept = groups.blocks, groups.width, groups.kept
@@ -265,7 +280,7 @@ def _eliminated(groups: Groups, rows: Sequence[Rows]) -> _Blocks:
         inside = np.flatnonzero((term.others >= kept).any(axis=0))
         if not len(inside):
             continue
-        run, numbers = _run(term), term.values.shape[1]
+        run = _run(term)
         used = term.others[:, inside[0]] >= kept
         of = (term.others[used, inside[0]] - kept) // width
         own, errors = term.values[used][:, :, run + inside], term.errors[used]
@@ -278,24 +293,9 @@ def _eliminated(groups: Groups, rows: Sequence[Rows]) -> _Blocks:
             continue
         every = term.values[used]
         values = np.concatenate([every[:, :, :run], every[:, :, run + rest]], axis=2)
-        absent = columns < 0
-        columns = np.where(absent, columns[:, :1], columns)
-        values = np.where(absent[:, None], 0.0, values)
-        starts = np.arange(numbers * len(of) + 1)
-        kept_rows = csr_array(
-            (
-                values.ravel(),
-                np.repeat(columns, numbers, axis=0).ravel(),
-                starts * columns.shape[1],
-            ),
-            shape=(numbers * len(of), kept),
-        )  # fmt: skip
         at = width * of[:, None] + np.arange(width)
-        own_rows = csr_array(
-            (own.ravel(), np.repeat(at, numbers, axis=0).ravel(), starts * width),
-            shape=(numbers * len(of), count * width),
-        )
-        coupled = coupled + (kept_rows.T @ own_rows).tocsc()
+        own_rows = _sparse(own, at, count * width)
+        coupled = coupled + (_sparse(values, columns, kept).T @ own_rows).tocsc()
     coupled = csc_array(coupled)
     coupled.sort_indices()
     sizes = np.diff(coupled.indptr)[::width]

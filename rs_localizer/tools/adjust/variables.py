@@ -184,6 +184,19 @@ class Freedom:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What one camera sees, and what of it is free."""
+
+    camera: Camera
+    observations: Observations
+    freedom: Freedom
+
+    def subset(self, chosen: BoolArray) -> View:
+        """With the chosen keypoints (n,)."""
+        return replace(self, observations=self.observations.subset(chosen))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class State:
     """All that is estimated."""
 

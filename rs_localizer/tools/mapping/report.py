@@ -12,7 +12,6 @@ from rs_localizer.core.arrays import BoolArray
 from rs_localizer.tools.mapping.build import Built
 from rs_localizer.tools.mapping.views import View
 
-PICTURES = ("map.png", "residuals.png")
 # Advice is given where more than this share of the images is blurred or has no pose.
 _MANY = 0.1
 
@@ -77,12 +76,11 @@ def advice(built: Built, views: Sequence[View]) -> list[str]:
 
 
 def written(built: Built, images: int, views: Sequence[View]) -> str:
-    """The same as a page of Markdown, with the pictures."""
+    """The same as a page of Markdown."""
     table = "\n".join(f"| {name} | {text} |" for name, text in rows(built, images, len(views)))
-    shown = "\n\n".join(f"![{name}]({name})" for name in PICTURES)
     film = "".join(f"* {text}\n" for text in advice(built, views))
     film = f"\nTo film otherwise:\n\n{film}" if film else ""
-    return f"# Map\n\n| | |\n|---|---|\n{table}\n{film}\n{shown}\n"
+    return f"# Map\n\n| | |\n|---|---|\n{table}\n{film}"
 
 
 def _of_shutter(built: Built) -> list[tuple[str, str]]:
