@@ -344,10 +344,10 @@ def _judged(
         blocks_of(camera, observations, fitted),
         blocks_of(camera, observations, fitted, 2),
     )
-    formal, doubt = fitted.readout_time_deviation, _interval_share(fitted, stamps)
+    formal, share = fitted.readout_time_deviation, _interval_share(fitted, stamps)
     values = _of(blocks, "readout_time")
     # Of images that are missing where stamps are even, each part has a share of its own.
-    deviations = np.hypot(_of(blocks, "deviation"), doubt * values)
+    deviations = np.hypot(_of(blocks, "deviation"), share * values)
     inflation, mount = disagreement(values, deviations), None
     if observations.gyro is not None:
         doubt = disagreement(_of(blocks, "delay"), _of(blocks, "delay_deviation"))
@@ -360,7 +360,7 @@ def _judged(
         readout_time=fitted.state.readout_time,
         deviation=math.hypot(
             formal * inflation,
-            doubt * fitted.state.readout_time,
+            share * fitted.state.readout_time,
             0.5 * apart_of(halves)[0],
             discrepancy(fitted.state.readout_time, values, inflation * deviations),
         ),
