@@ -5,10 +5,8 @@
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -19,7 +17,6 @@ from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.tools.mapping import MappingError
@@ -29,8 +26,6 @@ from rs_localizer.tools.mapping.colmap import SPARSE, Effort
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.report import written
 from rs_localizer.tools.mapping.views import View
-from rs_localizer.tools.simulation.frames import middle_stamp
-from rs_localizer.tools.simulation.renderer import Renderer
 from rs_localizer.tools.simulation.settings import ImageSettings
 
 pytest.importorskip("pycolmap")
@@ -167,10 +162,9 @@ def test_without_calibration_lens_and_shutter_are_found(views, folder):
 def test_the_model_of_colmap_becomes_that_of_a_global_shutter(
     room, views, built, folder, tmp_path, capsys
 ):
-    """Reprojection errors fall to the noise; images are nearly those of a global shutter."""
+    """Reprojection errors fall to the noise."""
     out = tmp_path / "global"
-    images = views[0].image.parent
-    words = [str(folder / SPARSE), str(out), "--rate", f"{WALK.rate}", "--images", str(images)]
+    words = [str(folder / SPARSE), str(out), "--rate", f"{WALK.rate}"]
     shutter = ["-p", f"readout_time:={CAMERA.readout_time}"]
     assert main(["map", "refine", "--colmap", *words, *shutter]) == 0
     (line,) = (
@@ -180,18 +174,6 @@ def test_the_model_of_colmap_becomes_that_of_a_global_shutter(
     )
     before, after = (float(line.split()[k]) for k in (5, 9))
     assert after < 0.5 * before
-    still = Renderer(replace(CAMERA, readout_time=0.0), room.planes, ImageSettings())
-    errors = []
-    for name in list(read_images(out))[::9]:
-        stamp = views[int(Path(name).stem)].stamp_ns
-        true = still.image(room.motion, middle_stamp(CAMERA, stamp)).astype(float)
-        made, rolling = (
-            cv2.imread(str(of / name), cv2.IMREAD_GRAYSCALE) for of in (out / "images", images)
-        )
-        known = made > 0
-        errors.append([np.mean(np.abs(true - image)[known]) for image in (rolling, made)])
-    # 10.3 and 3.3 grey levels, 0.41 and 0.20 px when this was written.
-    assert np.mean(errors, axis=0)[1] < 0.5 * np.mean(errors, axis=0)[0]
 
 
 def test_a_map_that_its_images_do_not_fit_is_refused_with_the_lens_that_may_be_why():

@@ -126,7 +126,6 @@ def test_what_cannot_be_used_is_named(model, tmp_path, capsys):
         ((), 2, "are not times (such as frame_0000.png): give --rate"),
         (("--rate", "30", "--shutter", "global"), 2, "of a global shutter needs no refinement"),
         (("--rate", "30", "--map", "map.npz"), 2, "--colmap goes without --map"),
-        (("--rate", "30", "--images", str(tmp_path)), 1, "has no frame_0000.png"),
         (("--rate", "30", "-p", "readout_time:=0.015"), 1, "15.0 ms was given"),
     ):
         assert main(["map", "refine", "--colmap", str(model), str(out), *words]) == code

@@ -15,10 +15,6 @@ from rs_localizer.cli.options import UsageError, option
 from rs_localizer.cli.settings_args import given_values, row_time
 
 if WORKING:
-    import cv2
-    import numpy as np
-    from tqdm import tqdm
-
     from rs_localizer.cli.map import check_readout, print_step
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.calibration import read_calibration
@@ -27,9 +23,8 @@ if WORKING:
     from rs_localizer.offline.image_sources import have_times, name_time
     from rs_localizer.settings import build
     from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, Shutter, undo_shutter
-    from rs_localizer.tools.rectified import map_depths, motion_between, rectified
 
-_LIST, _IMAGES = "images.txt", "images"
+_LIST = "images.txt"
 _NUMBER = re.compile(r"\d+")
 # What a recording needs, and a model has itself or cannot have.
 _OF_RECORDINGS = ("recordings", "out", "map", "hold")
@@ -50,9 +45,6 @@ class ColmapOptions:
     row: str = option(
         "of the poses: first, middle, last, or a row time from -0.5 to 0.5", "ROW", "middle"
     )
-    images: Path | None = option(
-        f"of the model: also write them as of a global shutter, to OUT/{_IMAGES}", "FOLDER"
-    )
 
 
 def run(args: Any) -> None:
@@ -71,19 +63,12 @@ def run(args: Any) -> None:
     if args.calibration is not None:
         camera = read_calibration(args.calibration)
     stamps = image_stamps(list(images), args.rate)
-    if args.images is not None:
-        missing = [name for name in images if not (args.images / name).is_file()]
-        if missing:
-            raise ValueError(f"{args.images} has no {missing[0]}, an image of the model")
     with atomic_directory(args.out, replaced(args, _LIST)) as built:
         result = undo_shutter(camera, model, images, stamps, _known(args), print_step)
         check_readout(args, result.refined.readout_check, "see --shutter estimated")
         built.mkdir()
         write_model(built, result.camera, result.images, result.points)
-        share = None if args.images is None else _write_images(args, result, built / _IMAGES)
     _tell(args, result, len(images), len(model.points))
-    if share is not None:
-        print(f"{args.out / _IMAGES}: {1 - share:.1%} of the pixels are left black: not known")
 
 
 def _known(args: Any) -> Shutter:
@@ -118,29 +103,6 @@ def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:
     if len(set(stamps.values())) < len(stamps):
         raise UsageError("images of the same number: --rate is for images of one video")
     return stamps
-
-
-def _write_images(args: Any, result: GlobalShutterModel, folder: Path) -> float:
-    """The images of the model; the share of their pixels that is known."""
-    depths = map_depths(result.points.points)
-    shares = []
-    for name, ends in tqdm(result.ends.items(), unit="image", desc="rectify", disable=None):
-        image = cv2.imread(
-            str(args.images / name), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-        )
-        size = None if image is None else (image.shape[1], image.shape[0])
-        if image is None or image.dtype != np.uint8 or size != result.camera.size:
-            raise ValueError(
-                f"{args.images / name} is no image of 8 bits and of the model's "
-                f"{result.camera.size[0]}x{result.camera.size[1]} pixels"
-            )
-        pixels = np.asarray(image, np.uint8)
-        made, known = rectified(result.camera, pixels, motion_between(*ends), depths, args.row)
-        file = folder / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(cv2.imencode(file.suffix, made)[1].tobytes())
-        shares.append(float(known.mean()))
-    return float(np.mean(shares))
 
 
 def _tell(args: Any, result: GlobalShutterModel, images: int, points: int) -> None:

@@ -37,9 +37,6 @@ from rs_localizer.tools.mapping.shutter_fit import (
 from rs_localizer.tools.mapping.triangulation import triangulate
 from rs_localizer.tools.readout_belief import ShutterFit
 
-Pose = tuple[Array, Array]
-"""Rotation (3,3) map_from_camera and position (3,) of the camera."""
-
 
 @dataclass(frozen=True, slots=True)
 class Shutter:
@@ -58,7 +55,6 @@ class GlobalShutterModel:
     camera: Camera  # with its lens and shutter as they were found
     images: dict[str, ModelImage]  # with the keypoints that fit
     points: Points
-    ends: dict[str, tuple[Pose, Pose]]  # of each image, at the first and the last row time
     refined: RefinedMap
     shutter: ShutterFit | None  # None: it was given, or too few images follow each other
     keypoints: int  # of points, that the model had
@@ -103,9 +99,9 @@ def undo_shutter(
     fits: BoolArray = (errors < (LIMIT * refined.deviation) ** 2) & (in_camera[:, 2] > 0.0)
     fits &= (np.bincount(rows[fits], minlength=len(points)) > 1)[rows]
     at, rows, pixels = at[fits], rows[fits], pixels[fits]
-    turns, places = _poses(refined, known.tau)
-    turns = np.swapaxes(turns, 1, 2)
-    views = turns, -np.einsum("nij,nj->ni", turns, places)
+    states = refined.spline.states(refined.times + abs(refined.readout_time) * known.tau)
+    turns = np.swapaxes(states.rotations, 1, 2)
+    views = turns, -np.einsum("nij,nj->ni", turns, states.positions)
     place = np.searchsorted(used, at)
     of_each = views[0][place], views[1][place]
     own = own[0][fits], own[1][fits]
@@ -122,10 +118,6 @@ def undo_shutter(
             pixels=moved[mine] + HALF,
             points=model.ids[rows[mine]],
         )
-    ends = [
-        list(zip(turns, places / given.scale, strict=True))
-        for turns, places in (_poses(refined, -0.5), _poses(refined, 0.5))
-    ]
     shown = np.unique(rows)
     counts = np.bincount(rows, minlength=len(points))
     means = np.bincount(rows, apart, len(points)) / np.maximum(counts, 1)
@@ -135,7 +127,6 @@ def undo_shutter(
         points=Points(
             model.ids[shown], points[shown] / given.scale, model.colors[shown], means[shown]
         ),
-        ends=dict(zip((names[row] for row in used.tolist()), zip(*ends, strict=True), strict=True)),
         refined=refined,
         shutter=shutter,
         keypoints=len(given.rows),
@@ -211,12 +202,6 @@ def _refined(
         return *fit_shutter(camera, seen, start, freedom, directions, done), used
     camera = replace(camera, readout_time=known.readout_time, scan_direction=directions[0])
     return refine(camera, seen, start, freedom, done=done), None, used
-
-
-def _poses(refined: RefinedMap, tau: float) -> tuple[Array, Array]:
-    """map_from_camera (g,3,3), (g,3) at a row time of the camera as it was found."""
-    states = refined.spline.states(refined.times + abs(refined.readout_time) * tau)
-    return states.rotations, states.positions
 
 
 def _moved(poses: tuple[Array, Array], points: Array) -> Array:
