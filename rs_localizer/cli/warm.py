@@ -20,7 +20,6 @@ if WORKING:
     from rs_localizer.core.simd.jit import cache_directory
     from rs_localizer.markers import detection
     from rs_localizer.pipeline.frames import FrameLocalizer
-    from rs_localizer.tools import warm_up as trajectory
 
 # Any that is known: with it, frames are tracked, too.
 _READOUT_TIME = 0.03
@@ -29,8 +28,8 @@ _READOUT_TIME = 0.03
 @dataclass(frozen=True, kw_only=True)
 class Options:
     solver: list[str] = option(
-        "only what frames need with this one; may be repeated (default: all solvers, and what "
-        "calibrate and replay --smooth need)", "NAME", list, choices=list(SOLVERS),
+        "only what frames need with this one; may be repeated (default: all solvers)", "NAME", list,
+        choices=list(SOLVERS),
     )  # fmt: skip
 
 
@@ -47,7 +46,6 @@ def run(options: Options) -> dict[str, object]:
         steps[f"solver {name}"] = localizer.warm_up_rest
     if not options.solver:
         steps["with an IMU"] = FrameLocalizer(NodeConfig(readout_time=_READOUT_TIME)).warm_up_imu
-        steps["calibrate, smooth"] = trajectory.warm_up
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "cache of kernels .* at the next start", RuntimeWarning)
         for name, compiles in steps.items():
