@@ -22,7 +22,7 @@ rosdoc2_settings["allow_other_extensions"] = True  # Mermaid, where it is instal
 by_rosdoc2 = "confpy_succeeded" in globals()  # which runs this file inside its own
 # The pages, in the order of the site's contents; rosdoc2 makes a front page of its own.
 PAGES = {
-    "Start": "concepts install camera cameras/index",
+    "Start": "concepts install phone camera common_cameras cameras/index",
     "Use": "node robot reasons detector features imu rigs recordings calibration mapping "
     "map_build maps simulation viewing integrations examples library policy",
     "Understand": "limits solvers estimator honesty benchmarks architecture api",
