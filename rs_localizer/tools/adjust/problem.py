@@ -30,8 +30,8 @@ from rs_localizer.tools.adjust.variables import EXTRINSICS, MOUNT, State, View
 
 # Errors beyond so many standard deviations do not count for the scale of the noise.
 _SCALE_LIMIT = 4.0
-# Median of a squared error in two dimensions, in variances.
-_MEDIAN = 2.0 * np.log(2.0)
+MEDIAN = 2.0 * np.log(2.0)
+"""Of a squared error in two dimensions, in variances."""
 _LOOSE_BODY = 100.0  # m, rad
 _STEPS, _MOST_DAMPINGS = 20, 6
 # A step that brings less than this, or than this part of the cost, is the last one.
@@ -295,7 +295,7 @@ def noise_of(squared: Array, deviation: float) -> float:
     near = squared[squared < (_SCALE_LIMIT * deviation) ** 2]
     if len(near) == 0:
         raise Undetermined("no keypoint agrees with the motion of the frames")
-    return float(np.sqrt(np.median(near) / _MEDIAN))
+    return float(np.sqrt(np.median(near) / MEDIAN))
 
 
 def _pieces(view: View, every: bool) -> Pieces:
@@ -320,4 +320,4 @@ def _shape_information(view: View, pieces: Pieces) -> Array | None:
     return np.asarray(np.linalg.inv(paper_covariance(landmarks, view.freedom.landmarks)))
 
 
-__all__ = ["LIMIT", "Problem", "Undetermined", "View", "minimise", "noise_of", "settle"]
+__all__ = ["LIMIT", "MEDIAN", "Problem", "Undetermined", "View", "minimise", "noise_of", "settle"]

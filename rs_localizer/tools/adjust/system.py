@@ -167,14 +167,14 @@ class _Blocks(NamedTuple):
     def times(self, right: Array) -> Array:
         """``W^T x`` (b,w,q) of kept unknowns (N,q)."""
         products = self.coupled[:, :, None] * right[self.touched][:, None, :]
-        return _sums(products, self.of, len(self.slope))
+        return sums(products, self.of, len(self.slope))
 
     def back(self, right: Array, kept: int) -> Array:
         """``W y`` (N,q) of blocks (b,w,q)."""
-        return _sums(np.einsum("mw,mwq->mq", self.coupled, right[self.of]), self.touched, kept)
+        return sums(np.einsum("mw,mwq->mq", self.coupled, right[self.of]), self.touched, kept)
 
 
-def _sums(values: Array, groups: IntArray, count: int) -> Array:
+def sums(values: Array, groups: IntArray, count: int) -> Array:
     """Sums (count,...) of values (n,...) by group (n,)."""
     flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
     picks = csr_array(
@@ -284,8 +284,8 @@ def _eliminated(groups: Groups, rows: Sequence[Rows]) -> _Blocks:
         used = term.others[:, inside[0]] >= kept
         of = (term.others[used, inside[0]] - kept) // width
         own, errors = term.values[used][:, :, run + inside], term.errors[used]
-        information += _sums(np.einsum("nri,nrj->nij", own, own), of, count)
-        slope += _sums(np.einsum("nri,nr->ni", own, errors), of, count)
+        information += sums(np.einsum("nri,nrj->nij", own, own), of, count)
+        slope += sums(np.einsum("nri,nr->ni", own, errors), of, count)
         rest = np.setdiff1d(np.arange(term.others.shape[1]), inside)
         first = term.first[used]
         columns = np.column_stack([first[:, None] + np.arange(run), term.others[used][:, rest]])

@@ -39,7 +39,7 @@ from rs_localizer.tools.mapping.gauge import Similarity, laid_on_held, scaled
 from rs_localizer.tools.mapping.observations import (
     MapObservations,
     Start,
-    most_observed,
+    adjusted_part,
 )
 from rs_localizer.tools.mapping.refine import DRIFT, RefinedMap, refine
 from rs_localizer.tools.mapping.shutter_fit import (
@@ -48,7 +48,7 @@ from rs_localizer.tools.mapping.shutter_fit import (
     fit_shutter,
     likely_axes,
 )
-from rs_localizer.tools.mapping.track_on_map import Tracked, track_on_map
+from rs_localizer.tools.mapping.track_on_map import track_on_map
 from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, moves, triangulate
 from rs_localizer.tools.mapping.views import View, blurred
 from rs_localizer.tools.readout_belief import ReadoutCheck, ShutterFit
@@ -171,12 +171,13 @@ def build_map(inputs: Given, work: Workshop) -> Built:
         scan_direction=likely_axes(structure.camera.size, inputs.scan_direction)[0],
     )
     with work.stage("track", len(inputs.views)) as step:
-        tracked = track_on_map(inputs.views, structure, camera, lambda: step(1))
-    refined, shutter, rows, check = _refined(inputs, tracked, structure, camera, work)
+        rows, shown, start = track_on_map(inputs.views, structure, camera, lambda: step(1))
+    used, adjusted, near = adjusted_part(shown, start, work.effort.adjusted)
+    refined, shutter, check = _refined(inputs, adjusted, near, camera, work)
     estimated = None if inputs.camera is not None else structure.camera.focal_length
     check_fit(refined.fit_share, estimated)
-    motion = Motion(rows, refined.times, refined)
-    seen = tracked.views[tracked.images], tracked.points, tracked.pixels
+    motion = Motion(rows[used], refined.times, refined)
+    seen = rows[shown.images], shown.landmarks, shown.pixels
     triangulated = triangulate(refined.camera, motion.sights(*seen), len(structure.points))
     anchors = inputs.anchors.seen(inputs.views)
     held = triangulate(refined.camera, motion.sights(*anchors), inputs.anchors.count)
@@ -283,16 +284,9 @@ def _structure(inputs: Given, keyframes: IntArray, work: Workshop) -> Structure:
 
 
 def _refined(
-    inputs: Given, tracked: Tracked, structure: Structure, camera: Camera, work: Workshop
-) -> tuple[RefinedMap, ShutterFit | None, IntArray, ReadoutCheck | None]:
-    """The refined map; a shutter that was unknown or wrong; rows of views; check of a given one."""
-    of = most_observed(tracked.points, tracked.images, work.effort.adjusted)[tracked.points]
-    used, images = np.unique(tracked.images[of], return_inverse=True)
-    rows = tracked.views[used]
-    observations = MapObservations(
-        inputs.stamps_ns[rows], images, tracked.points[of], tracked.pixels[of]
-    )
-    start = Start(structure.points, tracked.rotations[used], tracked.positions[used])
+    inputs: Given, observations: MapObservations, start: Start, camera: Camera, work: Workshop
+) -> tuple[RefinedMap, ShutterFit | None, ReadoutCheck | None]:
+    """The refined map; a shutter that was unknown or wrong; check of a given one."""
     freedom = colmap_freedom(observations, start, inputs.camera is None)
     freedom = replace(freedom, drifts=_MODES)
     if inputs.anchors.marker_map is not None:
@@ -313,11 +307,11 @@ def _refined(
             refined = refine(camera, observations, start, freedom, done=done)
             check = refined.readout_check
             if check is None or not check.differs:
-                return refined, None, rows, check
+                return refined, None, check
             # A map adjusted with the wrong one is bent to it, and fits it nearly as well.
             directions = [ScanDirection(camera.scan_direction)]
         fitted = fit_shutter(camera, observations, start, freedom, directions, done)
-        return *fitted, rows, check
+        return *fitted, check
 
 
 def _corners(inputs: Given, stamps_ns: IntArray) -> MapObservations:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
@@ -80,14 +81,7 @@ def through(points: Array, there: Array) -> Similarity:
 
 def upright(down: Array) -> Array:
     """The rotation (3,3) that turns a direction (3,) by the shortest way to ``-z``."""
-    unit = down / np.linalg.norm(down)
-    axis = np.cross(unit, [0.0, 0.0, -1.0])
-    cosine = float(-unit[2])
-    if cosine < -1.0 + 1e-12:  # upside down: any horizontal axis will do
-        return np.diag([1.0, -1.0, -1.0])
-    hat = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    turn: Array = np.eye(3) + hat + hat @ hat / (1.0 + cosine)
-    return turn
+    return np.asarray(Rotation.align_vectors([0.0, 0.0, -1.0], down)[0].as_matrix())
 
 
 _ROUNDS, _OUTLIERS = 5, 4.0

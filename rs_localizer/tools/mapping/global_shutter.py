@@ -26,7 +26,7 @@ from rs_localizer.tools.mapping.observations import (
     LEAST_KEYPOINTS,
     MapObservations,
     Start,
-    most_observed,
+    adjusted_part,
 )
 from rs_localizer.tools.mapping.refine import RefinedMap, refine
 from rs_localizer.tools.mapping.shutter_fit import (
@@ -85,13 +85,13 @@ def undo_shutter(
     """
     names = sorted(images, key=lambda name: stamps_ns[name])
     stamps = np.array([stamps_ns[name] for name in names], np.int64)
-    given = _Given.of(camera, model, [images[name] for name in names])
-    refined, shutter, used = _refined(given, camera, stamps, known, done)
+    scale, seen, start = _given(model, [images[name] for name in names], stamps)
+    refined, shutter, used = _refined(seen, start, camera, known, done)
     motion = Motion(used, refined.times, refined)
-    projected = motion.sights(given.images, given.rows, given.pixels)
-    posed = np.isin(given.images, used)
-    at, rows, pixels = given.images[posed], given.rows[posed], given.pixels[posed]
-    points = triangulate(refined.camera, projected, len(given.points)).points
+    projected = motion.sights(seen.images, seen.landmarks, seen.pixels)
+    posed = np.isin(seen.images, used)
+    at, rows, pixels = seen.images[posed], seen.landmarks[posed], seen.pixels[posed]
+    points = triangulate(refined.camera, projected, len(start.points)).points
     rotations = np.swapaxes(projected.rotations, 1, 2)
     own = rotations, -np.einsum("nij,nj->ni", rotations, projected.positions)
     in_camera = _moved(own, points[rows])
@@ -107,14 +107,14 @@ def undo_shutter(
     own = own[0][fits], own[1][fits]
     moved = transferred(refined.camera, pixels, own, of_each, in_camera[fits, 2])
     apart = np.linalg.norm(refined.camera.project(_moved(of_each, points[rows])) - moved, axis=1)
-    before = np.linalg.norm(given.errors(camera)[posed][fits], axis=1)
+    before = _global_errors(camera, seen, start)[posed][fits]
     made = {}
     for k, row in enumerate(used.tolist()):
         mine = at == row
         made[names[row]] = replace(
             images[names[row]],
             rotation=views[0][k],
-            translation=views[1][k] / given.scale,
+            translation=views[1][k] / scale,
             pixels=moved[mine] + HALF,
             points=model.ids[rows[mine]],
         )
@@ -124,78 +124,61 @@ def undo_shutter(
     return GlobalShutterModel(
         camera=refined.camera_as_found,
         images=made,
-        points=Points(
-            model.ids[shown], points[shown] / given.scale, model.colors[shown], means[shown]
-        ),
+        points=Points(model.ids[shown], points[shown] / scale, model.colors[shown], means[shown]),
         refined=refined,
         shutter=shutter,
-        keypoints=len(given.rows),
+        keypoints=len(seen.landmarks),
         before=float(np.sqrt(np.mean(before**2))),
         after=float(np.sqrt(np.mean(apart**2))),
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Given:
-    """A model as arrays, of about the size of a room: priors of motions are in metres."""
+def _given(
+    model: Model, images: list[ModelImage], stamps: IntArray
+) -> tuple[float, MapObservations, Start]:
+    """A model as arrays, and how much larger: of a room's size, as priors of motions are in metres.
 
-    scale: float
-    points: Array  # (p,3)
-    rotations: Array  # (g,3,3) world_from_camera
-    positions: Array  # (g,3)
-    images: IntArray  # (n,) of each keypoint
-    rows: IntArray  # (n,) of the points
-    pixels: Array  # (n,2) raw
+    Raises:
+        MappingError: for keypoints of points that are not there.
+    """
+    shown = [image.points >= 0 for image in images]
+    pairs = list(zip(images, shown, strict=True))
+    at = np.repeat(np.arange(len(images)), [np.count_nonzero(some) for some in shown])
+    ids = np.concatenate([image.points[some] for image, some in pairs])
+    pixels = np.concatenate([image.pixels[some] for image, some in pairs])
+    order = np.argsort(model.ids)
+    places = np.searchsorted(model.ids[order], ids)
+    rows = order[np.minimum(places, len(order) - 1)] if len(order) else np.zeros_like(ids)
+    if not len(ids) or np.any(model.ids[rows] != ids):
+        raise MappingError("the model's images list no keypoints of its points")
+    rotations = np.array([image.rotation.T for image in images])
+    translations = np.array([image.translation for image in images])
+    positions = -np.einsum("gij,gj->gi", rotations, translations)
+    scale = USUAL_DISTANCE / float(
+        np.median(np.linalg.norm(model.points[rows] - positions[at], axis=1))
+    )
+    seen = MapObservations(stamps, at, rows, pixels - HALF)
+    return scale, seen, Start(scale * model.points, rotations, scale * positions)
 
-    @staticmethod
-    def of(camera: Camera, model: Model, images: list[ModelImage]) -> _Given:
-        """Raises MappingError for keypoints of points that are not there."""
-        shown = [image.points >= 0 for image in images]
-        counts = [int(np.count_nonzero(some)) for some in shown]
-        ids = np.concatenate(
-            [image.points[some] for image, some in zip(images, shown, strict=True)]
-        )
-        order = np.argsort(model.ids)
-        places = np.searchsorted(model.ids[order], ids)
-        rows = order[np.minimum(places, len(order) - 1)] if len(order) else np.zeros_like(ids)
-        if not len(ids) or np.any(model.ids[rows] != ids):
-            raise MappingError("the model's images list no keypoints of its points")
-        pixels = np.concatenate(
-            [image.pixels[some] for image, some in zip(images, shown, strict=True)]
-        )
-        rotations = np.array([image.rotation.T for image in images])
-        translations = np.array([image.translation for image in images])
-        positions = -np.einsum("gij,gj->gi", rotations, translations)
-        at = np.repeat(np.arange(len(images)), counts)
-        depths = np.linalg.norm(model.points[rows] - positions[at], axis=1)
-        scale = USUAL_DISTANCE / float(np.median(depths))
-        return _Given(
-            scale, scale * model.points, rotations, scale * positions, at, rows, pixels - HALF
-        )
 
-    def errors(self, camera: Camera) -> Array:
-        """What the model leaves (n,2), px, with a global shutter."""
-        rotations = np.swapaxes(self.rotations, 1, 2)[self.images]
-        away = self.points[self.rows] - self.positions[self.images]
-        found: Array = camera.project(np.einsum("nij,nj->ni", rotations, away)) - self.pixels
-        return found
+def _global_errors(camera: Camera, seen: MapObservations, start: Start) -> Array:
+    """What a model leaves (n,), px, with a global shutter."""
+    rotations = np.swapaxes(start.rotations, 1, 2)[seen.images]
+    away = start.points[seen.landmarks] - start.positions[seen.images]
+    found = camera.project(np.einsum("nij,nj->ni", rotations, away)) - seen.pixels
+    return np.asarray(np.linalg.norm(found, axis=1))
 
 
 def _refined(
-    given: _Given, camera: Camera, stamps: IntArray, known: Shutter,
+    seen: MapObservations, start: Start, camera: Camera, known: Shutter,
     done: Callable[[str], object],
 ) -> tuple[RefinedMap, ShutterFit | None, IntArray]:  # fmt: skip
     """Motion and shutter, and which images (g,) have a pose."""
-    of = most_observed(given.rows, given.images, Effort().adjusted)[given.rows]
-    counts = np.bincount(given.images[of], minlength=len(stamps))
-    of &= (counts >= LEAST_KEYPOINTS)[given.images]
-    if not of.any():
+    used, seen, start = adjusted_part(seen, start, Effort().adjusted, LEAST_KEYPOINTS)
+    if not len(used):
         raise MappingError(
             f"no image of the model shows {LEAST_KEYPOINTS} points that three images see"
         )
-    used, images = np.unique(given.images[of], return_inverse=True)
-    seen = MapObservations(stamps[used], images, given.rows[of], given.pixels[of])
-    start = Start(given.points, given.rotations[used], given.positions[used])
     freedom = colmap_freedom(seen, start, known.lens)
     directions = likely_axes(camera.size, known.scan_direction)
     if known.readout_time is None:

@@ -231,6 +231,25 @@ def most_observed(landmarks: IntArray, images: IntArray, wanted: int) -> BoolArr
     return chosen
 
 
+def adjusted_part(
+    seen: MapObservations, start: Start, wanted: int, least: int = 1
+) -> tuple[IntArray, MapObservations, Start]:
+    """Images (k,) that show the most observed landmarks, and what they show of these.
+
+    Args:
+        wanted: keypoints of each image.
+        least: images with fewer are left out.
+    """
+    of = most_observed(seen.landmarks, seen.images, wanted)[seen.landmarks]
+    of &= (np.bincount(seen.images[of], minlength=len(seen.stamps_ns)) >= least)[seen.images]
+    used, images = np.unique(seen.images[of], return_inverse=True)
+    return (
+        used,
+        MapObservations(seen.stamps_ns[used], images, seen.landmarks[of], seen.pixels[of]),
+        Start(start.points, start.rotations[used], start.positions[used]),
+    )
+
+
 # A landmark in the wrong place is no outlier: keypoints count up to so many px beside the pose.
 _MOST_RESIDUAL = 12.0
 

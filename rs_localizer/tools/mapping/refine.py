@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
@@ -339,11 +340,18 @@ class _Refinement:
     def _problem(self, freedom: Freedom) -> Problem:
         return self.prepared.problem(self.seen, self.state, freedom)
 
+    def _of_all(self, name: str) -> NDArray[Any]:
+        """A field of the observations of all cameras, one after the other."""
+        return np.concatenate([getattr(own, name) for own in self.seen])
+
     def _result(self, problem: Problem, before: float, deviation: float) -> RefinedMap:
-        state, prepared, seen = self.state, self.prepared, joined(self.seen)
+        state, prepared, count = self.state, self.prepared, len(self.state.landmarks)
         squared = problem.errors(state)
         inliers = squared < (LIMIT * deviation) ** 2
-        sights, images = sights_of(seen, inliers)
+        points, frames = (self._of_all(name)[inliers] for name in ("points", "frames"))
+        sights = np.bincount(points, minlength=count)
+        pairs = np.unique(np.column_stack([points, frames]), axis=0)
+        images = np.bincount(pairs[:, 0], minlength=count)
         used = self._freedoms(state.spline) + 3 * int(np.count_nonzero(images))
         inflation = inflation_of(squared[inliers], deviation, used + problem.border)
         inflation = self._cluster_robust(problem, deviation, inflation)
@@ -396,13 +404,11 @@ class _Refinement:
 
     def _cluster_robust(self, problem: Problem, deviation: float, independent: float) -> float:
         """The covariances' inflation, with what errors of a second pull together."""
-        seen, squared = joined(self.seen), problem.errors(self.state)
-        every = problem.keypoint_rows(self.state, deviation)
-        rows = [np.dstack([of.values[..., -3:], of.errors]) for of in every]
+        squared, every = problem.errors(self.state), problem.keypoint_rows(self.state, deviation)
+        rows = np.concatenate([np.dstack([of.values[..., -3:], of.errors]) for of in every])
         inside = squared[squared < (LIMIT * deviation) ** 2]
-        held = self.prepared.deviations**-2.0
-        pull = pull_at_landmarks(np.concatenate(rows), seen.points, seen.times, held)
-        own = steepness(inside, deviation) ** 2
+        held, own = self.prepared.deviations**-2.0, steepness(inside, deviation) ** 2
+        pull = pull_at_landmarks(rows, self._of_all("points"), self._of_all("times"), held)
         own *= left_over(len(inside), self._freedoms(self.state.spline))
         return Pull(own * pull.measured, pull.expected).inflation(independent)
 
@@ -436,29 +442,28 @@ class _Refinement:
         return tuple(found)
 
     def _asked(self, deviation: float, inflation: float) -> list[ReadoutCheck | None]:
-        """Whether readout times that were given are those of the images."""
+        """Readout times that images ask for where others were given: a step from the minimum."""
         known = [one.camera.readout_time > 0.0 for one in self.prepared.rig]
         none: list[ReadoutCheck | None] = [None] * len(known)
         if self.freedom.readout_time or not any(known) or not self.prepared.tells_readout:
             return none
+        problem = self._problem(replace(self.freedom, readout_time=True))
         try:
-            asked = self._readout_times(deviation)
+            factored = Factored(problem.system(self.state, deviation))
+            step, variances = factored.step(), np.diag(factored.border_covariance())
         except Undetermined:
             return none
-        grown = [replace(one, deviation=math.sqrt(inflation) * one.deviation) for one in asked]
-        return [one if given else None for one, given in zip(grown, known, strict=True)]
-
-    def _readout_times(self, deviation: float) -> list[ReadoutCheck]:
-        """One step of each camera's from the minimum with those that were given."""
-        problem = self._problem(replace(self.freedom, readout_time=True))
-        factored = Factored(problem.system(self.state, deviation))
-        step, variances = factored.step(), np.diag(factored.border_covariance())
-        checks = []
-        for k, one in enumerate(problem.states(self.state)):
-            given, change = float(one.readout_time), float(step[problem.at[k]["readout"]])
-            deviations = np.sqrt(variances[problem.place("readout", k)])
-            checks.append(ReadoutCheck(given, given + change, float(deviations)))
-        return checks
+        given = [float(one.readout_time) for one in problem.states(self.state)]
+        return [
+            ReadoutCheck(
+                given[k],
+                given[k] + float(step[problem.at[k]["readout"]]),
+                math.sqrt(inflation * variances[problem.place("readout", k)]),
+            )
+            if known[k]
+            else None
+            for k in range(len(known))
+        ]
 
 
 def _as_in(one: Adjusted, state: State) -> Adjusted:
@@ -466,27 +471,6 @@ def _as_in(one: Adjusted, state: State) -> Adjusted:
     readout_time = float(state.readout_time)
     camera = with_lens(replace(one.camera, readout_time=abs(readout_time)), state.lens)
     return replace(one, camera=camera, readout_time=readout_time, extrinsics=state.extrinsics)
-
-
-def joined(parts: Sequence[Observations]) -> Observations:
-    """Those of all cameras, of one map, one after the other."""
-    if len(parts) == 1:
-        return parts[0]
-    names = ("times", "row_times", "pixels", "points", "frames", "trusted")
-    every: dict[str, Any] = {
-        name: np.concatenate([getattr(one, name) for one in parts]) for name in names
-    }
-    return replace(parts[0], **every)
-
-
-def sights_of(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:
-    """How many keypoints (p,) and how many images (p,) show each landmark."""
-    count = len(observations.landmarks)
-    sights = np.bincount(observations.points[inliers], minlength=count)
-    pairs = np.unique(
-        np.column_stack([observations.points[inliers], observations.frames[inliers]]), axis=0
-    )
-    return sights, np.bincount(pairs[:, 0], minlength=count)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,12 +9,11 @@ between them do: each is localized with the rolling shutter, by the code of the 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from rs_localizer.config import Matching, NodeConfig
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
@@ -23,6 +22,7 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher, Matches
 from rs_localizer.tools.mapping.colmap import Structure
+from rs_localizer.tools.mapping.observations import MapObservations, Start
 from rs_localizer.tools.mapping.views import View
 from rs_localizer.tracking import Tracker
 
@@ -30,25 +30,15 @@ from rs_localizer.tracking import Tracker
 _THRESHOLD = 4.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Tracked:
-    """Views with a pose, and the landmarks that they show."""
-
-    views: IntArray  # (k,) rows of the views that have a pose, rising
-    rotations: Array  # (k,3,3) map_from_camera at the middle row
-    positions: Array  # (k,3) m
-    points: IntArray  # (n,) rows of the map
-    images: IntArray  # (n,) rows of ``views``, rising
-    pixels: Array  # (n,2) raw
-
-
 def track_on_map(
     views: Sequence[View],
     structure: Structure,
     camera: Camera,
     done: Callable[[], object] = lambda: None,
-) -> Tracked:
-    """Poses of all views: of the keyframes as COLMAP has them, the others are localized.
+) -> tuple[IntArray, MapObservations, Start]:
+    """Rows (k,) of the views with a pose, and what they show.
+
+    Keyframes are where COLMAP has them, the others are localized.
 
     Args:
         views: in the order of their stamps.
@@ -80,14 +70,15 @@ def track_on_map(
                 rows.append(row)
         done()
     counts = [len(of) for of in points]
-    return Tracked(
-        np.array(rows, np.int64),
-        np.array([rotation for rotation, _ in poses]).reshape(-1, 3, 3),
-        np.array([position for _, position in poses]).reshape(-1, 3),
-        np.concatenate([*points, np.zeros(0, np.int64)]),
+    seen = MapObservations(
+        np.array([views[row].stamp_ns for row in rows], np.int64),
         np.repeat(np.arange(len(rows)), counts),
+        np.concatenate([*points, np.zeros(0, np.int64)]),
         np.concatenate([*pixels, np.zeros((0, 2))]),
     )
+    rotations = np.array([rotation for rotation, _ in poses]).reshape(-1, 3, 3)
+    positions = np.array([position for _, position in poses]).reshape(-1, 3)
+    return np.array(rows, np.int64), seen, Start(structure.points, rotations, positions)
 
 
 class _MapTracker:

@@ -4,22 +4,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.tools.adjust.problem import MEDIAN
+from rs_localizer.tools.adjust.system import sums
 
 _STEPS = 12
 # Tukey's limit in standard deviations, and the errors (px) that are noise in any case.
 _LIMIT, _LEAST_DEVIATION = 4.7, 0.1
 # The limit (px) closes from this by half from step to step: wrong keypoints pull at first.
 _FIRST_LIMIT = 100.0
-# Median of a squared error in two dimensions, in variances.
-_MEDIAN = 2.0 * np.log(2.0)
 # Rays that meet at a smaller angle than 0.5 degrees determine no depth: squared sine of half of it.
 _LEAST_SPREAD = np.sin(np.radians(0.25)) ** 2
 
@@ -75,14 +74,14 @@ def triangulate(camera: Camera, sights: Sights, count: int) -> Triangulated:
         errors, jacobians = _errors(camera, sights, points)
         squared = np.sum(errors**2, axis=1)
         usable = np.isfinite(squared)
-        noise = np.sqrt(np.median(squared[usable]) / _MEDIAN) if usable.any() else np.inf
+        noise = np.sqrt(np.median(squared[usable]) / MEDIAN) if usable.any() else np.inf
         deviation = max(float(noise), _LEAST_DEVIATION)
         limit = max(_LIMIT * deviation, _FIRST_LIMIT * 0.5**k)
         weights = np.where(usable, np.maximum(1.0 - squared / limit**2, 0.0) ** 2, 0.0)
         errors, jacobians = np.nan_to_num(errors), np.nan_to_num(jacobians)
         weighted = weights[:, None, None] * jacobians
-        normal = _sums(np.swapaxes(weighted, 1, 2) @ jacobians, sights.points, count)
-        slope = _sums(np.einsum("nij,ni->nj", weighted, errors), sights.points, count)
+        normal = sums(np.swapaxes(weighted, 1, 2) @ jacobians, sights.points, count)
+        slope = sums(np.einsum("nij,ni->nj", weighted, errors), sights.points, count)
         points = points - np.einsum("pij,pj->pi", _inverses(normal), slope)
     counts = np.bincount(sights.points[weights > 0.0], minlength=count)
     determined = (counts > 1) & np.isfinite(points).all(axis=1)
@@ -111,7 +110,7 @@ def moves(
     every = np.empty((count, 3, len(others)))
     for k, (lens, seen) in enumerate(others):
         change = np.nan_to_num(_errors(lens, seen, points)[0] - errors)
-        slope = _sums(np.einsum("nij,ni->nj", weighted, change), sights.points, count)
+        slope = sums(np.einsum("nij,ni->nj", weighted, change), sights.points, count)
         every[:, :, k] = -np.einsum("pij,pj->pi", inverses, slope)
     return every
 
@@ -127,12 +126,12 @@ def _nearest_to_rays(camera: Camera, sights: Sights, count: int) -> Array:
     directions = np.nan_to_num(directions)
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     across[~usable] = 0.0
-    sums = _sums(across, sights.points, count)
-    places = _sums(np.einsum("nij,nj->ni", across, sights.positions), sights.points, count)
-    least = np.linalg.eigvalsh(sums)[:, 0] / np.maximum(
+    normal = sums(across, sights.points, count)
+    places = sums(np.einsum("nij,nj->ni", across, sights.positions), sights.points, count)
+    least = np.linalg.eigvalsh(normal)[:, 0] / np.maximum(
         np.bincount(sights.points[usable], minlength=count), 1
     )
-    nearest: Array = np.einsum("pij,pj->pi", _inverses(sums), places)
+    nearest: Array = np.einsum("pij,pj->pi", _inverses(normal), places)
     nearest[least < _LEAST_SPREAD] = np.nan
     return nearest
 
@@ -151,24 +150,10 @@ def _errors(camera: Camera, sights: Sights, points: Array) -> tuple[Array, Array
     return camera.project(local) - sights.pixels, by_point
 
 
-def _sums(values: Array, groups: IntArray, count: int) -> Array:
-    """Sums (p,...) of values (n,...) by group."""
-    flat = values.reshape(len(values), math.prod(values.shape[1:]))
-    summed = np.zeros((count, flat.shape[1]))
-    for column, sums in zip(flat.T, summed.T, strict=True):
-        sums[:] = np.bincount(groups, weights=column, minlength=count)
-    return summed.reshape(count, *values.shape[1:])
-
-
 def _inverses(matrices: Array) -> Array:
     """Inverses (p,3,3) of symmetric matrices; NaN where there is none."""
-    good = _regular(matrices)
+    values = np.linalg.eigvalsh(np.nan_to_num(matrices))
+    good = values[:, 0] > 1e-10 * np.maximum(values[:, 2], 1e-300)
     inverses = np.full_like(matrices, np.nan)
     inverses[good] = np.linalg.inv(matrices[good])
     return inverses
-
-
-def _regular(matrices: Array) -> BoolArray:
-    values = np.linalg.eigvalsh(np.nan_to_num(matrices))
-    regular: BoolArray = values[:, 0] > 1e-10 * np.maximum(values[:, 2], 1e-300)
-    return regular
