@@ -6,8 +6,8 @@ What a map, a board or a lens is off by is smooth. Of a frame linearized at a st
 
     e = M x + S f + noise,      f ~ N(0, s^2),  noise ~ N(0, n^2)
 
-with the columns ``S`` of smooth errors (of the image, a cubic; of a map that is declared to be off,
-polynomials of the places, projected), the covariance of the errors is ``n^2 + s^2 S S^T``. With
+with the columns ``S`` of smooth errors (cubics of image and depth; of a map that is declared to be
+off, polynomials of its places, projected), the errors' covariance is ``n^2 + s^2 S S^T``. With
 ``S = U diag(d)^(1/2) V^T`` all that a fit needs follows, for every size ``s`` and noise ``n``, from
 the products ``M^T M``, ``U^T M`` and ``U^T e`` alone:
 
@@ -27,23 +27,29 @@ from numpy.polynomial.legendre import legvander
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import MOVE, PARAMETERS
+from rs_localizer.core.state import MOVE, PARAMETERS, TURN
 from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.refine import LEAST_NOISE, half_inverse, squared
 from rs_localizer.estimation.residuals import Lines, linearized
 
 DEGREE = 3
-TERMS = (DEGREE + 1) * (DEGREE + 2) // 2
 # Expected size of each degree: printers stretch paper, lenses bend at the rim; the mean square
-# over the image of a field of size 1 is 1.
+# over the image of a field of size 1 that has no depth is 1.
 _DEGREE_SIZES = (1.0, 1.0, 0.5, 0.25)
-_TERM_SIZES = np.array(
-    [
-        _DEGREE_SIZES[degree] * math.sqrt((2 * i + 1) * (2 * (degree - i) + 1))
-        for degree in range(DEGREE + 1)
-        for i in range(degree + 1)
-    ]
-) / math.sqrt(sum((d + 1) * size**2 for d, size in enumerate(_DEGREE_SIZES)))
+# So much smaller for each power of the depth: a map is off by more where it is near, a lens not.
+# With 1 a phone's lens is taken for its map, with 0.5 fewer regions hold in a room that is bent.
+_DEPTH = 0.7
+_POWERS = np.array([
+    (i, j, degree - i - j)
+    for degree in range(DEGREE + 1)
+    for i in range(degree + 1)
+    for j in range(degree + 1 - i)
+])  # fmt: skip
+TERMS = len(_POWERS)
+_TERM_SIZES = np.array([
+    _DEGREE_SIZES[i + j + k] * _DEPTH**k * math.sqrt((2 * i + 1) * (2 * j + 1) * (2 * k + 1))
+    for i, j, k in _POWERS.tolist()
+]) / math.sqrt(sum((d + 1) * size**2 for d, size in enumerate(_DEGREE_SIZES)))  # fmt: skip
 # Paper bends in finer waves than lenses: to a cubic a curled edge looks like fast motion.
 _BENT_SIZES = (*_DEGREE_SIZES, 0.125)
 # Combinations of functions that move no point by this part of the size are left out.
@@ -114,7 +120,7 @@ def smooth_columns(by_motion: Array, rays: Array, bend: Array) -> Array:
     Args:
         by_motion: (n,2,18) derivatives; a point that moves is a camera that moves back.
         rays: (n,2).
-        bend: (n,b) functions of the places in the map (:func:`bend_of`); (n,0): of the image.
+        bend: (n,b) functions of the places in the map (:func:`bend_of`); (n,0): of image and depth.
     """
     count = len(rays)
     if bend.shape[1] > 0:
@@ -127,26 +133,47 @@ def smooth_columns(by_motion: Array, rays: Array, bend: Array) -> Array:
                             -by_motion[i, side, MOVE.start + axis] * bend[i, k]
                         )
         return bent
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for i in range(count):
-        for axis in range(2):
-            low[axis] = min(low[axis], rays[i, axis])
-            high[axis] = max(high[axis], rays[i, axis])
     columns = np.zeros((count, 2, 2 * TERMS))
-    x, y = np.ones(DEGREE + 1), np.ones(DEGREE + 1)
+    places, powers = _places_of(by_motion, rays), np.ones((3, DEGREE + 1))
     for i in range(count):
-        x[1] = (2.0 * rays[i, 0] - low[0] - high[0]) / max(high[0] - low[0], 1e-12)
-        y[1] = (2.0 * rays[i, 1] - low[1] - high[1]) / max(high[1] - low[1], 1e-12)
-        for k in range(2, DEGREE + 1):  # Legendre
-            x[k] = ((2 * k - 1) * x[1] * x[k - 1] - (k - 1) * x[k - 2]) / k
-            y[k] = ((2 * k - 1) * y[1] * y[k - 1] - (k - 1) * y[k - 2]) / k
-        place = 0
-        for degree in range(DEGREE + 1):
-            for k in range(degree + 1):
-                value = x[k] * y[degree - k] * _TERM_SIZES[place]
-                columns[i, 0, place] = columns[i, 1, TERMS + place] = value
-                place += 1
+        for axis in range(3):
+            power, x = powers[axis], places[i, axis]
+            power[1] = x
+            for k in range(2, DEGREE + 1):  # Legendre
+                power[k] = ((2 * k - 1) * x * power[k - 1] - (k - 1) * power[k - 2]) / k
+        for place in range(TERMS):
+            value = _TERM_SIZES[place]
+            for axis in range(3):
+                value *= powers[axis, _POWERS[place, axis]]
+            columns[i, 0, place] = columns[i, 1, TERMS + place] = value
     return columns
+
+
+@kernel
+def _places_of(by_motion: Array, rays: Array) -> Array:
+    """Places (n,3) in image and depth, at most 1: depths are in parts of the scene's extent."""
+    places, low, high = np.empty((len(rays), 3)), np.full(5, np.inf), np.full(5, -np.inf)
+    each = np.empty(5)
+    for i in range(len(rays)):
+        x, y = rays[i]
+        turn = move = 0.0
+        for side in range(2):
+            for axis in range(3):
+                turn += by_motion[i, side, TURN.start + axis] ** 2
+                move += by_motion[i, side, MOVE.start + axis] ** 2
+        # What a turn moves has no depth.
+        flat = 2.0 * (x * y) ** 2 + (1.0 + x * x) ** 2 + (1.0 + y * y) ** 2 + x * x + y * y
+        depth = math.sqrt(turn / flat * (2.0 + x * x + y * y) / max(move, 1e-300))
+        places[i, 0], places[i, 1], places[i, 2] = x, y, depth
+        each[0], each[1], each[2], each[3], each[4] = x, y, depth, x * depth, y * depth
+        low, high = np.minimum(low, each), np.maximum(high, each)
+    extents = 0.5 * (high - low)
+    extents[2] = max(extents[2], extents[3], extents[4])
+    for i in range(len(rays)):
+        for axis in range(3):
+            middle = 0.5 * (low[axis] + high[axis])
+            places[i, axis] = (places[i, axis] - middle) / max(extents[axis], 1e-12)
+    return places
 
 
 def bend_of(points: Array, inliers: BoolArray, size: float) -> Array:
