@@ -28,7 +28,8 @@ PAGES = {
     "Understand": "limits solvers estimator honesty benchmarks architecture api",
 }
 OTHERS = (
-    *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README", "examples/README"),
+    *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README", "benchmarks/honesty"),
+    "examples/README",
     *("QUALITY_DECLARATION", "CHANGELOG", "docs/adr/0001-compiled-kernels"),
 )
 if not by_rosdoc2:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from rs_localizer.pipeline.refusal import IMU_REASONS, REASONS, Meaning
+from rs_localizer.pipeline.refusal import IMU_REASONS, REASONS, SETTINGS, Meaning
 
 REASONS_PAGE = Path(__file__).with_name("reasons.md")
 _REASONS_INTRODUCTION = """\
@@ -22,6 +22,7 @@ _REASONS_INTRODUCTION = """\
 
 Written by `python docs/make_reasons.py` from `rs_localizer/pipeline/refusal.py`. The reasons are
 the same in the library (`Failure.reason`), in `replay`, in the log and in `/diagnostics`.
+*Settings*: {settings}
 
 | reason | means | look at |
 |---|---|---|
@@ -41,12 +42,16 @@ def reasons_page() -> str:
     """The page of the reasons, with the part that is written by hand as it stands."""
     written = REASONS_PAGE.read_text(encoding="utf-8")
     by_hand = written[written.index(_BY_HAND) :]
-    tables = _REASONS_INTRODUCTION + _rows(REASONS) + _IMU_INTRODUCTION + _rows(IMU_REASONS)
+    introduction = _REASONS_INTRODUCTION.format(settings=SETTINGS)
+    tables = introduction + _rows(REASONS) + _IMU_INTRODUCTION + _rows(IMU_REASONS)
     return tables + by_hand
 
 
 def _rows(reasons: Mapping[str, Meaning]) -> str:
-    return "".join(f"| `{name}` | {means} | {look} |\n" for name, (means, look) in reasons.items())
+    return "".join(
+        f"| `{name}` | {means} | {look.replace(SETTINGS, '*settings*')} |\n"
+        for name, (means, look) in reasons.items()
+    )
 
 
 if __name__ == "__main__":

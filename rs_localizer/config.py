@@ -110,7 +110,7 @@ _LEAST_DEVIATION = 1e-6
 class VelocityPrior:
     """How fast cameras move: standard deviations of the zero-mean velocity prior.
 
-    Robots, drones and hands; what moves slower is told by the points.
+    Robots, drones and hands; the points themselves show slower motion.
     """
 
     angular: float = setting(

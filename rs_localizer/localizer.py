@@ -190,7 +190,7 @@ class Localizer:
         return self.accepted(self.find(points, pixels, scores, prior, expected_share, turn, stamps))
 
     def accepted(self, found: Estimate | Failure) -> Estimate | Failure:
-        """The same, or a :class:`Failure` where the points tell too little of the orientation."""
+        """The same, or a :class:`Failure` where the orientation is too uncertain."""
         if not found:
             return found
         failure = uncertain(found, self.config.max_orientation_deviation)
@@ -209,7 +209,7 @@ class Localizer:
     ) -> Estimate | Failure:
         """As :meth:`localize`, however uncertain it is: the next frames may know better.
 
-        ``error_modes``: of the map whose points are given, where it tells; covariances have them.
+        ``error_modes``: of the map of these points, if it has them; they enter covariances.
         """
         if prior is not None:
             instance("prior", prior, Prior)

@@ -93,7 +93,7 @@ class FrameContext:
     # s; velocities per readout say that much less of how far the camera goes.
     readout_time_deviation: float = 0.0
     of_rest: float = 0.0  # logarithm of the odds for a global shutter, beside those of any
-    error_modes: ErrorModes | None = None  # of the map whose points are given, where it tells
+    error_modes: ErrorModes | None = None  # of the map of these points, if it has them
 
 
 ORDINARY = FrameContext()
@@ -123,7 +123,7 @@ class Tracker:
         inertial: of the gyroscope whose samples come with the frames of a camera alone, which needs
             a readout time; None: there is none. Unless the motion is remembered, its bias is any
             that a gyroscope may have, and the offset of its stamps the given one.
-        memory: what frames tell the next ones.
+        memory: what frames pass on to the next ones.
 
     Raises:
         ValueError: without a readout time, with a global-shutter solver, or with something else
@@ -171,7 +171,7 @@ class Tracker:
 
     @property
     def smooth_error(self) -> float:
-        """Size (px) of what map or lens are surely off by, as the frames so far tell; else 0."""
+        """Size (px) of the errors of map or lens on which frames agree so far; else 0."""
         return 0.0 if self._track is None else self._track.experience.smooth_error
 
     def _trusts_motion(self, context: FrameContext) -> bool:
@@ -212,7 +212,7 @@ class Tracker:
     def prediction(
         self, time_ns: int, span: float | None = None, context: FrameContext = ORDINARY
     ) -> Prior | None:
-        """What the last frames, or others, say of the motion at a time; None: nobody does.
+        """Prediction of the motion at a time, of the last frames or others; None: there is none.
 
         ``span``: s, of the row times of the frame; None: as of the last one.
         """

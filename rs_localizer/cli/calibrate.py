@@ -169,7 +169,7 @@ class Options(TargetOptions, Settings, Inputs):
         "rotation, bias", default=False,
     )  # fmt: skip
     no_telemetry: bool = option(
-        "ignore the gyroscope and the readout time inside a video, or in a log beside it",
+        "ignore the gyroscope and the readout time inside a video, or in its log file",
         default=False,
     )
     rate: float | None = option(

@@ -58,7 +58,7 @@ class ImageOptions(Settings, Inputs):
         f"{CALIBRATION_KINDS} (default: the bag's camera_info)", "FILE"
     )
     no_telemetry: bool = option(
-        "ignore the gyroscope and the readout time inside a video, or in a log beside it",
+        "ignore the gyroscope and the readout time inside a video, or in its log file",
         default=False,
     )
     rate: float | None = option(

@@ -37,7 +37,7 @@ class Options(Overwrite):
     out: Path = argument("OUT.pdf or OUT.png to print, and beside it the map OUT.yaml", "OUT")
     grid: str | None = option(
         f"markers, columns x rows (default: {_GRID}); where they do not fit on a page together, "
-        "each has one of its own and is mounted as in the map", "2x3",
+        "each has its own and is mounted as in the map", "2x3",
     )  # fmt: skip
     chessboard: str | None = option("instead: inner corners, along a row x rows", "6x4")
     charuco: str | None = option("instead: squares, along a row x rows", "5x7")

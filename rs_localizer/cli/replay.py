@@ -96,7 +96,7 @@ class Options(Settings, Inputs, Many):
     )  # fmt: skip
     calibration: Path | None = option("of images: the lens, as for detect", "FILE")
     no_telemetry: bool = option(
-        "ignore the gyroscope and the readout time inside a video, or in a log beside it",
+        "ignore the gyroscope and the readout time inside a video, or in its log file",
         default=False,
     )
     smooth: bool = option(

@@ -202,7 +202,7 @@ class MotionOptions:
         f"(without any motion given: {_words(_LINEAR_VELOCITY)})", "X Y Z",
     )  # fmt: skip
     vibration: list[tuple[float, float]] = option(
-        "shake the camera besides, to and fro by DEG about any axis; may be repeated", "DEG HZ",
+        "add vibration by DEG about any axis; may be repeated", "DEG HZ",
         list, limits=_POSITIVE,
     )  # fmt: skip
     start: float = option("seconds to skip", "S", 0.0, limits=_POSITIVE)
@@ -277,7 +277,7 @@ class Options(MotionOptions, CameraOptions, ImuOptions):
     noise: float = option("deviation of each raw coordinate", "PX", _FRAMES.noise, limits=_POSITIVE)
     outliers: float = option("of the points", "SHARE", _FRAMES.outliers, limits=(0.0, 1.0))
     keypoints: bool = option(
-        f"pixels with binary descriptors, and the map beside them, {MAP}: for matching",
+        f"pixels with binary descriptors, and their map, {MAP}: for matching",
         default=False,
     )
     images: bool = option("render camera images, instead of points", default=False)

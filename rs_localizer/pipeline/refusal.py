@@ -60,7 +60,7 @@ class Meaning(NamedTuple):
     look_at: str
 
 
-_TURNED = (
+SETTINGS = (
     "is the readout time in seconds, the scan direction right, are the pixels raw (not rectified)?"
 )
 
@@ -71,7 +71,7 @@ REASONS: dict[str, Meaning] = {
     ),
     Reason.TOO_FEW_INLIERS: Meaning(
         "no motion fits min_inliers points to within inlier_threshold",
-        f"do map and calibration belong to these images; {_TURNED}",
+        f"do map and calibration belong to these images; {SETTINGS}",
     ),
     Reason.NO_HYPOTHESIS: Meaning(
         "no sample of points gave a pose", "are all points the same, or on one line?"
@@ -81,7 +81,7 @@ REASONS: dict[str, Meaning] = {
     ),
     Reason.RESIDUAL: Meaning(
         "inlier residuals are as large as inlier_threshold allows; no pose fits",
-        f"calibration, map, or a too small inlier_threshold; {_TURNED}",
+        f"calibration, map, or a too small inlier_threshold; {SETTINGS}",
     ),
     Reason.DEGENERATE: Meaning(
         "the points do not determine the motion, e.g. a frontoparallel plane",
@@ -89,7 +89,7 @@ REASONS: dict[str, Meaning] = {
         "on",
     ),
     Reason.IMPLAUSIBLE: Meaning(
-        "the motion exceeds what a camera can do", f"mostly chance matches; {_TURNED}"
+        "the motion exceeds what a camera can do", f"mostly chance matches; {SETTINGS}"
     ),
     Reason.MIRRORED: Meaning(
         "planar pose ambiguity: two poses, mirrored about the line of sight, fit equally well",
@@ -100,7 +100,7 @@ REASONS: dict[str, Meaning] = {
         "are large and smooth over the image: vibration that the rows cannot resolve, or a map "
         "or calibration too wrong for any pose",
         f"a stiffer mounting, the calibration (before a plane a wrong lens looks like a bent "
-        f"map: show points at several depths), the map; {_TURNED}",
+        f"map: show points at several depths), the map; {SETTINGS}",
     ),
     Reason.UNCERTAIN: Meaning(
         "orientation uncertainty exceeds max_orientation_deviation, as before a small plane when "
