@@ -230,7 +230,9 @@ def vibration() -> str:
 def rigs() -> str:
     """A wall through rolling shutters that rise, and a wall before a camera at rest that fits."""
     sheet = Drawing(820, 300)
-    sheet.text(20, 28, "a wall seen while rising (blue), and a leaning one at rest (red)", size=15)
+    sheet.text(
+        20, 28, "a wall seen while rising (blue), and a tilted one while stationary (red)", size=15
+    )
 
     def wall(x: float, y: float, wide: float, high: float, colour: str, dash: str) -> None:
         for k in range(5):
@@ -245,9 +247,9 @@ def rigs() -> str:
     # Rows read downwards follow the wall as it sinks in the image and stretch it; rows read upwards
     # meet it and squeeze it. A wall that leans to the side, and nearer, is stretched in both.
     cases = (
-        ("one camera", (1.25,), "fits: no motion told"),
-        ("two mounted alike", (1.25, 1.25), "fits both: no motion told"),
-        ("two opposed", (1.25, 0.8), "fits one only: motion told"),
+        ("one camera", (1.25,), "fits: motion unknown"),
+        ("two parallel", (1.25, 1.25), "fits both: motion unknown"),
+        ("two opposed", (1.25, 0.8), "fits one only: motion known"),
     )
     x = 90.0
     for name, stretches, verdict in cases:
@@ -266,37 +268,6 @@ def rigs() -> str:
     return sheet.svg()
 
 
-def coverage() -> str:
-    """How many truths lie inside their 95 % regions, by benchmarks.md."""
-    page = Path(__file__).with_name("benchmarks.md").read_text(encoding="utf-8")
-    lines = page.splitlines()
-    start = next(k for k, line in enumerate(lines) if line.startswith("| bench |"))
-    head = [cell.strip() for cell in lines[start].strip("| ").split("|")]
-    shown = {"pose at mid-frame": "#0d47a1", "twist at mid-frame": "#f9a825"}
-    rows = []
-    for line in lines[start + 2 :]:
-        if not line.startswith("|"):
-            break
-        cells = dict(zip(head, (cell.strip() for cell in line.strip("| ").split("|")), strict=True))
-        rows.append((cells["bench"].strip("`"), [cells[name].split(",")[0] for name in shown]))
-    sheet = Drawing(820, 80 + 26 * len(rows))
-    left, wide, bottom = 110.0, 6.4, 50 + 26 * len(rows)
-    sheet.text(left, 24, "truths inside their 95 % regions (%)", size=15)
-    for k, (name, colour) in enumerate(shown.items()):
-        sheet.box(430 + 170 * k, 13, 14, 12, colour)
-        sheet.text(450 + 170 * k, 24, name)
-    for share in (0, 25, 50, 75, 95):
-        x = left + wide * share
-        sheet.line(x, 38, x, bottom, colour=RED if share == 95 else "#cccccc", width=1)
-        sheet.text(x, bottom + 18, str(share), at="middle", colour=RED if share == 95 else INK)
-    for k, (name, shares) in enumerate(rows):
-        sheet.text(left - 8, 58 + 26 * k, name, at="end")
-        for i, (share, colour) in enumerate(zip(shares, shown.values(), strict=True)):
-            if share != "-":
-                sheet.box(left, 43 + 26 * k + 10 * i, wide * float(share), 9, colour)
-    return sheet.svg()
-
-
 PICTURES: dict[str, Callable[[], str]] = {
     "row_time.svg": row_time,
     "scan_directions.svg": scan_directions,
@@ -304,11 +275,10 @@ PICTURES: dict[str, Callable[[], str]] = {
     "vibration.svg": vibration,
     "rigs.svg": rigs,
 }
-OF_FIGURES = {"coverage.svg": coverage}  # of a table that changes with each measurement
 
 
 def main() -> None:
-    for name, draw in (PICTURES | OF_FIGURES).items():
+    for name, draw in PICTURES.items():
         Path(__file__).with_name(name).write_text(draw(), encoding="utf-8")
 
 
