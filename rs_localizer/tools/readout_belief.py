@@ -214,9 +214,9 @@ class Evidence:
         why = ""
         if self.jitter > _MOST_JITTER:
             why += (
-                f"; images were exposed {1e3 * self.jitter:.1f} ms rms beside "
-                "their stamps: record with the camera's own time stamps, without losing images or "
-                "encoding the video anew"
+                f"; exposures are {1e3 * self.jitter:.1f} ms rms off their "
+                "stamps: record with the camera's own time stamps, without losing images or "
+                "re-encoding the video"
             )
         if self.stabilised:
             why += (
@@ -233,12 +233,12 @@ class Evidence:
         if not self.long_enough:
             return (
                 f"; {self.telling} of {len(self.blocks)} parts of the "
-                f"{self.seconds:.1f} s determine it on their own, three have to, or 9 s: move the "
+                f"{self.seconds:.1f} s determine it on their own, three must, or 9 s: move the "
                 "camera faster and for longer"
             )
         if not self.determined:
             return (
-                f", known to less than {1e3 * self.limit:.1f} ms it would be; "
+                f" (limit {1e3 * self.limit:.1f} ms); "
                 "move the camera faster, rotate it about all axes, and for longer"
             )
         if self.too_fast:

@@ -78,7 +78,7 @@ class Mounted:
         )
         largest = (float(np.max(of)) for of in np.split(self.deviations, [3, 6]))
         return ", ".join(
-            f"{name} +- {unit * value:.2g} {of} (known to less than {unit * limit:.2g} it would be)"
+            f"{name} +- {unit * value:.2g} {of} (limit {unit * limit:.2g})"
             for (name, unit, of), value, limit in zip(units, largest, DETERMINED, strict=True)
             if not value < limit
         )

@@ -84,8 +84,8 @@ def remarks(result: Calibration) -> list[str]:
         )
     if result.jitter > _WORTH_A_WORD:
         said.append(
-            f"images were exposed {1e3 * result.jitter:.1f} ms rms beside their stamps, each at a "
-            "time of its own, which was estimated: the value depends on the mean interval"
+            f"exposures are {1e3 * result.jitter:.1f} ms rms off their stamps; their times were "
+            "estimated, and the value depends on the mean interval"
         )
     if result.stamps.missing:
         said.append(f"{result.stamps.missing} images are missing between the others")

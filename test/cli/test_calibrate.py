@@ -38,7 +38,7 @@ def test_the_webcam(tmp_path, capsys):
     words = ["calibrate", recording, "--out", str(out)]
     assert main(words) == 1
     said = capsys.readouterr()
-    assert "beside their stamps" in said.err
+    assert "off their stamps" in said.err
     assert "times less likely" not in said.out
     assert not out.exists()
     assert main([*words, "--intrinsics", "--plot", str(plots), "--force"]) == 1

@@ -147,7 +147,7 @@ def test_what_nothing_can_contradict_or_no_camera_has_is_refused(board):
     fit = found.fit
     off = replace(fit.camera, K=fit.camera.K + np.outer([1.0, 0.0, 0.0], [0.0, 0.0, 5e3]))
     assert "outside the image" in verdict.refusal(replace(found, fit=replace(fit, camera=off)))
-    assert "beside their stamps" in verdict.refusal(replace(found, jitter=1.1e-3))
+    assert "off their stamps" in verdict.refusal(replace(found, jitter=1.1e-3))
     # No rolling shutter takes a millisecond; a camera that stamps its images is to be believed.
     fast = replace(found, readout_time=1e-3, deviation=1e-4)
     assert verdict.refusal(fast) == ""

@@ -94,4 +94,4 @@ def test_motions_that_are_not_one_are_refused():
 def test_what_is_not_determined_is_named():
     rear = pair()["rear"]
     vague = replace(rear, deviations=np.r_[rear.deviations[:6], 0.003])
-    assert vague.undetermined == "clock +- 3 ms (known to less than 1.5 it would be)"
+    assert vague.undetermined == "clock +- 3 ms (limit 1.5)"
