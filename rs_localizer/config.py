@@ -422,6 +422,12 @@ class NodeConfig(LocalizerConfig):
         "Use the previous pose and twist as first guess and prior, with a rolling-shutter solver; "
         "without a readout_time only errors of map and lens are tracked",
     )
+    output_lag: int = setting(
+        0,
+        "Frames that a tracked result waits for: it is that of the frame so many before, whose "
+        "twist the later ones know, too; for maps, logs and filters with delayed states",
+        (0, 5),
+    )
     max_points: int = setting(
         20_000,
         "Most points of a frame that are used: those with the best scores, or without scores "

@@ -22,7 +22,7 @@ from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation import motion_model, observations, ransac
+from rs_localizer.estimation import motion_model, motion_window, observations, ransac
 from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
@@ -126,7 +126,7 @@ class Localizer:
         if not self._alone:
             Localizer(next(iter(self.rig.cameras.values())), self.config).warm_up()
             return
-        for part in (motion_model, observations, ransac):
+        for part in (motion_model, motion_window, observations, ransac):
             part.warm_up()
         # A still camera before a scene that is no plane; with half a prediction, which is dropped.
         count = max(160, self.config.min_inliers)
@@ -289,8 +289,8 @@ class Localizer:
         posterior = self._settle(observed, best, terms)
         innovation, _ = offset_between(predicted, posterior.state, terms.pivots[-1])
         known = len(terms.informations) > len(observed.terms.informations)
-        if known and innovation @ terms.informations[-1] @ innovation > _MOST_INNOVATION:
-            # A jump: the points know better.
+        jumped = known and innovation @ terms.informations[-1] @ innovation > _MOST_INNOVATION
+        if jumped:  # the points know better
             posterior = self._settle(observed, best, observed.terms)
         result = self._accept(observed, start, best, posterior, self._own_terms(observed, prior))
         if result and np.count_nonzero(result.inliers) < (
@@ -301,7 +301,17 @@ class Localizer:
                 f"{np.count_nonzero(result.inliers)} inliers near the prior motion, "
                 f"{expected_share:.0%} of {observed.observations.count} were expected",
             )
-        return result
+        return replace(result, jumped=bool(jumped)) if result else result
+
+    def known_of(self, prior: Prior | None, span: float) -> PriorTerms:
+        """What is known, beside its points, of a frame in the map's frame.
+
+        Args:
+            prior: of which the motion counts; None: the settings alone.
+            span: s, of the row times.
+        """
+        terms, _ = self._assume(span)
+        return terms if prior is None else with_motion(terms, prior, np.zeros(3))
 
     def _settle(self, observed: Observed, best: Candidate, terms: PriorTerms) -> Posterior:
         # Unless more is known of this very frame than the prior of the configuration.

@@ -3,21 +3,23 @@
 """From frame to frame: the last motion predicts the next, and its prior makes the next better.
 
 A single image sees the camera's velocity only through the shutter, and the linear part badly; two
-poses a frame apart show it well. The tracker is the extended Kalman filter that brings both
-together: its state is the camera's pose, velocities and accelerations with their covariance, its
-motion model accelerations that fade within a tenth of a second while new ones come (Singer,
-"Estimating optimal tracking filter performance for manned maneuvering targets", 1970), its
-measurement update the localizer's maximum a posteriori estimate with the prediction as prior (an
-iterated update). A gyroscope takes the place of the motion model's rotation where there is one
-(:mod:`rs_localizer.inertial.aiding`).
+poses a frame apart show it well. The tracker brings both together: its state is one trajectory
+through the last frames (:mod:`rs_localizer.estimation.motion_window`), whose accelerations fade
+within a tenth of a second while new ones come (Singer, "Estimating optimal tracking filter
+performance for manned maneuvering targets", 1970) and tell themselves how large they are. It
+predicts each frame, whose maximum a posteriori estimate has the prediction as prior; what the
+points say beside it joins the window. A gyroscope takes the place of the motion model's rotation
+where there is one (:mod:`rs_localizer.inertial.aiding`).
 """
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,8 +27,9 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
+from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Rig
-from rs_localizer.core.shutter import motion_of, numbers_of
+from rs_localizer.core.shutter import reprojection_errors
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
@@ -34,10 +37,18 @@ from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.motion_model import (
     FADING,
     acceleration_covariance,
-    predict,
     surprises_of,
     unshaken,
-    with_mean_turn,
+)
+from rs_localizer.estimation.motion_window import (
+    LENGTH,
+    Gaussian,
+    MotionWindow,
+    estimate_at,
+    gaussian_of,
+    motion_of,
+    predicted_estimate,
+    sample_of,
 )
 from rs_localizer.estimation.prior import Prior, offset_between, pivot_of, state_in
 from rs_localizer.integrity import Integrity
@@ -62,17 +73,16 @@ class Memory(Enum):
 
 
 # A prediction over a longer gap (s) says less than a fresh search costs.
-_LONGEST_GAP = 0.5
-# Frames in a row without a pose after which the track is given up.
-_MOST_FAILURES = 5
+_LONGEST_GAP = 1.0
 # Frames in a row that are closer than a microsecond come in seconds or milliseconds.
 _LEAST_STEP_NS, _MOST_TOO_CLOSE = 1000, 3
 # Share of inliers of the last frames: weight of the newest.
 _NEWEST = 0.3
-# How fast innovations change the expected accelerations (exponent), and how much at most.
-_LEARNING = 0.5
-# The least: with a tenth predictions hold 88 % of a webcam's frames, with this 93 and more.
-_LEAST_SCALE, _MOST_SCALE = 0.3, 1e4
+# Beside a gyroscope: how fast innovations change the expected variance of linear accelerations
+# (exponent), and by how much at most.
+_LEARNING, _LEAST_SCALE, _MOST_SCALE = 0.5, 0.3, 1e4
+# Squared distance of what was found by a search from the track: once in a million by chance.
+_MOST_INNOVATION = 62.0
 # Of the readout time: off by more, frames that stand alone are better than tracked ones. Errors of
 # a hand's turn rates, tracked over alone, where it is off by a factor of 1.3, 1.5, 1.7: 0.95, 1.3,
 # 1.5 (150 points, 0.3 px); known to a half, it is off by a third in the median.
@@ -108,9 +118,19 @@ class _Track:
     time_ns: int
     share: float  # of inliers among the points
     experience: Experience  # with shaking, map and lens
-    # (2,) how many times the configured accelerations, squared: angular, linear
-    process_noise_scale: Array
-    failures: int = 0  # frames without a pose since then
+    window: MotionWindow | None = None  # of the motion; None: it is not remembered
+    # Beside a gyroscope: how many times the configured linear accelerations, squared
+    linear_scale: float = 1.0
+
+
+@dataclass(slots=True)
+class _Seen:
+    """A frame of the last ones."""
+
+    time_ns: int
+    found: Estimate | Failure  # by its own fit; then as the window tells
+    points: Any
+    pixels: Any
 
 
 class Tracker:
@@ -124,6 +144,9 @@ class Tracker:
             a readout time; None: there is none. Unless the motion is remembered, its bias is any
             that a gyroscope may have, and the offset of its stamps the given one.
         memory: what frames pass on to the next ones.
+        output_lag: frames that :meth:`localize` waits for: its results are those of the frame so
+            many before, as the later ones tell, too; those without a gyroscope, of a camera alone.
+        max_prediction: s after the last frame until which :meth:`at` predicts.
 
     Raises:
         ValueError: without a readout time, with a global-shutter solver, or with something else
@@ -135,13 +158,19 @@ class Tracker:
         localizer: Localizer,
         inertial: InertialSettings | None = None,
         memory: Memory = Memory.MOTION,
+        output_lag: int = 0,
+        max_prediction: float = 0.1,
     ) -> None:
         instance("localizer", localizer, Localizer)
         if memory is Memory.MOTION:
             _check_motion(localizer)
         elif inertial is not None:
             inertial = replace(inertial, estimate_time_offset=False)
+        if not 0 <= output_lag < LENGTH:
+            raise ValueError(f"output_lag must be 0 to {LENGTH - 1} frames, got {output_lag}")
         self.localizer, self._memory = localizer, memory
+        self.output_lag, self.max_prediction = output_lag, max_prediction
+        self._seen: deque[_Seen] = deque(maxlen=LENGTH)  # the newest last
         self._track: _Track | None = None
         self._given: tuple[int, Prior] | None = None
         self._integrity = Integrity()
@@ -157,6 +186,7 @@ class Tracker:
         """Forget all frames so far."""
         self._track = self._given = None
         self._integrity.reset()
+        self._seen.clear()
         if self._aid is not None:
             self._aid.reset()
 
@@ -217,38 +247,51 @@ class Tracker:
         ``span``: s, of the row times of the frame; None: as of the last one.
         """
         track = self._track
-        if track is None or not self._follows(time_ns):
+        if track is None or track.window is None or not self._follows(time_ns):
             given = self._given
             return given[1] if given is not None and given[0] == time_ns else None
-        dt = (time_ns - track.time_ns) * 1e-9
-        readout_time = track.estimate.span if span is None else span
-        acceleration = self.localizer.config.acceleration
-        motion, covariance, swing = unshaken(track.estimate)
-        if track.estimate.turn is not None:
-            motion, covariance = with_mean_turn(motion, covariance, track.estimate.turn)
-        if readout_time != track.estimate.span:
-            units = (readout_time / track.estimate.span) ** np.array([0, 0, 1, 1, 2, 2])
-            each = zip(units, numbers_of(motion), strict=True)
-            motion, scale = motion_of(tuple(u * part for u, part in each)), np.repeat(units, 3)
-            covariance = covariance * np.outer(scale, scale)
-        motion, covariance = predict(motion, covariance, dt / readout_time, FADING / readout_time)
-        covariance += acceleration_covariance(
-            _scaled(acceleration, track.process_noise_scale), dt, readout_time
-        )
-        covariance += swing
-        if context.readout_time_deviation > 0.0:
-            share = context.readout_time_deviation / readout_time
-            velocity = np.r_[motion.angular_velocity, motion.linear_velocity]
-            displacement = share * dt / readout_time * velocity
-            covariance[:6, :6] += np.outer(displacement, displacement)
+        own = track.estimate.span
+        window = replace(track.window, readout_share=context.readout_time_deviation / own)
+        motion, covariance = motion_of(window.after(time_ns), own if span is None else span)
         try:
             return Prior(
                 motion=motion,
-                covariance=covariance,
+                covariance=covariance + unshaken(track.estimate)[2],
                 scales=track.experience.scales,
             )
         except ValueError:  # rounding errors are all that is left of the covariance
             return None
+
+    def at(self, time_ns: int) -> Estimate | None:
+        """The motion at a time, in ns as :meth:`localize` takes it.
+
+        Within the rows of one of the last frames it is that frame's, between frames what those
+        before and after tell, after them predicted under accelerations as they were of late. None
+        before the last frames and more than ``max_prediction`` after them. Points are those of the
+        frame that is nearest.
+        """
+        track = self._track
+        if track is None or track.window is None:
+            return None
+        window, swing = track.window, unshaken(track.estimate)[2]
+        if (time_ns - track.time_ns) * 1e-9 > self.max_prediction:
+            return None
+        frames = [seen for seen in self._seen if seen.found]
+        nearest = min(frames, key=lambda seen: abs(seen.time_ns - time_ns))
+        assert isinstance(nearest.found, Estimate)
+        seconds = 1e-9 * (time_ns - nearest.time_ns)
+        if abs(seconds) <= 0.5 * nearest.found.span:
+            return replace(nearest.found.at_time(seconds), time_ns=time_ns)
+        motion = window.at(time_ns)
+        if motion is None:
+            return None
+        return predicted_estimate(nearest.found, motion, swing)
+
+    def flush(self) -> list[Estimate | Failure]:
+        """The results that ``output_lag`` still holds back, at the end of a recording."""
+        held = list(self._seen)[max(len(self._seen) - self.output_lag, 0) :]
+        self._seen.clear()
+        return [seen.found for seen in held]
 
     def localize(
         self,
@@ -263,7 +306,7 @@ class Tracker:
         """Localize the frame whose middle row was exposed at ``time_ns``.
 
         Arguments, result and errors otherwise as :meth:`Localizer.localize`. A time that does not
-        follow the last one (a bag that starts over), a gap, or failures in a row end the track.
+        follow the last one (a bag that starts over) or a gap of a second ends the track.
 
         Args:
             imu: samples from before the last frame with a pose, if there are any, until after the
@@ -310,16 +353,49 @@ class Tracker:
             )
         if result:
             result = self._judged(result, points, pixels, prior)
+            if self._memory is Memory.MOTION:
+                result = replace(result, time_ns=time_ns)
             self._remember(time_ns, prior, result, context)
             if self._aid is not None and imu is not None:
                 camera = self.localizer.camera
                 assert pixels is not None and not isinstance(points, Mapping)  # noqa: PT018
                 self._aid.seek(camera, points, pixels, result, time_ns)
-        elif self._track is not None and self._memory is Memory.MOTION:
-            self._track.failures += 1
-            if self._track.failures >= _MOST_FAILURES:
-                self._track = None
-        return self.localizer.accepted(result)
+        if self._seen and self._seen[-1].time_ns == time_ns:  # the same frame, matched anew
+            self._seen.pop()
+        self._seen.append(_Seen(time_ns, result, points, pixels))
+        self._publish()
+        return self.delayed
+
+    @property
+    def newest(self) -> Estimate | Failure | None:
+        """The result of the last frame, whatever ``output_lag`` is; None before any."""
+        return self.localizer.accepted(self._seen[-1].found) if self._seen else None
+
+    @property
+    def newest_ns(self) -> int | None:
+        """When the middle row of the last frame was exposed; None before any."""
+        return self._seen[-1].time_ns if self._seen else None
+
+    @property
+    def delayed(self) -> Estimate | Failure:
+        """The result of the frame ``output_lag`` before the last one."""
+        if len(self._seen) > self.output_lag:
+            return self.localizer.accepted(self._seen[-1 - self.output_lag].found)
+        return Failure(
+            Reason.AWAITS_FRAMES,
+            f"output_lag is {self.output_lag} frames, of which {len(self._seen) - 1} have come",
+        )
+
+    def _publish(self) -> None:
+        """Give the last frames the motion that the window knows of them."""
+        window = None if self._track is None else self._track.window
+        if window is None or len(window) < 2:
+            return
+        known = {time_ns: k for k, time_ns in enumerate(reversed(window.times))}
+        for seen in list(self._seen)[-1 - self.output_lag :]:
+            alone = not isinstance(seen.points, Mapping)
+            if alone and seen.time_ns in known and isinstance(seen.found, Estimate):
+                seen.found = self._published(seen, window.before(known[seen.time_ns]))
 
     def _judged(
         self,
@@ -352,16 +428,36 @@ class Tracker:
 
         return without_gyro(prior, turn)
 
+    def _published(self, seen: _Seen, motion: Gaussian) -> Estimate:
+        """The estimate of one of the last frames by that motion, with its residuals."""
+        assert isinstance(seen.found, Estimate)
+        found = estimate_at(seen.found, motion)
+        residuals = reprojection_errors(
+            self.localizer.camera, found.at_rows, np.asarray(seen.points, float),
+            np.asarray(seen.pixels, float),
+        )  # fmt: skip
+        residuals[np.isnan(found.residuals)] = np.nan
+        fitted = found.residuals[found.inliers].max(initial=0.0)
+        gate = max(self.localizer.config.inlier_threshold, fitted)
+        return replace(found, residuals=residuals, inliers=residuals <= gate)
+
     def _remember(
         self, time_ns: int, prior: Prior | None, result: Estimate, context: FrameContext
     ) -> None:
         """Keep what the next frames are to know of this one."""
         track = self._track
+        if self._memory is Memory.NOTHING:
+            return
+        experience = Experience.of(result) if track is None else track.experience.and_of(result)
+        self._track = _Track(result, time_ns, 0.0, experience)
         if self._memory is Memory.MOTION:
-            self._track = _followed(track, prior, result, time_ns)
-        elif self._memory is Memory.MAP_AND_LENS:
-            experience = Experience.of(result) if track is None else track.experience.and_of(result)
-            self._track = _Track(result, time_ns, 0.0, experience, np.ones(2))
+            self._track.share = share = float(np.mean(result.inliers))
+            if track is not None:
+                if result.tracked:
+                    self._track.share = (1.0 - _NEWEST) * track.share + _NEWEST * share
+                if result.turn is not None:
+                    self._track.linear_scale = _learnt(track.linear_scale, prior, result)
+            self._track.window = self._window(time_ns, prior, result, track, context)
         if track is None or self._track is None or self._trusts_motion(context):
             return
         seconds = 1e-9 * (time_ns - track.time_ns)
@@ -371,6 +467,30 @@ class Tracker:
                 self.localizer.config.velocity_prior,
             )  # fmt: skip
 
+    def _window(
+        self, time_ns: int, prior: Prior | None, result: Estimate, track: _Track | None,
+        context: FrameContext,
+    ) -> MotionWindow:  # fmt: skip
+        """The last frames and this one; where it denies them, it alone."""
+        share = context.readout_time_deviation / result.span
+        alone = MotionWindow.begin(
+            gaussian_of(result, time_ns), self.localizer.config.acceleration, share
+        )
+        window = None if track is None else track.window
+        if window is None:
+            return alone
+        alone = replace(alone, deviations=window.deviations)
+        if result.turn is not None or not self._trusts_motion(context):
+            return alone
+        near = prior if result.tracked and not result.jumped else None
+        known = (self.localizer.known_of(before, result.span) for before in (near, None))
+        try:
+            sample = sample_of(result, time_ns, *known)
+            window = replace(window, readout_share=share).joined(sample)
+        except np.linalg.LinAlgError:  # rounding errors are all that is left of a covariance
+            return alone
+        return window if window.surprise < _MOST_INNOVATION else alone  # NaN is neither
+
     def _before(self, time_ns: int) -> Before | None:
         """What the last frame says of the motion beside what a gyroscope sees."""
         track = self._track
@@ -379,10 +499,10 @@ class Tracker:
         from rs_localizer.inertial.aiding import Before
 
         readout_time = self.localizer.camera.readout_time
-        motion, covariance, added = unshaken(track.estimate)
+        motion, covariance, added, _ = unshaken(track.estimate)
         dt = 1e-9 * (time_ns - track.time_ns)
-        scaled = _scaled(self._without_gyro, track.process_noise_scale)
-        expected = replace(self._without_gyro, linear=scaled.linear)
+        linear = math.sqrt(track.linear_scale) * self._without_gyro.linear
+        expected = replace(self._without_gyro, linear=max(linear, _LEAST_ACCELERATION))
         added += acceleration_covariance(expected, dt, readout_time)
         return Before(
             track.time_ns,
@@ -405,21 +525,12 @@ def _check_motion(localizer: Localizer) -> None:
         )
 
 
-def _followed(track: _Track | None, prior: Prior | None, newest: Estimate, time_ns: int) -> _Track:
-    """The track and its newest frame."""
-    share = float(np.mean(newest.inliers))
-    if track is None or prior is None or prior.motion is None:
-        return _Track(newest, time_ns, share, Experience.of(newest), np.ones(2))
-    if newest.tracked:
-        share = (1.0 - _NEWEST) * track.share + _NEWEST * share
-    innovation = _innovation(prior, newest)
-    return _Track(
-        newest,
-        time_ns,
-        share,
-        track.experience.and_of(newest),
-        np.clip(track.process_noise_scale * innovation**_LEARNING, _LEAST_SCALE, _MOST_SCALE),
-    )
+def _learnt(scale: float, prior: Prior | None, newest: Estimate) -> float:
+    """The scale of linear accelerations beside a gyroscope, by how far its prediction was off."""
+    if prior is None or prior.motion is None:
+        return 1.0
+    changed = scale * _innovation(prior, newest)[1] ** _LEARNING
+    return float(np.clip(changed, _LEAST_SCALE, _MOST_SCALE))
 
 
 def _innovation(prior: Prior, newest: Estimate) -> Array:
@@ -435,11 +546,3 @@ def _innovation(prior: Prior, newest: Estimate) -> Array:
     )
     innovation: Array = surprises_of(step, expected, joint)
     return innovation
-
-
-def _scaled(acceleration: Acceleration, variance_scale: Array) -> Acceleration:
-    angular, linear = np.sqrt(variance_scale).tolist()
-    return Acceleration(
-        max(angular * acceleration.angular, _LEAST_ACCELERATION),
-        max(linear * acceleration.linear, _LEAST_ACCELERATION),
-    )

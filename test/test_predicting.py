@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Predictions by themselves: how motions and errors are carried on, and what comes in between."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.polynomial import legendre
@@ -16,11 +14,10 @@ from rs_localizer.config import Acceleration
 from rs_localizer.core.scales import Scales
 from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.motion_model import acceleration_covariance, predict, unshaken
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.estimation.refine import apply_step
-from rs_localizer.tracking import _followed, _innovation, _Track
+from rs_localizer.tracking import _innovation
 
 READOUT = 0.03
 FADING = 0.1  # s
@@ -152,7 +149,7 @@ def whole_waves(estimate):
 def test_without_its_shaking_a_motion_is_what_the_shaking_goes_around():
     """Whole waves vanish on average; those of a frame are taken from the middle row."""
     estimate = shaking()
-    motion, _, swing = unshaken(estimate)
+    motion, _, swing, _ = unshaken(estimate)
     value, slope = whole_waves(estimate)
     # The camera at tau = 0 is the motion's, turned by the waves in its own axes.
     turned = motion.rotation.T @ Rotation.from_rotvec(value).as_matrix()
@@ -176,7 +173,7 @@ def test_without_its_shaking_a_motion_is_what_the_shaking_goes_around():
 
 def test_without_its_shaking_the_covariance_knows_of_it():
     estimate = shaking()
-    motion, covariance, _ = unshaken(estimate)
+    motion, covariance, _, _ = unshaken(estimate)
 
     def moved(error):
         s = apply_step(state(estimate), error[:18])
@@ -275,42 +272,3 @@ def test_a_frame_that_decides_nothing_does_not_surprise():
     assert _innovation(predicted(spread), at(np.zeros(18), spread)) == pytest.approx(0.0, abs=1e-9)
     # Rounding errors are not divided by the nothing that was expected.
     assert np.all(_innovation(predicted(spread), at(1e-6 * UNITS, spread)) < 1e-6)
-
-
-TURN = np.r_[0:3, 6:9, 12:15]
-WAY = TURN + 3
-
-
-def followed(times_deviation, tracked=True, jolts=1.0, of=None):
-    spread = covariance(np.random.default_rng(2))
-    first = at(np.zeros(18), 0.01 * spread)
-    step = np.zeros(18)
-    for part in (TURN, WAY) if of is None else (of,):
-        along = np.linalg.cholesky(spread[np.ix_(part, part)])[:, 0]
-        step[part] = times_deviation * np.sqrt(9.0) * along
-    found = replace(at(step, 0.01 * spread), tracked=tracked,
-                    inliers=np.array([True, False, False, False, False]))  # fmt: skip
-    track = _Track(first, 0, 1.0, Experience.of(first), jolts * np.ones(2))
-    return _followed(track, predicted(spread), found, 5)
-
-
-def test_surprises_raise_what_is_expected_and_calm_lowers_it():
-    assert followed(1.0).process_noise_scale == pytest.approx([1.0, 1.0], abs=0.01)
-    # A turn by 0.3 rad, whose move is told about what the camera sees.
-    assert followed(10.0).process_noise_scale == pytest.approx([10.0, 10.0], rel=0.03)
-    assert followed(0.1, jolts=20.0).process_noise_scale == pytest.approx([2.0, 2.0], rel=0.02)
-    # Never below what the configuration says, nor without bound.
-    assert followed(0.0).process_noise_scale == pytest.approx([0.3, 0.3])  # a calm camera
-    assert followed(100.0, jolts=9e3).process_noise_scale == pytest.approx([1e4, 1e4])
-
-
-@pytest.mark.parametrize(("of", "raised"), [(TURN, 0), (WAY, 1)])
-def test_turns_and_moves_surprise_apart(of, raised):
-    jolts = followed(10.0, of=of).process_noise_scale
-    assert jolts[raised] == pytest.approx(10.0, rel=0.02)
-    assert jolts[1 - raised] <= 1.0
-
-
-def test_the_share_of_inliers_follows_tracked_frames_slowly():
-    assert followed(1.0).share == pytest.approx(0.7 * 1.0 + 0.3 * 0.2)
-    assert followed(1.0, tracked=False).share == pytest.approx(0.2)

@@ -165,17 +165,106 @@ def test_a_gap_a_jump_and_a_bag_that_starts_over_need_a_search_and_are_localized
     assert not step(0.066).tracked  # the same time again
 
 
-def test_failures_in_a_row_lose_the_track_and_single_ones_do_not():
+def test_the_track_lives_through_less_than_a_second_without_a_pose():
     hand = Hand()
     tracker = Tracker(rsl.Localizer(CAMERA))
     nothing = np.zeros((0, 3)), np.zeros((0, 2))
-    assert tracker.localize(ns(0.0), *hand.frame(0.0, 100))
-    assert not tracker.localize(ns(0.033), *nothing)
-    assert tracker.localize(ns(0.066), *hand.frame(0.066, 100)).tracked
-    for k in range(3, 8):
-        assert not tracker.localize(ns(0.033 * k), *nothing)
-    assert tracker.prediction(ns(0.033 * 8)) is None
-    assert tracker.localize(ns(0.033 * 8), *hand.frame(0.033 * 8, 100))
+    for t in times(5):
+        assert tracker.localize(ns(t), *hand.frame(t, 100))
+    spreads = []
+    for t in times(29, 5 / 30.0):
+        assert not tracker.localize(ns(t), *nothing)
+        spreads.append(np.trace(tracker.prediction(ns(t)).covariance[:6, :6]))
+    assert np.all(np.diff(spreads) > 0.0)
+    assert tracker.prediction(ns(4 / 30.0 + 1.01)) is None
+    back = tracker.localize(ns(34 / 30.0), *hand.frame(34 / 30.0, 100))
+    assert back
+    assert error(back, hand.motion(34 / 30.0))[0] < 0.03
+
+
+def at_times(tracker, hand, moments):
+    """Squared lengths (n,2) of errors of pose and twist, in their own covariances."""
+    found = []
+    for t in moments:
+        there, truth = tracker.at(ns(t)), hand.motion(t)
+        assert there.time_ns == ns(t)
+        turn = Rotation.from_matrix(there.rotation @ truth.rotation.T).as_rotvec()
+        place = there.rotation @ (-truth.rotation.T @ truth.translation - there.position)
+        off = np.concatenate([
+            turn, place, truth.angular_velocity - there.angular_velocity,
+            truth.linear_velocity - there.linear_velocity,
+        ])  # fmt: skip
+        covariance = there.covariance
+        found.append([off[part] @ np.linalg.solve(covariance[part, part], off[part])
+                      for part in (slice(0, 6), slice(6, 12))])  # fmt: skip
+    return np.array(found)
+
+
+@pytest.mark.parametrize("after", [-0.05, -0.026, 0.0, 0.008, -0.008, 0.03, 0.1])
+def test_poses_and_twists_at_any_time_are_covered(after):
+    """Between frames, within their rows, and after them; truth by finite differences."""
+    hand, lengths = Hand(), []
+    for start in 0.7 * np.arange(16):
+        tracker = Tracker(rsl.Localizer(CAMERA))
+        for t in times(7, start):
+            assert tracker.localize(ns(t), *hand.frame(t, 60, noise=0.3))
+        lengths.append(at_times(tracker, hand, [start + 0.2 + after])[0])
+    # 95 % of six degrees of freedom; and not far too wide.
+    inside = np.mean(np.array(lengths) < 12.6, axis=0)
+    assert np.all(inside > 0.8), inside
+    assert np.all(np.median(lengths, axis=0) > 0.3)
+
+
+def test_there_is_no_motion_before_the_frames_nor_long_after_them():
+    hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA), max_prediction=0.02)
+    assert tracker.at(ns(0.0)) is None
+    for t in times(4, 1.0):
+        tracker.localize(ns(t), *hand.frame(t, 60))
+    assert tracker.at(ns(1.1) + 19_000_000) is not None
+    assert tracker.at(ns(1.1) + 21_000_000) is None
+    assert tracker.at(ns(0.9)) is None
+
+
+def test_an_estimate_moves_on_with_its_own_velocities():
+    hand = Hand()
+    result = rsl.Localizer(CAMERA).localize(*hand.frame(1.0, 100, noise=0.01))
+    for seconds in (-0.015, 0.012):
+        there, truth = result.at_time(seconds), hand.motion(1.0 + seconds)
+        assert error(there, truth)[0] < 1e-3
+        np.testing.assert_allclose(there.angular_velocity, truth.angular_velocity, atol=3e-3)
+        np.testing.assert_allclose(there.linear_velocity, truth.linear_velocity, atol=3e-3)
+    with pytest.raises(ValueError, match="finite seconds"):
+        result.at_time(np.nan)
+
+
+def test_results_of_a_frame_later_know_their_velocities_better():
+    hand, errors = Hand(), {}
+    for lag in (0, 1, 2):
+        tracker = Tracker(rsl.Localizer(CAMERA), output_lag=lag)
+        results = [tracker.localize(ns(t), *hand.frame(t, 40, WALL)) for t in times(30)]
+        assert [str(r.reason) for r in results[:lag]] == ["awaits_frames"] * lag
+        found = [*results[lag:], *tracker.flush()]
+        assert [one.time_ns for one in found] == [ns(t) for t in times(30)]
+        truths = [hand.motion(t) for t in times(30)]
+        off = [np.linalg.norm(one.angular_velocity - truth.angular_velocity)
+               for one, truth in zip(found, truths, strict=True)]  # fmt: skip
+        errors[lag] = np.median(off[3:-3])
+    assert errors[1] < 0.85 * errors[0]
+    assert errors[2] < 1.1 * errors[1]
+
+
+def test_residuals_are_those_of_the_published_motion():
+    hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA))
+    for t in times(5):
+        points, pixels = hand.frame(t, 60)
+        result = tracker.localize(ns(t), points, pixels)
+    rotations, translations = result.at_rows(CAMERA.row_time(pixels))
+    shown = CAMERA.project(np.einsum("nij,nj->ni", rotations, points) + translations)
+    np.testing.assert_allclose(result.residuals, np.linalg.norm(shown - pixels, axis=1))
+    single = rsl.Localizer(CAMERA).localize(points, pixels)
+    rotations, translations = single.at_rows(CAMERA.row_time(pixels))
+    shown = CAMERA.project(np.einsum("nij,nj->ni", rotations, points) + translations)
+    np.testing.assert_allclose(single.residuals, np.linalg.norm(shown - pixels, axis=1), atol=1e-4)
 
 
 def test_a_prediction_that_is_rounding_errors_is_none():

@@ -21,7 +21,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from benchmarks.real import gyro, solvers
+from benchmarks.real import gyro, motion, solvers
 from benchmarks.real.calibrations import report
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
@@ -72,7 +72,7 @@ _PARTS = {
 }  # fmt: skip
 
 
-JUDGES = {"gyro": gyro.main, "solvers": solvers.main}
+JUDGES = {"gyro": gyro.main, "solvers": solvers.main, "aria": motion.main}
 """Beside the boards, by the first argument."""
 
 

@@ -22,6 +22,7 @@ class Reason(StrEnum):
     MODEL_ERROR = "model_error"
     UNCERTAIN = "uncertain"
     SCAN_AXIS = "scan_axis"
+    AWAITS_FRAMES = "awaits_frames"
     # Messages that cannot be used, or not yet.
     NO_CAMERA_INFO = "no_camera_info"
     BAD_CAMERA_INFO = "bad_camera_info"

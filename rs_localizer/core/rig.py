@@ -12,7 +12,6 @@ with ``R = I`` and ``p = 0``.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
@@ -379,8 +378,9 @@ class RigEstimate(Estimate):
             values[name] = ByCamera.of(values[name], places)
         return cls(**values, time=exposure.time, names=exposure.names)
 
-    def at_time(self, time: float) -> tuple[Array, Array]:
-        """Rotation (3,3) and translation (3,) rig_from_map at a time in s."""
-        if not (math.isfinite(time) and self.span > 0.0):
-            raise ValueError(f"time must be finite and the span known, got {time!r}, {self.span}")
-        return self.at((time - self.time) / self.span)
+    def at_time(self, time: float) -> RigEstimate:
+        """The motion at a time in s, by the clock of the stamps, with the covariance of then."""
+        # Not by super(): a dataclass with slots is made anew.
+        moved = Estimate.at_time(self, time - self.time)
+        assert isinstance(moved, RigEstimate)
+        return replace(moved, time=time)

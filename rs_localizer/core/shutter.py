@@ -17,6 +17,7 @@ there has ``exp(tau [w]x) R X + t + tau t_drift``, so ``t_drift = w x t - v``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,6 +27,16 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.state import (
+    ANGULAR,
+    ANGULAR_ACCELERATION,
+    LINEAR,
+    LINEAR_ACCELERATION,
+    MOVE,
+    PARAMETERS,
+    TURN,
+)
 
 Numbers = tuple[Array, Array, Array, Array, Array, Array]
 """The fields of a :class:`Motion`, in their order, as kernels take them."""
@@ -97,9 +108,62 @@ def motion_of(numbers: Numbers) -> Motion:
     return Motion(*velocities, angular_acceleration=change, linear_acceleration=acceleration)
 
 
+@kernel
+def carried(motion: Numbers, readouts: float, fading: float) -> tuple[Numbers, Array]:
+    """The motion some readout times later, or before, and its derivative (18,18)."""
+    rotation, translation, angular, linear, change, acceleration = motion
+    left = math.exp(-readouts / fading)
+    # What a unit of acceleration adds to the velocity and to the way.
+    faster = -fading * math.expm1(-readouts / fading)
+    farther = fading * (readouts - faster)
+    angle = readouts * angular + farther * change
+    way = readouts * linear + farther * acceleration
+    back = so3.exp(-angle)  # then_from_now
+    turned = so3.right_jacobian_of(angle)
+    velocity = back @ (linear + faster * acceleration)
+    transport = np.zeros((PARAMETERS, PARAMETERS))
+    transport[TURN, TURN] = back
+    transport[TURN, ANGULAR] = readouts * turned
+    transport[TURN, ANGULAR_ACCELERATION] = farther * turned
+    transport[MOVE, MOVE] = back
+    transport[MOVE, TURN] = -(back @ so3.hat_of(way))
+    transport[MOVE, LINEAR] = readouts * back
+    transport[MOVE, LINEAR_ACCELERATION] = farther * back
+    transport[LINEAR, LINEAR] = back
+    transport[LINEAR, LINEAR_ACCELERATION] = faster * back
+    transport[LINEAR_ACCELERATION, LINEAR_ACCELERATION] = left * back
+    across = so3.hat_of(velocity) @ turned
+    transport[LINEAR, ANGULAR] = readouts * across
+    transport[LINEAR, ANGULAR_ACCELERATION] = farther * across
+    # Without acceleration the body rate stays what it is, however far the camera turns.
+    mean = farther / readouts if readouts != 0.0 else 0.0
+    transport[ANGULAR, ANGULAR_ACCELERATION] = (faster - mean) * turned
+    transport[ANGULAR, ANGULAR] = np.eye(3)
+    transport[ANGULAR, ANGULAR_ACCELERATION] += mean * np.eye(3)
+    transport[ANGULAR_ACCELERATION, ANGULAR_ACCELERATION] = left * np.eye(3)
+    later = (
+        back @ rotation, back @ (translation - way), turned @ (angular + faster * change), velocity,
+        left * change, left * (back @ acceleration),
+    )  # fmt: skip
+    return later, transport
+
+
 # Secant steps double the digits; even rows that overtake the image settle well before this.
 _MOST_STEPS = 50
 _ROW_TIME_TOLERANCE = 1e-12
+
+
+def reprojection_errors(
+    camera: Camera, poses_at: Callable[[Array], tuple[Array, Array]], points: Array, pixels: Array
+) -> Array:
+    """How far (n,) px points (n,3) are from pixels (n,2), each seen at the time of its pixel's row.
+
+    Arguments otherwise as of :func:`project_rolling`; NaN behind the camera.
+    """
+    rotations, translations = poses_at(camera.row_time(pixels))
+    shown = camera.project(np.einsum("nij,nj->ni", rotations, points) + translations)
+    errors: Array = np.linalg.norm(shown - pixels, axis=1)
+    return errors
 
 
 def project_rolling(

@@ -15,9 +15,12 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scales import Scales
-from rs_localizer.core.shake import shake_at, within_rows
-from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import MOTION_PARAMETERS, TURN
+from rs_localizer.core.shake import FUNCTIONS, shake_at, shake_basis, within_rows
+from rs_localizer.core.shutter import Motion, carried, numbers_of
+from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, TURN
+
+# Readouts within which accelerations fade by exp(-1): they stay what they are.
+_NO_FADING = 1e9
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -46,12 +49,16 @@ class Estimate(Motion):
     undetected_covariance: Array = field(
         default_factory=np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)).copy
     )
+    # (18,m) by one deviation of each error of calibration and map, if no other frame told
+    calibration_shifts: Array = field(default_factory=np.zeros((PARAMETERS, 0)).copy)
     still_deviation: float = math.inf  # rad, orientation_deviation if the motion were known
     # (k,3) rad: what the camera turns beside the motion (rs_localizer.core.shake): vibration
     shake: Array = field(default_factory=np.zeros((0, 3)).copy)
     model_error: float = 0.0  # px, rms of what map, lens and motion leave beside the noise
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
     tracked: bool = False  # found near a prior motion, without a search
+    jumped: bool = False  # likewise, and the points denied that motion: they alone tell
+    time_ns: int = 0  # of a tracker: when the middle row was exposed
     # How a gyroscope says that the camera turned; velocities and accelerations are those of both
     turn: GyroRotation | None = None
     # By how many readouts the points would delay the known turn, and the variance of that
@@ -140,6 +147,46 @@ class Estimate(Motion):
         velocity = Motion.linear_velocity_at(self.without_gyro(), tau)
         turned: Array = self.turned_beside(tau) @ velocity
         return turned
+
+    def at_time(self, seconds: float) -> Estimate:
+        """The motion so many s after its middle row, with the covariance of then.
+
+        Within the rows it is the frame's own; beyond them it goes on under the acceleration that
+        it had, of which the covariance knows how uncertain it is.
+
+        Raises:
+            ValueError: where the readout time is unknown.
+        """
+        if not (math.isfinite(seconds) and self.span > 0.0):
+            raise ValueError(f"needs finite seconds and a span, got {seconds!r} and {self.span}")
+        tau = seconds / self.span
+        beside = numbers_of(self.without_gyro())
+        later, transport = carried(beside, tau, _NO_FADING)
+        rotation, translation = self.at(tau)
+        values, rates = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
+        shake_basis(within_rows(tau), values, rates)
+        shaken = len(self.shake)
+        transport = np.hstack([transport, np.zeros((PARAMETERS, 3 * shaken))])
+        for k in range(shaken):
+            own = slice(PARAMETERS + 3 * k, PARAMETERS + 3 * k + 3)
+            transport[TURN, own] = values[k] * np.eye(3)
+            transport[ANGULAR, own] = rates[k] * np.eye(3) if tau == within_rows(tau) else 0.0
+        shared = transport[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
+        return replace(
+            self,
+            rotation=rotation,
+            translation=translation,
+            angular_velocity=self.angular_velocity_at(tau),
+            linear_velocity=self.linear_velocity_at(tau),
+            angular_acceleration=later[4],
+            linear_acceleration=later[5],
+            joint_covariance=transport @ self.joint_covariance @ transport.T,
+            calibration_covariance=shared @ self.calibration_covariance @ shared.T,
+            undetected_covariance=shared @ self.undetected_covariance @ shared.T,
+            shake=np.zeros((0, 3)),
+            turn=None,
+            time_ns=self.time_ns + round(1e9 * seconds),
+        )
 
     @property
     def position(self) -> Array:

@@ -17,17 +17,9 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.shake import MIDDLE_RATES, MIDDLE_VALUES
-from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
+from rs_localizer.core.shutter import Motion, Numbers, carried, motion_of, numbers_of
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import (
-    ANGULAR,
-    ANGULAR_ACCELERATION,
-    LINEAR,
-    LINEAR_ACCELERATION,
-    MOVE,
-    PARAMETERS,
-    TURN,
-)
+from rs_localizer.core.state import ANGULAR, PARAMETERS, TURN
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.refine import inverted
 
@@ -46,49 +38,8 @@ def predict(
     and ``c + R way``; all parts of the error are carried to first order into the camera axes of
     then.
     """
-    later, carried = _later(numbers_of(motion), covariance, float(readouts), float(fading))
-    return motion_of(later), carried
-
-
-@kernel
-def _later(
-    motion: Numbers, covariance: Array, readouts: float, fading: float
-) -> tuple[Numbers, Array]:
-    rotation, translation, angular, linear, change, acceleration = motion
-    left = math.exp(-readouts / fading)
-    # What a unit of acceleration adds to the velocity and to the way.
-    faster = fading * (1.0 - left)
-    farther = fading * (readouts - faster)
-    angle = readouts * angular + farther * change
-    way = readouts * linear + farther * acceleration
-    back = so3.exp(-angle)  # then_from_now
-    turned = so3.right_jacobian_of(angle)
-    velocity = back @ (linear + faster * acceleration)
-    transport = np.zeros((PARAMETERS, PARAMETERS))
-    transport[TURN, TURN] = back
-    transport[TURN, ANGULAR] = readouts * turned
-    transport[TURN, ANGULAR_ACCELERATION] = farther * turned
-    transport[MOVE, MOVE] = back
-    transport[MOVE, TURN] = -(back @ so3.hat_of(way))
-    transport[MOVE, LINEAR] = readouts * back
-    transport[MOVE, LINEAR_ACCELERATION] = farther * back
-    transport[LINEAR, LINEAR] = back
-    transport[LINEAR, LINEAR_ACCELERATION] = faster * back
-    transport[LINEAR_ACCELERATION, LINEAR_ACCELERATION] = left * back
-    across = so3.hat_of(velocity) @ turned
-    transport[LINEAR, ANGULAR] = readouts * across
-    transport[LINEAR, ANGULAR_ACCELERATION] = farther * across
-    # Without acceleration the body rate stays what it is, however far the camera turns.
-    mean = farther / readouts
-    transport[ANGULAR, ANGULAR_ACCELERATION] = (faster - mean) * turned
-    transport[ANGULAR, ANGULAR] = np.eye(3)
-    transport[ANGULAR, ANGULAR_ACCELERATION] += mean * np.eye(3)
-    transport[ANGULAR_ACCELERATION, ANGULAR_ACCELERATION] = left * np.eye(3)
-    later = (
-        back @ rotation, back @ (translation - way), turned @ (angular + faster * change), velocity,
-        left * change, left * (back @ acceleration),
-    )  # fmt: skip
-    return later, transport @ covariance @ transport.T
+    later, transport = carried(numbers_of(motion), float(readouts), float(fading))
+    return motion_of(later), transport @ covariance @ transport.T
 
 
 def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time: float) -> Array:
@@ -103,9 +54,10 @@ def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time:
 
 
 @kernel
-def _singer(angular: float, linear: float, dt: float, readout_time: float) -> Array:
-    x = dt / FADING
-    block = np.empty((3, 3))  # of way, velocity and acceleration
+def singer(seconds: float) -> Array:
+    """Covariance (3,3) of way, velocity and acceleration that a unit acceleration adds, SI."""
+    x = seconds / FADING
+    block = np.empty((3, 3))
     if x < _SHORT:
         # White noise on the acceleration, to first order.
         block[0, 0], block[0, 1], block[0, 2] = x**5 / 10.0, x**4 / 4.0, x**3 / 3.0
@@ -118,12 +70,21 @@ def _singer(angular: float, linear: float, dt: float, readout_time: float) -> Ar
         block[1, 1] = 4.0 * e - 3.0 - e2 + 2.0 * x
         block[1, 2] = e2 + 1.0 - 2.0 * e
         block[2, 2] = 1.0 - e2
-    # Way, velocity per readout and acceleration per readout squared of a unit acceleration.
-    units = (FADING * FADING, FADING * readout_time, readout_time * readout_time)
-    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    units = (FADING * FADING, FADING, 1.0)
+    for i in range(3):
+        for j in range(i, 3):
+            block[i, j] *= units[i] * units[j]
+            block[j, i] = block[i, j]
+    return block
+
+
+@kernel
+def _singer(angular: float, linear: float, dt: float, readout_time: float) -> Array:
+    block, covariance = singer(dt), np.zeros((PARAMETERS, PARAMETERS))
+    units = (1.0, readout_time, readout_time * readout_time)
     for i in range(3):
         for j in range(3):
-            value = units[i] * units[j] * block[min(i, j), max(i, j)]
+            value = units[i] * units[j] * block[i, j]
             for axis in range(3):
                 row, column = 6 * i + axis, 6 * j + axis
                 covariance[row, column] = angular * angular * value
@@ -131,22 +92,23 @@ def _singer(angular: float, linear: float, dt: float, readout_time: float) -> Ar
     return covariance
 
 
-def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
-    """The motion without its shaking, its covariance (18,18), and that of the shaking.
+def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
+    """The motion without its shaking, its covariance (18,18), that of the shaking, and the
+    derivative (18,18 + 3 k) of that motion by the estimate's own and its coefficients.
 
     A camera that shakes is, in the middle row, somewhere on its swing; a frame later it is
     somewhere else on it. What a gyroscope knows of the turn is not in the motion, either.
     """
-    motion, covariance, swing = _unshaken(
+    motion, covariance, swing, jacobian = _unshaken(
         numbers_of(estimate.without_gyro()),
         np.ascontiguousarray(estimate.shake),
         np.ascontiguousarray(estimate.joint_covariance),
     )
-    return motion_of(motion), covariance, swing
+    return motion_of(motion), covariance, swing, jacobian
 
 
 @kernel
-def _unshaken(motion: Numbers, shake: Array, joint: Array) -> tuple[Numbers, Array, Array]:
+def _unshaken(motion: Numbers, shake: Array, joint: Array) -> tuple[Numbers, Array, Array, Array]:
     values, slopes = MIDDLE_VALUES, MIDDLE_RATES
     rotation, translation, angular, linear, change, acceleration = motion
     turn, rate, swing = np.zeros(3), np.zeros(3), np.zeros((PARAMETERS, PARAMETERS))
@@ -178,7 +140,7 @@ def _unshaken(motion: Numbers, shake: Array, joint: Array) -> tuple[Numbers, Arr
         for j in range(i):
             covariance[i, j] = 0.5 * (covariance[i, j] + covariance[j, i])
             covariance[j, i] = covariance[i, j]
-    return beside, covariance, swing
+    return beside, covariance, swing, jacobian
 
 
 def with_mean_turn(motion: Motion, covariance: Array, turn: GyroRotation) -> tuple[Motion, Array]:

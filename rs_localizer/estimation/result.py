@@ -179,5 +179,6 @@ def estimate_of(
         delay=delay,
         span=observed.sighted.exposure.span,
         calibration_covariance=effect.covariance,
+        calibration_shifts=effect.shifts,
         still_deviation=effect.still_deviation,
     )

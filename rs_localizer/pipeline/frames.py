@@ -179,6 +179,8 @@ class FrameLocalizer:
         self._tags: Tags | None = None
         self._stream = Stream(notice, self._forget_motion)
         self._pose_prior = PosePrior(notice)
+        # Of the last frames, by time of the middle row: with what their results are published.
+        self._waiting: dict[int, tuple[Correspondences, float]] = {}
         self._too_many = False  # whether clouds above max_points have been noticed
         self._settings = self._config = config  # an estimated readout time takes the place of one
         self._use(config)
@@ -231,7 +233,9 @@ class FrameLocalizer:
             # Without a readout time frames cannot predict each other; map and lens stay the same.
             memory = Memory.MOTION if timed else Memory.MAP_AND_LENS
         inertial = inertial_settings(config) if timed and alone else None
-        self._tracker = Tracker(Localizer(device, config), inertial, memory)
+        lag = config.output_lag if memory is Memory.MOTION and alone else 0
+        self._tracker = Tracker(Localizer(device, config), inertial, memory, lag)
+        self._waiting.clear()
         if config.rig != self._config.rig:
             self._assembler = FrameAssembler(config.cameras, config.rig.window, self._notice)
         self._cameras, self._config = seen, config
@@ -414,7 +418,19 @@ class FrameLocalizer:
         result = self._localize(cloud)
         if result:
             self._landmarks.lacking = False  # who sends correspondences needs none
-        return result
+        return self._delayed(result, cloud.stamp_ns)
+
+    def _delayed(self, newest: Localized | Refusal, stamp_ns: int) -> Localized | Refusal:
+        """The result that ``output_lag`` asks for once the frame of this stamp has come."""
+        tracker = self._tracker
+        if tracker.output_lag == 0 or tracker.newest_ns != self._middle_row_ns(stamp_ns):
+            return newest
+        late = tracker.delayed
+        if not late:
+            return Refusal(late.reason, late.detail)
+        waiting = self._waiting[late.time_ns]
+        published = self._published(waiting[0], late, waiting[1])
+        return self.mounted(published) if published else published
 
     def localize_keypoints(self, message: Any) -> Localized | Refusal:
         """Localize one sensor_msgs/PointCloud2 of keypoints; never raises for bad ones.
@@ -440,8 +456,8 @@ class FrameLocalizer:
             result = None if prior is None else self._localize_by_map(keypoints, prior)
             # Without its mounting a pose is none the worse.
             if result or (result is not None and result.reason is Reason.NO_TRANSFORM):
-                return result
-        return self._localize_by_map(keypoints, None)
+                return self._delayed(result, keypoints.stamp_ns)
+        return self._delayed(self._localize_by_map(keypoints, None), keypoints.stamp_ns)
 
     def localize_detections(self, message: Any) -> Localized | Refusal:
         """Localize one AprilTagDetectionArray by ``marker_map``; never raises for bad ones."""
@@ -517,7 +533,9 @@ class FrameLocalizer:
             matches = cloud.points, cloud.pixels, cloud.scores
             return self._tracker.localize(time_ns, *matches, imu=samples, context=context)
 
-        result = self.imu.track(self._tracker, config, time_ns, frame, self.transforms, localized)
+        self.imu.track(self._tracker, config, time_ns, frame, self.transforms, localized)
+        result = self._tracker.newest
+        assert result is not None
         try:
             adopted = self.readout_watch.add(Watched(time_ns, cloud, result, config, camera))
         except NotCompiled:  # what it takes comes, and the next frames tell it more
@@ -526,6 +544,10 @@ class FrameLocalizer:
         if result and not self.readout_watch.wrong_axis:
             self._stream.pace(time_ns, result, config)
             self._pose_prior.judge(result)
+        if self._tracker.output_lag > 0:
+            self._waiting[time_ns] = cloud, context.readout_time_deviation
+            while len(self._waiting) > self._tracker.output_lag + 1:
+                del self._waiting[next(iter(self._waiting))]
         published = self._published(cloud, result, context.readout_time_deviation)
         if adopted is not config:  # from the next frame on
             self._use(adopted)

@@ -114,6 +114,10 @@ REASONS: dict[str, Meaning] = {
         "set scan_direction to the direction that the message names; a driver that rotates images "
         "rotates the scan, too",
     ),
+    Reason.AWAITS_FRAMES: Meaning(
+        "output_lag holds results back until so many later frames have come",
+        "nothing is wrong: the first frames have none yet",
+    ),
     Reason.NO_CAMERA_INFO: Meaning(
         "no usable camera_info came before it", "is it recorded, is its topic the right one?"
     ),

@@ -1,0 +1,498 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The motion over the last frames: one trajectory, whose accelerations tell how large they are.
+
+Frames are samples of a trajectory of which accelerations fade while new ones come
+(:mod:`rs_localizer.estimation.motion_model`); what a frame's points say of its motion beside what
+was known before is a Gaussian ``exp(-d' L d / 2 + g' d)`` of the step ``d`` from its estimate. A
+filter runs forward through the window, a smoother back (Rauch, Tung, Striebel, "Maximum likelihood
+estimates of linear dynamic systems", 1965). With the prediction's covariance ``P`` and the smoothed
+step ``x`` from it, of covariance ``V``, the score of the variance of one axis' accelerations, of
+which the transition adds ``Q`` to ``P``, is
+
+    e' Q e - tr(Q M),      e = P^-1 x,      M = cov(e) = P^-1 - P^-1 V P^-1,
+
+and a variance ``r`` times as large makes it ``(r - 1) tr(Q M Q M)`` in the mean: so the scales of
+a tripod, of a hand and of a car are found within a few frames, from below and from above.
+
+What errors of calibration and map move is the same in all frames: their effect on each frame's
+points runs through the same gains (Schmidt, "Application of state-space methods to navigation
+problems", 1966), so that it does not tell a motion from frame to frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from rs_localizer.config import Acceleration
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.shutter import Motion, carried
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.state import (
+    MOTION_PARAMETERS,
+    PARAMETERS,
+    STATE_ANGULAR,
+    STATE_ANGULAR_ACCELERATION,
+    STATE_LINEAR,
+    STATE_LINEAR_ACCELERATION,
+    STATE_SIZE,
+    STATE_TRANSLATION,
+    rotation_of,
+    step_between,
+)
+from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.motion_model import FADING, singer, unshaken, with_mean_turn
+from rs_localizer.estimation.prior import PriorTerms, add_prior, state_in
+from rs_localizer.estimation.refine import apply_step, inverted
+
+LENGTH = 6
+"""Frames of the window: at 30 Hz a fifth of a second, in which a hand changes its mind."""
+# Weight of a transition's score by its age, in transitions.
+_FORGETTING = 0.8
+# Numbers that must have told of a scale before it follows them halfway.
+_DOUBT = 5.0
+# How much variances may change in a round, and rounds: by a hundred within two frames.
+_LEAST_CHANGE, _MOST_CHANGE, _ROUNDS = 0.2, 25.0, 2
+# Of the configured deviations: a tripod's, and that of a blow.
+_LEAST_SCALE, _MOST_SCALE = 0.03, 100.0
+# Who turns about one axis turns a little about the others: of the largest deviation.
+_LEAST_SHARE = 0.3
+
+
+class Gaussian(NamedTuple):
+    """A motion at a time; s, m and rad, camera_from_map."""
+
+    time_ns: int
+    state: Array  # (24,)
+    covariance: Array  # (18,18) of a step
+    shifts: Array  # (18,m) by one deviation of each error of calibration and map
+
+
+class Sample(NamedTuple):
+    """What the points of one frame say of its motion."""
+
+    time_ns: int
+    state: Array  # (24,) the frame's estimate
+    information: Array  # (18,18)
+    gradient: Array  # (18,)
+    pulls: Array  # (18,m) gradient by one deviation of each error of calibration and map
+
+
+class _Solved(NamedTuple):
+    predicted: Array  # (n,24)
+    predictions: Array  # (n,18,18) their covariances
+    transports: Array  # (n,18,18) from the sample before
+    filtered: Array  # (n,24)
+    covariances: Array  # (n,18,18)
+    shifts: Array  # (n,18,m)
+    smoothed: Array  # (n,24)
+    smoothed_covariances: Array  # (n,18,18)
+    smoothed_shifts: Array  # (n,18,m)
+    scores: Array  # (4,3) of the deviations: squared, expected, information
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionWindow:
+    """The last frames with a pose that hang together.
+
+    Args:
+        start: the motion of the frame before them, by all frames until then.
+        samples: the frames after it.
+        deviations: (4,) of accelerations, angular about the camera's axes (rad/s^2) and linear.
+        configured: (4,) those of the settings.
+        readout_share: deviation of the readout time, as a part of it.
+    """
+
+    start: Gaussian
+    configured: Array
+    deviations: Array
+    samples: tuple[Sample, ...] = ()
+    solved: _Solved | None = None
+    readout_share: float = 0.0
+
+    @classmethod
+    def begin(
+        cls, start: Gaussian, acceleration: Acceleration, readout_share: float = 0.0
+    ) -> MotionWindow:
+        """From a motion of which no other frame tells."""
+        configured = np.repeat([acceleration.angular, acceleration.linear], (3, 1)).astype(float)
+        return cls(start, configured, configured.copy(), readout_share=readout_share)
+
+    @property
+    def newest(self) -> Gaussian:
+        """The motion of the last frame, as all frames tell."""
+        return self.before(0)
+
+    @property
+    def times(self) -> list[int]:
+        """Of its frames, ns."""
+        return [self.start.time_ns, *(sample.time_ns for sample in self.samples)]
+
+    @property
+    def surprise(self) -> float:
+        """Squared distance of the last frame's points from its prediction; chi-squared of 18."""
+        if self.solved is None:
+            return 0.0
+        solved, sample = self.solved, self.samples[-1]
+        moved = step_between(solved.predicted[-1], solved.filtered[-1])
+        pulled = step_between(sample.state, solved.filtered[-1])
+        squared = moved @ np.linalg.solve(solved.predictions[-1], moved)
+        squared += pulled @ (sample.information @ pulled - 2.0 * sample.gradient)
+        return float(squared)
+
+    def __len__(self) -> int:
+        return len(self.samples) + 1
+
+    def before(self, frames: int) -> Gaussian:
+        """The motion so many frames before the last one, as all frames tell."""
+        if self.solved is None:
+            return self.start
+        row = len(self.samples) - 1 - frames
+        if row < 0:
+            return self._smoothed_start()
+        solved = self.solved
+        return Gaussian(
+            self.samples[row].time_ns, solved.smoothed[row], solved.smoothed_covariances[row],
+            solved.smoothed_shifts[row],
+        )  # fmt: skip
+
+    def after(self, time_ns: int) -> Gaussian:
+        """The motion at a time after the last frame."""
+        return _moved(self.newest, time_ns, self.deviations, self.readout_share)
+
+    def at(self, time_ns: int) -> Gaussian | None:
+        """The motion at a time, as all frames tell; None before the first of them."""
+        if time_ns < self.start.time_ns:
+            return None
+        if time_ns >= self.newest.time_ns:
+            return self.after(time_ns)
+        times = self.times
+        if time_ns in times:
+            return self.before(len(times) - 1 - times.index(time_ns))
+        row = int(np.searchsorted(times, time_ns)) - 1
+        neighbour = self.samples[row]
+        silent = Sample(
+            time_ns, neighbour.state, np.zeros((PARAMETERS,) * 2), np.zeros(PARAMETERS),
+            np.zeros_like(neighbour.pulls),
+        )  # fmt: skip
+        samples = (*self.samples[:row], silent, *self.samples[row:])
+        solved = _solved(self.start, samples, self.deviations, self.readout_share)
+        return replace(self, samples=samples, solved=solved).before(len(self.samples) - row)
+
+    def joined(self, sample: Sample) -> MotionWindow:
+        """With one more frame, and with what it tells of the accelerations."""
+        start, samples = self.start, (*self.samples, sample)
+        if len(samples) >= LENGTH:
+            assert self.solved is not None
+            first, solved = samples[0], self.solved
+            start = Gaussian(
+                first.time_ns, solved.filtered[0], solved.covariances[0], solved.shifts[0]
+            )
+            samples = samples[1:]
+        deviations = self.deviations
+        for _ in range(_ROUNDS):
+            solved = _solved(start, samples, deviations, self.readout_share)
+            deviations = self._learnt(deviations, solved.scores)
+        solved = _solved(start, samples, deviations, self.readout_share)
+        return replace(self, start=start, samples=samples, deviations=deviations, solved=solved)
+
+    def _learnt(self, deviations: Array, scores: Array) -> Array:
+        """Deviations (4,) that the scores (4,3) would rather have."""
+        squared, expected, information = scores.T
+        ratio = 1.0 + (squared - expected) / (information + _DOUBT)
+        changed = deviations * np.sqrt(np.clip(ratio, _LEAST_CHANGE, _MOST_CHANGE))
+        changed = np.clip(changed / self.configured, _LEAST_SCALE, _MOST_SCALE) * self.configured
+        changed[:3] = np.maximum(changed[:3], _LEAST_SHARE * changed[:3].max())
+        learnt: Array = changed
+        return learnt
+
+    def _smoothed_start(self) -> Gaussian:
+        solved, start = self.solved, self.start
+        assert solved is not None
+        return Gaussian(
+            start.time_ns,
+            *_back(
+                start.state, start.covariance, start.shifts, solved.predicted[0],
+                solved.predictions[0], solved.transports[0], solved.smoothed[0],
+                solved.smoothed_covariances[0], solved.smoothed_shifts[0],
+            ),
+        )  # fmt: skip
+
+
+def _moved(motion: Gaussian, time_ns: int, deviations: Array, readout_share: float) -> Gaussian:
+    seconds = 1e-9 * (time_ns - motion.time_ns)
+    if seconds == 0.0:
+        return motion
+    state, covariance, transport = _predicted(
+        motion.state, motion.covariance, seconds, deviations, readout_share
+    )
+    return Gaussian(time_ns, state, covariance, transport @ motion.shifts)
+
+
+def _solved(
+    start: Gaussian, samples: tuple[Sample, ...], deviations: Array, readout_share: float
+) -> _Solved:
+    times = np.array([1e-9 * (sample.time_ns - start.time_ns) for sample in samples])
+    width = max(start.shifts.shape[1], *(sample.pulls.shape[1] for sample in samples))
+    pulls = np.zeros((len(samples), PARAMETERS, width))
+    for k, sample in enumerate(samples):
+        pulls[k, :, : sample.pulls.shape[1]] = sample.pulls
+    shifts = np.zeros((PARAMETERS, width))
+    shifts[:, : start.shifts.shape[1]] = start.shifts
+    return _Solved(
+        *_solve(
+            times, np.array([sample.state for sample in samples]),
+            np.array([sample.information for sample in samples]),
+            np.array([sample.gradient for sample in samples]), pulls,
+            start.state, start.covariance, shifts, deviations, readout_share,
+        )
+    )  # fmt: skip
+
+
+@kernel
+def _predicted(
+    state: Array, covariance: Array, seconds: float, deviations: Array, readout_share: float
+) -> tuple[Array, Array, Array]:
+    """State and covariance so much later, and the derivative of the state."""
+    numbers = (
+        state[:9].copy().reshape(3, 3), state[9:12].copy(), state[12:15].copy(),
+        state[15:18].copy(), state[18:21].copy(), state[21:24].copy(),
+    )  # fmt: skip
+    later, transport = carried(numbers, seconds, FADING)
+    predicted = np.empty(STATE_SIZE)
+    predicted[:9] = later[0].copy().reshape(9)
+    predicted[9:12], predicted[12:15], predicted[15:18] = later[1], later[2], later[3]
+    predicted[18:21], predicted[21:24] = later[4], later[5]
+    spread = transport @ covariance @ transport.T + _noise(seconds, deviations)
+    for i in range(6):
+        for j in range(6):
+            moved = predicted[12 + i] * predicted[12 + j]
+            spread[i, j] += (readout_share * seconds) ** 2 * moved
+    return predicted, spread, transport
+
+
+@kernel
+def _noise(seconds: float, deviations: Array) -> Array:
+    """What new accelerations add (18,18)."""
+    unit = singer(abs(seconds))
+    noise = np.zeros((PARAMETERS, PARAMETERS))
+    for i in range(3):
+        for j in range(3):
+            for axis in range(6):
+                square = deviations[min(axis, 3)] ** 2
+                noise[6 * i + axis, 6 * j + axis] = square * unit[i, j]
+    return noise
+
+
+@kernel
+def _back(
+    state: Array, covariance: Array, shifts: Array, predicted: Array, prediction: Array,
+    transport: Array, smoothed: Array, smoothed_covariance: Array, smoothed_shifts: Array,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """A filtered motion with what the next sample's smoothed one tells of it."""
+    gain = covariance @ transport.T @ inverted(prediction)
+    back = apply_step(state, gain @ step_between(predicted, smoothed))
+    spread = covariance + gain @ (smoothed_covariance - prediction) @ gain.T
+    moved = shifts + gain @ (smoothed_shifts - transport @ shifts)
+    return back, 0.5 * (spread + spread.T), moved
+
+
+@kernel
+def _solve(
+    times: Array, states: Array, informations: Array, gradients: Array, pulls: Array,
+    start: Array, start_covariance: Array, start_shifts: Array, deviations: Array,
+    readout_share: float,
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:  # fmt: skip
+    """Filter and smoother: the fields of :class:`_Solved`; times (n,) in s after the start."""
+    count, width = len(times), pulls.shape[2]
+    square = (count, PARAMETERS, PARAMETERS)
+    predicted, filtered = np.empty((count, STATE_SIZE)), np.empty((count, STATE_SIZE))
+    predictions, transports, covariances = np.empty(square), np.empty(square), np.empty(square)
+    shifts = np.empty((count, PARAMETERS, width))
+    state, covariance, shift, time = start, start_covariance, start_shifts, 0.0
+    for k in range(count):
+        predicted[k], predictions[k], transports[k] = _predicted(
+            state, covariance, times[k] - time, deviations, readout_share
+        )
+        known = inverted(predictions[k])
+        covariances[k] = inverted(informations[k] + known)
+        right = gradients[k] + known @ step_between(states[k], predicted[k])
+        filtered[k] = apply_step(states[k], covariances[k] @ right)
+        shifts[k] = covariances[k] @ (pulls[k] + known @ (transports[k] @ shift))
+        state, covariance, shift, time = filtered[k], covariances[k], shifts[k], times[k]
+    smoothed, smoothed_covariances = filtered.copy(), covariances.copy()
+    smoothed_shifts, scores = shifts.copy(), np.zeros((4, 3))
+    weight, block, unit = 1.0, np.empty((3, 3)), np.empty((3, 3))
+    for k in range(count - 1, -1, -1):
+        known = inverted(predictions[k])
+        pulled = known @ step_between(predicted[k], smoothed[k])
+        spread = known - known @ smoothed_covariances[k] @ known
+        unit[:] = singer(times[k] - (times[k - 1] if k > 0 else 0.0))
+        for axis in range(6):
+            place, total, expected = min(axis, 3), 0.0, 0.0
+            for i in range(3):
+                for j in range(3):
+                    added = deviations[place] ** 2 * unit[i, j]
+                    total += added * pulled[6 * i + axis] * pulled[6 * j + axis]
+                    block[i, j] = 0.0
+                    for m in range(3):
+                        shared = deviations[place] ** 2 * unit[i, m]
+                        block[i, j] += shared * spread[6 * m + axis, 6 * j + axis]
+                expected += block[i, i]
+            scores[place, 0] += weight * total
+            scores[place, 1] += weight * expected
+            for i in range(3):
+                for j in range(3):
+                    scores[place, 2] += weight * block[i, j] * block[j, i]
+        weight *= _FORGETTING
+        if k > 0:
+            smoothed[k - 1], smoothed_covariances[k - 1], smoothed_shifts[k - 1] = _back(
+                filtered[k - 1], covariances[k - 1], shifts[k - 1], predicted[k], predictions[k],
+                transports[k], smoothed[k], smoothed_covariances[k], smoothed_shifts[k],
+            )  # fmt: skip
+    return (
+        predicted, predictions, transports, filtered, covariances, shifts, smoothed,
+        smoothed_covariances, smoothed_shifts, scores,
+    )  # fmt: skip
+
+
+@kernel
+def _told_by_points(covariance: Array, known: Array) -> Array:
+    """Information (18,18) of a posterior's covariance beside that which was known before.
+
+    By the eigenvalues of what was known, in units of the posterior: none of them exceeds 1.
+    """
+    whole = inverted(covariance)
+    scale = np.sqrt(np.diag(whole))
+    units = np.outer(scale, scale)
+    factor = np.linalg.cholesky(whole / units)
+    back = np.linalg.inv(factor)
+    part = back @ (known / units) @ back.T
+    values, vectors = np.linalg.eigh(0.5 * (part + part.T))
+    root = np.empty_like(whole)
+    for k in range(len(values)):
+        root[:, k] = vectors[:, k] * np.sqrt(max(1.0 - values[k], 0.0))
+    half = np.ascontiguousarray(factor) @ root
+    told: Array = (half @ half.T) * units
+    return told
+
+
+def _per_second(span: float) -> Array:
+    """Of a step (18,): per second what is per readout."""
+    units: Array = np.repeat(1.0 / span ** np.array([0, 0, 1, 1, 2, 2]), 3)
+    return units
+
+
+def _state(motion: Motion, units: Array) -> Array:
+    state: Array = state_in(motion, np.zeros(3))
+    state[12:] *= units[6:]
+    return state
+
+
+def gaussian_of(estimate: Estimate, time_ns: int) -> Gaussian:
+    """What one frame says of its motion without its shaking, and without a gyroscope's turn."""
+    motion, covariance, _, _ = unshaken(estimate)
+    if estimate.turn is not None:
+        motion, covariance = with_mean_turn(motion, covariance, estimate.turn)
+    units = _per_second(estimate.span)
+    shifts = units[:, None] * estimate.calibration_shifts
+    return Gaussian(time_ns, _state(motion, units), covariance * np.outer(units, units), shifts)
+
+
+def motion_of(gaussian: Gaussian, span: float) -> tuple[Motion, Array]:
+    """The motion and its covariance (18,18), per readout of ``span`` s."""
+    units = 1.0 / _per_second(span)
+    state = gaussian.state.copy()
+    state[12:] *= units[6:]
+    motion = Motion(
+        rotation_of(state).copy(), state[STATE_TRANSLATION], state[STATE_ANGULAR],
+        state[STATE_LINEAR], angular_acceleration=state[STATE_ANGULAR_ACCELERATION],
+        linear_acceleration=state[STATE_LINEAR_ACCELERATION],
+    )  # fmt: skip
+    return motion, gaussian.covariance * np.outer(units, units)
+
+
+def sample_of(
+    estimate: Estimate, time_ns: int, known: PriorTerms, configured: PriorTerms
+) -> Sample:
+    """What the points of an estimate say beside what was known of its motion before.
+
+    Args:
+        known: that, in the map's frame.
+        configured: what the settings alone know of any frame.
+    """
+    motion, covariance, _, _ = unshaken(estimate)
+    information, slope = np.zeros((PARAMETERS,) * 2), np.zeros(PARAMETERS)
+    add_prior(known, state_in(motion, np.zeros(3)), 1.0, information, slope)
+    units = _per_second(estimate.span)
+    told: Array = _told_by_points(covariance, information)
+    # As far as the settings' prior lets errors move the motion, the points have pulled it.
+    pulls = (told + configured.informations[0]) @ estimate.calibration_shifts
+    return Sample(
+        time_ns, _state(motion, units), told / np.outer(units, units), slope / units,
+        pulls / units[:, None],
+    )  # fmt: skip
+
+
+def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
+    """A frame's estimate with what a window knows of its motion; residuals are as they were.
+
+    What shakes beside the motion goes along as far as the frame's covariance ties it to it.
+    """
+    motion, covariance, _, jacobian = unshaken(estimate)
+    known, spread = motion_of(gaussian, estimate.span)
+    joint = estimate.joint_covariance
+    gain = np.linalg.solve(covariance, jacobian @ joint).T
+    origin = np.zeros(3)
+    step = gain @ step_between(state_in(motion, origin), state_in(known, origin))
+    state = apply_step(state_in(estimate, origin), step[:PARAMETERS])
+    joint = joint + gain @ (spread - covariance) @ gain.T
+    units = 1.0 / _per_second(estimate.span)
+    shifts = gain[:MOTION_PARAMETERS] @ (units[:, None] * gaussian.shifts)
+    return replace(
+        estimate,
+        rotation=rotation_of(state).copy(),
+        translation=state[STATE_TRANSLATION],
+        angular_velocity=state[STATE_ANGULAR],
+        linear_velocity=state[STATE_LINEAR],
+        angular_acceleration=state[STATE_ANGULAR_ACCELERATION],
+        linear_acceleration=state[STATE_LINEAR_ACCELERATION],
+        shake=estimate.shake + step[PARAMETERS:].reshape(-1, 3),
+        joint_covariance=0.5 * (joint + joint.T),
+        calibration_covariance=shifts @ shifts.T,
+    )
+
+
+def predicted_estimate(nearest: Estimate, gaussian: Gaussian, swing: Array) -> Estimate:
+    """The motion between frames or after them, beside the points of the nearest frame.
+
+    Args:
+        swing: (18,18) covariance of the shaking about that motion, per readout.
+    """
+    motion, covariance = motion_of(gaussian, nearest.span)
+    units = 1.0 / _per_second(nearest.span)
+    shifts = (units[:, None] * gaussian.shifts)[:MOTION_PARAMETERS]
+    return replace(
+        nearest,
+        **{each.name: getattr(motion, each.name) for each in fields(Motion)},
+        joint_covariance=covariance + swing,
+        calibration_covariance=shifts @ shifts.T,
+        shake=np.zeros((0, 3)),
+        turn=None,
+        time_ns=gaussian.time_ns,
+    )
+
+
+def warm_up() -> None:
+    """Compile the kernels, or load them from the cache."""
+    still = np.concatenate([np.eye(3).ravel(), np.zeros(STATE_SIZE - 9)])
+    unit = np.eye(PARAMETERS)
+    start = Gaussian(0, still, unit, np.zeros((PARAMETERS, 1)))
+    sample = Sample(10**7, still, unit, np.zeros(PARAMETERS), np.zeros((PARAMETERS, 1)))
+    window = MotionWindow.begin(start, Acceleration(1.0, 1.0)).joined(sample)
+    window.before(1)
+    window.after(2 * 10**7)
+    _told_by_points(unit, 0.5 * unit)

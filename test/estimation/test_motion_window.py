@@ -1,0 +1,288 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The motion over several frames, against dense least squares by SciPy."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import rs_localizer as rsl
+from rs_localizer.config import Acceleration
+from rs_localizer.core.state import step_between
+from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.motion_window import (
+    LENGTH,
+    Gaussian,
+    MotionWindow,
+    Sample,
+    estimate_at,
+    gaussian_of,
+    sample_of,
+)
+from rs_localizer.estimation.prior import Prior, motion_terms, with_motion
+from rs_localizer.estimation.refine import apply_step
+
+FADING, PERIOD = 0.1, 1.0 / 30.0  # s
+SPAN = 0.03
+STILL = np.concatenate([np.eye(3).ravel(), np.zeros(15)])
+# Motions small enough that turns add up.
+SMALL = 1e-3
+HAND = SMALL * np.repeat([10.0, 4.0], 3)  # rad/s^2, m/s^2
+# Deviations of what a frame sees of each number of its motion; accelerations it does not see.
+NOISE = SMALL * np.repeat([3e-4, 2e-3, 0.05, 0.1], 3)
+SEEN = np.diag(np.concatenate([NOISE**-2.0, np.zeros(6)]))
+WIDE = np.diag((SMALL * np.repeat([0.1, 0.1, 1.0, 1.0, 10.0, 4.0], 3)) ** 2)
+
+
+def dynamics():
+    """Of way, velocity and acceleration over a period: transition, and noise of a unit."""
+    matrix = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / FADING]])
+    steps = 400
+    noise, dt = np.zeros((3, 3)), PERIOD / steps
+    for k in range(steps):
+        reached = expm((k + 0.5) * dt * matrix)[:, 2]
+        noise += dt * 2.0 / FADING * np.outer(reached, reached)
+    return expm(PERIOD * matrix), noise
+
+
+STEP, UNIT_NOISE = dynamics()
+
+
+def whole(blocks):
+    """(18,18) of six axes' blocks (3,3): way, velocity, acceleration of turn and place."""
+    result = np.zeros((18, 18))
+    for axis, block in enumerate(blocks):
+        own = np.array([axis, axis + 6, axis + 12])
+        result[np.ix_(own, own)] = block
+    return result
+
+
+def simulated(deviations, count, rng, state=None):
+    """Small motions (count,18) about rest, whose accelerations have these deviations (6,)."""
+    factor = np.linalg.cholesky(UNIT_NOISE)
+    if state is None:
+        state = np.zeros((6, 3))
+        state[:, 2] = deviations * rng.normal(size=6)
+    path = []
+    for _ in range(count):
+        state = state @ STEP.T + deviations[:, None] * (rng.normal(size=(6, 3)) @ factor.T)
+        path.append(state.T.ravel())
+    return np.array(path), state
+
+
+def samples_of(path, rng, first=0):
+    """What frames see of it."""
+    found = []
+    for k, truth in enumerate(path):
+        seen = truth + np.concatenate([NOISE * rng.normal(size=12), np.zeros(6)])
+        seen[12:] = 0.0
+        time_ns = round(1e9 * PERIOD * (first + k + 1))
+        found.append(
+            Sample(time_ns, apply_step(STILL, seen), SEEN, np.zeros(18), np.zeros((18, 0)))
+        )
+    return found
+
+
+def start():
+    return Gaussian(0, STILL, WIDE, np.zeros((18, 0)))
+
+
+def through(samples, window=None):
+    window = window or MotionWindow.begin(start(), Acceleration(HAND[0], HAND[3]))
+    for sample in samples:
+        window = window.joined(sample)
+    return window
+
+
+def dense(samples, deviations):
+    """All motions at once by least squares: means (n + 1,18) and covariances (n + 1,18,18)."""
+    n = len(samples)
+    size = 18 * (n + 1)
+    information, right = np.zeros((size, size)), np.zeros(size)
+    information[:18, :18] += np.linalg.inv(WIDE)
+    move = whole([STEP] * 6)
+    inverse = np.linalg.inv(whole([d**2 * UNIT_NOISE for d in deviations]))
+    for k, sample in enumerate(samples):
+        rows = np.zeros((18, size))
+        rows[:, 18 * k : 18 * k + 18] = -move
+        rows[:, 18 * k + 18 : 18 * k + 36] = np.eye(18)
+        information += rows.T @ inverse @ rows
+        own = slice(18 * k + 18, 18 * k + 36)
+        information[own, own] += sample.information
+        right[own] += sample.information @ step_between(STILL, sample.state)
+    covariance = np.linalg.inv(information)
+    return (covariance @ right).reshape(n + 1, 18), [
+        covariance[18 * k : 18 * k + 18, 18 * k : 18 * k + 18] for k in range(n + 1)
+    ]
+
+
+def test_it_is_least_squares_over_all_its_frames():
+    rng = np.random.default_rng(0)
+    path, _ = simulated(0.1 * HAND, LENGTH - 1, rng)
+    samples = samples_of(path, rng)
+    window = through(samples)
+    means, covariances = dense(samples, np.repeat(window.deviations, (1, 1, 1, 3)))
+    scale = np.sqrt(np.diag(covariances[-1]))
+    for k in range(LENGTH):
+        found = window.before(len(samples) - k)
+        np.testing.assert_allclose(
+            step_between(STILL, found.state) / scale, means[k] / scale, atol=0.03
+        )
+        np.testing.assert_allclose(
+            found.covariance / np.outer(scale, scale),
+            covariances[k] / np.outer(scale, scale), atol=0.01, rtol=0.01,
+        )  # fmt: skip
+        assert found.time_ns == (0 if k == 0 else samples[k - 1].time_ns)
+
+
+def test_frames_that_leave_the_window_still_count():
+    rng = np.random.default_rng(1)
+    path, _ = simulated(HAND, 12, rng)
+    samples = samples_of(path, rng)
+    window = through(samples)
+    assert len(window) == LENGTH
+    means, covariances = dense(samples, np.repeat(window.deviations, (1, 1, 1, 3)))
+    scale = np.sqrt(np.diag(covariances[-1]))
+    # Scales have changed on the way.
+    off = (step_between(STILL, window.newest.state) - means[-1]) / scale
+    assert np.abs(off).max() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "frames", "low", "high"),
+    # From a hand to a blow, and back; to a tripod, of which noise leaves no more to be told.
+    [(0.1, 10.0, 4, 0.5, 2.0), (10.0, 1.0, 12, 0.5, 2.0), (1.0, 0.03, 16, 0.0, 10.0)],
+)
+def test_scales_are_learnt_from_both_sides_within_a_few_frames(before, after, frames, low, high):
+    rng = np.random.default_rng(2)
+    found = []
+    for _ in range(20):
+        path, state = simulated(before * HAND, 8, rng)
+        window = through(samples_of(path, rng))
+        state[:, 2] = after * HAND * rng.normal(size=6)
+        path, _ = simulated(after * HAND, frames, rng, state)
+        found.append(through(samples_of(path, rng, 8), window).deviations)
+    typical = np.exp(np.mean(np.log(found), axis=0)) / HAND[[0, 1, 2, 3]]
+    assert np.all(typical > low * after), typical
+    assert np.all(typical < high * after), typical
+
+
+def test_deviations_hold_the_errors_of_every_lag():
+    rng = np.random.default_rng(3)
+    squared = {0: [], 1: [], 2: []}
+    for _ in range(60):
+        path, _ = simulated(0.5 * HAND, 10, rng)
+        window = through(samples_of(path, rng))
+        for lag, found in squared.items():
+            there = window.before(lag)
+            off = step_between(there.state, apply_step(STILL, path[-1 - lag]))[:12]
+            found.append(off @ np.linalg.solve(there.covariance[:12, :12], off))
+    for lag, found in squared.items():
+        assert 0.85 < np.mean(np.array(found) < 21.03) <= 1.0, lag  # chi-squared of 12
+        assert 8.0 < np.mean(found) < 18.0, lag
+
+
+def test_between_frames_it_passes_through_both_and_after_them_it_spreads():
+    rng = np.random.default_rng(4)
+    path, _ = simulated(0.5 * HAND, 5, rng)
+    window = through(samples_of(path, rng))
+    before, last = window.before(1), window.newest
+    for near, frame in ((before.time_ns + 1000, before), (last.time_ns - 1000, last)):
+        found = window.at(near)
+        np.testing.assert_allclose(found.state, frame.state, atol=1e-3 * SMALL)
+        scale = np.sqrt(np.diag(frame.covariance))
+        np.testing.assert_allclose(
+            found.covariance / np.outer(scale, scale), frame.covariance / np.outer(scale, scale),
+            atol=0.02,
+        )  # fmt: skip
+    middle = window.at((before.time_ns + last.time_ns) // 2)
+    turn = step_between(before.state, middle.state)[:3]
+    halfway = 0.5 * step_between(before.state, last.state)[:3]
+    np.testing.assert_allclose(turn, halfway, atol=3e-3 * SMALL)
+    grown = [np.trace(window.after(last.time_ns + ms * 10**6).covariance[:3, :3])
+             for ms in (0, 10, 30, 100)]  # fmt: skip
+    assert np.all(np.diff(grown) > 0.0)
+    assert window.at(window.start.time_ns - 1) is None
+
+
+def test_what_all_frames_share_is_no_motion():
+    """An error that turns every frame alike moves the pose, and no velocity."""
+    shared = np.zeros((18, 1))
+    shared[:3, 0] = [1e-3, -2e-3, 5e-4]
+    pulls = SEEN @ shared
+    samples = [sample._replace(pulls=pulls)
+               for sample in samples_of(np.zeros((8, 18)), np.random.default_rng(5))]  # fmt: skip
+    window = MotionWindow.begin(
+        start()._replace(shifts=shared, covariance=np.linalg.inv(SEEN + np.linalg.inv(WIDE))),
+        Acceleration(HAND[0], HAND[3]),
+    )
+    window = through(samples, window)
+    for lag in (0, 1, 2):
+        shifts = window.before(lag).shifts
+        np.testing.assert_allclose(shifts[:3], shared[:3], rtol=1e-4)
+        np.testing.assert_allclose(shifts[6:9], 0.0, atol=1e-5)
+
+
+def estimate(step, joint, shake=None):
+    state = apply_step(STILL, step)
+    return Estimate(
+        state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18],
+        angular_acceleration=state[18:21], linear_acceleration=state[21:],
+        inliers=np.ones(5, bool), residuals=np.zeros(5), joint_covariance=joint,
+        global_shutter_inliers=0, iterations=0, span=SPAN,
+        shake=np.zeros((0, 3)) if shake is None else shake,
+    )  # fmt: skip
+
+
+UNITS = np.repeat([1.0, 1.0, SPAN, SPAN, SPAN**2, SPAN**2], 3)  # per readout
+
+
+def test_points_tell_what_the_posterior_knows_beside_its_prior():
+    rng = np.random.default_rng(6)
+    root = rng.normal(size=(18, 18))
+    information = 1e4 * root[:, :10] @ root[:, :10].T  # some numbers are not seen at all
+    gradient = information @ (1e-3 * rng.normal(size=18))
+    spread = 1e-4 * (root @ root.T + np.eye(18))
+    known = with_motion(
+        motion_terms((1.0, 1.0), (1.0, 1.0)),
+        Prior(motion=rsl.Motion(np.eye(3), *np.zeros((3, 3))), covariance=spread), np.zeros(3),
+    )  # fmt: skip
+    before = np.linalg.inv(spread)
+    before[6:12, 6:12] += np.eye(6)  # the velocities of the settings
+    posterior = np.linalg.inv(information + before)
+    sample = sample_of(estimate(posterior @ gradient, posterior), 7, known, known)
+    scale = np.sqrt(np.diag(information + before))
+    np.testing.assert_allclose(
+        sample.information / np.outer(UNITS * scale, UNITS * scale),
+        information / np.outer(scale, scale), atol=2e-3,
+    )  # fmt: skip
+    # The gradient at the estimate: the points pull as much as the prior holds.
+    left = gradient - information @ (posterior @ gradient)
+    np.testing.assert_allclose(
+        sample.gradient / UNITS / scale, left / scale, atol=1e-2 * np.abs(left / scale).max()
+    )
+
+
+def test_an_estimate_by_its_own_window_is_itself():
+    rng = np.random.default_rng(7)
+    root = 1e-3 * rng.normal(size=(18 + 84, 18 + 84))
+    fit = estimate(1e-2 * rng.normal(size=18), root @ root.T, 1e-3 * rng.normal(size=(28, 3)))
+    same = estimate_at(fit, gaussian_of(fit, 0))
+    np.testing.assert_allclose(same.rotation, fit.rotation, atol=1e-9)
+    np.testing.assert_allclose(same.shake, fit.shake, atol=1e-9)
+    np.testing.assert_allclose(same.joint_covariance, fit.joint_covariance, atol=1e-10)
+
+
+def test_shaking_goes_along_with_the_motion_that_it_is_tied_to():
+    """Conditioning on an exactly known motion beside the shaking."""
+    rng = np.random.default_rng(8)
+    root = 1e-3 * rng.normal(size=(18 + 84, 18 + 84))
+    fit = estimate(np.zeros(18), root @ root.T, np.zeros((28, 3)))
+    own = gaussian_of(fit, 0)
+    exact = own._replace(state=apply_step(own.state, 1e-4 * rng.normal(size=18)),
+                         covariance=1e-16 * np.eye(18))  # fmt: skip
+    by = estimate_at(fit, exact)
+    again = gaussian_of(by, 0)
+    np.testing.assert_allclose(again.state, exact.state, atol=1e-8)
+    assert np.abs(again.covariance).max() < 1e-8
+    assert np.abs(by.shake).max() > 1e-6
