@@ -62,6 +62,9 @@ _MOST_INNOVATION = 62.0
 # (95 % of Rayleigh's distribution).
 _MAP_GATE = 2.45
 _UNRANKED = np.zeros(0, np.int64)
+# A point is seen at the time of its row, which it decides: each look makes the error of that a
+# hundredth, the part of the image that a readout moves it.
+_LOOKS = 3
 # Points that agree with a prediction's optimum, as a share of those that agreed before.
 _STILL_TRACKED = 0.7
 
@@ -302,6 +305,31 @@ class Localizer:
                 f"{expected_share:.0%} of {observed.observations.count} were expected",
             )
         return replace(result, jumped=bool(jumped)) if result else result
+
+    def reprojection_errors(
+        self,
+        found: Estimate,
+        points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
+        pixels: ArrayLike | None = None,
+        stamps: Mapping[str, float] | None = None,
+    ) -> Array:
+        """How far (n,) px a motion shows the points of a frame from their pixels.
+
+        Each at the time of the row that it is shown in; NaN behind the camera. Arguments as of
+        :meth:`localize`.
+        """
+        exposure, counts, landmarks, seen, _ = self._sights(points, pixels, None, stamps)
+        shown, first = seen.copy(), 0
+        for place, (name, count) in enumerate(zip(exposure.names, counts, strict=True)):
+            own = slice(first, first + count)
+            axes, moved = self.rig.camera_from_rig[name]
+            for _ in range(_LOOKS):
+                at_rows = found.at_rows(exposure.row_time(place, shown[own]))
+                local = np.einsum("nij,nj->ni", at_rows[0], landmarks[own]) + at_rows[1]
+                shown[own] = exposure.cameras[place].project(local @ axes.T + moved)
+            first += count
+        errors: Array = np.linalg.norm(shown - seen, axis=1)
+        return errors
 
     def known_of(self, prior: Prior | None, span: float) -> PriorTerms:
         """What is known, beside its points, of a frame in the map's frame.

@@ -28,8 +28,7 @@ from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.rig import Rig
-from rs_localizer.core.shutter import reprojection_errors
+from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
@@ -49,6 +48,7 @@ from rs_localizer.estimation.motion_window import (
     motion_of,
     predicted_estimate,
     sample_of,
+    within_readout,
 )
 from rs_localizer.estimation.prior import Prior, offset_between, pivot_of, state_in
 from rs_localizer.integrity import Integrity
@@ -131,6 +131,7 @@ class _Seen:
     found: Estimate | Failure  # by its own fit; then as the window tells
     points: Any
     pixels: Any
+    stamps: Mapping[str, float] | None = None
 
 
 class Tracker:
@@ -281,17 +282,21 @@ class Tracker:
         assert isinstance(nearest.found, Estimate)
         seconds = 1e-9 * (time_ns - nearest.time_ns)
         if abs(seconds) <= 0.5 * nearest.found.span:
-            return replace(nearest.found.at_time(seconds), time_ns=time_ns)
-        motion = window.at(time_ns)
-        if motion is None:
-            return None
-        return predicted_estimate(nearest.found, motion, swing)
+            there = replace(Estimate.at_time(nearest.found, seconds), time_ns=time_ns)
+        else:
+            motion = window.at(time_ns)
+            if motion is None:
+                return None
+            there = predicted_estimate(nearest.found, motion, swing)
+        if isinstance(there, RigEstimate):
+            there = replace(there, time=there.time + seconds)
+        return there
 
     def flush(self) -> list[Estimate | Failure]:
         """The results that ``output_lag`` still holds back, at the end of a recording."""
         held = list(self._seen)[max(len(self._seen) - self.output_lag, 0) :]
         self._seen.clear()
-        return [seen.found for seen in held]
+        return [self.localizer.accepted(seen.found) for seen in held]
 
     def localize(
         self,
@@ -355,6 +360,9 @@ class Tracker:
             result = self._judged(result, points, pixels, prior)
             if self._memory is Memory.MOTION:
                 result = replace(result, time_ns=time_ns)
+                window = None if self._track is None else self._track.window
+                if window is not None and result.turn is None:
+                    result = within_readout(result, window.deviations)
             self._remember(time_ns, prior, result, context)
             if self._aid is not None and imu is not None:
                 camera = self.localizer.camera
@@ -362,7 +370,7 @@ class Tracker:
                 self._aid.seek(camera, points, pixels, result, time_ns)
         if self._seen and self._seen[-1].time_ns == time_ns:  # the same frame, matched anew
             self._seen.pop()
-        self._seen.append(_Seen(time_ns, result, points, pixels))
+        self._seen.append(_Seen(time_ns, result, points, pixels, stamps))
         self._publish()
         return self.delayed
 
@@ -393,8 +401,7 @@ class Tracker:
             return
         known = {time_ns: k for k, time_ns in enumerate(reversed(window.times))}
         for seen in list(self._seen)[-1 - self.output_lag :]:
-            alone = not isinstance(seen.points, Mapping)
-            if alone and seen.time_ns in known and isinstance(seen.found, Estimate):
+            if seen.time_ns in known and isinstance(seen.found, Estimate):
                 seen.found = self._published(seen, window.before(known[seen.time_ns]))
 
     def _judged(
@@ -432,11 +439,10 @@ class Tracker:
         """The estimate of one of the last frames by that motion, with its residuals."""
         assert isinstance(seen.found, Estimate)
         found = estimate_at(seen.found, motion)
-        residuals = reprojection_errors(
-            self.localizer.camera, found.at_rows, np.asarray(seen.points, float),
-            np.asarray(seen.pixels, float),
-        )  # fmt: skip
-        residuals[np.isnan(found.residuals)] = np.nan
+        errors = self.localizer.reprojection_errors(found, seen.points, seen.pixels, seen.stamps)
+        residuals = np.where(np.isnan(found.residuals), np.nan, errors)
+        if isinstance(found.residuals, ByCamera):
+            residuals = found.residuals.like(residuals)
         fitted = found.residuals[found.inliers].max(initial=0.0)
         gate = max(self.localizer.config.inlier_threshold, fitted)
         return replace(found, residuals=residuals, inliers=residuals <= gate)

@@ -90,7 +90,7 @@ def test_what_was_learned_is_forgotten_where_a_frame_fits_only_without():
 def test_the_settings_say_what_is_remembered(monkeypatch, settings, memory):
     chosen = []
 
-    def make(localizer, inertial, memory):
+    def make(localizer, inertial, memory, *lag):
         chosen.append(memory)
         return Tracker(localizer, inertial, memory)
 

@@ -63,7 +63,7 @@ def judged(clip: Clip, lens: Camera, shutter: Shutter, config: NodeConfig) -> di
         row[f"{name}_ms"] = 1e3 * (time.process_time() - begin) / len(whole)
         reasons = [str(one.reason) for one in poses[name] if isinstance(one, Failure)]
         row |= {f"{name}_{reason}": count for reason, count in Counter(reasons).items()}
-    for name in (*METHODS, "poselib"):
+    for name in (*METHODS, *(peer for peer in PEERS if peer != PEER)):
         of_name = _jitter(clip, poses[name], poses[PEER])
         row |= {f"{name}_{key}": x for key, x in of_name.items()}
     for name in METHODS[1:]:

@@ -58,8 +58,8 @@ class Motion:
 
     def twist(self, time: float) -> tuple[Array, Array]:
         """Angular and linear velocity in camera axes, rad/s and m/s."""
-        turn = self.turns(time)
-        return turn.inv().apply(self.turns(time, 1)), turn.inv().apply(self.places(time, 1))
+        # SciPy's spline has its rates in the axes of the body.
+        return self.turns(time, 1), self.turns(time).inv().apply(self.places(time, 1))
 
 
 def read_aria(folder: Path) -> tuple[Motion, Array]:

@@ -339,6 +339,10 @@ class ByCamera(np.ndarray[Any, Any]):
         split._places = places
         return split
 
+    def like(self, values: Array) -> ByCamera:
+        """Other values of the same points."""
+        return ByCamera.of(values, self._places)
+
     def __array_finalize__(self, source: Any) -> None:
         self._places = getattr(source, "_places", {})
 

@@ -153,19 +153,6 @@ _MOST_STEPS = 50
 _ROW_TIME_TOLERANCE = 1e-12
 
 
-def reprojection_errors(
-    camera: Camera, poses_at: Callable[[Array], tuple[Array, Array]], points: Array, pixels: Array
-) -> Array:
-    """How far (n,) px points (n,3) are from pixels (n,2), each seen at the time of its pixel's row.
-
-    Arguments otherwise as of :func:`project_rolling`; NaN behind the camera.
-    """
-    rotations, translations = poses_at(camera.row_time(pixels))
-    shown = camera.project(np.einsum("nij,nj->ni", rotations, points) + translations)
-    errors: Array = np.linalg.norm(shown - pixels, axis=1)
-    return errors
-
-
 def project_rolling(
     camera: Camera, poses_at: Callable[[Array], tuple[Array, Array]], points: Array
 ) -> tuple[Array, Array]:

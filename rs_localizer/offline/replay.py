@@ -13,6 +13,7 @@ import numpy as np
 
 from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagError, BagReader, make_message
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
@@ -366,6 +367,11 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
         topic, _, message = item
         return topic == topics.frames and localizer.awaits_imu(stamp_ns(message), LOOK_AHEAD)
 
+    def answer(recorded_ns: int, message: Any, result: Localized | Refusal) -> Answer:
+        if result and localizer.config.output_lag > 0:  # of a frame that has waited
+            return Answer(recorded_ns, result.input_stamp_ns, result)
+        return Answer(recorded_ns, stamp_ns(message), result)
+
     for name, topic in topics.of.items():  # which recorders may write last
         if name.endswith(CAMERA_INFO):
             first = next((message for _, _, message in bag.messages((topic,))), None)
@@ -375,10 +381,11 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
     for last in messages:
         topic, recorded_ns, message = last
         for result in _each(inputs[topic].take(localizer, message)):
-            yield Answer(recorded_ns, stamp_ns(message), result)
+            if result or result.reason is not Reason.AWAITS_FRAMES:  # it comes
+                yield answer(recorded_ns, message, result)
     for result in localizer.flush():
         assert last is not None  # which waits
-        yield Answer(last[1], stamp_ns(last[2]), result)
+        yield answer(last[1], last[2], result)
 
 
 def inlier_columns(frame: Localized, names: str) -> Array:

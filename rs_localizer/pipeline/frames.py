@@ -425,11 +425,14 @@ class FrameLocalizer:
         tracker = self._tracker
         if tracker.output_lag == 0 or tracker.newest_ns != self._middle_row_ns(stamp_ns):
             return newest
-        late = tracker.delayed
-        if not late:
-            return Refusal(late.reason, late.detail)
-        waiting = self._waiting[late.time_ns]
-        published = self._published(waiting[0], late, waiting[1])
+        return self._late(tracker.delayed)
+
+    def _late(self, found: Estimate | Failure) -> Localized | Refusal:
+        """What is published of a frame that has waited."""
+        if not found:
+            return Refusal(found.reason, found.detail)
+        cloud, deviation = self._waiting[found.time_ns]
+        published = self._published(cloud, found, deviation)
         return self.mounted(published) if published else published
 
     def localize_keypoints(self, message: Any) -> Localized | Refusal:
@@ -496,7 +499,8 @@ class FrameLocalizer:
 
     def flush(self) -> list[Localized | Refusal]:
         """The results of what still waits for other images: none will come."""
-        return [self._localize_frame(frame) for frame in self._assembler.flush()]
+        frames = [self._localize_frame(frame) for frame in self._assembler.flush()]
+        return [*frames, *map(self._late, self._tracker.flush())]
 
     def _read(
         self, name: str, kind: str, message: Any, camera: Camera

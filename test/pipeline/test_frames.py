@@ -145,6 +145,8 @@ def test_results_wait_for_as_many_frames_as_output_lag_says(
         else:
             assert localized(one).input_stamp_ns == 5 * 10**9 + 33_000_000 * k
             assert len(localized(one).inliers) == 4
+    last = [localized(one).input_stamp_ns for one in frames.flush()]
+    assert last == [5 * 10**9 + 33_000_000 * k for k in range(5 - lag, 5)]
 
 
 @pytest.mark.usefixtures("mock")
