@@ -40,6 +40,7 @@ _NEAR = 1.0  # px
 _FASTEST = 15  # images
 _NS = 1e-9
 _AXES = "xyz"
+_LAGS = (0, 1, 2)  # images that a tracked result waits for
 SINGLE, TRACKED = "single", "tracked"
 
 Poses = Mapping[int, "Estimate | GlobalPose"]
@@ -86,9 +87,12 @@ def localized(recording: Recording, config: LocalizerConfig) -> dict[str, Poses]
     localizer = Localizer(camera, config)
     single = [localizer.localize(frame.points, frame.pixels) for frame in frames]
     found[SINGLE] = {k: one for k, one in enumerate(single) if one}
-    tracker = Tracker(Localizer(camera, config))
-    results = [tracker.localize(frame.middle_ns, frame.points, frame.pixels) for frame in frames]
-    found[TRACKED] = {k: one for k, one in enumerate(results) if one}
+    for lag in _LAGS:
+        tracker = Tracker(Localizer(camera, config), output_lag=lag)
+        at_once = [tracker.localize(each.middle_ns, each.points, each.pixels) for each in frames]
+        results = [*at_once[lag:], *tracker.flush()]
+        name = f"{TRACKED}, {lag} later" if lag else TRACKED
+        found[name] = {k: one for k, one in enumerate(results) if one}
     return found
 
 

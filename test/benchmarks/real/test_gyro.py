@@ -80,7 +80,7 @@ def test_the_command_writes_table_and_picture(recording, gyroscope, tmp_path):
     command.main(["gyro", str(recording), "--gyroscope", str(text), "--out", str(tmp_path),
                   "-p", f"readout_time:={TRUE.readout_time}"])  # fmt: skip
     table = (tmp_path / "gyro.md").read_text().splitlines()
-    assert len(table) == 2 + len(PEERS) + 2
+    assert len(table) == 2 + len(PEERS) + 4  # single, and tracked at once, one later, two later
     assert (tmp_path / "gyro.png").stat().st_size > 10_000
 
 
