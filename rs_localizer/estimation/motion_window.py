@@ -5,7 +5,7 @@
 Frames are samples of a trajectory of which accelerations fade while new ones come
 (:mod:`rs_localizer.estimation.motion_model`); what a frame's points say of its motion beside what
 was known before is a Gaussian ``exp(-d' L d / 2 + g' d)`` of the step ``d`` from its estimate. A
-filter runs forward through the window, a smoother back (Rauch, Tung, Striebel, "Maximum likelihood
+filter runs forward through the window, a smoother back (Rauch et al., "Maximum likelihood
 estimates of linear dynamic systems", 1965). With the prediction's covariance ``P`` and the smoothed
 step ``x`` from it, of covariance ``V``, the score of the variance of one axis' accelerations, of
 which the transition adds ``Q`` to ``P``, is
