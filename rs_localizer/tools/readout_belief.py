@@ -114,7 +114,7 @@ _LEAST_TELLING, _LONG = 3, 9.0
 # shutters take 4 ms.
 _GLOBAL_SIGMAS, _GLOBAL = 3.0, 2e-3
 # Images that were exposed so far (s rms) beside their stamps have stamps that no camera gave.
-_MOST_JITTER = 1e-3
+_BESIDE = 1e-3
 # Readouts cannot take longer than this part of the interval between images.
 _LONGEST = 1.05
 
@@ -171,29 +171,14 @@ class Evidence:
         return self.determined and self.near_zero and sure and self.own_stamps
 
     @property
-    def too_fast(self) -> bool:
-        """Whether it is a readout that no sensor has, by stamps that a file was given."""
-        slowest = abs(self.readout_time) + _GLOBAL_SIGMAS * self.deviation
-        return not (self.near_zero or self.own_stamps) and slowest < _GLOBAL
-
-    @property
-    def scatter(self) -> float:
-        """Standard deviation of the blocks' values, s."""
-        values = [block.readout_time for block in self.blocks]
-        return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
-
-    @property
     def stabilised(self) -> bool:
         """Whether the parts disagree as those of a camera that turns its picture do."""
         least = max(_STABILISED * abs(self.readout_time), self.limit)
         apart, noise = apart_of(self.halves)
         by_halves = apart > max(_HALVES_SIGMAS * noise, 2.0 * least)
-        return bool((self.inflation > 1.0 and self.scatter > least) or by_halves)
-
-    @property
-    def apart(self) -> float:
-        """By how much (s) the two halves differ."""
-        return apart_of(self.halves)[0]
+        values = [block.readout_time for block in self.blocks]
+        scatter = np.std(values, ddof=1) if len(values) > 1 else 0.0
+        return bool((self.inflation > 1.0 and scatter > least) or by_halves)
 
     def parts(self, sign: float) -> str:
         """The values of the blocks, ms, along a direction."""
@@ -212,7 +197,7 @@ class Evidence:
     def _why_not(self, sign: float) -> str:
         """What speaks against it, beginning with how that goes on from the value."""
         why = ""
-        if self.jitter > _MOST_JITTER:
+        if self.jitter > _BESIDE:
             why += (
                 f"; exposures are {1e3 * self.jitter:.1f} ms rms off their "
                 "stamps: record with the camera's own time stamps, without losing images or "
@@ -241,7 +226,8 @@ class Evidence:
                 f" (limit {1e3 * self.limit:.1f} ms); "
                 "move the camera faster, rotate it about all axes, and for longer"
             )
-        if self.too_fast:
+        slowest = abs(self.readout_time) + _GLOBAL_SIGMAS * self.deviation
+        if not (self.near_zero or self.own_stamps) and slowest < _GLOBAL:
             return "; no rolling shutter is that fast: was the video stabilised or processed?"
         if self.near_zero and not self.global_shutter:
             reason = (

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,10 +28,10 @@ from rs_localizer.estimation.motion_model import FADING
 from rs_localizer.inertial.settings import SCALE_DEVIATION
 from rs_localizer.inertial.turning import MOST_ROUGH
 from rs_localizer.tools.adjust.fit import Fit, cheaper, solve
-from rs_localizer.tools.adjust.motion import acceleration_rows, told_of_accelerations
+from rs_localizer.tools.adjust.motion import acceleration_rows
 from rs_localizer.tools.adjust.observe import Observed, collect
 from rs_localizer.tools.adjust.problem import LIMIT, Problem, View
-from rs_localizer.tools.adjust.spline import LONGEST_SPACING, States, first_spline, refined
+from rs_localizer.tools.adjust.spline import LONGEST_SPACING, Spline, States, first_spline, refined
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.variables import (
     Extrinsics,
@@ -38,7 +39,6 @@ from rs_localizer.tools.adjust.variables import (
     Observations,
     State,
     rig_state,
-    start_state,
 )
 
 # What is known beforehand: as much as so many numbers of this size (rad/s^2, m/s^2) would tell. A
@@ -46,20 +46,11 @@ from rs_localizer.tools.adjust.variables import (
 _NUMBERS, _USUAL = 6.0, np.array([2.0, 1.0])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class Told(NamedTuple):
     """What an estimate says of its prior, of angular and of linear accelerations."""
 
     squares: Array  # (2,) sums, (rad/s^2)^2 and (m/s^2)^2
     numbers: Array  # (2,) how many of them the keypoints tell
-
-    def most_likely(self, freedom: Freedom) -> Freedom:
-        """The same with accelerations one step nearer to the greatest marginal likelihood."""
-        squares = self.squares + _NUMBERS * _USUAL**2
-        angular, linear = np.sqrt(squares / (np.maximum(self.numbers, 0.0) + _NUMBERS))
-        return replace(
-            freedom, angular_acceleration=float(angular), linear_acceleration=float(linear)
-        )
 
 
 def told(fitted: Fit) -> Told:
@@ -67,10 +58,12 @@ def told(fitted: Fit) -> Told:
     spline = fitted.state.spline
     prior = fitted.freedom.accelerations(spline.layout.spacing)
     rows = acceleration_rows(spline, prior)
-    covariances = fitted.factored.local_covariances(rows.first // CONTROL)
-    squares, variances = told_of_accelerations(rows, covariances)
+    spread = fitted.factored.local_covariances(rows.first // CONTROL)
+    variances = np.einsum("nri,nij,nrj->nr", rows.values, spread, rows.values)
+    each = np.array([rows.errors**2, variances]).reshape(2, len(rows.errors), 2, 3)
+    squares, unknown = each.sum(axis=(1, 3))
     usual = np.array([prior.angular, prior.linear]) ** 2
-    return Told(usual * squares, 3 * len(rows.first) - variances)
+    return Told(usual * squares, 3 * len(rows.first) - unknown)
 
 
 # Between images the motion is told as long as its deviations stay within so many of the usual ones.
@@ -342,9 +335,10 @@ def smooth(
     observations = observations.subset(
         spline.layout.inside(observations.times) & np.isfinite(observations.pixels[:, 0])
     )
-    parts = [(camera, observations)]
-    best = _best(parts, start_state(camera, observations, spline, readout_time), fading)
-    shaken = _shaken(best, parts, camera.focal_length, estimates)
+    best, shaken = _through(
+        [(camera, observations)], [Extrinsics.none()], spline, fading, camera.focal_length,
+        estimates,
+    )  # fmt: skip
     counted = shaken if fast is None else shaken[fast.covered]
     if counted.mean() > _MOST_SHAKEN:
         shaken[:] = True
@@ -392,9 +386,7 @@ def smooth_rig(rig: Rig, frames: list[RigFrame]) -> Smoothed:
         parts.append((camera, seen.subset(spline.layout.inside(seen.times))))
         axes, moved = rig.camera_from_rig[name]
         mounted.append(Extrinsics(axes, -axes.T @ moved, 0.0))
-    start = rig_state(spline, ((*part, one) for part, one in zip(parts, mounted, strict=True)))
-    best = _best(parts, start, fading)
-    shaken = _shaken(best, parts, rig.focal_length, estimates)
+    best, shaken = _through(parts, mounted, spline, fading, rig.focal_length, estimates)
     if shaken.mean() > _MOST_SHAKEN:
         shaken[:] = True
     readout_time = next(iter(rig.cameras.values())).readout_time
@@ -414,6 +406,16 @@ def _all_inliers(estimate: Estimate, image: Observed) -> Estimate:
 
 def _problem(parts: Parts, state: State, freedom: Freedom) -> Problem:
     return Problem([View(*part, freedom) for part in parts], state)
+
+
+def _through(
+    parts: Parts, mounted: list[Extrinsics], spline: Spline, fading: float, focal_length: float,
+    estimates: list[Estimate],
+) -> tuple[Fit, BoolArray]:  # fmt: skip
+    """The motion, and which images (f,) shake in a way that it does not follow."""
+    start = rig_state(spline, ((*part, one) for part, one in zip(parts, mounted, strict=True)))
+    best = _best(parts, start, fading)
+    return best, _shaken(best, parts, focal_length, estimates)
 
 
 def _best(parts: Parts, start: State, fading: float) -> Fit:
@@ -465,15 +467,18 @@ def _turns_in_frame(focal_length: float, estimates: list[Estimate]) -> BoolArray
 
 
 def _lively(parts: Parts, fitted: Fit) -> Fit:
-    """With a prior of the accelerations that the motion itself shows."""
+    """With a prior of the accelerations that the motion itself shows.
+
+    Each round is a step nearer to the greatest marginal likelihood.
+    """
     for _ in range(_ROUNDS):
-        before, freedom = fitted.freedom, told(fitted).most_likely(fitted.freedom)
+        before, of = fitted.freedom, told(fitted)
+        squares = of.squares + _NUMBERS * _USUAL**2
+        angular, linear = np.sqrt(squares / (np.maximum(of.numbers, 0.0) + _NUMBERS)).tolist()
+        freedom = replace(before, angular_acceleration=angular, linear_acceleration=linear)
         problem = _problem(parts, fitted.state, freedom)
         fitted = solve(problem, fitted.state, fitted.deviation)
-        changed = (
-            freedom.angular_acceleration / before.angular_acceleration,
-            freedom.linear_acceleration / before.linear_acceleration,
-        )
+        changed = angular / before.angular_acceleration, linear / before.linear_acceleration
         if np.all(np.abs(np.log(changed)) < _ALIKE):
             break
     return fitted

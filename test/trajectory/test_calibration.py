@@ -221,3 +221,5 @@ def test_stamps_of_an_even_camera_with_missing_images():
     assert found.interval == pytest.approx(1 / 30, rel=1e-9)
     assert found.missing == 3
     assert not found.irregular
+    rng = np.random.default_rng(0)
+    assert examine(times + 7e-4 * rng.normal(size=len(times))).irregular

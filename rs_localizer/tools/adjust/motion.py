@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import IntArray
 from rs_localizer.tools.adjust.spline import Layout, Spline
 from rs_localizer.tools.adjust.spline_kernels import CONTROL, LOCAL
 from rs_localizer.tools.adjust.system import Rows
@@ -72,16 +72,3 @@ def rest_rows(spline: Spline, angular: float, linear: float) -> Rows:
     errors *= weights
     none = np.zeros((len(at), 0), np.int64)
     return Rows(values * weights[:, None], CONTROL * at, none, errors, float(np.sum(errors**2)))
-
-
-def told_of_accelerations(rows: Rows, covariances: Array) -> tuple[Array, Array]:
-    """Sums (2,) of squares, and of variances, of angular and linear errors of acceleration rows.
-
-    Args:
-        rows: of :func:`acceleration_rows`.
-        covariances: (k,24,24) of the four controls of each row.
-    """
-    variances = np.einsum("nri,nij,nrj->nr", rows.values, covariances, rows.values)
-    each = np.array([rows.errors**2, variances]).reshape(2, len(rows.errors), 2, 3)
-    squares, spread = each.sum(axis=(1, 3))
-    return squares, spread
