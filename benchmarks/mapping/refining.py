@@ -18,6 +18,7 @@ from benchmarks.mapping.rooms import (
     walls,
 )
 from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.tools.adjust.system import Factored
 from rs_localizer.tools.adjust.variables import Freedom, start_state
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.observations import MapObservations, RigCamera, Start
@@ -115,9 +116,9 @@ def _least(seen: MapObservations, found: RefinedMap, freedom: MapFreedom) -> Arr
     (sights,) = problem.sights(state)
     fitting = replace(observed, pixels=observed.pixels + sights.errors)
     problem = prepared.problem([fitting], state, free)
-    return apply_similarity(
-        problem, state, _NOISE, np.ones(len(found.points), np.bool_)
-    ).covariances
+    factored = Factored(problem.system(state, _NOISE))
+    every = np.ones(len(found.points), np.bool_)
+    return apply_similarity(problem, state, factored, every).covariances
 
 
 def large(seed: int) -> Iterator[str]:

@@ -355,7 +355,11 @@ class _Refinement:
         used = self._freedoms(state.spline) + 3 * int(np.count_nonzero(images))
         inflation = inflation_of(squared[inliers], deviation, used + problem.border)
         inflation = self._cluster_robust(problem, deviation, inflation)
-        placed = apply_similarity(problem, state, deviation, images > 1)
+        factored = Factored(problem.system(state, deviation))
+        modes = np.zeros((problem.groups.kept, 0))
+        if prepared.freedom.drifts:
+            modes = DRIFT * math.sqrt(inflation) * factored.modes(prepared.freedom.drifts)
+        placed = apply_similarity(problem, state, factored, images > 1)
         covariances = inflation * placed.covariances
         spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         refined = (images > 1) & (spread < _KNOWN * prepared.size)
@@ -383,17 +387,11 @@ class _Refinement:
             tells_readout=prepared.tells_readout,
             apart=prepared.freedom.apart,
         )
-        return replace(found, drifts=self._drifts(found, problem, deviation, inflation))
+        return replace(found, drifts=self._drifts(found, problem, modes))
 
-    def _drifts(
-        self, found: RefinedMap, problem: Problem, deviation: float, inflation: float
-    ) -> tuple[RefinedMap, ...]:
-        count = self.prepared.freedom.drifts
-        if not count:
-            return ()
-        factored, drifts = Factored(problem.system(self.state, deviation)), []
-        still = np.zeros(3 * len(self.state.landmarks))
-        for mode in DRIFT * math.sqrt(inflation) * factored.modes(count).T:
+    def _drifts(self, found: RefinedMap, problem: Problem, modes: Array) -> tuple[RefinedMap, ...]:
+        drifts, still = [], np.zeros(3 * len(self.state.landmarks))
+        for mode in modes.T:
             state = problem.moved(self.state, np.concatenate([mode, still]))
             cameras = tuple(
                 _as_in(one, moved)
@@ -483,19 +481,20 @@ class Placed:
     spline: Spline
 
 
-def apply_similarity(problem: Problem, state: State, deviation: float, usable: BoolArray) -> Placed:
+def apply_similarity(
+    problem: Problem, state: State, factored: Factored, usable: BoolArray
+) -> Placed:
     """Lay the map over the given one, unless landmarks of known place hold it.
 
     Args:
         problem: whose minimum the state is.
         state: map and motion.
-        deviation: px, of the noise.
+        factored: its normal equations; they are used up.
         usable: (p,) which landmarks may hold the whole.
 
     Raises:
         Undetermined: when the images leave something open.
     """
-    factored = Factored(problem.system(state, deviation))
     if not problem.floating:
         return Placed(state.landmarks, *factored.block_covariances(), state.spline)
     given = problem.views[0].observations.landmarks
