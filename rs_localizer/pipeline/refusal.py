@@ -96,17 +96,14 @@ REASONS: dict[str, Meaning] = {
         "come nearer, look from an angle, use a larger board or markers on several walls",
     ),
     Reason.MODEL_ERROR: Meaning(
-        "neighbouring rows share errors, many points lie just beyond the inlier gate, or errors "
-        "are large and smooth over the image: vibration that the rows cannot resolve, or a map "
-        "or calibration too wrong for any pose",
-        f"a stiffer mounting, the calibration (before a plane a wrong lens looks like a bent "
-        f"map: show points at several depths), the map; {SETTINGS}",
+        "errors that no motion explains: of neighbouring rows, of points just beyond the inlier "
+        "gate, or smooth over the image",
+        f"vibration (a stiffer mounting, an IMU), calibration, map; {SETTINGS}",
     ),
     Reason.UNCERTAIN: Meaning(
-        "orientation uncertainty exceeds max_orientation_deviation, as before a small plane when "
-        "the camera may move",
-        "come nearer, use a larger board or markers on several walls; leave tracking on, give the "
-        "velocity_prior of a slow camera, or raise the limit where a filter weighs each pose",
+        "orientation uncertainty exceeds max_orientation_deviation, as before a small plane",
+        "come nearer, use a larger board or markers on several walls; leave tracking on, or raise "
+        "the limit where a filter weighs each pose",
     ),
     Reason.SCAN_AXIS: Meaning(
         "the shutter scans columns instead of rows, or rows instead of columns: scan_direction "
