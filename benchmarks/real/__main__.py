@@ -21,7 +21,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from benchmarks.real import gyro, motion, solvers
+from benchmarks.real import gyro, mocap, motion, solvers
 from benchmarks.real.calibrations import report
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
@@ -72,7 +72,9 @@ _PARTS = {
 }  # fmt: skip
 
 
-JUDGES = {"gyro": gyro.main, "solvers": solvers.main, "aria": motion.main}
+JUDGES = {
+    "gyro": gyro.main, "solvers": solvers.main, "aria": motion.main, "mocap": mocap.main
+}  # fmt: skip
 """Beside the boards, by the first argument."""
 
 

@@ -58,7 +58,7 @@ def clips_of(folder: Path, cache: Path, most: int, only: list[str]) -> list[Clip
         if only and Path(name).stem not in only:
             continue
         columns, lines = (int(word) for word in corners.split("x"))
-        clip = _clip(folder / name, Chessboard(columns, lines, float(square)), cache, most)
+        clip = clip_of(folder / name, Chessboard(columns, lines, float(square)), cache, most)
         if len(clip.images) < _FEWEST:
             print(f"{name}: {len(clip.images)} images show a board of {corners} corners: left out")
         else:
@@ -66,7 +66,8 @@ def clips_of(folder: Path, cache: Path, most: int, only: list[str]) -> list[Clip
     return clips
 
 
-def _clip(path: Path, board: Chessboard, cache: Path, most: int) -> Clip:
+def clip_of(path: Path, board: Chessboard, cache: Path, most: int) -> Clip:
+    """So many images of a video that show a board; corners are kept in the folder ``cache``."""
     file = cache / f"{path.stem}_corners.npz"
     if not file.exists():
         _detect(path, board, file)

@@ -3,11 +3,14 @@
 """``python -m benchmarks.real gyro RECORDING --gyroscope FILE``: turn rates before a real truth.
 
 RECORDING is a bag with ``camera_info`` and correspondences, FILE a text of lines ``t wx wy wz`` (s
-by the clock of the stamps, rad/s in the camera's optical axes) that no estimator sees. Beside
-twists there are the turns from pose to pose, of which estimators without a shutter have some, too.
+by the clock of the stamps, rad/s in the camera's optical axes) that no estimator sees; with
+``--align`` by another clock and in other axes. Beside twists there are the turns from pose to pose,
+of which estimators without a shutter have some, too. Of a video with a gyroscope inside, before a
+printed board, nothing else is needed:
 
     python -m benchmarks.real gyro rec --gyroscope gyroscope.txt -p readout_time:=0.0318 \\
         -p stamp_offset:=-0.0028
+    python -m benchmarks.real gyro GX010042.MP4 --board 9x6 --square 0.025
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
+from benchmarks.real.gyroscopes import Gyroscope, aligned, read_board_video
 from benchmarks.real.options import add_settings, settings_of
 from benchmarks.real.peers import PEERS, GlobalPose, solve_pnp_ransac
 from benchmarks.real.recordings import Recording, read_bag
@@ -29,6 +33,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import ANGULAR
 from rs_localizer.core.types import Estimate
 from rs_localizer.localizer import Localizer
+from rs_localizer.markers.prints import Chessboard
 from rs_localizer.tracking import Tracker
 
 mpl.use("Agg")
@@ -42,39 +47,10 @@ _NS = 1e-9
 _AXES = "xyz"
 _LAGS = (0, 1, 2)  # images that a tracked result waits for
 SINGLE, TRACKED = "single", "tracked"
+_LATER = f"{TRACKED}, 1 later"
 
 Poses = Mapping[int, "Estimate | GlobalPose"]
 """By the place of the image."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Gyroscope:
-    """Turn rates (k,3) rad/s in camera axes at times (k,) s."""
-
-    times: Array
-    rates: Array
-
-    @classmethod
-    def read(cls, path: Path) -> Gyroscope:
-        """A text of ``t wx wy wz``; raises ``ValueError`` for another."""
-        table = np.atleast_2d(np.loadtxt(path))
-        if table.shape[1] != 4 or len(table) < 2 or not np.all(np.diff(table[:, 0]) > 0.0):
-            raise ValueError(
-                f"{path} must hold lines t wx wy wz (s, rad/s) in the order of time, found "
-                f"{table.shape[0]} of {table.shape[1]} numbers"
-            )
-        return cls(table[:, 0], table[:, 1:])
-
-    def mean_rate(self, first: Array, last: Array) -> Array:
-        """Mean rates (n,3) rad/s between times (n,) s."""
-        step = 0.5 * (self.rates[1:] + self.rates[:-1]) * np.diff(self.times)[:, None]
-        angles = np.vstack([np.zeros(3), np.cumsum(step, axis=0)])
-
-        def at(time: Array) -> Array:
-            return np.stack([np.interp(time, self.times, angles[:, k]) for k in range(3)], axis=1)
-
-        rate: Array = (at(last) - at(first)) / (last - first)[:, None]
-        return rate
 
 
 def localized(recording: Recording, config: LocalizerConfig) -> dict[str, Poses]:
@@ -221,12 +197,16 @@ def text(judged: Judged) -> str:
 
 
 def draw(judged: Judged, gyroscope: Gyroscope, readout_time: float, file: Path) -> None:
-    """Turn rates of single images, with 95 % bars, over the gyroscope's line."""
-    estimates = {k: x for k, x in judged.poses[SINGLE].items() if isinstance(x, Estimate)}
-    rates, covariances = rates_of(estimates, readout_time)
-    bars = _QUANTILE * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    """Turn rates of single images, with 95 % bars, and of tracked ones over the gyroscope's."""
     start = judged.times[0]
-    seconds = judged.times[list(estimates)] - start
+    shown_rates = {}
+    for name in (SINGLE, _LATER):
+        estimates = {k: x for k, x in judged.poses[name].items() if isinstance(x, Estimate)}
+        rates, covariances = rates_of(estimates, readout_time)
+        bars = _QUANTILE * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+        shown_rates[name] = judged.times[list(estimates)] - start, rates, bars
+    seconds, rates, bars = shown_rates[SINGLE]
+    later, tracked, _ = shown_rates[_LATER]
     shown = (gyroscope.times > start) & (gyroscope.times < judged.times[-1])
     figure, panels = plt.subplots(3, 1, figsize=(9, 6), sharex=True, layout="constrained")
     for k, panel in enumerate(panels):
@@ -238,9 +218,13 @@ def draw(judged: Judged, gyroscope: Gyroscope, readout_time: float, file: Path) 
             seconds, np.rad2deg(rates[:, k]), np.rad2deg(bars[:, k]), fmt="o", color="#1f4e9c",
             markersize=3, linewidth=0.7, label="one image each, with 95 %",
         )  # fmt: skip
+        panel.plot(
+            later, np.rad2deg(tracked[:, k]), ".", color="#2a8c4a", markersize=4,
+            label="tracked, known one image later",
+        )  # fmt: skip
         panel.set_ylabel(f"{_AXES[k]} (deg/s)")
         panel.grid(alpha=0.3)
-    panels[0].legend(loc="upper right", fontsize="small", ncols=2)
+    panels[0].legend(loc="upper right", fontsize="small", ncols=3)
     panels[-1].set_xlabel("time (s)")
     figure.savefig(file, dpi=100)
     plt.close(figure)
@@ -252,16 +236,26 @@ def main(argv: Sequence[str]) -> None:
         prog="python -m benchmarks.real gyro", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("recording", type=Path, help="a bag")
-    parser.add_argument("--gyroscope", type=Path, required=True, help="t wx wy wz, held back")
+    parser.add_argument("recording", type=Path, help="a bag, or a video of a board")
+    parser.add_argument("--gyroscope", type=Path, help="t wx wy wz, held back (bags need it)")
+    parser.add_argument("--align", action="store_true", help="find its clock, axes and bias")
+    parser.add_argument("--board", default="9x6", help="inner corners, of a video")
+    parser.add_argument("--square", type=float, default=0.025, help="m, its side")
     parser.add_argument("--out", type=Path, default=Path("real"), help="table and picture")
     add_settings(parser)
     args = parser.parse_args(argv)
     config = settings_of(args)
-    recording = read_bag(args.recording, config)
-    gyroscope = Gyroscope.read(args.gyroscope)
-    judged = judge(recording, gyroscope, config)
     args.out.mkdir(parents=True, exist_ok=True)
+    if args.gyroscope is None:
+        columns, lines = (int(word) for word in args.board.split("x"))
+        board = Chessboard(columns, lines, args.square)
+        recording, gyroscope = read_board_video(args.recording, board, config, args.out)
+    else:
+        recording, gyroscope = read_bag(args.recording, config), Gyroscope.read(args.gyroscope)
+    if args.align or args.gyroscope is None:
+        gyroscope, said = aligned(gyroscope, recording)
+        print(said)
+    judged = judge(recording, gyroscope, config)
     table = text(judged)
     print(table)
     (args.out / "gyro.md").write_text(table + "\n", encoding="utf-8")

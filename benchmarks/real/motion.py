@@ -3,16 +3,18 @@
 """``python -m benchmarks.real aria FOLDER``: a head's real motion before its room's real points.
 
 FOLDER is the ``trajectory`` of a recording of Aria's MPS: ``closed_loop_trajectory.csv`` (1 kHz
-poses of the device) and ``global_points.csv.gz`` or ``semidense_points.csv.gz``. The device's axes
-are taken for those of a rolling-shutter camera; pixels are projected row by row by the second
-simulator, which shares no line with what is judged.
+poses of the device) and ``global_points.csv.gz`` or ``semidense_points.csv.gz``; or a trajectory of
+anything as text, which gets points all around. The body's axes are taken for those of a
+rolling-shutter camera; pixels are projected row by row by the second simulator, which shares no
+line with what is judged.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,7 @@ from benchmarks.real.recordings import Frame, Recording
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
+from rs_localizer.io.trajectories import read_tum, split_at_gaps
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 
@@ -32,6 +35,9 @@ _MARGIN = 2.0  # px from the rim
 _NEAREST, _FARTHEST = 0.3, 30.0  # m
 _INSIDE = 12.592  # 95 % quantile of chi-squared with six degrees of freedom
 _RATE = 30.0  # Hz
+_AHEAD = (0.01, 0.033)  # s after the middle of an image, for which the tracker is asked
+_ROOM, _POINTS = 3.0, 20_000  # m about a trajectory
+_BAND, _TONES, _SHORT_SPACING = (4.0, 40.0), 24, 0.002  # Hz of shaking; s
 _SPACING = 0.005  # s, of the samples of a trajectory
 _EXPECTED = ("tx_world_device", "ty_world_device", "tz_world_device", "qx_world_device",
              "qy_world_device", "qz_world_device", "qw_world_device")  # fmt: skip
@@ -85,6 +91,28 @@ def read_aria(folder: Path) -> tuple[Motion, Array]:
     motion = Motion.of(times[kept], Rotation.from_quat(values[kept, 3:]), values[kept, :3])
     landmarks = np.genfromtxt(cloud, delimiter=",", names=True)
     return motion, np.column_stack([landmarks[f"p{axis}_world"] for axis in "xyz"])
+
+
+def read_trajectory(path: Path) -> tuple[Motion, Array]:
+    """The longest part without a gap of a text of poses, and points (n,3) all around it."""
+    part = max(split_at_gaps(read_tum(path)), key=len)
+    seconds = 1e-9 * (part.stamps_ns - part.stamps_ns[0])
+    motion = Motion.of(seconds, Rotation.from_quat(part.quaternions), part.positions)
+    low, high = part.positions.min(axis=0) - _ROOM, part.positions.max(axis=0) + _ROOM
+    return motion, np.random.default_rng(0).uniform(low, high, (_POINTS, 3))
+
+
+def shaken(motion: Motion, size: float, seed: int = 0) -> Motion:
+    """The same, shaken about all axes over a broad band: ``size`` rad/s, root mean square."""
+    rng, times = np.random.default_rng(seed), np.arange(motion.start, motion.end, _SHORT_SPACING)
+    rates = 2.0 * np.pi * np.geomspace(*_BAND, _TONES)
+    amplitudes = size * np.sqrt(2.0 / 3.0 / _TONES) / rates
+    angles = np.zeros((len(times), 3))
+    for rate, amplitude in zip(rates, amplitudes, strict=True):
+        angles += amplitude * np.sin(rate * times[:, None] + rng.uniform(0.0, 2.0 * np.pi, 3))
+    return Motion.of(
+        times, motion.turns(times) * Rotation.from_rotvec(angles), motion.places(times)
+    )
 
 
 def simulated(
@@ -147,6 +175,14 @@ def judge(recording: Recording, motion: Motion) -> dict[str, Row]:
     localizer = Localizer(camera)
     single = [(frame.middle_ns, localizer.localize(frame.points, frame.pixels)) for frame in frames]
     rows["single"] = _row([(ns, one) for ns, one in single if one], camera, motion)
+    for ahead in _AHEAD:
+        tracker, predicted = Tracker(Localizer(camera)), []
+        for each in frames:
+            tracker.localize(each.middle_ns, each.points, each.pixels)
+            there = tracker.at(each.middle_ns + round(1e9 * ahead))
+            if there is not None:
+                predicted.append((there.time_ns, there))
+        rows[f"tracked, {1e3 * ahead:.0f} ms ahead"] = _row(predicted, camera, motion)
     for lag in (0, 1, 2):
         tracker = Tracker(Localizer(camera), output_lag=lag)
         found = [tracker.localize(each.middle_ns, each.points, each.pixels) for each in frames]
@@ -216,13 +252,19 @@ def text(rows: dict[str, Row], images: int) -> str:
 def main(argv: Sequence[str]) -> None:
     """Run it."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.real aria", description=__doc__)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, help="Aria's, or a text of poses")
+    parser.add_argument("--shake", type=float, default=0.0, help="deg/s, root mean square")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="of it, at most")
     parser.add_argument("--readout-time", type=float, default=0.016, help="s")
     parser.add_argument("--points", type=int, default=150, help="of each image")
     parser.add_argument("--noise", type=float, default=0.5, help="px")
     parser.add_argument("--out", type=Path, default=Path("real"), help="table")
     args = parser.parse_args(argv)
-    motion, points = read_aria(args.folder)
+    read = read_aria if args.folder.is_dir() else read_trajectory
+    motion, points = read(args.folder)
+    if args.shake > 0.0:
+        motion = shaken(motion, math.radians(args.shake))
+    motion = replace(motion, end=min(motion.end, motion.start + args.seconds))
     camera = TrueCamera(readout_time=args.readout_time)
     recording = simulated(args.folder.name, motion, points, camera, args.points, args.noise)
     table = text(judge(recording, motion), len(recording.frames))

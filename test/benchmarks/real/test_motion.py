@@ -65,12 +65,19 @@ def test_rows_see_the_room_when_they_are_exposed_and_the_judge_knows_the_truth(f
     shown = camera.project(np.einsum("nji,nj->ni", turns, frame.points - places))
     assert np.abs(shown - frame.pixels).max() < 1.5  # five deviations of the noise, and more
     rows = motions.judge(recording, moving)
-    for name in ("single", "tracked", "tracked, 1 later"):
+    for name in ("single", "tracked", "tracked, 10 ms ahead", "tracked, 1 later"):
         assert rows[name].localized == 18
         assert rows[name].errors[0, 0] < 0.3 * rows["solvepnp"].errors[0, 0]
         assert min(rows[name].inside) > 0.8
     assert rows["tracked, 1 later"].errors[2, 0] < rows["tracked"].errors[2, 0]
     assert motions.text(rows, 18).count("\n") == 1 + len(rows)
+
+
+def test_shaking_has_the_size_that_was_asked_for(folder):
+    moving, _ = motions.read_aria(folder)
+    shaking, times = motions.shaken(moving, 0.2), np.arange(0.1, 0.8, 0.001)
+    beside = shaking.turns(times, 1) - moving.turns(times, 1)
+    assert np.sqrt(np.mean(np.sum(beside**2, axis=1))) == pytest.approx(0.2, rel=0.15)
 
 
 def test_what_is_missing_is_named(tmp_path):
