@@ -428,6 +428,15 @@ class NodeConfig(LocalizerConfig):
         "twist the later ones know, too; for maps, logs and filters with delayed states",
         (0, 5),
     )
+    output_rate: float = setting(
+        0.0,
+        "Rate of pose, twist and odometry, in Hz, each predicted to now by the motion of the last "
+        "tracked frames; 0: one of each image",
+        (0.0, 1000.0),
+    )
+    max_prediction: float = setting(
+        0.1, "How long after the last pose output_rate goes on, in s", (0.0, 1.0)
+    )
     max_points: int = setting(
         20_000,
         "Most points of a frame that are used: those with the best scores, or without scores "

@@ -201,6 +201,11 @@ class Tracker:
         self.localizer = Localizer(rig, self.localizer.config)
 
     @property
+    def remembers_motion(self) -> bool:
+        """Whether frames tell the next ones how the camera moves."""
+        return self._memory is Memory.MOTION
+
+    @property
     def smooth_error(self) -> float:
         """Size (px) of the errors of map or lens on which frames agree so far; else 0."""
         return 0.0 if self._track is None else self._track.experience.smooth_error

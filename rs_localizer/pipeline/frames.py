@@ -46,7 +46,7 @@ from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
 from rs_localizer.pipeline.imu import ImuInput, inertial_settings
 from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.pipeline.landmarks import Landmarks, read_landmarks
-from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
+from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, published_moment, twist_at
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch, Watched
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
@@ -135,6 +135,7 @@ _BESIDE = frozenset({
     "readout_time_deviation", "estimate_readout_time", "pose_time", "max_points", "base_frame",
     "odom_frame", "publish_tf", "tf_rate", "hold", "two_d_mode", "orientation_covariance",
     "transform_tolerance", "map_file", "map_frame", "marker_map", "matching", "autostart",
+    "output_rate",
 })  # fmt: skip
 
 
@@ -181,6 +182,8 @@ class FrameLocalizer:
         self._pose_prior = PosePrior(notice)
         # Of the last frames, by time of the middle row: with what their results are published.
         self._waiting: dict[int, tuple[Correspondences, float]] = {}
+        # The newest of them that has a pose, without its rows.
+        self._newest: tuple[Correspondences, float] | None = None
         self._too_many = False  # whether clouds above max_points have been noticed
         self._settings = self._config = config  # an estimated readout time takes the place of one
         self._use(config)
@@ -234,7 +237,10 @@ class FrameLocalizer:
             memory = Memory.MOTION if timed else Memory.MAP_AND_LENS
         inertial = inertial_settings(config) if timed and alone else None
         lag = config.output_lag if memory is Memory.MOTION and alone else 0
-        self._tracker = Tracker(Localizer(device, config), inertial, memory, lag)
+        self._tracker = Tracker(
+            Localizer(device, config), inertial, memory, lag, config.max_prediction
+        )
+        self._newest = None
         self._waiting.clear()
         if config.rig != self._config.rig:
             self._assembler = FrameAssembler(config.cameras, config.rig.window, self._notice)
@@ -312,6 +318,7 @@ class FrameLocalizer:
         self._forget_motion()
 
     def _forget_motion(self) -> None:
+        self._newest = None
         self.readout_watch.reset()
         self._tracker.reset()
 
@@ -553,6 +560,9 @@ class FrameLocalizer:
             while len(self._waiting) > self._tracker.output_lag + 1:
                 del self._waiting[next(iter(self._waiting))]
         published = self._published(cloud, result, context.readout_time_deviation)
+        if published and self.predicts:
+            rows = cloud.table[:0]
+            self._newest = replace(cloud, table=rows, dropped=0), context.readout_time_deviation
         if adopted is not config:  # from the next frame on
             self._use(adopted)
         return self.mounted(published) if published else published
@@ -563,6 +573,26 @@ class FrameLocalizer:
         watch = self.readout_watch
         deviation = max(self._config.readout_time_deviation, watch.error)
         return FrameContext(watch.trusted, deviation, watch.of_rest, self._landmarks.error_modes)
+
+    @property
+    def predicts(self) -> bool:
+        """Whether frames are tracked, so that :meth:`at` knows the motion between them."""
+        return self._alone and self._tracker.remembers_motion
+
+    def at(self, stamp_ns: int) -> Localized | Refusal | None:
+        """Pose and twist at a time of the images' clock, without inliers.
+
+        None before the last frames, more than ``max_prediction`` after them, and where frames do
+        not know how the camera moves (:attr:`predicts`).
+        """
+        found = self._tracker.at(stamp_ns) if self.predicts else None
+        if found is None or self._newest is None:
+            return None
+        cloud, deviation = self._newest
+        cloud = replace(cloud, stamp_ns=stamp_ns)
+        if self.readout_watch.wrong_axis:
+            return None
+        return self.mounted(self._made(cloud, found, deviation, (stamp_ns, 0.0)))
 
     def _published(
         self, cloud: Correspondences, result: Estimate | Failure, deviation: float
@@ -581,10 +611,27 @@ class FrameLocalizer:
             self._notice(Notice.DOUBTFUL, text)
         if (off := self._tracker.smooth_error) > 0.0 and not watch.axis_in_doubt:
             self._notice(Notice.LENS, lens_is_off(off))
+        return self._made(cloud, result, deviation)
+
+    def _made(
+        self,
+        cloud: Correspondences,
+        estimate: Estimate,
+        deviation: float,
+        moment: tuple[int, float] | None = None,
+    ) -> Localized:
+        """What is published of an estimate; ``moment``: as of :func:`.of_camera`."""
+        watch = self.readout_watch
         readout = ReadoutKnown(
-            deviation, watch.may_be_reversed, watch.surely_global, watch.other_axis
+            deviation,
+            self._camera.first_row_time,
+            watch.may_be_reversed,
+            watch.surely_global,
+            watch.other_axis,
         )
-        return of_camera(cloud, result, self._config, self._camera, self.camera_frame, readout)
+        if moment is None:
+            moment = published_moment(self._config, self._camera, cloud.stamp_ns)
+        return of_camera(cloud, estimate, self._config, self.camera_frame, moment, readout)
 
     def _thinned(self, cloud: Correspondences) -> Correspondences:
         """The cloud with no more points than ``max_points``, which is said once."""

@@ -23,7 +23,6 @@ import numpy as np
 from rs_localizer.config import NodeConfig, OrientationCovariance, PublishTf
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences, select_inliers
@@ -35,7 +34,6 @@ from rs_localizer.pipeline.pose_at_time import (
     either,
     either_twist,
     pose_at,
-    published_moment,
     twist_at,
     with_timing,
 )
@@ -148,6 +146,7 @@ class ReadoutKnown:
     """How well the readout time is known."""
 
     deviation: float  # s
+    first_row_time: float  # from the middle row, in readout times
     may_be_reversed: bool  # rows may run the other way
     global_shutter: bool  # all rows are exposed at once, whatever is set
     other_axis: Estimate | None = None  # the same frame, if its rows may be its columns
@@ -157,17 +156,18 @@ def of_camera(
     cloud: Correspondences,
     estimate: Estimate,
     config: NodeConfig,
-    camera: Camera,
     frame: str,
+    moment: tuple[int, float],
     readout: ReadoutKnown,
 ) -> Localized:
-    """Pose and twist of the camera's optical frame, of this name, at the published moment.
+    """Pose and twist of the camera's optical frame, of this name, at a moment.
 
     Args:
-        known: of the readout time.
+        cloud: with the rows of the estimate, or with none.
+        moment: its stamp and row time.
     """
     readout_time = config.readout_time
-    stamp_ns, tau = published_moment(config, camera, cloud.stamp_ns)
+    stamp_ns, tau = moment
     moving = readout_time > 0.0 and find_solver(config.solver).rolling_shutter
     if readout.global_shutter and estimate.turn is None:
         moving = False  # an image says nothing of velocities
@@ -184,9 +184,10 @@ def of_camera(
         twist = either_twist(either_twist(twist, columns), backwards(columns))
     if twist is not None and deviation > 0.0:
         # The middle row comes later where the readout takes longer; the first one does not.
-        delay = deviation * camera.first_row_time if tau == 0.0 else 0.0
+        delay = deviation * readout.first_row_time if tau == 0.0 else 0.0
         share = deviation / readout_time
         pose, twist = with_timing(pose, twist, share, delay, config.acceleration)
+    seen = estimate.inliers if len(cloud.table) else np.zeros(0, np.bool_)
     return Localized(
         input_stamp_ns=cloud.stamp_ns,
         stamp_ns=stamp_ns,
@@ -194,7 +195,7 @@ def of_camera(
         body_frame=frame,
         pose=pose,
         twist=twist,
-        inliers=select_inliers(cloud.table, estimate.inliers, estimate.residuals),
+        inliers=select_inliers(cloud.table, seen, estimate.residuals),
         dropped=cloud.dropped,
         estimate=estimate,
     )

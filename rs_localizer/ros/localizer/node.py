@@ -6,21 +6,23 @@ import contextlib
 import functools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.serialization import deserialize_message
+from rclpy.timer import Timer
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray  # type: ignore[import-untyped]
 
-from rs_localizer.config import ImuUse, NodeConfig
+from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
-from rs_localizer.io.topics import CAMERA_MARKER, GIVEN_POSES, INTEGRITY, LIVE
+from rs_localizer.io.topics import CAMERA_MARKER, GIVEN_POSES, INLIERS, INTEGRITY, LIVE
 from rs_localizer.pipeline.compiling import compile_rest, give_back_compiler
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.given_pose import read_given_pose
@@ -243,10 +245,9 @@ class Outputs:
             for name, type_name in TYPES.items()
         }
 
-    def publish(self, frame: Localized) -> None:
-        """Publish what somebody listens to; nothing else is built."""
-        publishers = self._publishers.items()
-        wanted = [name for name, it in publishers if it.get_subscription_count()]
+    def publish(self, frame: Localized, names: Collection[str] = tuple(TYPES)) -> None:
+        """Publish, of these, what somebody listens to; nothing else is built."""
+        wanted = [name for name in names if self._publishers[name].get_subscription_count()]
         for name, message in each_message(frame, make_message, wanted):
             self._publishers[name].publish(message)
 
@@ -255,6 +256,8 @@ class Outputs:
             self._node.destroy_lifecycle_publisher(publisher)
 
 
+# What output_rate publishes.
+_MOTION = tuple(name for name in TYPES if name != INLIERS)
 # Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
 _ODD = (
     "map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "no_images",
@@ -271,6 +274,8 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def __init__(self, **options: Any) -> None:
         self._localizer: FrameLocalizer | None = None  # the worker's: here only to be read
         self._feed: Feed | None = None
+        self._ticks: Timer | None = None  # of output_rate
+        self._publish_now: Callable[[FrameLocalizer], None] = lambda _: None
         self._undo = contextlib.ExitStack()  # of what :meth:`open` has made
         super().__init__(NODE_NAME, NodeConfig, tell, **options)
         self._broadcaster = Broadcaster(self, self.refusals)
@@ -311,8 +316,13 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
             self._undo.callback(self.destroy_lifecycle_publisher, publisher)
 
         def publish_all(frame: Localized) -> None:
-            outputs.publish(frame)
-            self._broadcaster.publish(frame, frames.config)
+            if frames.config.output_rate == 0.0 or not frames.predicts:
+                outputs.publish(frame)
+                self._broadcaster.publish(frame, frames.config)
+            else:  # the motion is published at its own times
+                outputs.publish(frame, [INLIERS])
+                if frames.config.publish_tf == PublishTf.MAP_TO_ODOM:
+                    self._broadcaster.publish(frame, frames.config)
             map_view.show(frame.map_frame, frames.map_points)
             corners = frames.view_corners
             if corners is not None and camera_view.get_subscription_count():
@@ -320,6 +330,20 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
             if math.isfinite(frame.estimate.integrity):
                 integrity.publish(Float64(data=frame.estimate.integrity))
 
+        newest_ns = 0
+
+        def publish_now(frames: FrameLocalizer) -> None:
+            nonlocal newest_ns
+            now_ns = self.get_clock().now().nanoseconds
+            frame = None if now_ns == newest_ns else frames.at(now_ns)  # a simulated clock rests
+            if not frame or self._ticks is None:
+                return
+            newest_ns = now_ns
+            outputs.publish(frame, _MOTION)
+            if frames.config.publish_tf == PublishTf.MAP_TO_CAMERA:
+                self._broadcaster.publish(frame, frames.config)
+
+        self._publish_now = publish_now
         rest = compile_rest(config.solver)
         if rest is not None:
             self.get_logger().info(
@@ -350,13 +374,31 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
             f"active with solver {config.solver}, listening to {' and '.join(topics)}"
         )
 
+        self._tick_at(config.output_rate)
+
     def end(self) -> None:
+        self._tick_at(0.0)
         self._broadcaster.forget()
+
+    def _tick_at(self, rate: float) -> None:
+        """Have the motion published so many times a second; 0: with the images only."""
+        if self._ticks is not None:
+            self.destroy_timer(self._ticks)
+            self._ticks = None
+        if rate > 0.0:
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            self._ticks = self.create_timer(1.0 / rate, self._tick, clock=clock)
+
+    def _tick(self) -> None:
+        if self.worker is not None:
+            self.worker.update("output", self._publish_now)
 
     def change(self, config: NodeConfig) -> None:
         if self._feed is not None:
             self._broadcaster.configure(config)
             self._feed.take_config(config)
+            if self.state == "active":
+                self._tick_at(config.output_rate)
 
     def examine(self) -> tuple[Health, str]:
         frames = self._localizer
