@@ -64,6 +64,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   integrity                        the chance of a wrong pose or map: reliability, ROC
   rigs                             several cameras, against their bounds
   real                             videos of real cameras
+  gross                            grossly wrong lenses and maps: what is published
   honesty                          against P3P, a real global shutter, rendered walls
   mapping                          refined maps and surveyed markers
   experiments.mapped_room          a map of a rendered room by markers, and poses in it

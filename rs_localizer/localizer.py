@@ -23,9 +23,10 @@ from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation import motion_model, motion_window, observations, ransac
-from rs_localizer.estimation.acceptance import refusal, uncertain
+from rs_localizer.estimation.acceptance import refusal, speeding, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
+from rs_localizer.estimation.left_out import LeftOut, left_out
 from rs_localizer.estimation.observations import (
     NEAREST,
     Observed,
@@ -390,10 +391,13 @@ class Localizer:
                 observed, posterior, own_terms, self.config.calibration,
                 own_terms is not observed.terms, observed.error_modes,
             )  # fmt: skip
-        known = math.hypot(posterior.declared, effect.residual)  # px, of map and calibration
+        posterior = posterior._replace(
+            declared=math.hypot(posterior.declared, effect.residual),  # px, of map and calibration
+            speeding=speeding(observed, posterior.state),
+        )
         failure = refusal(
             observed.observations,
-            posterior._replace(declared=known),
+            posterior,
             best.samples,
             min_inliers=self.config.min_inliers,
             threshold=self._gate(observed, posterior.state),
@@ -401,5 +405,13 @@ class Localizer:
         )
         if failure is not None:
             return failure
+        odd = LeftOut()
+        if self._solver.rolling_shutter:  # a global shutter leaves out rows of one that moves
+            gate = self._gate(observed, posterior.state)
+            known = own_terms is not observed.terms
+            odd = left_out(self._search, observed, posterior, gate, known=known)
+        if odd.failure is not None:
+            return odd.failure
         still = self._search.global_shutter_inliers(observed, start)
-        return estimate_of(observed, posterior, still, best.samples, effect)
+        estimate = estimate_of(observed, posterior, still, best.samples, effect)
+        return replace(estimate, left_out=odd.notice) if odd.notice else estimate

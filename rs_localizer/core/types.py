@@ -66,6 +66,7 @@ class Estimate(Motion):
     span: float = 0.0  # s of a readout, as which row times count; 0: unknown
     # Probability that the pose lies outside its region or the map is another one; NaN: not judged
     integrity: float = math.nan
+    left_out: str = ""  # what is odd about the points that are no inliers, one sentence
 
     @property
     def covariance(self) -> Array:

@@ -13,11 +13,15 @@ from rs_localizer.core.blocks import median
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import (
+    LINEAR,
+    POSE,
+    POSE_SIZE,
     STATE_ANGULAR,
     STATE_LINEAR,
+    VELOCITIES,
 )
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.observations import Observations, median_depth
+from rs_localizer.estimation.observations import Observations, Observed, median_depth
 from rs_localizer.estimation.posterior import Mirror, Posterior
 from rs_localizer.estimation.residuals import row_paces
 
@@ -41,6 +45,10 @@ _OPEN = 3.0
 _LEAST_MODEL_ERROR = 0.05
 # Errors of map and lens (root mean square, inlier thresholds) beyond which no region is believed.
 _MOST_MODEL_ERROR = 1.5
+# A wrong lens before a wall is fitted by velocities that nobody expects, and leaves smooth errors:
+# of this limit so many squared deviations of the velocities leave a part of 1 / e. Cameras that are
+# fast leave none (a phone at 3.4 deviations: 0.04 px).
+_SPEEDS_AND_ERRORS, _LEAST_OF_THE_LIMIT = 8.0, 0.25
 # An image that moves along with the rows is one moment of the scene, drawn out: any motion that
 # does so fits anything. See :func:`.row_paces`.
 _LEAST_PACE = 0.25
@@ -115,8 +123,9 @@ def refusal(
             f"{posterior.near_outliers} points lie just beyond the gate of {found} inliers: "
             "unmodelled vibration, or a second motion",
         )
+    doubt = max(math.exp(-posterior.speeding / _SPEEDS_AND_ERRORS), _LEAST_OF_THE_LIMIT)
     if rolling and posterior.model_error > math.hypot(
-        _MOST_MODEL_ERROR * threshold, _MOST_DECLARED * posterior.declared
+        doubt * _MOST_MODEL_ERROR * threshold, _MOST_DECLARED * posterior.declared
     ):
         return Failure(
             Reason.MODEL_ERROR,
@@ -148,6 +157,13 @@ def refusal(
     ):
         return _not_ruled_out(mirror, "the pose mirrored on it")
     return None
+
+
+def speeding(observed: Observed, state: Array) -> float:
+    """Squared velocities, in standard deviations of what the configuration expects of them."""
+    part = VELOCITIES if observed.sighted.turn is None else LINEAR  # of the rest a gyroscope knows
+    velocities = state[POSE_SIZE - POSE.stop :][part]
+    return float(velocities @ observed.terms.informations[0][part, part] @ velocities)
 
 
 @kernel

@@ -244,11 +244,14 @@ class Observations:
 
     def thinned(self, count: int) -> Observations:
         """So many of the points, evenly taken."""
-        chosen = np.linspace(0, len(self) - 1, count).astype(np.int64)
+        return self.only(np.linspace(0, len(self) - 1, count).astype(np.int64))
+
+    def only(self, chosen: IntArray) -> Observations:
+        """These of the points."""
         packed = thin(self.packed, chosen)
         return Observations(
             self.points[chosen], self.rays[chosen], self.tau[chosen], self.camera[chosen],
-            self.mounts, packed, count,
+            self.mounts, packed, len(chosen),
         )  # fmt: skip
 
     def __len__(self) -> int:

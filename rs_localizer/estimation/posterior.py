@@ -83,6 +83,7 @@ class Posterior(NamedTuple):
     shared: float = 0.0  # px, likewise, of all modes together
     agreement: float = 0.0  # of neighbouring rows, standard deviations
     declared: float = 0.0  # px, the part of it that the map is known to be off
+    speeding: float = 0.0  # squared velocities, in deviations of what the configuration expects
     # Probabilities of the typical speeds; empty: the configured one
     speeds: Array = np.zeros(0)
     near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance

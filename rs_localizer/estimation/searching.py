@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
@@ -30,7 +32,7 @@ from rs_localizer.solvers.table import Solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
 # of the image; it only has to be right to some degrees. In focal lengths.
-_GLOBAL_SHUTTER_SCALE = 0.05
+GLOBAL_SHUTTER_SCALE = 0.05
 _POOL_SCALE = 0.12
 # Minimal models are scored at this multiple of the inlier threshold: noise makes a six-point
 # model miss the other inliers by several times their own noise.
@@ -59,7 +61,8 @@ class MotionSearch:
         threshold = config.inlier_threshold
         self._noise = EXPECTED_NOISE * threshold
         expected = self._noise, config.solver_iterations
-        wide = max(_GLOBAL_SHUTTER_SCALE * focal_length, threshold)
+        wide = max(GLOBAL_SHUTTER_SCALE * focal_length, threshold)
+        self._rough = wide
         scales = (wide, wide) if solver.rolling_shutter else (_SCORE_SCALE * threshold, threshold)
         self._starts = Hypotheses(start, _GLOBAL_SHUTTER_BLOCK, *scales, *expected)
         self._motions = Hypotheses(solver, _BLOCK, _SCORE_SCALE * threshold, threshold, *expected)
@@ -126,6 +129,21 @@ class MotionSearch:
             return start, best
         rival = self._motion(observed, second, self._config.max_iterations)
         return (second, rival) if rival.cost < best.cost else (start, best)
+
+    def among(self, observed: Observed, chosen: BoolArray, least: int) -> Candidate:
+        """The motion of these points alone, if more than so many agree roughly on a pose."""
+        part = replace(
+            observed, observations=observed.observations.only(np.flatnonzero(chosen)),
+            ranking=observed.ranking[:0],
+        )  # fmt: skip
+        everything = np.ones(part.observations.count, np.bool_)
+        start = self._global_shutter(part, everything, _SECOND_LOOK_SAMPLES)
+        if (
+            not start.found
+            or np.count_nonzero(part.observations.within(start.state, self._rough)) <= least
+        ):
+            return NOTHING
+        return self._motion(part, start, _FIRST_SAMPLES)
 
     def _global_shutter(
         self, observed: Observed, among: BoolArray, most: int, before: Candidate = NOTHING

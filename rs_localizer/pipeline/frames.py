@@ -609,6 +609,8 @@ class FrameLocalizer:
         if result.integrity > _DOUBTFUL:
             text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
             self._notice(Notice.DOUBTFUL, text)
+        if result.left_out:
+            self._notice(Notice.DOUBTFUL, result.left_out)
         if (off := self._tracker.smooth_error) > 0.0 and not watch.axis_in_doubt:
             self._notice(Notice.LENS, lens_is_off(off))
         return self._made(cloud, result, deviation)

@@ -1,0 +1,170 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Points that a motion leaves out: mismatches, or witnesses against it.
+
+Mismatches lie anywhere. Before a lens or a map that is grossly wrong a motion fits a part of the
+points, by velocities that it needs for that, and the rest is no chance: it lies near where it ought
+to, or it has a motion of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.state import MOVE, TURN, step_between
+from rs_localizer.core.types import Failure
+from rs_localizer.estimation.observations import Observed
+from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior
+from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.searching import GLOBAL_SHUTTER_SCALE, MotionSearch
+
+# A rest of half as many points as the inliers, or more, says as much as they do.
+_SHARE = 0.5
+# Six points have a motion whatever they are.
+_SAMPLE = 6
+# Groups that chance makes of mismatches in one frame of 1,000 (Desolneux, Moisan and Morel, IJCV
+# 2000: the number of false alarms).
+_LEAST_CHANCE = -math.log(1e-3)
+# Errors of inliers from this part of the gate on are spread over it: they may go on beyond.
+_SPREAD = 0.35
+# Beyond so many gates a point is another's.
+_ELSEWHERE = 2.0
+# How much the errors of two neighbours may differ, as a part of their distance: scales are off by
+# twice at most.
+_STRETCH = 0.5
+_MANY = 60
+# A side of the image that has all but this part of a group.
+_ELSE = 0.1
+
+
+class LeftOut(NamedTuple):
+    """What is odd about the points that are left out."""
+
+    failure: Failure | None = None
+    notice: str = ""
+
+
+def left_out(
+    search: MotionSearch, observed: Observed, posterior: Posterior, threshold: float, known: bool
+) -> LeftOut:
+    """Whether the points that a motion leaves out speak against it.
+
+    Args:
+        posterior: of an accepted motion.
+        threshold: px, of inliers.
+        known: the motion was predicted, so that a group as large is another thing.
+    """
+    count, inliers = observed.observations.count, int(np.count_nonzero(posterior.inliers))
+    if count - inliers < _SAMPLE:
+        return LeftOut()
+    share = (1.0 if known else _SHARE) * math.exp(-0.25 * posterior.speeding)
+    near = _near(observed, posterior, threshold)
+    if near >= max(share * inliers, 1.0):
+        return LeftOut(Failure(
+            Reason.MODEL_ERROR,
+            f"{inliers} points fit to {posterior.noise:.2g} px (one sigma), and of the "
+            f"{count - inliers} others {near:.0f} lie so near to their places that they are no "
+            "mismatches: the calibration or the map is too far off for any pose",
+        ))  # fmt: skip
+    rest = ~(posterior.squared_errors < (_ELSEWHERE * WIDEST_GATE * threshold) ** 2)
+    left = int(np.count_nonzero(rest))
+    few = left < share * inliers
+    if left <= _SAMPLE or (few and _moved_alike(observed, posterior, rest) <= _SAMPLE):
+        return LeftOut()
+    own = search.among(observed, rest, _SAMPLE)
+    if not own.found:
+        return LeftOut()
+    group = rest & observed.observations.within(own.state, WIDEST_GATE * threshold)
+    size = int(np.count_nonzero(group))
+    if _surprise(left, size, _chance(observed, WIDEST_GATE * threshold)) < _LEAST_CHANCE:
+        return LeftOut()
+    text = _described(observed, posterior, own.state, group)
+    text = f"{inliers} points fit one motion, and {size} of the {left} left out {text}"
+    if size < share * inliers:
+        return LeftOut(notice=f"{text}: have these points been moved, or do they move?")
+    return LeftOut(Failure(
+        Reason.MODEL_ERROR,
+        f"{text}: a part of the map was moved, or the calibration is grossly wrong (is K, its "
+        "binning or its region of interest that of another image?)",
+    ))  # fmt: skip
+
+
+def _chance(observed: Observed, distance: float) -> float:
+    """Of a mismatch, to lie within a distance (px) of its place."""
+    area = min(math.prod(camera.size) for camera in observed.sighted.exposure.cameras)
+    return min(math.pi * distance**2 / area, 1.0)
+
+
+def _near(observed: Observed, posterior: Posterior, threshold: float) -> float:
+    """How many points lie near where they ought to, though not within the gate, and not by chance;
+    0 where the inliers are apart from the others.
+    """
+    if posterior.noise < _SPREAD * threshold:
+        return 0.0
+    distance = GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
+    others = posterior.squared_errors[~posterior.inliers]
+    near = np.count_nonzero(others < distance**2)
+    return float(near) - len(others) * _chance(observed, distance)
+
+
+def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> int:
+    """How many of the points that are left out are off as their nearest neighbours are.
+
+    It costs a tenth of a search, and mismatches seldom are.
+    """
+    count = observed.observations.count
+    lines = linearized(
+        observed.observations.packed, count, posterior.state, np.zeros((count, 6))
+    )  # fmt: skip
+    some = np.flatnonzero(rest & np.isfinite(lines.errors[:, 0]))
+    some = some[:: len(some) // _MANY + 1]
+    if len(some) <= _SAMPLE:
+        return len(some)
+    places = observed.assumed.focal_length * observed.observations.rays[some]
+    apart = np.hypot(*(places[:, None] - places).T)
+    np.fill_diagonal(apart, np.inf)
+    nearest = apart.argmin(axis=0)
+    distance = np.hypot(*(lines.errors[some] - lines.errors[some[nearest]]).T)
+    rough = GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
+    alike = distance < rough + _STRETCH * apart[nearest, np.arange(len(some))]
+    return int(np.count_nonzero(alike)) * (int(np.count_nonzero(rest)) // len(some))
+
+
+def _surprise(total: int, size: int, chance: float) -> float:
+    """Negative logarithm of how many groups of a size chance makes of so many mismatches."""
+    if size <= _SAMPLE:
+        return 0.0
+
+    def choices(n: int, k: int) -> float:
+        return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
+
+    free = size - _SAMPLE
+    return -(choices(total, size) + choices(size, _SAMPLE) + free * math.log(chance))
+
+
+def _described(observed: Observed, posterior: Posterior, state: Array, group: BoolArray) -> str:
+    """Where a group of points lies, and how far away its own pose is."""
+    step = step_between(posterior.state, state)
+    turn, move = float(np.linalg.norm(step[TURN])), float(np.linalg.norm(step[MOVE]))
+    where = _side(observed, posterior.inliers, group)
+    return f"{where}have a pose of their own, {math.degrees(turn):.1f} deg and {move:.2g} m away"
+
+
+def _side(observed: Observed, inliers: BoolArray, group: BoolArray) -> str:
+    """On which side of the image a group of points lies, beside the inliers; empty: on none."""
+    if not observed.sighted.exposure.alone:
+        return ""
+    pixels = observed.sighted.pixels[observed.sighted.usable.indices]
+    for axis, names in enumerate((("left", "right"), ("top", "bottom"))):
+        low, high = np.quantile(pixels[group, axis], [_ELSE, 1.0 - _ELSE])
+        least, most = np.quantile(pixels[inliers, axis], [_ELSE, 1.0 - _ELSE])
+        if high < least:
+            return f"at the {names[0]} of the image "
+        if low > most:
+            return f"at the {names[1]} of the image "
+    return ""

@@ -1,0 +1,51 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Points that are left out: mismatches, or witnesses against the motion."""
+
+import numpy as np
+import pytest
+
+import rs_localizer as rsl
+from benchmarks.gross import frame
+
+
+def results(scene, fault, count=6):
+    random = np.random.default_rng(5)
+    for _ in range(count):
+        camera, points, pixels, _ = frame(scene, fault, random)
+        yield rsl.Localizer(camera).localize(points, pixels)
+
+
+@pytest.mark.parametrize("scene", ["corner", "markers", "volume"])
+def test_right_calibrations_lose_no_frame(scene):
+    for fault in ("right", "a tenth wrong"):
+        assert all(result and not result.left_out for result in results(scene, fault))
+
+
+@pytest.mark.parametrize(
+    ("scene", "fault"),
+    [
+        ("corner", "binned twice"), ("markers", "binned twice"), ("volume", "ROI twice"),
+        ("wall", "half moved"), ("volume", "half moved"),
+    ],
+)  # fmt: skip
+def test_what_has_two_poses_has_none(scene, fault):
+    found = [result for result in results(scene, fault) if result]
+    assert found == []
+
+
+def test_a_moved_half_is_described():
+    failure = next(iter(results("wall", "half moved")))
+    assert failure.reason is rsl.Reason.MODEL_ERROR
+    assert "of the image have a pose of their own" in failure.detail
+
+
+def test_a_moved_corner_is_a_notice():
+    camera, points, pixels, rotation = frame("volume", "right", np.random.default_rng(2))
+    moved = np.argsort(points[:, 0])[: len(points) // 4]
+    points[moved] += (0.0, 0.5, 0.0)
+    result = rsl.Localizer(camera).localize(points, pixels)
+    assert result
+    assert not result.inliers[moved].any()
+    assert "left out at the left of the image have a pose of their own" in result.left_out
+    assert np.abs(result.rotation - rotation).max() < 0.01
