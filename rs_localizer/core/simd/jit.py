@@ -176,6 +176,9 @@ def _obtained(compiled: Any, compile_or_load: Callable[..., Any], signature: Any
     """The entry point of a kernel: from the cache, where a process of its own compiles to."""
     if _thread.compiles:
         return compile_or_load(signature)
+    loaded = compiled.overloads.get(tuple(signature))
+    if loaded is not None:
+        return loaded.entry_point
     before, _thread.asks = _thread.asks, True
     try:
         return compile_or_load(signature)
@@ -319,7 +322,7 @@ class _Cache(FunctionCache):
     def holds(self, signature: Any, target: Any) -> bool:
         """Whether a signature is there, by its files."""
         with contextlib.suppress(*_DAMAGE, OSError):
-            target.refresh()
+            _refresh_once(target)
             return self._cache_file.load(self._index_key(signature, target.codegen())) is not None
         return False
 
@@ -327,7 +330,8 @@ class _Cache(FunctionCache):
         overload = None
         try:
             if _is_ours(Path(self._cache_path)):
-                overload = super().load_overload(signature, target)
+                _refresh_once(target)
+                overload = self._load_overload(signature, target)
         except _DAMAGE as error:
             if not isinstance(error, _AnotherCallee):
                 _say(f"damaged files are compiled anew ({self._cache_path}: {error!r})")
@@ -348,6 +352,12 @@ class _Cache(FunctionCache):
             super().save_overload(signature, compiled)
         except OSError as error:
             _say(f"kernels are compiled again at the next start: {error.strerror or error}")
+
+
+@functools.cache
+def _refresh_once(target: Any) -> None:
+    """Numba's run time and symbols, which it would look for anew with each kernel."""
+    target.refresh()
 
 
 @functools.cache
