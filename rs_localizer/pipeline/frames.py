@@ -140,7 +140,8 @@ _BESIDE = frozenset({
 
 
 def _of_estimates(config: NodeConfig) -> tuple[object, ...]:
-    config = replace(config, imu=replace(config.imu, wait=0.0))
+    rig = config.rig if config.of_cameras else type(config.rig)()
+    config = replace(config, imu=replace(config.imu, wait=0.0), rig=rig)
     return tuple(getattr(config, it.name) for it in fields(config) if it.name not in _BESIDE)
 
 

@@ -26,6 +26,7 @@ from rs_localizer.io.recording import make_camera_info
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.settings import build
 from rs_localizer.tools.simulation.frames import simulate_frames
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.settings import FrameSettings
@@ -328,3 +329,9 @@ def test_no_more_than_max_points_are_used_and_that_is_said_once():
         assert isinstance(result, Localized)
         assert len(result.estimate.inliers) == 500
     assert notices == ["3000 points have come; max_points of them, 500, are used"]
+
+
+def test_what_one_camera_does_not_read_leaves_its_track():
+    frames = FrameLocalizer(NodeConfig(readout_time=0.03))
+    assert not frames.change(build({"readout_time": 0.03, "rig.window": 0.03}))
+    assert frames.change(build({"readout_time": 0.03, "min_inliers": 20}))
