@@ -1,0 +1,128 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m benchmarks.load.changes``: what it costs a live node when a setting is changed.
+
+A hand-held camera, 30 images a second. Every parameter that a running node lets be set is set to
+another value, and back ten frames later. Of the ten frames after the first change: those without a
+pose, and the largest standard deviation of the turn rate beside that of the ten before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+
+from benchmarks.frame_times import messages
+from benchmarks.hand_held import CAMERA, HandHeld
+from rs_localizer.io import topics
+from rs_localizer.io.recording import make_camera_info
+from rs_localizer.ros.graph.live import LiveNode
+from rs_localizer.settings import NODE_NAME, Setting, settings
+
+_POINTS, _RATE = 120, 30.0
+_FRAMES, _SETTLING = 10, 5
+# Moves the stamps of the poses, by which they are told apart here.
+_LEFT_OUT = "pose_time"
+_SETTINGS: dict[str, Any] = {"readout_time": CAMERA.readout_time}
+
+
+def another(setting: Setting) -> Any:
+    """A value beside the default; None: there is none to be tried."""
+    value = setting.default
+    if isinstance(value, bool):
+        return not value
+    if setting.choices:
+        return next(choice for choice in setting.choices if choice != value)
+    if not isinstance(value, int | float):
+        return None
+    least = -np.inf if setting.minimum is None else setting.minimum
+    most = np.inf if setting.maximum is None else setting.maximum
+    step = 1 if isinstance(value, int) else max(0.1 * abs(value), 1e-3)
+    tried = (type(value)(value + step), type(value)(value - step))
+    return next((one for one in tried if least <= one <= most), None)
+
+
+class Session:
+    """A live node, and the frames that it is sent one after the other."""
+
+    def __init__(self, node: LiveNode, count: int) -> None:
+        self._node, self._frame = node, 0
+        self._clouds = messages(HandHeld(_POINTS, 0.2, _RATE, count), 0.0).clouds
+        self._info = make_camera_info(CAMERA, 0)
+        self._deviations: list[float] = []
+        own = f"{node.namespace}/{NODE_NAME}"
+        ros = node._node
+        ros.create_subscription(
+            TwistWithCovarianceStamped, f"{own}/{topics.TWIST_WITH_COVARIANCE}", self._take, 10
+        )
+        self._client = ros.create_client(SetParameters, f"{own}/set_parameters")
+
+    def _take(self, message: Any) -> None:
+        turn = np.array(message.twist.covariance).reshape(6, 6)[3:, 3:]
+        self._deviations.append(float(np.sqrt(np.trace(turn) / 3.0)))
+
+    def send(self, count: int) -> tuple[int, float]:
+        """Frames without a pose among so many, and the largest deviation (rad/s)."""
+        self._deviations.clear()
+        lost = 0
+        for cloud in self._clouds[self._frame : self._frame + count]:
+            lost += self._node.localize(self._info, cloud) is None
+        self._frame += count
+        return lost, max(self._deviations, default=np.nan)
+
+    def set(self, name: str, value: Any) -> str:
+        """Set a parameter; why it was refused, or nothing."""
+        request = SetParameters.Request(
+            parameters=[Parameter(name, value=value).to_parameter_msg()]
+        )
+        future = self._client.call_async(request)
+        self._node._until(future.done)
+        (result,) = future.result().results
+        return "" if result.successful else str(result.reason)
+
+
+def main() -> int:
+    argparse.ArgumentParser(
+        prog="python -m benchmarks.load.changes", description=__doc__
+    ).parse_args()
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 100 + 1)
+    changes = {
+        name: value
+        for name, one in settings().items()
+        if not (one.read_only or one.fixed or name == _LEFT_OUT)
+        and (value := another(one)) is not None
+    }
+    head = ("poses lost", "deg/s before", "deg/s after")
+    print(f"{'set':44}" + "".join(f"{name:>14}" for name in head))
+    with (
+        tempfile.TemporaryDirectory() as place,
+        LiveNode(_SETTINGS, Path(place) / "log", 0) as node,
+    ):
+        node.wait(lambda line: None)
+        count = (len(changes) + 2) * (2 * _FRAMES + _SETTLING)
+        session = Session(node, count)
+        session.send(_FRAMES)
+        for name, value in changes.items():
+            _, before = session.send(_FRAMES)
+            default = _SETTINGS.get(name, settings()[name].default)
+            refused = session.set(name, value)
+            lost, after = session.send(_FRAMES)
+            figures = f"{lost:14}{np.degrees(before):14.2f}{np.degrees(after):14.2f}"
+            print(f"{f'{name}: {value}':44}{refused or figures}", flush=True)
+            session.set(name, default)
+            session.send(_SETTLING)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
