@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -62,6 +62,8 @@ _MOST_INNOVATION = 62.0
 # Points whose places are off by a standard deviation in either direction lie within so many of them
 # (95 % of Rayleigh's distribution).
 _MAP_GATE = 2.45
+# rad/s, twice the range of most gyroscopes (2000 deg/s).
+_FASTEST_RATE = 70.0
 _UNRANKED = np.zeros(0, np.int64)
 # A point is seen at the time of its row, which it decides: each look makes the error of that a
 # hundredth, the part of the image that a readout moves it.
@@ -118,6 +120,20 @@ class Localizer:
             partial(assumptions, rig=camera, config=self.config, solver=self._solver)
         )
 
+    def __repr__(self) -> str:
+        ordinary, values = LocalizerConfig(), self.config
+        own = [
+            f", {field.name}={getattr(values, field.name)!r}"
+            for field in fields(values)
+            if getattr(values, field.name) != getattr(ordinary, field.name)
+        ]
+        seen = ", ".join(
+            f"{name} {each.width}x{each.height}, {1e3 * each.readout_time:g} ms "
+            f"{each.scan_direction}".strip()
+            for name, each in self.rig.cameras.items()
+        )
+        return f"Localizer({seen}, solver={values.solver!r}{''.join(own)})"
+
     @property
     def camera(self) -> Camera:
         """The camera of a rig of one; ``ValueError`` where there are several."""
@@ -141,7 +157,7 @@ class Localizer:
         still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
         prior = Prior(motion=still, covariance=1e-4 * np.eye(18), gravity=(0.0, 0.0, 1.0),
                       gravity_deviation=1.0, gravity_in_map=(0.0, 0.0, 1.0))  # fmt: skip
-        self.localize(points, pixels, np.arange(count, dtype=np.float64), prior)
+        self.localize(points, pixels, np.arange(count, dtype=np.float64), prior=prior)
         self.localize(points, pixels)
         pivot_of(np.eye(18))  # by a tracker
         # And with one that shakes, rows to and fro.
@@ -164,6 +180,7 @@ class Localizer:
         points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
         pixels: ArrayLike | None = None,
         scores: ArrayLike | None = None,
+        *,
         prior: Prior | None = None,
         expected_share: float = 0.5,
         turn: GyroRotation | None = None,
@@ -217,6 +234,7 @@ class Localizer:
         """
         if prior is not None:
             instance("prior", prior, Prior)
+            self._check_rate(prior)
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
         sights = self._sights(points, pixels, scores, stamps)
@@ -229,6 +247,18 @@ class Localizer:
         if self._alone or not found:
             return found
         return RigEstimate.of(found, given.exposure, given.counts)
+
+    def _check_rate(self, prior: Prior) -> None:
+        """Refuse a gyroscope's rate that no gyroscope measures."""
+        if prior.angular_velocity is None or not self._exposure.span > 0.0:
+            return
+        rate = float(np.linalg.norm(np.asarray(prior.angular_velocity, float)))
+        if rate / self._exposure.span > _FASTEST_RATE:
+            raise ValueError(
+                f"angular_velocity of the prior, {rate:.3g} rad per readout, would be "
+                f"{rate / self._exposure.span:.3g} rad/s, more than gyroscopes measure: is it in "
+                "rad/s, or in degrees? Multiply rad/s by the readout time"
+            )
 
     def _sights(
         self, points: Any, pixels: Any, scores: Any, stamps: Mapping[str, float] | None

@@ -76,6 +76,9 @@ class Memory(Enum):
 _LONGEST_GAP = 1.0
 # Frames in a row that are closer than a microsecond come in seconds or milliseconds.
 _LEAST_STEP_NS, _MOST_TOO_CLOSE = 1000, 3
+# A nanosecond count below this is none of a video's; these are seconds and milliseconds of the
+# years 2001 to 2096.
+_COUNTED, _SINCE_1970 = 1_000_000, ((10**9, 4 * 10**9), (10**12, 4 * 10**12))
 # Share of inliers of the last frames: weight of the newest.
 _NEWEST = 0.3
 # Beside a gyroscope: how fast innovations change the expected variance of linear accelerations
@@ -175,7 +178,8 @@ class Tracker:
         self._track: _Track | None = None
         self._given: tuple[int, Prior] | None = None
         self._integrity = Integrity()
-        self._last_ns, self._too_close = 0, 0
+        self._last_ns: int | None = None
+        self._too_close = 0
         self._aid: GyroscopeAid | None = None
         if inertial is not None:
             from rs_localizer.inertial.aiding import GyroscopeAid
@@ -230,9 +234,12 @@ class Tracker:
                 f"time_ns must be a whole number of nanoseconds, got {time_ns!r} "
                 f"({type(time_ns).__name__}): round(1e9 * seconds)"
             )
-        step, self._last_ns = time_ns - self._last_ns, time_ns
+        before, self._last_ns = self._last_ns, time_ns
+        step = _LEAST_STEP_NS if before is None else time_ns - before
         self._too_close = self._too_close + 1 if 0 < step < _LEAST_STEP_NS else 0
-        if self._too_close >= _MOST_TOO_CLOSE:
+        # Seconds or milliseconds since 1970, or milliseconds since the start, once are enough.
+        coarse = time_ns < _COUNTED or any(low <= time_ns < high for low, high in _SINCE_1970)
+        if self._too_close >= (1 if coarse else _MOST_TOO_CLOSE):
             raise ValueError(
                 f"frames are {step} ns apart: time_ns is in nanoseconds, 1e9 of a second and 1e6 "
                 "of a millisecond"
@@ -309,6 +316,7 @@ class Tracker:
         points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
         pixels: ArrayLike | None = None,
         scores: ArrayLike | None = None,
+        *,
         imu: ImuSamples | None = None,
         stamps: Mapping[str, float] | None = None,
         context: FrameContext = ORDINARY,

@@ -3,6 +3,7 @@
 """The whole method on simulated frames whose truth comes from elsewhere: SciPy's rotations, and a
 root finder that looks for the row which sees a point."""
 
+import copy
 import warnings
 from dataclasses import replace
 
@@ -287,6 +288,26 @@ def test_normalized_coordinates_are_not_taken_for_pixels():
     assert not failure
     assert failure.reason == rsl.Reason.DEGENERATE
     assert "normalized coordinates" in failure.detail
+
+
+def test_what_users_mistake_is_named():
+    points, pixels, _ = frame(camera(), Path())
+    localizer = rsl.Localizer(camera(), inlier_threshold=3.0)
+    assert "640x480, " in repr(localizer)
+    assert "inlier_threshold=3.0" in repr(localizer)
+    result = localizer.localize(points, pixels)
+    for tau in (240.0, -0.6, np.nan):
+        with pytest.raises(ValueError, match=r"tau must lie between -0\.5, the first row"):
+            result.at(tau)
+    degrees = rsl.Prior(angular_velocity=(0.0, 30.0, 0.0), angular_velocity_deviation=0.1)
+    with pytest.raises(ValueError, match="is it in rad/s, or in degrees"):
+        localizer.localize(points, pixels, prior=degrees)
+    with pytest.raises(TypeError, match="positional"):
+        localizer.localize(points, pixels, None, degrees)
+    failure = localizer.localize(points[:5], pixels[:5])
+    with pytest.raises(AttributeError, match=r"no rotation, because there is no pose .*if result"):
+        failure.rotation  # noqa: B018
+    assert copy.deepcopy(failure) == failure
 
 
 def test_pixels_beyond_the_lens_are_left_out_and_marked():

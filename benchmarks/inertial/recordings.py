@@ -113,7 +113,7 @@ class _Follower:
         points, pixels = frames.seen(frame, self._noise)
         imu = self._recorded.around(frame) if self._aided else None
         start = time.thread_time()
-        found = tracker.localize(frames.middle_ns(frame), points, pixels, None, imu)
+        found = tracker.localize(frames.middle_ns(frame), points, pixels, imu=imu)
         taken = time.thread_time() - start
         if place >= self._skipped:
             self._seconds.append(taken)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, NoReturn
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, TURN
 
 # Readouts within which accelerations fade by exp(-1): they stay what they are.
 _NO_FADING = 1e9
+
+# Pixels at the rim lie a little beyond the first and the last row.
+_LAST_ROW = 0.55
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -117,7 +120,20 @@ class Estimate(Motion):
         return shaken if self.turn is None else self.turn.at(tau)[0] @ shaken
 
     def at(self, tau: float) -> tuple[Array, Array]:
-        """Rotation (3,3) and translation (3,) camera_from_map at row time ``tau``."""
+        """Rotation (3,3) and translation (3,) camera_from_map at row time ``tau``.
+
+        Raises:
+            ValueError: beyond the rows; :meth:`at_time` goes on.
+        """
+        if not abs(tau) <= _LAST_ROW:
+            raise ValueError(
+                f"tau must lie between -0.5, the first row, and 0.5, the last, got {tau!r}: it is "
+                "a row time, neither seconds nor a row: camera.row_time(pixels) gives those of "
+                "pixels, result.at_time(seconds) goes beyond the rows"
+            )
+        return self._at(tau)
+
+    def _at(self, tau: float) -> tuple[Array, Array]:
         # Not by the object itself: a dataclass with slots is made anew, and this is overridden.
         rotation, translation = Motion.at(self.without_gyro(), tau)
         turned = self.turned_beside(tau)
@@ -163,7 +179,7 @@ class Estimate(Motion):
         tau = seconds / self.span
         beside = numbers_of(self.without_gyro())
         later, transport = carried(beside, tau, _NO_FADING)
-        rotation, translation = self.at(tau)
+        rotation, translation = self._at(tau)
         values, rates = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
         shake_basis(within_rows(tau), values, rates)
         shaken = len(self.shake)
@@ -225,3 +241,13 @@ class Failure:
 
     def __str__(self) -> str:
         return f"{self.reason}: {self.detail}"
+
+    if not TYPE_CHECKING:  # which knows what there is
+
+        def __getattr__(self, name: str) -> NoReturn:
+            if name.startswith("_") or name in ("reason", "detail"):
+                raise AttributeError(name)
+            raise AttributeError(
+                f"there is no {name}, because there is no pose ({self}): test the result before, "
+                "`if result:`"
+            )

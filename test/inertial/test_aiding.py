@@ -30,7 +30,7 @@ def statuses(recorded, change, frames=60):
     for frame in range(frames):
         samples = change(recorded.around(frame), frame)
         seen = recorded.frames.seen(frame, 1.0)
-        result = tracker.localize(recorded.frames.middle_ns(frame), *seen, None, samples)
+        result = tracker.localize(recorded.frames.middle_ns(frame), *seen, imu=samples)
         found.append((tracker.inertial, result))
     return found
 

@@ -90,7 +90,7 @@ def test_a_step_of_the_stamps_is_found(shaking):
         imu = replace(
             samples, times_ns=times_ns[later], angular_velocity=samples.angular_velocity[later]
         )
-        found = tracker.localize(middle_ns, *stepped.frames.seen(frame, 1.0), None, imu)
+        found = tracker.localize(middle_ns, *stepped.frames.seen(frame, 1.0), imu=imu)
         deviations.append(tracker.inertial.time_offset_deviation)
         if found:
             inside.append(rate_error(stepped, frame, found) < 7.81)
