@@ -30,6 +30,8 @@ NODES: dict[Kind, str] = {
 }
 # Parameters that every ROS 2 node may have; they say nothing about poses.
 _FOREIGN = ("use_sim_time", "qos_overrides", "start_type_description_service")
+# What a camera's file has beside its parameters.
+_LENS = "lens"
 
 
 Kind = type[NodeConfig] | type[DetectorConfig] | type[FeatureConfig]
@@ -95,7 +97,7 @@ def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
 def unknown(name: str, kind: Kind = NodeConfig) -> str | None:
     """What to say of a name that is no setting; None for settings and what every node may have."""
     names = settings(kind)
-    if name in names or name.split(".")[0] in _FOREIGN or _of_camera(name, kind):
+    if name in names or name.split(".")[0] in (*_FOREIGN, _LENS) or _of_camera(name, kind):
         return None
     close = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(names)}"
@@ -180,6 +182,18 @@ def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
     return {name: _checked(name, value, str(path), kind) for name, value in values.items()}
 
 
+def camera_values(path: Path) -> dict[str, Any]:
+    """Values by dotted name of a camera's file, as calibrate writes it; none of a lens alone.
+
+    Raises:
+        SettingsError: for parameters that cannot be used.
+    """
+    with contextlib.suppress(OSError, UnicodeDecodeError):  # told by who reads the lens
+        if "ros__parameters" in path.read_text(encoding="utf-8"):
+            return load_params_file(path)
+    return {}
+
+
 def parse_assignment(text: str) -> tuple[str, Any]:
     """Name and value of ``name:=value``, the value read as YAML as in ROS 2.
 
@@ -210,7 +224,7 @@ def _blocks(tree: Any, path: str, node: str) -> Iterator[tuple[str, Any]]:
 def _flatten(parameters: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
     for key, value in parameters.items():
         name = f"{prefix}{key}"
-        if name.split(".")[0] in _FOREIGN:
+        if name.split(".")[0] in (*_FOREIGN, _LENS):
             continue
         if isinstance(value, dict):
             yield from _flatten(value, f"{name}.")

@@ -223,7 +223,7 @@ def main() -> int:
     settings = FrameSettings(args.points, 0.7, args.outliers, _RATE)
     stamps = {
         name: of[: round(60.0 * args.minutes * _RATE)]
-        for name, of in camera_stamps(_PARTS, motion, _RATE, seed=4, triggered=False).items()
+        for name, of in camera_stamps(_PARTS, motion, _RATE, seed=4).items()
     }
 
     def see(name: str, mounted: TrueMotion, seed: int) -> Iterator[SimulatedFrame]:

@@ -16,7 +16,14 @@ from typing import Any
 
 from rs_localizer.cli import WORKING, image_input, refuse_existing, with_values, write_all
 from rs_localizer.cli.marker_map import TargetOptions, find_map
-from rs_localizer.cli.options import Inputs, Settings, UsageError, argument, option
+from rs_localizer.cli.options import (
+    CAMERA_FLAGS,
+    Inputs,
+    Settings,
+    UsageError,
+    argument,
+    option,
+)
 from rs_localizer.cli.rig_input import cameras_of, mounting_lines, numbers
 from rs_localizer.cli.settings_args import given_settings, given_topics, remapped
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
@@ -30,7 +37,12 @@ if WORKING:
     from rs_localizer.core.camera import Camera, DistortionModel
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
-    from rs_localizer.io.calibration import kalibr_fields, read_calibration, write_calibration
+    from rs_localizer.io.calibration import (
+        kalibr_fields,
+        lens_parameters,
+        read_calibration,
+        write_calibration,
+    )
     from rs_localizer.io.camera_info import read_camera_info
     from rs_localizer.io.images import Image
     from rs_localizer.io.imu import ImuRecording
@@ -159,11 +171,13 @@ class Options(TargetOptions, Settings, Inputs):
         "the recordings are those of cameras on one body, one each, or one bag has topics of "
         "several, or one video several lenses (.insv): find where the cameras are, and their "
         "clocks, too; the first one's axes and clock are the rig's. Cameras are named as their "
-        "files, or as their topics begin; --calibration is a camchain, or FILE of all as "
+        "files, or as their topics begin; --camera is a camchain, or FILE of all as "
         "FILE#NAME", default=False,
     )  # fmt: skip
-    calibration: Path | None = option("lens; without one it is found, too", "FILE")
-    intrinsics: bool = option("find the lens as well, and write camera_info", default=False)
+    calibration: Path | None = option(
+        "lens; without one it is found, too", "FILE", flag=CAMERA_FLAGS
+    )
+    intrinsics: bool = option("find the lens as well", default=False)
     imu: bool = option(
         "find how the IMU of a bag or of a video goes with the camera: offset of its stamps, "
         "rotation, bias", default=False,
@@ -175,7 +189,11 @@ class Options(TargetOptions, Settings, Inputs):
     rate: float | None = option(
         "images per second of a video or of files", "HZ", limits=(0.0, math.inf), above=True
     )
-    out: Path | None = option("parameters for node and replay --params", "FILE.yaml")
+    out: Path | None = option(
+        "what is known of the camera, lens and shutter: --camera of the other commands, params "
+        "file and camera_file of the node", "FILE.yaml",
+    )  # fmt: skip
+    camera_info: Path | None = option("also the lens alone, for ROS drivers", "FILE")
     overwrite: bool = option("replace an earlier result", default=False)
     plot: Path | None = option("directory for pictures", "DIR")
     force: bool = option(
@@ -218,9 +236,10 @@ def _finds_lens(args: Any, recording: Path) -> bool:
 def calibrate_one(args: Any) -> Figures:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
-        lens = _finds_lens(args, args.recording)
-        beside = {_LENS: lens, _MAP: args.map or args.board} | dict.fromkeys(_SHARED, args.share)
+        beside = {_MAP: args.map or args.board} | dict.fromkeys(_SHARED, args.share)
         refuse_existing(args, *(name for name, written in beside.items() if written))
+    if args.camera_info is not None:
+        refuse_existing(with_values(args, out=args.camera_info))
     config = _config(args)
     source = _read(args, config)
     intrinsics = args.intrinsics or source.new_lens
@@ -441,7 +460,7 @@ def _write(
     config: NodeConfig,
     refused: str,
 ) -> bool:
-    """FILE.yaml, and beside it the lens and the map as they were found; and what comes next.
+    """FILE.yaml, and beside it the map as it was found; and what comes next.
 
     Args:
         refused: why the shutter is not known, then it is left out; or ''.
@@ -450,7 +469,7 @@ def _write(
         Whether there was anything to write.
     """
     path: Path = args.out
-    lens, shape = args.calibration, args.map
+    shape = args.map
     text = "/**:\n  ros__parameters:\n" + (
         f"    # readout_time {refused}\n    scan_direction: {config.scan_direction}\n"
         if refused
@@ -462,8 +481,6 @@ def _write(
     if intrinsics:
         values = found.lens._asdict().items()
         text += "".join(f"    calibration.{name}: {value:.4g}\n" for name, value in values)
-        lens = path.with_name(f"{path.stem}_{_LENS}")
-        writers[lens] = lambda part: write_calibration(part, found.fit.camera)
     if marker_map is not None:
         if verdict.shape_is_free(found):
             places = verdict.moved(found, marker_map.points)
@@ -473,22 +490,27 @@ def _write(
             writers[shape] = partial(write_marker_map, marker_map=marker_map)
         declared = config.map_deviation or marker_map.settings.get("map_deviation", 0.0)
         text += f"    map_deviation: {declared:.3g}\n" if declared else ""
-    if refused and not writers:
+    if refused and not writers and not intrinsics:
         return False
+    text += lens_parameters(found.fit.camera)
+    if args.camera_info is not None:
+        writers[args.camera_info] = partial(write_calibration, camera=found.fit.camera)
     writers[path] = lambda part: part.write_text(text, encoding="utf-8")
     write_all(writers)
-    print(f"next: {_next(args, path, lens, shape)}")
+    print(f"next: {_next(args, path, intrinsics, shape)}")
     return True
 
 
-def _next(args: Any, out: Path, lens: Path | None, shape: Path | None) -> str:
+def _next(args: Any, out: Path, intrinsics: bool, shape: Path | None) -> str:
     """The commands that make poses of this recording with what was found."""
     recording, seen = str(args.recording), out.with_name(f"{out.stem}_seen")
-    params, poses = ["--params", str(out)], str(out.with_name(f"{out.stem}_poses"))
+    lens = intrinsics or args.calibration is not None
+    params = ["--camera" if lens else "--params", str(out)]
+    poses = str(out.with_name(f"{out.stem}_poses"))
     if shape is None:  # a recording of correspondences
         return shlex.join(["rs_localizer", "replay", recording, *params, "--out", poses])
     topics = [word for text in args.remaps for word in ("-r", text)]
-    options = {"--map": shape, "--calibration": lens, "--rate": args.rate}
+    options = {"--map": shape, "--rate": args.rate}
     detect = ["rs_localizer", "detect", recording, *_words(options), *topics, *params]
     detect += ["--out", str(seen)]
     return f"{shlex.join(detect)} && {image_input.replay_command(seen)}"
@@ -629,7 +651,7 @@ def _next_of_rig(args: Any) -> str:
     if len(args.recordings) > 1 or is_bag(recording) or args.map is None:
         return shlex.join(["ros2", "launch", str(path.with_name(f"{stem}_transforms.launch.xml"))])
     chain, poses = path.with_name(f"{stem}_camchain.yaml"), path.with_name(f"{stem}_poses")
-    files = {"--map": args.map, "--calibration": chain, "--params": path, "--out": poses}
+    files = {"--map": args.map, "--camera": chain, "--params": path, "--out": poses}
     return shlex.join(["rs_localizer", "replay", str(recording), *_words(files)])
 
 

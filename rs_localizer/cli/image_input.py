@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from rs_localizer.cli import WORKING, with_values
-from rs_localizer.cli.options import Inputs, Settings, UsageError, option
+from rs_localizer.cli.options import CAMERA_FLAGS, Inputs, Settings, UsageError, option
 from rs_localizer.cli.settings_args import given_values, remapped
 from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE
-from rs_localizer.settings import build, write_parameters
+from rs_localizer.settings import build, camera_values, write_parameters
 
 if WORKING:
     import numpy as np
@@ -55,8 +55,9 @@ class ImageOptions(Settings, Inputs):
     """images: their camera and their times."""
 
     calibration: Path | None = option(
-        f"{CALIBRATION_KINDS} (default: the bag's camera_info)", "FILE"
-    )
+        f"as calibrate writes it, lens and shutter; or {CALIBRATION_KINDS} (default: the bag's "
+        "camera_info)", "FILE", flag=CAMERA_FLAGS,
+    )  # fmt: skip
     no_telemetry: bool = option(
         "ignore the gyroscope and the readout time inside a video, or in its log file",
         default=False,
@@ -74,14 +75,14 @@ class ImageOptions(Settings, Inputs):
 
 def shutter_values(args: Any) -> dict[str, Any]:
     """The settings that were given, or that stand beside the images of a bag, by dotted name."""
-    beside = args.images / PARAMETERS
-    if args.params is None and is_bag(args.images) and beside.exists():
+    beside, calibration = args.images / PARAMETERS, getattr(args, "calibration", None)
+    given = args.params is not None or (calibration is not None and camera_values(calibration))
+    if not given and is_bag(args.images) and beside.exists():
         return given_values(with_values(args, params=beside))
     values = given_values(args)
     telemetry = telemetry_of(args.images, args)
     if telemetry is not None and telemetry.readout_time is not None:
         values.setdefault("readout_time", telemetry.readout_time)
-    calibration = getattr(args, "calibration", None)
     if calibration is not None and not {"readout_time", "cameras"} & set(values):
         known = read_calibration(calibration).readout_time  # of Gyroflow's profiles
         values |= {"readout_time": known} if known else {}
@@ -252,7 +253,7 @@ def opened(
                 raise UsageError("--rate is for one camera: leave it out with cameras")
             if args.calibration is None:
                 raise UsageError(
-                    "cameras in one file: --calibration FILE_camchain.yaml of calibrate --rig"
+                    "cameras in one file: --camera FILE_camchain.yaml of calibrate --rig"
                 )
             yield of_files(args, path, read_calibration(args.calibration), start)
             return
@@ -261,7 +262,7 @@ def opened(
         if camera is None and calibrated:
             camera = None if telemetry is None else telemetry.profile
             if camera is None:
-                raise UsageError("a video or folder has no camera_info: give --calibration")
+                raise UsageError("a video or folder has no camera_info: give --camera")
         source = of_files(args, path, camera, start)
         if telemetry is not None and source.clock is not None:
             moving = with_telemetry(source.shots, telemetry, source.clock)

@@ -76,13 +76,12 @@ COMMANDS = {
     "detect": Command(
         "rs_localizer.cli.detect",
         "find markers or a board in a video, a bag or a folder of images; writes a recording",
-        "rs_localizer detect video.mp4 --map wall.yaml --calibration camera.yaml --params "
-        "shutter.yaml --out seen",
+        "rs_localizer detect video.mp4 --map wall.yaml --camera camera.yaml --out seen",
     ),
     "calibrate": Command(
         "rs_localizer.cli.calibrate",
         "readout time, scan direction and lens of a camera that moves in a recording; or of a rig",
-        "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --out shutter.yaml",
+        "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --out camera.yaml",
     ),
     "readout": Command(
         "rs_localizer.cli.readout",
@@ -97,13 +96,13 @@ COMMANDS = {
     "map build": Command(
         "rs_localizer.cli.map.build",
         "a map of landmarks from images: structure by COLMAP, refined with the rolling shutter",
-        "rs_localizer map build walk.mp4 --calibration lens.yaml --params shutter.yaml --out room",
+        "rs_localizer map build walk.mp4 --camera camera.yaml --out room",
     ),
     "map survey": Command(
         "rs_localizer.cli.map.survey",
         "find the poses of all markers that a recording shows; sizes are taken as given",
-        "rs_localizer map survey wall.mp4 --family apriltag_36h11 --size 0.15 --calibration "
-        "lens.yaml --out wall.yaml",
+        "rs_localizer map survey wall.mp4 --family apriltag_36h11 --size 0.15 --camera "
+        "camera.yaml --out wall.yaml",
     ),
     "map refine": Command(
         "rs_localizer.cli.map.refine",

@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 T = TypeVar("T")
+CAMERA_FLAGS = "--camera --calibration"
+"""One file a camera, and its name where it is a lens alone."""
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
 
@@ -58,7 +60,7 @@ def option(
         help: what it does; a default that is no None, False or empty list is added.
         metavar: of its value; of a list whose values stand behind one flag, ``ID ...``.
         default: ``list`` for one that may be repeated; of a switch, False.
-        flag: another name, such as ``-p``.
+        flag: another name, such as ``-p``, or several.
         choices: of a text.
         limits: least and largest number.
         above: the least itself is refused.
@@ -188,7 +190,7 @@ def _add(group: argparse._ActionsContainer, name: str, hint: Any, item: Any) -> 
         words |= {"default": item.default, "required": about["required"]}
         if item.default is not None:
             words["help"] += f" (default: {item.default})"
-    group.add_argument(flag, dest=name, **words)
+    group.add_argument(*flag.split(), dest=name, **words)
 
 
 def _element(hint: Any) -> tuple[Any, Any]:

@@ -19,7 +19,15 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NoReturn
 
 from rs_localizer.cli import WORKING
-from rs_localizer.cli.options import Inputs, Many, Settings, UsageError, argument, option
+from rs_localizer.cli.options import (
+    CAMERA_FLAGS,
+    Inputs,
+    Many,
+    Settings,
+    UsageError,
+    argument,
+    option,
+)
 from rs_localizer.cli.replay_result import (
     BRIDGED,
     POSES,
@@ -94,7 +102,9 @@ class Options(Settings, Inputs, Many):
         "the map of the keypoints; of images, also markers or the result of map build, which "
         "brings the lens and the shutter", "FILE",
     )  # fmt: skip
-    calibration: Path | None = option("of images: the lens, as for detect", "FILE")
+    calibration: Path | None = option(
+        "as calibrate writes it: lens and shutter; or a lens alone", "FILE", flag=CAMERA_FLAGS
+    )
     no_telemetry: bool = option(
         "ignore the gyroscope and the readout time inside a video, or in its log file",
         default=False,
@@ -184,7 +194,7 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
         own = matches / PARAMETERS
         alone = replace(
             options, params=own if own.exists() else None, assignments=[],
-            map=None if by_markers else _map_file(options.map), remaps=[],
+            map=None if by_markers else _map_file(options.map), remaps=[], calibration=None,
         )  # fmt: skip
         return _replay_matches(alone, matches, recording, out, timed)
 
@@ -267,7 +277,7 @@ def _write_table(tables: list[Table], file: Path) -> None:
 
 def _detect_command(path: Path) -> str:
     """What finds the matches in images."""
-    calibration = "" if is_bag(path) else " --calibration camera.yaml"
+    calibration = "" if is_bag(path) else " --camera camera.yaml"
     out = shlex.quote(f"{_name(path)}_seen")
     return (
         f"run: rs_localizer detect {shlex.quote(str(path))} --map MAP.yaml{calibration} --out "

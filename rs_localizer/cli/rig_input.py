@@ -161,7 +161,7 @@ def map_cameras(args: Any, config: NodeConfig) -> list[MapCamera]:
         given, shutters = _by_tf(sources), dict(config.of_cameras)
     if lacking := [name for name in sources if name not in given]:
         raise UsageError(
-            f"it is not known where {', '.join(lacking)} of the rig is mounted: give --calibration "
+            f"it is not known where {', '.join(lacking)} of the rig is mounted: give --camera "
             "CAMCHAIN, or a bag with TF; calibrate --rig finds it"
         )
     if lacking := [name for name in sources if not shutters[name].readout_time > 0.0]:

@@ -14,7 +14,7 @@ from rs_localizer.pipeline.inputs import INPUTS
 
 if WORKING:
     from rs_localizer.config import NodeConfig
-    from rs_localizer.settings import build, load_params_file, parse_assignment
+    from rs_localizer.settings import build, camera_values, load_params_file, parse_assignment
 
 # Rows by name, as row times.
 _ROWS = {"first": -0.5, "middle": 0.0, "last": 0.5}
@@ -25,20 +25,27 @@ def given_values(
     also: Sequence[str] = (),
     check: Callable[[NodeConfig], object] | None = None,
 ) -> dict[str, Any]:
-    """The values of a params file, and single ones over them, by dotted name.
+    """The values of a camera's file, of a params file, and single ones, by dotted name.
+
+    Each goes over those before.
 
     Args:
-        args: with ``params`` and ``assignments``.
+        args: with ``params`` and ``assignments``, and ``calibration`` where there is a lens.
         also: further assignments, ``name:=value``.
         check: raises ``ValueError`` for settings that cannot be used.
 
     Raises:
         UsageError: for what is no setting, or a wrong value, with where it was given.
     """
-    where, values = "--params", dict[str, Any]()
+    where, values = "--camera", dict[str, Any]()
+    lens = getattr(args, "calibration", None)
     try:
+        if lens is not None:
+            values = camera_values(lens)
+            _check(values, check)
+        where = "--params"
         if args.params is not None:
-            values = load_params_file(args.params)
+            values |= load_params_file(args.params)
             where = f"--params: {args.params}"
             _check(values, check)
         where = "-p"

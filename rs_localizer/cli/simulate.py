@@ -7,21 +7,20 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from rs_localizer.cli import WORKING, replaced
 from rs_localizer.cli.options import UsageError, argument, option
-from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.io.bags import STORAGES, BagWriter
+from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.calibration import pinhole_matrix, read_calibration
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
-from rs_localizer.settings import settings, write_parameters
+from rs_localizer.settings import build, camera_values, settings, write_parameters
 from rs_localizer.tools.simulation.settings import (
-    BODY_FROM_CAMERA,
     FORMATS,
-    KNOT_SPACING,
     Encoding,
     FrameSettings,
     ImageSettings,
@@ -72,7 +71,8 @@ _START_NS = 1_000_000_000
 _VIBRATION_STREAM = 60
 # Stands for the bundled trajectory.
 _BUNDLED = "tum_vi_room5"
-_FRAMES, _IMAGES, _IMU, _ENCODING = FrameSettings(), ImageSettings(), ImuSettings(), Encoding()
+_FRAMES, _IMAGES, _ENCODING = FrameSettings(), ImageSettings(), Encoding()
+_READOUT_TIME = 0.03  # s, of a webcam
 _POSITIVE = (0.0, math.inf)
 
 
@@ -92,21 +92,15 @@ def rig_of(args: Options) -> RigParts:
 
 
 def camera_of(args: Options) -> Camera:
-    """The camera; UsageError for a lens that cannot be."""
-    K = np.array(
-        [
-            [args.focal, 0.0, 0.5 * (args.width - 1)],
-            [0.0, args.focal, 0.5 * (args.height - 1)],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-    try:
-        return Camera(
-            args.width, args.height, K, np.array(args.distortion), args.distortion_model,
-            args.readout_time, args.scan_direction,
-        )  # fmt: skip
-    except ValueError as error:  # the other arguments are checked already
-        raise UsageError(f"--distortion: {error}") from error
+    """The camera of ``--camera``, or a webcam; its shutter is what the options say."""
+    lens = Camera(640, 480, pinhole_matrix(500.0, 500.0, 319.5, 239.5), readout_time=_READOUT_TIME)
+    values = dict[str, Any]()
+    if args.camera is not None:
+        lens, values = read_calibration(args.camera), camera_values(args.camera)
+    given = {"readout_time": args.readout_time, "scan_direction": args.scan_direction}
+    values |= {name: value for name, value in given.items() if value is not None}
+    config = build({"readout_time": lens.readout_time or _READOUT_TIME} | values)
+    return replace(lens, readout_time=config.readout_time, scan_direction=config.scan_direction)
 
 
 def motion_of(args: Options) -> TrueMotion:
@@ -123,7 +117,7 @@ def _unshaken(args: Options) -> TrueMotion:
         file = args.trajectory
         if file == Path(_BUNDLED) and not file.exists():
             file = data.path(data.HAND_MOTION)
-        return RecordedMotion(read_tum(file), args.axes, args.knot_spacing)
+        return RecordedMotion(read_tum(file))
     angular, linear = velocities
     if angular is None and linear is None:
         angular, linear = _ANGULAR_VELOCITY, _LINEAR_VELOCITY
@@ -148,33 +142,22 @@ def stamps_of(args: Options, camera: Camera, motion: TrueMotion) -> list[int]:
 
 # Its random numbers are its own: the frames are the same with and without it.
 _STREAM = 14
-_OPTIONS = (
-    "imu_rate",
-    "gyroscope_noise",
-    "gyroscope_bias",
-    "gyroscope_bias_walk",
-    "accelerometer_noise",
-    "accelerometer_bias",
-    "imu_offset",
-)
 
 
-def bag_of(args: Options, out: Path, motion: TrueMotion) -> BagWriter:
+def bag_of(args: Options, out: Path, motion: TrueMotion, readout_time: float) -> BagWriter:
     """The recording that is written; with ``--imu`` one that holds its readings besides."""
-    defaults = ImuSettings()
-    settings = ImuSettings(*(getattr(args, name) for name in _OPTIONS))
     if not args.imu:
-        if settings != defaults:
-            raise UsageError("options of the IMU need --imu")
-        return BagWriter(out, args.storage)
-    lever = Lever()
+        if args.imu_offset:
+            raise UsageError("--imu-offset needs --imu")
+        return BagWriter(out)
+    lever, settings = Lever(), ImuSettings(time_offset=args.imu_offset)
     track = simulate_imu(motion, settings, lever, np.random.default_rng([args.seed, _STREAM]))
-    return ImuBagWriter(out, args.storage, args.readout_time, track, settings, lever)
+    return ImuBagWriter(out, readout_time, track, settings, lever)
 
 
 # Options of the one kind of recording that mean nothing to the other.
 _OF_POINTS = ("points", "noise", "outliers", "keypoints")
-_OF_IMAGES = ("walls", "exposure", "grey_noise", "vignetting", "format", "quality")
+_OF_IMAGES = ("walls", "exposure", "grey_noise", "format")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,14 +167,6 @@ class MotionOptions:
     trajectory: Path | None = option(
         "follow recorded poses: TUM text, also .gz; gaps are left out, never bridged "
         f"({_BUNDLED}: the bundled motion of a hand-held rig)", "FILE",
-    )  # fmt: skip
-    axes: str = option(
-        "axes of the recorded body; the camera looks forward", default="forward_left_up",
-        choices=sorted(BODY_FROM_CAMERA),
-    )  # fmt: skip
-    knot_spacing: float = option(
-        "seconds between the knots of the spline through recorded poses; 0: through every pose, "
-        "shaking with its noise", "S", KNOT_SPACING, limits=_POSITIVE,
     )  # fmt: skip
     angular_velocity: tuple[float, float, float] | None = option(
         "rad/s in camera axes (x right, y down, z forward) "
@@ -216,20 +191,16 @@ class MotionOptions:
 class CameraOptions:
     """camera."""
 
-    width: int = option("of the image", "PX", 640, limits=(2, math.inf))
-    height: int = option("of the image", "PX", 480, limits=(2, math.inf))
-    focal: float = option("focal length", "PX", 500.0, limits=_POSITIVE, above=True)
-    distortion_model: str = option(
-        "of the lens", default=DistortionModel.PLUMB_BOB.value,
-        choices=[model.value for model in DistortionModel],
+    camera: Path | None = option(
+        "lens and shutter, as calibrate writes it; or a calibration (default: 640x480, 500 px)",
+        "FILE",
     )  # fmt: skip
-    distortion: list[float] = option("coefficients in the order of CameraInfo", "D ...", list)
-    readout_time: float = option(
-        "from the first row to the last", "S", 0.03,
+    readout_time: float | None = option(
+        f"from the first row to the last (default: that of the camera, or {_READOUT_TIME:g})", "S",
         limits=(0.0, settings()["readout_time"].maximum or 0.0),
     )  # fmt: skip
-    scan_direction: str = option(
-        "of the shutter", default=ScanDirection.TOP_TO_BOTTOM.value,
+    scan_direction: str | None = option(
+        "of the shutter (default: that of the camera, or top_to_bottom)",
         choices=[direction.value for direction in ScanDirection],
     )  # fmt: skip
     rate: float = option("frames per second", "HZ", _FRAMES.rate, limits=_POSITIVE, above=True)
@@ -237,10 +208,6 @@ class CameraOptions:
         "several cameras in place of one: Kalibr's camchain, with readout_time (s) and "
         "scan_direction of each camera besides", "FILE",
     )  # fmt: skip
-    triggered: bool = option(
-        "the cameras of --rig begin their images at once, instead of by clocks of their own",
-        default=False,
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,23 +215,7 @@ class ImuOptions:
     """IMU."""
 
     imu: bool = option("write an IMU, too, and its mounting on /tf_static", default=False)
-    imu_rate: float = option("of the IMU", "HZ", _IMU.rate, limits=_POSITIVE, above=True)
-    gyroscope_noise: float = option("rad/s/sqrt(Hz)", "N", _IMU.gyroscope_noise, limits=_POSITIVE)
-    gyroscope_bias: float = option(
-        "rad/s, in any direction", "B", _IMU.gyroscope_bias, limits=_POSITIVE
-    )
-    gyroscope_bias_walk: float = option(
-        "rad/s^2/sqrt(Hz)", "N", _IMU.gyroscope_bias_walk, limits=_POSITIVE
-    )
-    accelerometer_noise: float = option(
-        "m/s^2/sqrt(Hz)", "N", _IMU.accelerometer_noise, limits=_POSITIVE
-    )
-    accelerometer_bias: float = option(
-        "m/s^2, in any direction", "B", _IMU.accelerometer_bias, limits=_POSITIVE
-    )
-    imu_offset: float = option(
-        "to add to its stamps to get the camera's time", "S", _IMU.time_offset
-    )
+    imu_offset: float = option("to add to its stamps to get the camera's time", "S", 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -292,13 +243,8 @@ class Options(MotionOptions, CameraOptions, ImuOptions):
     grey_noise: float = option(
         "of images: deviation, of 255", "GREY", _IMAGES.noise, limits=_POSITIVE
     )
-    vignetting: float = option(
-        "of the light that the corners lose", "SHARE", _IMAGES.vignetting, limits=(0.0, 1.0)
-    )
     format: str = option("of images", default=_ENCODING.format, choices=list(FORMATS))
-    quality: float = option("of JPEG", "PERCENT", _ENCODING.quality, limits=(1.0, 100.0))
     seed: int = option("of all random numbers", "N", 0, limits=(0, math.inf))
-    storage: str = option("of the bag", default="mcap", choices=list(STORAGES))
 
 
 _DEFAULTS = {item.name: item.default for item in fields(Options)}
@@ -314,8 +260,6 @@ def run(args: Options) -> dict[str, object]:
             if args.images
             else f"{option} is for images; give --images, too"
         )
-    if args.rig is None and args.triggered:
-        raise UsageError("--triggered is for --rig")
     write = _write_alone if args.rig is None else _write_rig
     return {"recording": str(args.out), **write(args)}
 
@@ -325,7 +269,7 @@ def _write_alone(args: Options) -> dict[str, object]:
     stamps, rng = stamps_of(args, camera, motion), np.random.default_rng(args.seed)
     world, counts = _world(args, motion, rng), list[int]()
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
-        with bag_of(args, built, motion) as bag:
+        with bag_of(args, built, motion, camera.readout_time) as bag:
             frames = _see(args, world, camera, motion, stamps)
             for frame in tqdm(frames, "simulate", len(stamps), unit="frame", disable=None):
                 if isinstance(frame, RenderedFrame):
@@ -333,7 +277,10 @@ def _write_alone(args: Options) -> dict[str, object]:
                 else:
                     write_simulated(bag, camera, frame, _keypoints(args, world, frame, rng))
                     counts.append(len(frame.points))
-        shutter = {"readout_time": args.readout_time, "scan_direction": args.scan_direction}
+        shutter = {
+            "readout_time": camera.readout_time,
+            "scan_direction": str(camera.scan_direction),
+        }
         _save(args, world, built, shutter, counts)
     what, lasted = "images" if args.images else "frames", (stamps[-1] - stamps[0]) * 1e-9
     said = f"{args.out}: {len(stamps)} {what} in {lasted:.1f} s"
@@ -345,7 +292,7 @@ def _write_rig(args: Options) -> dict[str, object]:
     some = stamps_of(args, next(iter(parts.cameras.values())), motion)
     stamps = {
         name: [stamp for stamp in all_ if some[0] <= stamp <= some[-1]]
-        for name, all_ in camera_stamps(parts, motion, args.rate, args.seed, args.triggered).items()
+        for name, all_ in camera_stamps(parts, motion, args.rate, args.seed).items()
     }
     rng, total = np.random.default_rng(args.seed), sum(map(len, stamps.values()))
     world, counts = _world(args, motion, rng), list[int]()
@@ -354,7 +301,7 @@ def _write_rig(args: Options) -> dict[str, object]:
         return _see(args, world, parts.cameras[name], mounted, stamps[name], place)
 
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
-        with BagWriter(built, args.storage) as bag:
+        with BagWriter(built) as bag:
             bag.write(TF_STATIC, make_mounts(parts), some[0])
             images = simulate_rig(parts, motion, see)
             for image in tqdm(images, "simulate", total, unit="image", disable=None):
@@ -387,9 +334,9 @@ def _see(
     """What a camera sees; ``place`` is its own among the random numbers."""
     seed = args.seed + place
     if isinstance(world, Scene):
-        pictures = ImageSettings(args.exposure, args.grey_noise, args.vignetting)
+        pictures = ImageSettings(args.exposure, args.grey_noise)
         renderer = Renderer(camera, world.planes, pictures)
-        encoding = Encoding(args.format, round(args.quality))
+        encoding = Encoding(args.format)
         return rendered_frames(renderer, motion, stamps, encoding, seed)
     seen = FrameSettings(args.points, args.noise, args.outliers, args.rate)
     return simulate_frames(camera, motion, world.points, seen, stamps_ns=stamps, seed=seed)

@@ -76,6 +76,8 @@ CALIBRATION_KINDS = (
     "calibration file of ROS' camera_calibration, OpenCV (YAML, XML), Kalibr (camchain), COLMAP "
     "(cameras.txt), PhotonVision, Gyroflow, VINS, ORB-SLAM, or JSON with K, D, width and height"
 )
+# Where a params file has the lens, as calibrate writes it.
+_BESIDE_PARAMETERS = ("/**.ros__parameters.lens", "/**/rs_localizer.ros__parameters.lens")
 # Who writes FILE#cam1 means a camera in a file; a name of a file may hold the sign, too.
 _CHOICE = re.compile(r"(.+)#([^/#]+)")
 
@@ -133,6 +135,7 @@ def _camera(text: str, chosen: str | None) -> Camera | None:
     tree = _load_tree(text)
     if not isinstance(tree, dict):
         return None
+    tree = next(iter(_at(tree, _BESIDE_PARAMETERS)), tree)
     cameras = {name: item for name, item in tree.items() if _is_kalibr(item)}
     if cameras:
         return kalibr_camera(_choose(cameras, chosen))
@@ -446,6 +449,18 @@ def kalibr_fields(camera: Camera) -> dict[str, Any]:
         "distortion_coeffs": [] if plain else D[:4],
         "resolution": [camera.width, camera.height],
     }
+
+
+def lens_parameters(camera: Camera) -> str:
+    """Lines of a ROS params file for :func:`read_calibration`, which nodes pass over."""
+    # Of none ROS could not tell what they are.
+    D = camera.D if len(camera.D) else np.zeros(5)
+    rows = (("camera_matrix", camera.K), ("distortion_coefficients", D))
+    text = f"    lens:\n      image_width: {camera.width}\n      image_height: {camera.height}\n"
+    text += f"      distortion_model: {camera.distortion_model}\n"
+    for name, values in rows:
+        text += f"      {name}: [{', '.join(repr(float(value)) for value in values.ravel())}]\n"
+    return text
 
 
 def write_calibration(path: Path, camera: Camera) -> None:

@@ -36,20 +36,22 @@ def test_the_webcam(tmp_path, capsys):
     out, plots = tmp_path / "webcam.yaml", tmp_path / "plots"
     recording = str(data.path(data.WEBCAM))
     words = ["calibrate", recording, "--out", str(out)]
+    alone = ["--camera-info", str(tmp_path / "lens.yaml")]
     assert main(words) == 1
     said = capsys.readouterr()
     assert "off their stamps" in said.err
     assert "times less likely" not in said.out
     assert not out.exists()
-    assert main([*words, "--intrinsics", "--plot", str(plots), "--force"]) == 1
+    assert main([*words, "--intrinsics", "--plot", str(plots), "--force", *alone]) == 1
     assert [file.name for file in plots.iterdir()] == ["readout_time.png"]
     values = load_params_file(out)
     # A third of the interval, by single poses (see ATTRIBUTION.md).
     assert 0.010 < values["readout_time"] < 0.015
     assert 0.0 < values["readout_time_deviation"] < 2e-3
     assert values["scan_direction"] == "top_to_bottom"
-    camera = read_calibration(tmp_path / "webcam_camera_info.yaml")
+    camera = read_calibration(out)
     assert camera.K[0, 0] == pytest.approx(529.0, rel=0.02)
+    np.testing.assert_allclose(read_calibration(tmp_path / "lens.yaml").D, camera.D)
 
 
 def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path, capsys, monkeypatch):
@@ -129,7 +131,7 @@ def test_faults(flight, tmp_path, capsys):
     for words, text in (
         (["--out", str(earlier)], f"{earlier} exists; choose another OUT, or --overwrite"),
         (["--out", str(earlier / "a.yaml")], "a.yaml cannot be written: Not a directory"),
-        (["--out", str(tmp_path / "other.yaml"), "--intrinsics"], f"{lens} exists"),
+        (["--out", str(tmp_path / "other.yaml"), "--camera-info", str(lens)], f"{lens} exists"),
     ):
         capsys.readouterr()
         assert main(["calibrate", str(flight), *words]) == 1

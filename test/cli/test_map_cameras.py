@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
+from rs_localizer.io.calibration import write_calibration
 from rs_localizer.io.maps.files import read_map_file, write_map_file
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import MARKER_MAP
@@ -26,7 +27,7 @@ OVER, CENTRE = np.diag([-1.0, -1.0, 1.0]), np.array([0.1, 0.0, 0.0])
 
 
 SCENE = {
-    "alone": ("--width", "320", "--height", "240", "--focal", "260"),
+    "alone": ("--camera", "camera.yaml"),
     "pair": ("--rig", "chain.yaml"),
 }
 ROOM = ("--trajectory", "tum_vi_room5", "--readout-time", "0.03")
@@ -37,6 +38,7 @@ def film(tmp_path_factory):
     """Simulates with one camera or with both."""
     folder = tmp_path_factory.mktemp("film")
     camera = Camera(width=320, height=240, K=K, readout_time=0.03)
+    write_calibration(folder / "camera.yaml", camera)
     mounts = {"up": (np.eye(3), np.zeros(3)), "down": (OVER, -OVER @ CENTRE)}
     write_camchain(
         folder / "chain.yaml", RigParts({"up": camera, "down": camera}, mounts, {"down": 0.2})
@@ -44,7 +46,8 @@ def film(tmp_path_factory):
 
     def film(which: str, name: str, *words: str) -> Path:
         out = folder / f"{which}_{name}"
-        scene = [word.replace("chain.yaml", str(folder / "chain.yaml")) for word in SCENE[which]]
+        option, file = SCENE[which]
+        scene = (option, str(folder / file))
         if not out.exists():
             assert main(["simulate", str(out), *ROOM, *scene, *words]) == 0
         return out

@@ -90,7 +90,7 @@ def record(
     settings = FrameSettings(points=80, noise=noise, outliers=0.2)
     parts = PARTS._replace(cameras={name: PARTS.cameras[name] for name in names})
     true = true._replace(cameras=parts.cameras)
-    stamps = camera_stamps(parts, motion, settings.rate, seed=4, triggered=False)
+    stamps = camera_stamps(parts, motion, settings.rate, seed=4)
     points = wall() if points is None else points
 
     def see(name: str, mounted: TrueMotion, seed: int) -> Any:

@@ -237,7 +237,7 @@ def _tell(args: Any, built: Built, looked: Looked) -> None:
     for text in advice(built, looked.views):
         print(f"to film otherwise: {text}")
     out = shlex.quote(str(args.out))
-    lens = f" --calibration {out}/{CAMERA}" if looked.camera is None else ""
+    lens = f" --camera {out}/{CAMERA}" if looked.camera is None else ""
     print(
         f"next, for images of another walk: rs_localizer detect IMAGES --features sift{lens} --out "
         f"seen && rs_localizer replay seen --params {out}/{PARAMETERS} --map {out}/{MAP} --out "

@@ -13,7 +13,7 @@ from pathlib import Path
 from rs_localizer.cli import WORKING, refuse_existing, write_all
 from rs_localizer.cli.map import ReadoutOptions, check_readout, colmap, print_step
 from rs_localizer.cli.map.colmap import ColmapOptions
-from rs_localizer.cli.options import Inputs, Settings, UsageError, argument, option
+from rs_localizer.cli.options import CAMERA_FLAGS, Inputs, Settings, UsageError, argument, option
 from rs_localizer.cli.rig_input import (
     MapCamera,
     MountingOptions,
@@ -61,7 +61,9 @@ class Options(ReadoutOptions, MountingOptions, ColmapOptions, Settings, Inputs):
         "how well these are known", "M", _HOLD, limits=(0.0, math.inf), above=True
     )
     calibration: Path | None = option(
-        "instead of camera_info; of a rig, a camchain as calibrate --rig writes it", "FILE"
+        "instead of camera_info; of a rig, a camchain as calibrate --rig writes it",
+        "FILE",
+        flag=CAMERA_FLAGS,
     )
 
 

@@ -124,7 +124,7 @@ class ImuBagWriter(BagWriter):
     real camera; between the frames come the readings, recorded when they were taken.
 
     Args:
-        path, storage: as for :class:`BagWriter`.
+        path: as for :class:`BagWriter`.
         readout_time: s.
         track, settings, lever: of the IMU.
     """
@@ -132,13 +132,12 @@ class ImuBagWriter(BagWriter):
     def __init__(
         self,
         path: Path,
-        storage: str,
         readout_time: float,
         track: ImuTrack,
         settings: ImuSettings,
         lever: Lever,
     ) -> None:
-        super().__init__(path, storage)
+        super().__init__(path)
         self._delay_ns = round(readout_time * 1e9)
         self._track, self._settings, self._lever = track, settings, lever
         self._next: int | None = None  # reading to be written

@@ -174,7 +174,6 @@ class Renderer:
         step = camera.row_time_gradient[int(not self._sideways)]
         first = float(camera.row_time(np.zeros((1, 2)))[0])
         self._tau = first + step * np.arange(self._rays.shape[0])
-        self._light = _light(camera, self.settings.vignetting)
 
     def image(self, motion: TrueMotion, stamp_ns: int, seed: Sequence[int] = (0,)) -> Image:
         """The image (height, width) whose first row is exposed around ``stamp_ns``.
@@ -202,7 +201,7 @@ class Renderer:
             len(lines),
             lines,
         )
-        image: NDArray[np.float32] = (lines.T if self._sideways else lines) * self._light
+        image: NDArray[np.float32] = lines.T if self._sideways else lines
         if self.settings.noise > 0.0:
             rng = np.random.default_rng(list(seed))
             image += self.settings.noise * rng.standard_normal(image.shape, np.float32)
@@ -237,16 +236,6 @@ def _rays(camera: Camera, sideways: bool) -> NDArray[np.float32]:
     x, y = (lines, along) if sideways else (along, lines)
     rays = camera.rays(np.column_stack([x.ravel(), y.ravel()]))
     return rays.astype(np.float32).reshape(size, other, 4, 2)
-
-
-def _light(camera: Camera, vignetting: float) -> NDArray[np.float32]:
-    """Factor (height, width) float32 of the light, which falls with the fourth power off centre."""
-    width, height = camera.size
-    x = (np.arange(width) - 0.5 * (width - 1)) / (0.5 * (width - 1))
-    y = (np.arange(height) - 0.5 * (height - 1)) / (0.5 * (height - 1))
-    aspect = height / width
-    squared = (x**2 + (aspect * y[:, None]) ** 2) / (1.0 + aspect**2)
-    return np.asarray(1.0 - vignetting * squared**2, np.float32)
 
 
 T = TypeVar("T")

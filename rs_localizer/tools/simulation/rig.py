@@ -70,21 +70,17 @@ class RigFrame:
 
 
 def camera_stamps(
-    parts: RigParts, motion: TrueMotion, rate: float, seed: int, triggered: bool
+    parts: RigParts, motion: TrueMotion, rate: float, seed: int
 ) -> dict[str, list[int]]:
     """When the first rows of each camera are exposed, in ns of true time.
 
-    ``triggered``: all at once; otherwise each camera runs freely, at any phase, with a rate that is
-    off by some parts in a hundred thousand.
+    Each camera runs freely, at any phase, with a rate that is off by some parts in a hundred
+    thousand.
     """
     stamps = {}
     for place, (name, camera) in enumerate(parts.cameras.items()):
         rng = np.random.default_rng([seed, _CLOCK_STREAM, place])
-        phase, error = (
-            (0.0, 0.0)
-            if triggered
-            else (rng.uniform(0.0, 1.0 / rate), rng.normal(0.0, _RATE_ERROR))
-        )
+        phase, error = rng.uniform(0.0, 1.0 / rate), rng.normal(0.0, _RATE_ERROR)
         steady = np.array(frame_stamps(motion, camera, rate * (1.0 + error)), np.int64)
         shifted = steady + round(phase * 1e9)
         lasts_ns = round(camera.readout_time * 1e9)

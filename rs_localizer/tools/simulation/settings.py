@@ -12,6 +12,7 @@ from rs_localizer.io.video import Image
 
 # As the format of sensor_msgs/CompressedImage says it.
 FORMATS = ("jpeg", "png")
+_QUALITY = 95  # of JPEG: its artefacts stay below the noise of a corner
 
 # Camera axes (x right, y down, z forward) in the body axes of a recorded trajectory; columns are
 # the camera's axes. Motion capture of a rig or robot mostly gives REP-103's body, x forward and
@@ -41,11 +42,10 @@ class FrameSettings:
 
 @dataclass(frozen=True, slots=True)
 class ImageSettings:
-    """What the sensor and the lens do to the picture."""
+    """What the sensor does to the picture."""
 
     exposure: float = 0.0  # s that each row is exposed, around its row time; 0: an instant
     noise: float = 0.0  # standard deviation of a grey level (of 255)
-    vignetting: float = 0.0  # share of the light that is lost in the corners
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +66,9 @@ class Encoding:
     """How images are compressed."""
 
     format: str = "jpeg"
-    quality: int = 95  # of JPEG: its artefacts stay below the noise of a corner
 
     def __call__(self, image: Image) -> bytes:
-        parameters = [cv2.IMWRITE_JPEG_QUALITY, self.quality] if self.format == "jpeg" else []
+        parameters = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY] if self.format == "jpeg" else []
         done, data = cv2.imencode(f".{self.format}", image, parameters)
         if not done:
             raise ValueError(f"an image of {image.shape} cannot be written as {self.format}")
