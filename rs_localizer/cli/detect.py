@@ -27,7 +27,7 @@ from rs_localizer.cli.marker_map import TargetOptions, find_map
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.cli.rig_input import cameras_of
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
-from rs_localizer.io.bags import STORAGES, BagWriter, is_bag
+from rs_localizer.io.bags import BagWriter, is_bag
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock
 from rs_localizer.settings import build, settings
 
@@ -50,7 +50,7 @@ if WORKING:
 Seen = TypeVar("Seen")
 
 # Options of markers and boards.
-_OF_MARKERS = ("map", "board", "pattern", "square", "min_side")
+_OF_MARKERS = ("map", "board", "pattern", "square")
 _LEAST_KEYPOINTS = settings(FeatureConfig)["max_keypoints"].minimum or 1.0
 
 
@@ -59,10 +59,6 @@ class Options(TargetOptions, ImageOptions):
     images: Path = argument(
         "a video (also a stream of JPEG images, .mjpeg), a rosbag2 or ROS 1 bag with raw or "
         "compressed images, or a folder of .jpg or .png files", "VIDEO|BAG|FOLDER",
-    )  # fmt: skip
-    min_side: float | None = option(
-        f"markers with a shorter side are left out (default: {DetectorConfig().min_side:g})", "PX",
-        limits=(0.0, math.inf),
     )  # fmt: skip
     features: str | None = option(
         "instead: keypoints with descriptors, to be matched with a map; sift: as COLMAP's",
@@ -75,7 +71,6 @@ class Options(TargetOptions, ImageOptions):
     out: Path = option("bag directory to create", "DIR", required=True)
     overwrite: bool = option("replace an earlier result", default=False)
     with_images: bool = option("copy compressed images, too", default=False, flag="--images")
-    storage: str = option("of the bag", default="mcap", choices=list(STORAGES))
     timing: bool = option("say how long it took, and how much of it OpenCV did", default=False)
 
 
@@ -96,7 +91,7 @@ def run(args: Options) -> Figures | None:
 def detect_one(args: Options) -> Figures:
     """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
     marker_map = find_map(args)
-    config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
+    config = DetectorConfig()
 
     def look(
         shots: Shots, bag: BagWriter, options: offline.Options, bar: Any
@@ -144,7 +139,7 @@ def _look(
     """
     settings, seen = build(shutter_values(args)), []
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
-        with BagWriter(out, args.storage) as bag:
+        with BagWriter(out) as bag:
             cameras = {"": args}
             if settings.of_cameras:
                 rig = cameras_of(with_values(args, recordings=[args.images]), settings)

@@ -26,21 +26,19 @@ if WORKING:
 _TOPICS = ("pose", "twist", "truth_pose", "truth_twist")
 # Deg: less is an error, not another frame. And what is left once a rotation explains the rest.
 _ANOTHER_FRAME, _EXPLAINED = 10.0, 0.2
+# Largest difference of times that are compared: rounding, where both are of one image.
+_TOLERANCE_NS = 1_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
     estimate: Path = argument("TUM text, a directory of replay, or a recording", "EST")
     truth: Path = argument("likewise", "TRUTH")
-    twists: Path | None = option("estimated twists as text", "FILE")
     truth_twists: Path | None = option("true twists as text", "FILE")
     remaps: list[str] = option(
         f"a topic of recordings, NAME one of {', '.join(_TOPICS)}; may be repeated (default: the "
         "only one of its type)", "NAME:=TOPIC", list, flag="-r",
     )  # fmt: skip
-    tolerance: float = option(
-        "largest difference of times that are compared, s", "S", 1e-3, limits=(0.0, 1e9)
-    )
     offset: float = option("add this to the times of EST, s", "S", 0.0)
     ate: bool = option(
         "also ATE and RPE after alignment, by evo (pip install 'rs_localizer[evo]')", default=False
@@ -52,16 +50,14 @@ def run(options: Options) -> Figures:
     topics = _topics(options)
     estimate = read_motions(options.estimate, topics.get("pose"), topics.get("twist"))
     truth = read_motions(options.truth, topics.get("truth_pose"), topics.get("truth_twist"))
-    if options.twists is not None:
-        estimate = Motions(estimate.poses, read_twists(options.twists))
     if options.truth_twists is not None:
         truth = Motions(truth.poses, read_twists(options.truth_twists))
     estimate = _moved(estimate, round(options.offset * 1e9))
-    tolerance_ns = round(options.tolerance * 1e9)
+    tolerance_ns = _TOLERANCE_NS
     poses = metrics.pose_errors(estimate.poses, truth.poses, tolerance_ns)
     if len(poses.stamps_ns) == 0:
         raise ValueError(
-            f"no pose of {options.estimate} is within {options.tolerance:g} s of one of "
+            f"no pose of {options.estimate} is within {1e-9 * _TOLERANCE_NS:g} s of one of "
             f"{options.truth}: {_span(estimate.poses)} against {_span(truth.poses)}"
         )
     rows = [("position", "m", poses.linear), ("orientation", "deg", poses.angular)]

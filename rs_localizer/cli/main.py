@@ -111,13 +111,8 @@ COMMANDS = {
     ),
     "map align": Command(
         "rs_localizer.cli.map.align",
-        "bring a map to metres, to z up, to an origin; what is not given stays as it is",
+        "write a map to another file; in metres, z up, with an origin, where these are given",
         "rs_localizer map align room.npz level.npz --up 0 -1 0 --origin 7",
-    ),
-    "map convert": Command(
-        "rs_localizer.cli.map.convert",
-        "write a map to another file",
-        "rs_localizer map convert wall.yaml field.json",
     ),
     "map info": Command(
         "rs_localizer.cli.map.info",

@@ -41,7 +41,7 @@ from rs_localizer.cli.replay_result import (
 )
 from rs_localizer.cli.settings_args import given_settings, given_topics
 from rs_localizer.io.atomic_files import atomic_files, check_writable, write_errors
-from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
+from rs_localizer.io.bags import BagReader, BagWriter, is_bag, open_bag
 
 if WORKING:
     import numpy as np
@@ -122,7 +122,6 @@ class Options(Settings, Inputs, Many):
         "also write one table of all recordings, a row a frame: poses, twists, covariances, why "
         "frames were refused (pip install 'rs_localizer[table]')", "FILE",
     )  # fmt: skip
-    storage: str = option("of the bag", default="mcap", choices=list(STORAGES))
 
 
 def run(options: Options) -> Figures | None:
@@ -329,7 +328,7 @@ def _replay(
     start = time.perf_counter()
     # The bar is for a person who waits: none in a log file.
     with (
-        BagWriter(out / RESULT, options.storage) as writer,
+        BagWriter(out / RESULT) as writer,
         tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
     ):
         frames = _localized(bag, topics, localizer, tally, refused, bar)

@@ -40,7 +40,7 @@ def test_info(tmp_path, capsys):
 
 def test_a_model_of_colmap_becomes_a_file(tmp_path, capsys):
     out = tmp_path / "map.npz"
-    words = ["map", "convert", str(COLMAP / "text"), str(out)]
+    words = ["map", "align", str(COLMAP / "text"), str(out)]
     assert main(words) == 0
     said = capsys.readouterr().out
     assert "128 x float32, compared by L2 distance" in said
@@ -50,7 +50,8 @@ def test_a_model_of_colmap_becomes_a_file(tmp_path, capsys):
     assert "exists; choose another OUT, or --overwrite" in capsys.readouterr().err
     assert main([*words, "--overwrite", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)["result"]
-    assert result["landmarks"] == str(len(read_map_file(out, "map")))
+    assert result["landmarks"] == len(read_map_file(out, "map"))
+    assert (result["descriptor_length"], result["descriptor_type"]) == (128, "float32")
     assert result["written_to"] == str(out)
 
 
@@ -68,18 +69,18 @@ def test_info_and_convert(tmp_path, marker_file, capsys):
     assert "markers of apriltag_36h11" in said
     assert "6, ids 0 to 5" in said
     field, back = tmp_path / "field.json", tmp_path / "back.yaml"
-    assert main(["map", "convert", str(marker_file), str(field)]) == 0
+    assert main(["map", "align", str(marker_file), str(field)]) == 0
     assert len(json.loads(field.read_text())["tags"]) == 6
-    assert main(["map", "convert", str(field), str(back)]) == 1
+    assert main(["map", "align", str(field), str(back)]) == 1
     assert "give --size" in capsys.readouterr().err
     assert not back.exists()
-    words = ["convert", str(field), str(back), "--size", "0.16", "--to", "apriltag_ros"]
+    words = ["align", str(field), str(back), "--size", "0.16", "--to", "apriltag_ros"]
     assert main(["map", *words]) == 0
     found, kind = read_any(back)
     assert kind == "apriltag_ros"
     np.testing.assert_allclose(found.points, read_marker_map(marker_file).points, atol=1e-9)
     corners = tmp_path / "corners.npz"
-    assert main(["map", "convert", str(marker_file), str(corners)]) == 0
+    assert main(["map", "align", str(marker_file), str(corners)]) == 0
     landmarks = read_map_file(corners, "map")
     np.testing.assert_array_equal(landmarks.points, read_marker_map(marker_file).points)
 

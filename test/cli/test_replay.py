@@ -15,7 +15,7 @@ from recorded import CAMERA, READOUT_TIME, SHUTTER, flight, write_ros1
 from rs_localizer.cli import replay as replay_command
 from rs_localizer.cli.main import main
 from rs_localizer.cli.replay_result import Tally, figures, print_summary
-from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
+from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES, Localized
 from rs_localizer.io.trajectories import read_motions, read_tum, read_twists
 from rs_localizer.pipeline.readout_estimate import MeasuredReadout
@@ -91,8 +91,7 @@ def test_every_kind_of_recording_gives_the_same(recording, tmp_path):
     texts = []
     for i, bag in enumerate(bags):
         out = tmp_path / f"out{i}"
-        storage = list(STORAGES)[i % 2]
-        arguments = ["--out", str(out), "--storage", storage, *SHUTTER]
+        arguments = ["--out", str(out), *SHUTTER]
         assert main(["replay", str(bag), *arguments]) == 0
         texts.append([(out / name).read_text() for name in ("poses.txt", "twists.txt")])
     assert texts.count(texts[0]) == len(bags)

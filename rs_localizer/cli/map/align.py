@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``rs_localizer map align``: scale, direction of gravity and origin of a map."""
+"""``rs_localizer map align``: scale, direction of gravity, origin and format of a map."""
 
 from __future__ import annotations
 
@@ -175,10 +175,18 @@ class Options(either.OtherFileOptions):
     origin_at: tuple[float, float, float] | None = option("instead: in the map as it is", "X Y Z")
 
 
-def run(options: Options) -> None:
+def run(options: Options) -> either.Figures:
     either.check_output(options)
     wishes = _wishes(options)
-    any_map, _ = either.read(options)
+    any_map, kind = either.read(options)
+    result = any_map if wishes is None else _aligned(any_map, wishes)
+    figures = either.describe(options.file, result, kind)
+    either.write(options, result)
+    return {**figures, "written_to": str(options.out)}
+
+
+def _aligned(any_map: Map | MarkerMap, wishes: Wishes) -> Map | MarkerMap:
+    """The map as it is wanted; says what that changes."""
     by = alignment(any_map, wishes)
     result = moved_markers(any_map, by) if isinstance(any_map, MarkerMap) else moved(any_map, by)
     turn = np.degrees(Rotation.from_matrix(by.rotation).magnitude())
@@ -186,14 +194,14 @@ def run(options: Options) -> None:
     print(f"scaled by {by.scale:.6g}, turned by {turn:.3f} deg, shifted by ({shift}) m")
     if isinstance(any_map, MarkerMap) and by.scale != 1.0:
         print("the sizes of the markers are scaled as well")
-    either.write(options, result)
+    return result
 
 
-def _wishes(options: Options) -> Wishes:
+def _wishes(options: Options) -> Wishes | None:
+    """What is to hold of the map; None: it is only to be written to another file."""
     names = ("scale", "distance", "up", "floor", "upright", "origin", "origin_at")
     if not any(getattr(options, name) not in (None, []) for name in names):
-        raise UsageError("say what to align: --scale, --distance, --up, --floor, --upright, "
-                         "--origin or --origin-at")  # fmt: skip
+        return None
     for group in (("scale", "distance"), ("up", "floor", "upright"), ("origin", "origin_at")):
         given = [name for name in group if getattr(options, name) not in (None, [])]
         if len(given) > 1:

@@ -19,7 +19,7 @@ class Options(either.MapFileOptions):
     pass
 
 
-def run(options: Options) -> dict[str, str]:
+def run(options: Options) -> either.Figures:
     any_map, kind = either.read(options)
     table = either.describe(options.file, any_map, kind)
     if isinstance(any_map, MarkerMap) and (faults := list(other_units(any_map))):

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,7 +20,7 @@ from rs_localizer.cli.rig_input import (
     mounting_lines,
 )
 from rs_localizer.cli.settings_args import given_settings
-from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family, family
+from rs_localizer.markers.families import FAMILIES, Family, family
 
 if WORKING:
     import numpy as np
@@ -63,10 +62,6 @@ class Options(ReadoutOptions, MountingOptions, ImageOptions):
     )  # fmt: skip
     out: Path = option("map to write", "WALL.yaml", required=True)
     overwrite: bool = option("replace WALL.yaml", default=False)
-    map_frame: str = option("of the map", "NAME", "map")
-    min_side: float = option(
-        "markers with a shorter side are left out", "PX", LEAST_SIDE, limits=(0.0, math.inf)
-    )
 
 
 def run(args: Options) -> None:
@@ -79,7 +74,7 @@ def run(args: Options) -> None:
         if origin is None:
             raise UsageError(f"--origin: {' and '.join(args.family)} have no id {args.origin}")
     refuse_existing(args)
-    spotter, cameras = Spotter(markers, args.min_side), map_cameras(args, config)
+    spotter, cameras = Spotter(markers), map_cameras(args, config)
     filmed = [_filmed(camera, spotter) for camera in cameras]
     found = survey_rig(filmed, markers, origin=origin)
     every = found.deviations_of_shape if args.deviations == _SHAPE else found.deviations
@@ -89,7 +84,7 @@ def run(args: Options) -> None:
         check_readout(args, result.readout_check, instead, camera.name)
     pairs = zip(found.markers, every, strict=True)
     surveyed = tuple(replace(marker, deviations=deviations) for marker, deviations in pairs)
-    marker_map = MarkerMap(surveyed, map_frame=args.map_frame)
+    marker_map = MarkerMap(surveyed)
     write_all({args.out: partial(write_marker_map, marker_map=marker_map)})
     for text in other_units(marker_map):
         print(f"warning: {text}")

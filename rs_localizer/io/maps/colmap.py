@@ -3,7 +3,7 @@
 """Sparse models of COLMAP: cameras, images, points with who sees them, and descriptors.
 
 They are read by pycolmap (extra ``mapping``), in a process of its own
-(:mod:`rs_localizer.io.maps.colmap_process`). Where there is none (ARM), ``map convert`` elsewhere
+(:mod:`rs_localizer.io.maps.colmap_process`). Where there is none (ARM), ``map align`` elsewhere
 makes a ``.npz`` of a model.
 """
 

@@ -69,8 +69,8 @@ class Spotter:
         MarkerMapError: for families that this OpenCV does not know.
     """
 
-    def __init__(self, markers: Sequence[Marker], min_side: float = LEAST_SIDE) -> None:
-        self._detector = MarkerDetector(MarkerMap(tuple(markers)), min_side)
+    def __init__(self, markers: Sequence[Marker]) -> None:
+        self._detector = MarkerDetector(MarkerMap(tuple(markers)), LEAST_SIDE)
         self._end = 4 * len(markers)
 
     def spot(self, image: NDArray[np.uint8], stamp_ns: int) -> Spotted:
