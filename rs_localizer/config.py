@@ -482,6 +482,12 @@ class NodeConfig(LocalizerConfig):
         "stamped into the future, in s",
         (0.0, 10.0),
     )
+    camera_file: str = setting(
+        "",
+        "What calibrate writes of a camera: its lens, in place of camera_info's, and the settings "
+        "that are not given otherwise; empty: none",
+        read_only=True,
+    )
     map_file: str = setting(
         "",
         "Map that keypoints are matched with: a .npz file or a sparse model of COLMAP; "

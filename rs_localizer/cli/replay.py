@@ -158,7 +158,8 @@ def _check_place(options: Options) -> None:
 
 def _settings(options: Options) -> NodeConfig:
     """The settings that the options give; refuses those that cannot be."""
-    also = [] if options.map is None else [f"map_file:={json.dumps(str(options.map))}"]
+    files = {"map_file": options.map, "camera_file": options.calibration}
+    also = [f"{name}:={json.dumps(str(file))}" for name, file in files.items() if file is not None]
     return given_settings(options, also, FrameLocalizer)
 
 

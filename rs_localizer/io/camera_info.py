@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """sensor_msgs/CameraInfo -> Camera."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -45,6 +47,20 @@ class Calibration:
             )
         except ValueError as error:
             raise MessageError(str(error)) from error
+
+    def with_lens(self, lens: Camera) -> Calibration:
+        """The same image, of a camera with another lens.
+
+        Raises:
+            MessageError: for a lens that is of another image.
+        """
+        if (lens.width, lens.height) != (self.width, self.height):
+            raise MessageError(
+                f"camera_file is of an image of {lens.width}x{lens.height}, camera_info of "
+                f"{self.width}x{self.height}"
+            )
+        K, D = tuple(lens.K.ravel().tolist()), tuple(lens.D.tolist())
+        return replace(self, K=K, D=D, distortion_model=str(lens.distortion_model))
 
 
 def read_camera_info(message: Any) -> Calibration:

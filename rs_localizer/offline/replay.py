@@ -342,7 +342,7 @@ def prepare(
     if DETECTIONS in topics.of and not config.marker_map:
         raise BagError(f"{bag.path} has {topics.frames}; -p marker_map:=FILE says where tags are")
     localizer = FrameLocalizer(config, notice, find_transforms(bag, topics, config))
-    localizer.load_map()
+    localizer.load_files()
     return topics, localizer
 
 

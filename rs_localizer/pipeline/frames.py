@@ -135,7 +135,7 @@ _BESIDE = frozenset({
     "readout_time_deviation", "estimate_readout_time", "pose_time", "max_points", "base_frame",
     "odom_frame", "publish_tf", "tf_rate", "hold", "two_d_mode", "orientation_covariance",
     "transform_tolerance", "map_file", "map_frame", "marker_map", "matching", "autostart",
-    "output_rate",
+    "output_rate", "camera_file",
 })  # fmt: skip
 
 
@@ -179,6 +179,7 @@ class FrameLocalizer:
         self._assembler = FrameAssembler(config.cameras, config.rig.window, notice)
         self._landmarks = Landmarks(notice)
         self._tags: Tags | None = None
+        self._lens: Camera | None = None  # of camera_file
         self._stream = Stream(notice, self._forget_motion)
         self._pose_prior = PosePrior(notice)
         # Of the last frames, by time of the middle row: with what their results are published.
@@ -354,6 +355,8 @@ class FrameLocalizer:
             MessageError: for one that no camera can have; the previous stays.
         """
         before = self.calibrations.get(name)
+        if self._lens is not None:
+            calibration = calibration.with_lens(self._lens)
         if calibration == before:  # drivers repeat it with every image
             return
         own, frame = _shutters(self._settings)[name], self.camera_frame
@@ -380,12 +383,16 @@ class FrameLocalizer:
         time_ns = self._middle_row_ns(stamp_ns)
         return self.imu.awaits(self._tracker, self._config, time_ns, patience)
 
-    def load_map(self) -> None:
-        """Use the maps of the settings ``map_file`` and ``marker_map``, where there are any.
+    def load_files(self) -> None:
+        """Use ``camera_file`` and the maps ``map_file`` and ``marker_map`` of the settings, if any.
 
         Raises:
             ValueError: for a file that cannot be read or holds no such map.
         """
+        if self.config.camera_file and self._alone:
+            from rs_localizer.io.calibration import read_calibration
+
+            self._lens = read_calibration(self.config.camera_file)
         if self.config.marker_map:  # others need no detector
             from rs_localizer.pipeline.tags import read_tags
 

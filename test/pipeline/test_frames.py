@@ -19,6 +19,7 @@ from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
+from rs_localizer.io.calibration import lens_parameters
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
@@ -335,3 +336,14 @@ def test_what_one_camera_does_not_read_leaves_its_track():
     frames = FrameLocalizer(NodeConfig(readout_time=0.03))
     assert not frames.change(build({"readout_time": 0.03, "rig.window": 0.03}))
     assert frames.change(build({"readout_time": 0.03, "min_inliers": 20}))
+
+
+def test_the_lens_of_a_camera_file_takes_the_place_of_camera_info(tmp_path, make_camera_info):
+    file, K = tmp_path / "camera.yaml", np.array([[400.0, 0, 319], [0, 400, 239], [0, 0, 1]])
+    file.write_text("/**:\n  ros__parameters:\n" + lens_parameters(Camera(640, 480, K)))
+    frames = FrameLocalizer(NodeConfig(camera_file=str(file)))
+    frames.load_files()
+    frames.calibrate(read_camera_info(make_camera_info(width=640, height=480)))
+    assert tuple(K.ravel()) == frames.calibrations[""].K
+    with pytest.raises(MessageError, match="camera_file is of an image of 640x480, camera_info of"):
+        frames.calibrate(read_camera_info(make_camera_info(width=320)))

@@ -58,7 +58,7 @@ def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name, tmp_p
         "quaternion: [0, 0, 0, 1]}]}"
     )
     localizer = FrameLocalizer(NodeConfig(marker_map=str(wall)))
-    localizer.load_map()
+    localizer.load_files()
     refusal = item.take(localizer, broken)
     assert isinstance(refusal, Refusal)
     assert refusal.reason == item.refused

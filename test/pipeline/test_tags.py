@@ -120,7 +120,7 @@ def test_pixels_and_corners_are_those_of_our_own_detector(walls: Path) -> None:
 def localizer(walls: Path, notices: list[tuple[str, str]]) -> FrameLocalizer:
     config = NodeConfig(readout_time=READOUT, marker_map=str(walls / "marker_map.yaml"))
     made = FrameLocalizer(config, lambda name, text: notices.append((name, text)))
-    made.load_map()
+    made.load_files()
     with open_bag(walls) as bag:
         (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("CameraInfo"))
         _, _, info = next(iter(bag.messages([topic])))

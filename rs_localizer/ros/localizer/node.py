@@ -287,7 +287,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
 
         def load() -> None:
             with contextlib.suppress(ValueError):  # of which on_configure tells, at once
-                frames.load_map()
+                frames.load_files()
                 seconds = load_kernels(frames)
                 self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
 
@@ -299,7 +299,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
 
     def open(self, config: NodeConfig) -> None:
         frames = FrameLocalizer(config, self.refusals.notice, self._broadcaster.tf)
-        frames.load_map()
+        frames.load_files()
         if frames.map is not None:
             self.get_logger().info(described(frames.map))
         self._undo.callback(self._broadcaster.close)

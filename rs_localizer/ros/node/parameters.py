@@ -3,6 +3,9 @@
 """ROS parameters, declared by walking the settings of :mod:`rs_localizer.config`."""
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -15,7 +18,16 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rs_localizer.config import NodeConfig, type_of
-from rs_localizer.settings import Config, Kind, Setting, build, camera_settings, settings, unknown
+from rs_localizer.settings import (
+    Config,
+    Kind,
+    Setting,
+    build,
+    camera_settings,
+    camera_values,
+    settings,
+    unknown,
+)
 
 _UNCONFIGURED = "unconfigured"
 
@@ -30,9 +42,22 @@ def declare(node: Node, kind: type[Config]) -> Config:
     Raises:
         ValueError: for a value of a wrong type or out of range, saying what was found.
     """
-    _declare(node, settings(kind))
+    _declare(node, settings(kind), _of_camera_file(node, kind))
     _declare(node, _of_cameras(node, kind))
     return read(node, kind)
+
+
+def _of_camera_file(node: Node, kind: Kind) -> dict[str, Any]:
+    """What ``camera_file`` says; a parameters file that holds the defaults does not change it."""
+    given, known = node._parameter_overrides, settings(kind)
+    if kind is not NodeConfig or "camera_file" not in given or not given["camera_file"].value:
+        return {}
+    values = camera_values(Path(str(given["camera_file"].value)))
+    return {
+        name: value
+        for name, value in values.items()
+        if name in known and (name not in given or given[name].value == known[name].default)
+    }
 
 
 def _of_cameras(node: Node, kind: Kind) -> dict[str, Setting]:
@@ -42,10 +67,13 @@ def _of_cameras(node: Node, kind: Kind) -> dict[str, Setting]:
     return camera_settings({name: node.get_parameter(name).value for name in settings(kind)})
 
 
-def _declare(node: Node, names: Mapping[str, Setting]) -> None:
+def _declare(
+    node: Node, names: Mapping[str, Setting], own: Mapping[str, Any] = MappingProxyType({})
+) -> None:
     for name, setting in names.items():
         try:
-            node.declare_parameter(name, setting.default, _descriptor(setting))
+            default = own.get(name, setting.default)
+            node.declare_parameter(name, default, _descriptor(setting), ignore_override=name in own)
         except InvalidParameterTypeException as error:
             value = node._parameter_overrides[name].value
             hint = ""

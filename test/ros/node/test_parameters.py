@@ -4,7 +4,9 @@
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
 import rclpy
 from rclpy.context import Context
@@ -12,6 +14,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rs_localizer.config import NodeConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.calibration import lens_parameters
 from rs_localizer.ros.node import parameters
 from rs_localizer.settings import settings
 
@@ -90,3 +94,20 @@ def test_what_is_refused_stays_as_it_was(recorder, change, reason):
 def test_bad_values_at_start(context, assignment, text):
     with pytest.raises(ValueError, match=text):
         Recorder(context, "-p", assignment)
+
+
+@pytest.mark.parametrize("way", ["--params-file", "camera_file"])
+def test_a_file_of_a_camera_is_a_params_file_too(context, tmp_path, way):
+    """Its lens is no parameter; the file of all defaults does not take back what it says."""
+    file, shipped = tmp_path / "camera.yaml", Path("config/rs_localizer.yaml").absolute()
+    K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
+    file.write_text(
+        "/**:\n  ros__parameters:\n    readout_time: 0.021\n    min_inliers: 9\n"
+        + lens_parameters(Camera(640, 480, K))
+    )
+    words = ["-r", "__node:=rs_localizer", "--params-file", str(shipped)]
+    words += [way, str(file)] if way != "camera_file" else ["-p", f"camera_file:={file}"]
+    made = Recorder(context, *words, "-p", "min_inliers:=11")
+    assert (made.config.readout_time, made.config.min_inliers) == (0.021, 11)
+    assert parameters.unknown_names(made.node, NodeConfig) == []
+    made.node.destroy_node()
