@@ -18,7 +18,6 @@ from typing import TypeVar
 from tqdm import tqdm
 
 from benchmarks.experiments import (
-    augmented_reality,
     bound,
     convergence,
     features,
@@ -54,7 +53,6 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "features": features.run,
     "readout-time": readout_time.run,
     "real": real.run,
-    "augmented-reality": augmented_reality.run,
 }
 
 # All experiments with so many trials take about a quarter of an hour on two cores.
@@ -70,11 +68,9 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   experiments.mapped_room          a map of a rendered room by markers, and poses in it
   fuzzing                          wrong input for everything that reads
   profiling, frame_times           where the time of a frame goes
-  size                             lines, modules, constants, and calls of one cloud
-  load, load.rig, load.signals     live nodes under load, of a rig, and stopped at random moments
+  load, load.signals               live nodes under load, and stopped at random moments
   image_flight                     rendered flights through live nodes
   signals                          commands that are stopped at random moments
-  rig_calibration                  calibrate --rig against its bounds
   start                            memory and time of a start of the node
   fusion                           estimates in the filter of robot_localization
 """

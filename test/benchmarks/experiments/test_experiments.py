@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.__main__ import EXPERIMENTS
-from benchmarks.experiments import augmented_reality, readout_time
+from benchmarks.experiments import readout_time
 from benchmarks.experiments.results import Context, Result, Verdict
 from benchmarks.experiments.trials import Setting, Trials, draw_trials
 from benchmarks.experiments.views import View, synthetic_views
@@ -26,7 +26,6 @@ from rs_localizer.estimation.refine import apply_step
 TRIALS = 200
 # Of many conditions; what they measure is held by tests of their own.
 FEW = {
-    "augmented-reality": 100,
     "honesty": 2,
     "inertial": 4,
     "readout-time": 40,
@@ -51,7 +50,6 @@ HELD = _names(
             "fast fast_gross outliers outliers_gross faster faster_gross slow slow_gross "
             "rest_gross none_hidden"
         ),
-        "augmented-reality": "localizer position reprojection cube",
         "matching": "localized alike scores",
         "features": "localized better",
     }
@@ -80,8 +78,6 @@ def result(name: str) -> Result:
     with pytest.MonkeyPatch.context() as patch:
         # Of some 500 conditions even a single frame takes long.
         patch.setattr(against_p3p, "conditions", some(against_p3p.conditions, 9))
-        # The least that is taken for a result is too much here.
-        patch.setattr(augmented_reality, "_LEAST_FRAMES", 20)
         patch.setattr(readout_time, "_LEAST", 4)
         patch.setattr(readout_time, "_GLOBAL", 4)  # one of them
         patch.setattr(inertial, "_TEN_SECONDS", 150)
