@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.rigs import RigParts, read_camchain, write_camchain
-from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import build, load_params_file
 
 K = np.array([[420.0, 0.0, 320.0], [0.0, 422.0, 240.0], [0.0, 0.0, 1.0]])
@@ -154,10 +153,3 @@ def test_smoothed_frames_are_nearer_to_the_truth(pair, pose_time, tmp_path, caps
               "angular_velocity_median_deg_per_s": 0.6}  # fmt: skip
     for quantity, limit in limits.items():
         assert smooth[quantity] < limit * plain[quantity]
-
-
-def test_samples_of_the_motion(pair, tmp_path):
-    parameters = ["--params", f"{pair}/parameters.yaml", "--smooth", "--rate", "100"]
-    assert main(["replay", pair, *parameters, "--out", str(tmp_path / "fast")]) == 0
-    # 3 s, of which the first and the last readout may be left out.
-    assert 275 <= len(read_tum(tmp_path / "fast" / "poses.txt")) <= 301
