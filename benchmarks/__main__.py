@@ -64,6 +64,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   real                             videos of real cameras
   gross                            grossly wrong lenses and maps: what is published
   honesty                          against P3P, a real global shutter, rendered walls
+  mutants                          planted bugs, and whether tests catch them
   mapping                          refined maps and surveyed markers
   experiments.mapped_room          a map of a rendered room by markers, and poses in it
   fuzzing                          wrong input for everything that reads

@@ -233,18 +233,18 @@ def test_no_input_crashes_or_warns(solver, points, pixels):
 
 @pytest.mark.bench
 def test_the_larger_of_two_moving_groups_wins():
-    """Half of the points are the scene, a fifth another object, the rest is strewn."""
+    """Half of the points are the scene, three of 20 another object, the rest is strewn."""
     cam = camera()
     localizer = rsl.Localizer(cam)
     wrong = 0
     for seed in range(40):
         scene, thing = Path(seed, 1.0, 1.0), Path(seed + 1000, 1.0, 1.0)
         points, pixels, _ = frame(cam, scene, 100, 0.5, seed=seed)
-        others, seen, _ = frame(cam, thing, 40, 0.5, seed=seed)
+        others, seen, _ = frame(cam, thing, 30, 0.5, seed=seed)
         rng = np.random.default_rng(seed)
-        strewn = rng.uniform([0, 0], [639, 479], (60, 2))
+        strewn = rng.uniform([0, 0], [639, 479], (70, 2))
         result = localizer.localize(
-            np.concatenate([points, others, rng.uniform(-2, 2, (60, 3))]),
+            np.concatenate([points, others, rng.uniform(-2, 2, (70, 3))]),
             np.concatenate([pixels, seen, strewn]),
         )
         wrong += not (result and result.inliers[:100].mean() > 0.95 and result.left_out)

@@ -62,7 +62,7 @@ def left_out(
     count, inliers = observed.observations.count, int(np.count_nonzero(posterior.inliers))
     if count - inliers < _SAMPLE:
         return LeftOut()
-    share = (1.0 if known else _SHARE) * math.exp(-0.25 * posterior.speeding)
+    share = (1.0 if known else _SHARE) * math.exp(-0.5 * posterior.speeding)
     near = _near(observed, posterior, threshold)
     if near >= max(share * inliers, 1.0):
         return LeftOut(Failure(

@@ -27,6 +27,7 @@ from rs_localizer.cli import image_input
 from rs_localizer.cli.main import main, parse
 from rs_localizer.cli.map import build
 from rs_localizer.core.camera import Camera
+from rs_localizer.io import telemetry as files
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.telemetry import (
@@ -460,3 +461,13 @@ def test_a_focal_length_that_disagrees_is_named(video, telemetry, capsys, focal,
     said = capsys.readouterr().out
     assert "lens profile, not used" in said
     assert ("(its focal length is 140 px, 150 px was measured" in said) == doubted
+
+
+def test_a_slower_accelerometer_is_read_at_the_times_of_the_gyroscope():
+    """Both begin and end together, and forces that grow with time are those of then."""
+    times = 3.0 + np.linspace(0.0, 2.0, 401)
+    forces = np.linspace(0.0, 2.0, 101)[:, None] * (1.0, -2.0, 3.0)
+    np.testing.assert_allclose(
+        files._spread(forces, times), (times - 3.0)[:, None] * (1.0, -2.0, 3.0), atol=1e-12
+    )
+    assert np.isnan(files._spread(forces[:1], times)).all()
