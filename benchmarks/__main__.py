@@ -69,7 +69,8 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   experiments.mapped_room          a map of a rendered room by markers, and poses in it
   fuzzing                          wrong input for everything that reads
   profiling, frame_times           where the time of a frame goes
-  load, load.signals               live nodes under load, and stopped at random moments
+  load, load.changes               live nodes under load, and set anew
+  load.signals                     live nodes stopped at random moments
   image_flight                     rendered flights through live nodes
   signals                          commands that are stopped at random moments
   start                            memory and time of a start of the node

@@ -20,7 +20,6 @@ from rs_localizer.cli import WORKING, import_ros, stage
 from rs_localizer.cli.options import option
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.solvers.table import SOLVERS
 from rs_localizer.tools.simulation.settings import FrameSettings
 
 if WORKING:
@@ -73,13 +72,12 @@ Your own camera, next:
 """
 
 
+_SOLVER = NodeConfig().solver
+
+
 @dataclass(frozen=True, kw_only=True)
 class Options:
     out: Path = option("for the pictures", "DIR", Path("out"))
-    solver: str = option(
-        "that is compared with p3p", default=NodeConfig().solver,
-        choices=[name for name, row in SOLVERS.items() if row.rolling_shutter],
-    )  # fmt: skip
     quick: bool = option("a few frames of each recording only", default=False)
 
 
@@ -94,7 +92,7 @@ class Act(NamedTuple):
 def run(options: Options) -> None:
     started = time.monotonic()
     options.out.mkdir(parents=True, exist_ok=True)
-    methods = {options.solver: options.solver, "p3p (one pose per image)": "p3p"}
+    methods = {_SOLVER: _SOLVER, "p3p (one pose per image)": "p3p"}
     most = _QUICK_FRAMES if options.quick else None
     print(
         f"{_minutes(_FIRST)} at the first time on this machine, {_minutes(_EACH)} later; 0.5 GB of "
@@ -112,7 +110,7 @@ def run(options: Options) -> None:
         residuals = plots.residual_picture(webcam, board.results, board.readout_time)
         _draw(options.out, webcam_residuals=residuals)
         _cube(place, most, methods, options.out / CUBE)
-        _live(flight, options.solver, place)
+        _live(flight, _SOLVER, place)
     print(f"done in {time.monotonic() - started:.0f} s\n{_AFTERWARDS}", end="")
 
 

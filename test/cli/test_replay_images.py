@@ -69,11 +69,11 @@ def test_images_are_sent_to_detect(tmp_path, capsys, name, text):
         file.touch()
     assert main(["replay", str(path)]) == 1
     said = f"{path} {text}, not matches: first run: rs_localizer detect {path} --map MAP.yaml"
-    assert f"{said} --calibration camera.yaml" in capsys.readouterr().err
+    assert f"{said} --camera camera.yaml" in capsys.readouterr().err
 
 
 def test_what_is_missing_is_said(walls: Path, tmp_path: Path, capsys: Any) -> None:
     words = ["replay", str(walls.parent / "walls.mp4"), "--out", str(tmp_path / "out"), "--map"]
     assert main([*words, str(walls / "marker_map.yaml")]) == 2
-    assert "a video or folder has no camera_info: give --calibration" in capsys.readouterr().err
+    assert "a video or folder has no camera_info: give --camera" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
