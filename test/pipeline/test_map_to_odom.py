@@ -54,6 +54,16 @@ def test_it_is_held_for_ever_or_as_long_as_is_wanted():
     assert correction.held(SECOND, 0.0) is None
 
 
+def test_in_the_plane_it_is_as_sure_as_of_x_and_y_and_heading():
+    frame = found(SECOND, place(1, 0, 0))
+    frame.pose.covariance[...] = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    for two_d, expected in ((True, [3.0, 6.0]), (False, [6.0, 15.0])):
+        correction = MapToOdom()
+        correction.take(frame, place(0, 0, 0), two_d=two_d)
+        holding = correction.holding(SECOND, place(0, 0, 0))
+        assert [holding.position**2, holding.angle**2] == pytest.approx(expected)
+
+
 def drive(rng: np.random.Generator, scale: float, turn: float) -> tuple[list, list]:
     """A minute of a robot at 0.5 m/s with turns, 30 frames a second; odometry is off like this."""
     truth, odometry = [place(0, 0, 0)], [place(5, 3, 1.0)]
