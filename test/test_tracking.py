@@ -392,3 +392,34 @@ def test_times_in_other_units_are_refused(unit):
     assert tracker.localize(0, points, pixels)
     with pytest.raises(ValueError, match="frames are 33 ns apart"):
         tracker.localize(33, points, pixels)
+
+
+def test_after_a_third_of_a_second_without_the_board_no_pose_jumps():
+    """A single board of 48 corners, by P3P up to 5 deg off; before and after, half a degree."""
+    grid = 0.025 * np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0)), -1).reshape(-1, 2)
+    board = np.column_stack([grid - grid.mean(axis=0), np.zeros(len(grid))])
+    errors = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        phase, tracker = rng.uniform(0.0, 2.0 * np.pi, (2, 3)), Tracker(rsl.Localizer(CAMERA))
+        for k in (*range(12), 22):
+            time, pixels = k / 30.0, np.full((len(board), 2), 240.0)
+
+            def pose(t, phase=phase):
+                turn = np.array([0.25, 0.3, 0.1]) * np.sin(2.0 * t + phase[0])
+                return Rotation.from_rotvec(turn), 0.05 * np.sin(2.0 * t + phase[1]) + (0, 0, 0.6)
+
+            for _ in range(4):
+                tau = CAMERA.readout_time * CAMERA.row_time(pixels)
+                moved = [
+                    pose(time + t)[0].apply(p) + pose(time + t)[1]
+                    for t, p in zip(tau, board, strict=True)
+                ]
+                pixels = CAMERA.project(np.array(moved))
+            found = tracker.localize(
+                10**9 + round(1e9 * time), board, pixels + rng.normal(0.0, 0.2, pixels.shape)
+            )
+            assert found
+        true = pose(22 / 30.0)[0].as_matrix()
+        errors.append(Rotation.from_matrix(found.rotation @ true.T).magnitude())
+    assert np.degrees(np.max(errors)) < 1.5
