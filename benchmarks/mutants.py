@@ -35,7 +35,7 @@ _POSE, _SHUTTER, _CAMERA = (
     "test/pipeline/test_pose_at_time.py", "test/core/test_shutter.py", "test/core/test_camera.py",
 )  # fmt: skip
 _SO3, _TF, _OUT = "test/core/test_so3.py", "test/io/transforms", "test/io/test_outputs.py"
-_UNITS = "test/core/test_shutter.py test/test_public_names.py test/test_localizer.py"
+_UNITS = "test/core/test_units.py"
 MUTANTS = [Mutant(*row) for row in (
     # The five that were found alive.
     ("pipeline/pose_at_time.py", " + 0.25 * delay**2 * change", "", _POSE),
