@@ -197,7 +197,7 @@ def serve(asked: Connection[Any, Any]) -> None:
 
 
 def _spare() -> None:
-    """Spare Numba a quarter of its own work, of which the machine code shows nothing.
+    """Spare Numba an eighth of its own work, of which the machine code shows nothing.
 
     Each search for a function hashes and compares all flags of the compiler, each call of LLVM
     tells of itself, and each assignment to a part of an array brings the text of its error.
