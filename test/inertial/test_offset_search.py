@@ -31,7 +31,7 @@ def followed(tracker, recorded, frames):
     for frame in range(frames):
         seen = recorded.frames.seen(frame, 1.0)
         middle = recorded.frames.middle_ns(frame)
-        assert tracker.localize(middle, *seen, None, recorded.around(frame))
+        assert tracker.localize(middle, *seen, imu=recorded.around(frame))
         going.append(tracker._aid._search is not None)
     return going, tracker.inertial
 

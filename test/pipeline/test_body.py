@@ -111,7 +111,8 @@ class Chain:
         return CAMERA_FROM_BASE
 
     def map_from_base(self, motion: Motion, seconds: float) -> Array:
-        rotation, translation = motion.at((seconds - self.middle) / READOUT_TIME)
+        # Also beyond the rows, which an estimate refuses.
+        rotation, translation = Motion.at(motion, (seconds - self.middle) / READOUT_TIME)
         map_from_camera = np.linalg.inv(matrix(translation, rotation))
         result: Array = map_from_camera @ self.camera_from_base(seconds)
         return result
