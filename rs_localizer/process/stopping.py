@@ -54,7 +54,7 @@ class StopRequest:
 
     def __enter__(self) -> Self:
         for number in _SIGNALS:
-            if signal.getsignal(number) != signal.SIG_IGN or number == signal.SIGINT:  # nohup
+            if signal.getsignal(number) != signal.SIG_IGN or number != signal.SIGHUP:  # nohup
                 signal.signal(number, self._take)
         return self
 

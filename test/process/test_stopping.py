@@ -59,6 +59,23 @@ def test_no_interrupt_is_lost(tmp_path, number, body):
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
+@pytest.mark.parametrize(("number", "heard"), [(signal.SIGTERM, True), (signal.SIGHUP, False)])
+def test_only_nohup_is_inherited(number, heard):
+    """A parent that has ignored SIGTERM would have its nodes never end."""
+    program = f"""
+import os, signal
+from rs_localizer.process.stopping import StopRequest
+signal.signal({number:d}, signal.SIG_IGN)
+with StopRequest() as stop:
+    os.kill(os.getpid(), {number:d})
+    print(stop.requested)
+"""
+    said = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert said.stdout == f"{heard}\n"
+
+
 def test_an_alarm_as_the_clean_up_ends_raises_nothing():
     body = "os.kill(os.getpid(), 15)"
     late = """signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])

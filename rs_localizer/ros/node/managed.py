@@ -353,7 +353,7 @@ def run(
 
 @contextlib.contextmanager
 def _ends_within(seconds: float) -> Iterator[None]:
-    """An end that the middleware holds up (once in some hundred runs) is cut short, and says so."""
+    """An end that the middleware holds up is cut short, and says so."""
 
     def leave() -> None:
         sys.stderr.write(f"the node did not end within {seconds:g} s, and stands here:\n")

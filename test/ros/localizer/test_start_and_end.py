@@ -44,7 +44,7 @@ def test_started_with_bad_parameters(start_node):
 
 
 def test_an_end_that_the_middleware_holds_up_is_cut_short(start_node):
-    """In CI a node once stood for more than 60 s after SIGTERM."""
+    """Launch files kill what has not ended after five seconds."""
     node = start_node(
         run="import rclpy, sys, time; rclpy.try_shutdown = lambda: time.sleep(60);"
         "from rs_localizer.ros.main import main; sys.exit(main())",
