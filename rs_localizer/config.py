@@ -210,8 +210,8 @@ class LocalizerConfig:
     calibration: CalibrationErrors = field(default_factory=CalibrationErrors)
     map_deviation: float = setting(
         0.0,
-        "Standard deviation of the map's points, in m ( neighbours share "
-        "their errors); it widens covariances and gates",
+        "Standard deviation of the map's points, in m, of errors that neighbours share; it widens "
+        "covariances and gates",
         (0.0, 1000.0),
     )
 
