@@ -280,8 +280,8 @@ class Tracker:
 
         Within the rows of one of the last frames it is that frame's, between frames what those
         before and after tell, after them predicted under accelerations as they were of late. None
-        before the last frames and more than ``max_prediction`` after them. Points are those of the
-        frame that is nearest.
+        before the last frames, more than ``max_prediction`` after them, and where the orientation
+        is too uncertain. Points are those of the frame that is nearest.
         """
         track = self._track
         if track is None or track.window is None:
@@ -289,20 +289,22 @@ class Tracker:
         window, swing = track.window, unshaken(track.estimate)[2]
         if (time_ns - track.time_ns) * 1e-9 > self.max_prediction:
             return None
-        frames = [seen for seen in self._seen if seen.found]
-        nearest = min(frames, key=lambda seen: abs(seen.time_ns - time_ns))
-        assert isinstance(nearest.found, Estimate)
-        seconds = 1e-9 * (time_ns - nearest.time_ns)
-        if abs(seconds) <= 0.5 * nearest.found.span:
-            there = replace(Estimate.at_time(nearest.found, seconds), time_ns=time_ns)
+        # Of frames that failed since there may be more than are kept.
+        frames = [*((seen.time_ns, seen.found) for seen in self._seen if seen.found)]
+        frames.append((track.time_ns, track.estimate))
+        nearest_ns, nearest = min(frames, key=lambda frame: abs(frame[0] - time_ns))
+        assert isinstance(nearest, Estimate)
+        seconds = 1e-9 * (time_ns - nearest_ns)
+        if abs(seconds) <= 0.5 * nearest.span:
+            there = replace(Estimate.at_time(nearest, seconds), time_ns=time_ns)
         else:
             motion = window.at(time_ns)
             if motion is None:
                 return None
-            there = predicted_estimate(nearest.found, motion, swing)
+            there = predicted_estimate(nearest, motion, swing)
         if isinstance(there, RigEstimate):
             there = replace(there, time=there.time + seconds)
-        return there
+        return there if self.localizer.accepted(there) else None
 
     def flush(self) -> list[Estimate | Failure]:
         """The results that ``output_lag`` still holds back, at the end of a recording."""

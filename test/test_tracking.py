@@ -225,6 +225,30 @@ def test_there_is_no_motion_before_the_frames_nor_long_after_them():
     assert tracker.at(ns(0.9)) is None
 
 
+def test_there_is_a_motion_while_all_frames_that_are_kept_have_failed():
+    hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA), max_prediction=0.2)
+    for t in times(4, 1.0):
+        assert tracker.localize(ns(t), *hand.frame(t, 60))
+    nothing = np.zeros((0, 3)), np.zeros((0, 2))
+    for t in 1.1 + 0.01 * np.arange(1, 9):
+        assert not tracker.localize(ns(t), *nothing)
+    there = tracker.at(ns(1.19))
+    assert error(there, hand.motion(1.19))[0] < 3.0 * there.orientation_deviation
+    assert tracker.flush() == []
+    assert tracker.at(ns(1.1)) is not None
+
+
+def test_a_motion_that_is_too_uncertain_is_not_told():
+    hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA), max_prediction=0.9)
+    for t in times(4, 1.0):
+        assert tracker.localize(ns(t), *hand.frame(t, 60))
+    ahead = [tracker.at(ns(1.1 + later)) for later in (0.01, 0.3, 0.9)]
+    assert ahead[0] is not None
+    assert ahead[2] is None
+    most = tracker.localizer.config.max_orientation_deviation
+    assert all(there.orientation_deviation <= most for there in ahead if there)
+
+
 def test_an_estimate_moves_on_with_its_own_velocities():
     hand = Hand()
     result = rsl.Localizer(CAMERA).localize(*hand.frame(1.0, 100, noise=0.01))
