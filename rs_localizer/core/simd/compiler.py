@@ -180,7 +180,6 @@ def serve(asked: Connection[Any, Any]) -> None:
     from rs_localizer.core.simd import jit
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: its end is that of who asks
-    _spare()
     njit: Any = numba.njit
     njit(lambda: 0)()  # what all have in common is done before the forks
     answers, asking = Connection(os.dup(1), readable=False), os.getppid()
@@ -194,32 +193,6 @@ def serve(asked: Connection[Any, Any]) -> None:
             return
         if code != _GROWN:
             answers.send(False)  # it broke off, as without memory
-
-
-def _spare() -> None:
-    """Spare Numba an eighth of its own work, of which the machine code shows nothing.
-
-    Each search for a function hashes and compares all flags of the compiler, each call of LLVM
-    tells of itself, and each assignment to a part of an array brings the text of its error.
-    """
-    from numba.core import event, targetconfig
-    from numba.core.typing.templates import builtin_registry
-    from numba.np import arrayobj
-
-    events: Any = event
-    events.install_timer = lambda *_: contextlib.nullcontext()
-    events.broadcast = lambda _: None
-    flags: Any = targetconfig.TargetConfig
-    compared = flags.__eq__
-    flags.__hash__ = lambda _: 0
-    flags.__eq__ = lambda self, other: (
-        getattr(other, "_values", None) == self._values or compared(self, other)
-    )
-    shorter: Any = arrayobj.ol_raise_with_shape_context_generic
-    for function, kind in builtin_registry.globals:
-        if function is arrayobj.raise_with_shape_context:
-            for template in kind.templates:
-                template._overload_func = staticmethod(shorter)
 
 
 def _compile_all(asked: Connection[Any, Any], answers: Connection[Any, Any]) -> NoReturn:
