@@ -67,7 +67,7 @@ _FASTEST_RATE = 70.0
 _UNRANKED = np.zeros(0, np.int64)
 # A point is seen at the time of its row, which it decides: each look makes the error of that a
 # hundredth, the part of the image that a readout moves it.
-_LOOKS = 3
+_LOOKS = 2
 # Points that agree with a prediction's optimum, as a share of those that agreed before.
 _STILL_TRACKED = 0.7
 

@@ -142,6 +142,8 @@ class Estimate(Motion):
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
         """Rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
         rotations, translations = Motion.at_rows(self.without_gyro(), tau)
+        if self.turn is None and not len(self.shake):
+            return rotations, translations
         turns = shake_at(np.clip(np.asarray(tau, float), -0.5, 0.5), self.shake)
         turned = so3.exp_many(-turns[:, :3])
         if self.turn is not None:
