@@ -49,3 +49,15 @@ def test_a_moved_corner_is_a_notice():
     assert not result.inliers[moved].any()
     assert "left out at the left of the image have a pose of their own" in result.left_out
     assert np.abs(result.rotation - rotation).max() < 0.01
+
+
+def test_two_fifths_of_the_matches_that_are_shifted_alike_are_left_out():
+    random = np.random.default_rng(3)
+    for shift in (6.0, 12.0, 25.0):
+        camera, points, pixels, rotation = frame("volume", "right", random)
+        some = random.permutation(len(points))[: 2 * len(points) // 5]
+        pixels[some] += (shift, 0.0)
+        result = rsl.Localizer(camera).localize(points, pixels)
+        assert result
+        assert not result.inliers[some].any()
+        assert np.abs(result.rotation - rotation).max() < 0.01
