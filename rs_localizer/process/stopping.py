@@ -27,6 +27,8 @@ _FRAGILE = ("numba", "llvmlite", "importlib", "_frozen_importlib")
 # So is the module that the constructor of a named tuple believes to be in: machine code calls it
 # for its results (a SystemError, 1 of 194 random signals).
 _NAMED_TUPLE = "namedtuple_"
+# A child that has been started but not been returned is nobody's: nobody would end it.
+_STARTS = "Popen.__init__"
 # s: how often it is tried to interrupt them; so long compiling may take, of which nothing stays.
 _PERIOD, _PATIENCE = 0.02, 2.0
 # s until an exception that nobody handles counts as lost, as in a finalizer; unwinding takes less.
@@ -103,8 +105,9 @@ class StopRequest:
 class StopSignals(StopRequest):
     """The first signal raises KeyboardInterrupt in the main thread; more change nothing.
 
-    It waits until none of :data:`_FRAGILE` is on the stack, at most :data:`_PATIENCE`: then the
-    process ends. Where the exception gets lost, it is raised again.
+    It waits until none of :data:`_FRAGILE` is on the stack, and no process is being started, at
+    most :data:`_PATIENCE`: then the process ends. Where the exception gets lost, it is raised
+    again.
     Enter it before ``rclpy.init``: rclpy's own handlers call those that they found.
     """
 
@@ -147,6 +150,8 @@ def _is_fragile(frame: FrameType | None) -> bool:
     while frame is not None:
         name = str(frame.f_globals.get("__name__"))
         if name.partition(".")[0] in _FRAGILE or name.startswith(_NAMED_TUPLE):
+            return True
+        if name == "subprocess" and frame.f_code.co_qualname == _STARTS:
             return True
         frame = frame.f_back
     return False

@@ -38,6 +38,31 @@ def test_random_signals():
     assert any(one.code > 128 for one in ended)
 
 
+def test_a_process_that_is_being_started_is_not_lost():
+    """Ctrl-C after the fork, before anybody has the process to end it."""
+    program = """
+import os, signal, subprocess, sys
+from rs_localizer.process.stopping import StopSignals
+fork, started = subprocess._fork_exec, None
+def forked(*arguments):
+    pid = fork(*arguments)
+    os.kill(os.getpid(), signal.SIGINT)
+    return pid
+subprocess._fork_exec = forked
+with StopSignals():
+    try:
+        started = subprocess.Popen(["sleep", "60"])
+        import time; time.sleep(30)
+    except KeyboardInterrupt:
+        started.kill()
+        print("ended", started.wait())
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ended.stdout == "ended -9\n", ended.stderr
+
+
 @pytest.mark.parametrize(
     ("body", "number"), [("import numba.fake", signal.SIGINT), ("Finalized()", signal.SIGHUP)]
 )

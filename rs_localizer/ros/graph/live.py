@@ -68,7 +68,16 @@ class LiveNode:
 
     def __enter__(self) -> Self:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        self._process: subprocess.Popen[bytes] | None = None
         self._signals.__enter__()
+        try:
+            self._start()
+        except BaseException as error:
+            self.__exit__(None, error, None)
+            raise
+        return self
+
+    def _start(self) -> None:
         rclpy.init()
         self._node = node = rclpy.create_node("demo", namespace=self.namespace)
         self._executor = SingleThreadedExecutor()
@@ -89,16 +98,17 @@ class LiveNode:
                 [sys.executable, "-c", _NODE, "--ros-args", *words],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
             )  # fmt: skip
-        return self
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
-        self._process.terminate()
         try:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(_STOP_TIMEOUT)
+            if self._process is not None:
+                self._process.terminate()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(_STOP_TIMEOUT)
         finally:
-            self._process.kill()
-            self._process.wait()
+            if self._process is not None:
+                self._process.kill()
+                self._process.wait()
             rclpy.try_shutdown()
             self._signals.__exit__()
         if error is not None and self._signals.requested:
@@ -108,6 +118,7 @@ class LiveNode:
     @property
     def pid(self) -> int:
         """Of the node's process."""
+        assert self._process is not None
         return self._process.pid
 
     def publisher(self, kind: type, topic: str) -> Any:
@@ -190,6 +201,7 @@ class LiveNode:
         return self._log.read_text(errors="replace").strip().splitlines()
 
     def _until(self, condition: Callable[[], bool]) -> None:
+        assert self._process is not None
         while not condition():
             self._executor.spin_once(timeout_sec=0.05)
             code, silence = self._process.poll(), time.monotonic() - self._heard
