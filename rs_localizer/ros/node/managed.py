@@ -335,12 +335,13 @@ def run(
         return 1
     log = node.get_logger()
     warnings.showwarning = lambda message, *_: log.warning(" ".join(str(message).split()))
+    code = 1
     try:
         code = _start(node, stop) or spin(node, lambda: stop.requested)
     except ExternalShutdownException:
         code = 0
     finally:
-        with _ends_within(_LONGEST_END):
+        with _ends_within(_LONGEST_END, code):
             node.destroy_node()
             rclpy.try_shutdown()
     if not wait_for_workers(_LAST_FRAME_TIMEOUT):
@@ -352,19 +353,21 @@ def run(
 
 
 @contextlib.contextmanager
-def _ends_within(seconds: float) -> Iterator[None]:
-    """An end that the middleware holds up is cut short, and says so."""
+def _ends_within(seconds: float, code: int) -> Iterator[None]:
+    """An end that the middleware holds up is cut short with this exit code, and says so."""
 
     def leave() -> None:
         sys.stderr.write(f"the node did not end within {seconds:g} s, and stands here:\n")
         faulthandler.dump_traceback(all_threads=True)
-        os._exit(0)
+        os._exit(code)
 
     timer = threading.Timer(seconds, leave)
     timer.daemon = True
     timer.start()
-    yield
-    timer.cancel()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _start(node: Any, stop: StopRequest) -> int:
