@@ -19,6 +19,7 @@ from visualization_msgs.msg import MarkerArray  # type: ignore[import-untyped]
 
 from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.core.reasons import Notice
+from rs_localizer.core.simd.jit import NotCompiled, at_once
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
@@ -335,8 +336,14 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         def publish_now(frames: FrameLocalizer) -> None:
             nonlocal newest_ns
             now_ns = self.get_clock().now().nanoseconds
-            frame = None if now_ns == newest_ns else frames.at(now_ns)  # a simulated clock rests
-            if not frame or self._ticks is None:
+            if now_ns == newest_ns or self._ticks is None:  # a simulated clock rests
+                return
+            try:
+                with at_once():
+                    frame = frames.at(now_ns)
+            except NotCompiled:
+                return
+            if not frame:
                 return
             newest_ns = now_ns
             outputs.publish(frame, _MOTION)
