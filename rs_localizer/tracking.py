@@ -32,7 +32,7 @@ from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
-from rs_localizer.estimation.experience import Experience
+from rs_localizer.estimation.experience import Experience, covering
 from rs_localizer.estimation.motion_model import (
     FADING,
     acceleration_covariance,
@@ -378,6 +378,7 @@ class Tracker:
                 window = None if self._track is None else self._track.window
                 if window is not None and result.turn is None:
                     result = within_readout(result, window.deviations)
+                result = self._covering(result, context)
             self._remember(time_ns, prior, result, context)
             if self._aid is not None and imu is not None:
                 camera = self.localizer.camera
@@ -418,6 +419,14 @@ class Tracker:
         for seen in list(self._seen)[-1 - self.output_lag :]:
             if seen.time_ns in known and isinstance(seen.found, Estimate):
                 seen.found = self._published(seen, window.before(known[seen.time_ns]))
+
+    def _covering(self, result: Estimate, context: FrameContext) -> Estimate:
+        """The same; where rows may not tell it, velocities as uncertain as frames show them."""
+        track = self._track
+        if track is None or self._trusts_motion(context):
+            return result
+        seconds = 1e-9 * (result.time_ns - track.time_ns)
+        return covering(track.estimate, result, seconds) if seconds > 0.0 else result
 
     def _judged(
         self,

@@ -354,6 +354,21 @@ def test_with_a_readout_time_far_off_each_image_speaks_for_itself():
     assert by_doubt < 1.05 * alone
 
 
+def test_rows_that_show_no_motion_leave_the_twist_as_unknown_as_frames_show_it():
+    hand, tracker, inside = Hand(), Tracker(rsl.Localizer(CAMERA)), []
+    unsure = FrameContext(readout_time_deviation=0.6 * READOUT)
+    for t in times(60):
+        truth, chosen = hand.motion(t), np.random.default_rng(round(t * 1e4)).choice(400, 60)
+        pixels = CAMERA.project(MAP[chosen] @ truth.rotation.T + truth.translation)  # all at once
+        noise = np.random.default_rng(round(t * 1e4)).normal(size=pixels.shape)
+        result = tracker.localize(ns(t), MAP[chosen], pixels + noise, context=unsure)
+        assert result, str(result)
+        off = result.angular_velocity - truth.angular_velocity
+        spread = result.covariance[6:9, 6:9]
+        inside.append(off @ np.linalg.solve(spread, off) < 7.8)
+    assert np.mean(inside[1:]) > 0.9  # of the first no frame before tells
+
+
 def test_where_the_readout_time_is_in_doubt_so_is_how_far_the_camera_goes():
     hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA))
     tracker.localize(ns(0.0), *hand.frame(0.0, 150, noise=0.3))

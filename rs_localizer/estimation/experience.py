@@ -14,7 +14,7 @@ from rs_localizer.config import VelocityPrior
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.scales import INDEPENDENT, SPEED_MEMORY, SPEEDS, Scales, joined
-from rs_localizer.core.state import POSE
+from rs_localizer.core.state import POSE, VELOCITIES
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.modes import FAR_LESS_PROBABLE
 from rs_localizer.estimation.prior import WALKING
@@ -57,8 +57,7 @@ class Experience:
         """
         if min(typical.angular, typical.linear) == 0.0:
             return self
-        turn = so3.log(np.ascontiguousarray(before.rotation @ after.rotation.T))
-        step = np.concatenate([turn, after.rotation @ (after.position - before.position)])
+        step = _step(before, after)
         spread = before.joint_covariance[POSE, POSE] + after.joint_covariance[POSE, POSE]
         likelihoods = []
         for part in SPEEDS[1:]:
@@ -71,3 +70,22 @@ class Experience:
         # A camera may start to move.
         odds = np.maximum(odds - odds.max(), -FAR_LESS_PROBABLE)
         return replace(self, scales=self.scales._replace(speeds=odds))
+
+
+def covering(before: Estimate, after: Estimate, seconds: float) -> Estimate:
+    """The newest of two frames, its velocities uncertain by how far they are from the step's.
+
+    Rows of a readout time that nobody knows may all have been exposed at once: then they show no
+    motion, however fast the camera is.
+    """
+    off = _step(before, after) * after.span / seconds
+    off -= np.concatenate([after.angular_velocity, after.linear_velocity])
+    joint = after.joint_covariance.copy()
+    joint[VELOCITIES, VELOCITIES] += np.outer(off, off)
+    return replace(after, joint_covariance=joint)
+
+
+def _step(before: Estimate, after: Estimate) -> Array:
+    """Turn and way (6,) of the camera between two frames."""
+    turn = so3.log(np.ascontiguousarray(before.rotation @ after.rotation.T))
+    return np.concatenate([turn, after.rotation @ (after.position - before.position)])
