@@ -3,10 +3,11 @@
 """Whether a map of markers can be true: by itself, and the residual of each marker in images."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -188,6 +189,98 @@ class LeaveOneOut:
             f"{fit:.2f} px without it, it is off by {off:.1f} px, about "
             f"{100.0 * np.linalg.norm(away):.1f} cm ({x}, {y}, {z} m in the map)"
         )
+
+
+# Another reading leaves this share of what is told, in this share of the images.
+_MUCH_BETTER, _MOSTLY = 0.4, 0.8
+_TURNED = ("", "a quarter", "half", "three quarters")  # of a whole turn
+_SCALES = np.exp(np.linspace(-0.8, 0.8, 17))  # 0.45 to 2.2
+_LENS, _SIZE = "lens", "size"
+
+
+class OtherReadings:
+    """Whether all markers fit another way round, of other sizes, or by a lens of another scale.
+
+    Args:
+        marker_map: the map.
+    """
+
+    def __init__(self, marker_map: MarkerMap) -> None:
+        self._markers = marker_map.markers
+        self._images = 0
+        self._votes: dict[str, list[float]] = {}
+
+    def add(self, camera: Camera, detections: Detections) -> None:
+        """Take in what an image shows."""
+        whole = whole_markers(detections, 4 * len(self._markers))
+        if len(whole) < _LEAST_MARKERS or self._images >= _ALL_UNTIL:
+            return
+        self._images += 1
+        rows = np.array(list(whole.values()))
+        points, pixels = detections.points[rows], detections.pixels[rows]
+        told = _still_rms(camera, points, pixels)
+        if not told > _STILL:
+            return
+        middles = points.mean(axis=1, keepdims=True)
+
+        def of_size(scale: float) -> float:
+            return _still_rms(camera, middles + scale * (points - middles), pixels)
+
+        def of_lens(scale: float) -> float:
+            matrix = camera.K * [[scale, 1.0, 1.0], [1.0, scale, 1.0], [1.0, 1.0, 1.0]]
+            return _still_rms(replace(camera, K=matrix), points, pixels)
+
+        def of_image(scale: float) -> float:
+            matrix = camera.K * [[scale], [scale], [1.0]]
+            return _still_rms(replace(camera, K=matrix), points, pixels)
+
+        found = {
+            text: (_still_rms(camera, np.roll(points, turns, axis=1), pixels), float(turns))
+            for turns, text in enumerate(_TURNED) if turns
+        }  # fmt: skip
+        found[_SIZE], found[_LENS] = _least(of_size), min(_least(of_lens), _least(of_image))
+        best = min(found, key=lambda name: found[name][0])
+        if found[best][0] < _MUCH_BETTER * told:
+            self._votes.setdefault(best, []).append(found[best][1])
+
+    def fault(self) -> str | None:
+        """What all of them say; None where the map is the best reading."""
+        if self._images < _LEAST_MARKERS or not self._votes:
+            return None
+        name, scales = max(self._votes.items(), key=lambda item: len(item[1]))
+        if len(scales) < _MOSTLY * self._images:
+            return None
+        scale, count = float(np.median(scales)), len(self._markers)
+        if name == _LENS:
+            return (
+                f"the focal length that fits is {scale:.2f} of what is told: is K that of a binned "
+                "image, or of another resolution?"
+            )
+        if name == _SIZE:
+            why = "measured with the white rim" if scale < 1.0 else "is it the side of the pattern"
+            return (
+                f"each marker alone says {scale:.2f} of its size in the map: {why}? It is the side "
+                "of the black square"
+            )
+        drawn = any("apriltag" in marker.family.kind for marker in self._markers)
+        why = "OpenCV draws AprilTags so" if drawn and name == _TURNED[2] else "do they hang so?"
+        return f"all {count} markers fit turned by {name}: {why}"
+
+
+def _still_rms(camera: Camera, points: Array, pixels: Array) -> float:
+    """What a still camera leaves (px) of markers (m,4,3) at pixels (m,4,2); inf: no pose."""
+    points, pixels = points.reshape(-1, 3), pixels.reshape(-1, 2)
+    predict = still_fit(camera, points, pixels)
+    left = np.inf if predict is None else rms(predict(points) - pixels)
+    return float(left) if np.isfinite(left) else np.inf
+
+
+def _least(left: Callable[[float], float]) -> tuple[float, float]:
+    """What the best scale leaves, and that scale."""
+    best = int(np.argmin([left(float(scale)) for scale in _SCALES]))
+    around = _SCALES[max(best - 1, 0)], _SCALES[min(best + 1, len(_SCALES) - 1)]
+    fine = minimize_scalar(left, bounds=around, method="bounded", options={"xatol": 1e-3})
+    return float(fine.fun), float(fine.x)
 
 
 def _median(views: list[_View], name: str) -> float:
