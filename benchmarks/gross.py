@@ -118,6 +118,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.gross", description=__doc__)
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--only", nargs="+", default=[])
+    parser.add_argument("--seed", type=int, default=0, help="other frames of the same kinds")
     options = parser.parse_args()
     sys.stdout.write(f"{'':24} published  beyond {_FAR:g}  refused\n")
     for scene in SCENES:
@@ -125,7 +126,8 @@ def main() -> int:
             name = f"{scene}/{fault}"
             if not all(word in name for word in options.only):
                 continue
-            random = np.random.default_rng([list(SCENES).index(scene), FAULTS.index(fault)])
+            kind = (list(SCENES).index(scene), FAULTS.index(fault))
+            random = np.random.default_rng([*kind, options.seed])
             far, published, reasons = 0, 0, Counter[str]()
             for _ in range(options.frames):
                 camera, points, pixels, rotation = frame(scene, fault, random)

@@ -35,6 +35,9 @@ _LEAST_CHANCE = -math.log(1e-3)
 _SPREAD = 0.35
 # Beyond so many gates a point is another's.
 _ELSEWHERE = 2.0
+# Mismatches are strewn over the image: this part of them lies about its places in circles of this
+# part of the image.
+_CIRCLE = 0.1
 # How much the errors of two neighbours may differ, as a part of their distance: scales are off by
 # twice at most.
 _STRETCH = 0.5
@@ -63,18 +66,36 @@ def left_out(
     count, inliers = observed.observations.count, int(np.count_nonzero(posterior.inliers))
     if count - inliers < _SAMPLE:
         return LeftOut()
-    share = (1.0 if known else _SHARE) * math.exp(-0.5 * posterior.speeding)
+    most = (1.0 if known else _SHARE) * math.exp(-0.5 * posterior.speeding) * inliers
     near = _near(observed, posterior, threshold)
-    if near >= max(share * inliers, 1.0):
-        return LeftOut(Failure(
-            Reason.MODEL_ERROR,
-            f"{inliers} points fit to {posterior.noise:.2g} px (one sigma), and of the "
-            f"{count - inliers} others {near:.0f} lie so near to their places that they are no "
-            "mismatches: the calibration or the map is too far off for any pose",
-        ))  # fmt: skip
+    found = LeftOut()
+    if near < max(most, 1.0):
+        found = _moved(search, observed, posterior, threshold, most)
+        if found.failure is not None or known:  # what is matched near predictions is near them
+            return found
+        near = _not_strewn(observed, posterior)
+    if near < max(most, 1.0):
+        return found
+    return LeftOut(Failure(
+        Reason.MODEL_ERROR,
+        f"{inliers} points fit to {posterior.noise:.2g} px (one sigma), and of the "
+        f"{count - inliers} others {near:.0f} lie so near to their places that they are no "
+        "mismatches: the calibration or the map is too far off for any pose",
+    ))  # fmt: skip
+
+
+def _moved(
+    search: MotionSearch, observed: Observed, posterior: Posterior, threshold: float, most: float
+) -> LeftOut:
+    """Whether the points that are left out have a motion of their own.
+
+    Args:
+        most: points that are no reason to refuse the frame.
+    """
+    inliers = int(np.count_nonzero(posterior.inliers))
     rest = ~(posterior.squared_errors < (_ELSEWHERE * WIDEST_GATE * threshold) ** 2)
     left = int(np.count_nonzero(rest))
-    few = left < share * inliers
+    few = left < most
     if left <= _SAMPLE or (few and _moved_alike(observed, posterior, rest) <= _SAMPLE):
         return LeftOut()
     own = search.among(observed, rest, _SAMPLE)
@@ -86,7 +107,7 @@ def left_out(
         return LeftOut()
     text = _described(observed, posterior, own.state, group)
     text = f"{inliers} points fit one motion, and {size} of the {left} left out {text}"
-    if size < share * inliers:
+    if size < most:
         return LeftOut(notice=f"{text}: have these points been moved, or do they move?")
     return LeftOut(Failure(
         Reason.MODEL_ERROR,
@@ -111,6 +132,22 @@ def _near(observed: Observed, posterior: Posterior, threshold: float) -> float:
     others = posterior.squared_errors[~posterior.inliers]
     near = np.count_nonzero(others < distance**2)
     return float(near) - len(others) * _chance(observed, distance)
+
+
+def _not_strewn(observed: Observed, posterior: Posterior) -> float:
+    """How many of the points that are left out lie nearer to their places than mismatches, which
+    are strewn over the image; 0 where chance may do it.
+    """
+    area = min(math.prod(camera.size) for camera in observed.sighted.exposure.cameras)
+    others = math.pi * posterior.squared_errors[~posterior.inliers] / area
+    count, inside = len(others), int(np.count_nonzero(others < _CIRCLE))
+    beyond = count - inside
+    if inside <= _CIRCLE * count:
+        return 0.0
+    surprise = inside * math.log(inside / (_CIRCLE * count))
+    if beyond:
+        surprise += beyond * math.log(beyond / ((1.0 - _CIRCLE) * count))
+    return inside - beyond * _CIRCLE / (1.0 - _CIRCLE) if surprise > _LEAST_CHANCE else 0.0
 
 
 def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> int:

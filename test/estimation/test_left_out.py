@@ -34,6 +34,12 @@ def test_what_has_two_poses_has_none(scene, fault):
     assert found == []
 
 
+def test_what_is_left_out_and_not_strewn_speaks_against_a_volume():
+    """A few points of a volume fit anything; the others lie about their places, or nearly so."""
+    found = [result for result in results("volume", "binned twice", 60) if result]
+    assert len(found) <= 1
+
+
 def test_a_moved_half_is_described():
     failure = next(iter(results("wall", "half moved")))
     assert failure.reason is rsl.Reason.MODEL_ERROR
