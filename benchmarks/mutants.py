@@ -128,7 +128,7 @@ MUTANTS = [Mutant(*row) for row in (
     ("estimation/posterior.py", "2.0 * np.sum(inliers) - freedom", "2.0 * np.sum(inliers)",
      "test/estimation/test_posterior.py"),
     ("estimation/acceptance.py", "[part, part] @ velocities", "[part, part] @ velocities * 0.0",
-     "test/estimation/test_left_out.py"),
+     "test/estimation/test_acceptance.py"),
 )]  # fmt: skip
 
 

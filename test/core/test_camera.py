@@ -131,7 +131,9 @@ def test_inside_is_the_area_of_the_pixels():
     assert camera().inside(
         np.array([[-0.4, -0.4], [639.4, 479.4], [-0.6, 3], [3, 479.6], [np.nan, 3]])
     ).tolist() == [True, True, False, False, False]
-    assert camera(binning=(2, 2), roi=Roi(0, 0, 400, 300)).size == (200, 150)
+    binned = camera(binning=(2, 3), roi=Roi(0, 0, 400, 300))
+    assert binned.size == (200, 100)
+    assert binned.focal_length == pytest.approx(np.sqrt(250.0 * 170.0))
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,13 @@ def test_log_undoes_exp(axis, angle):
     np.testing.assert_allclose(back, vector(axis, angle), atol=1e-8 if angle > 3 else 1e-13)
 
 
+def test_hat_is_the_cross_product():
+    first, second = np.array([0.3, -1.2, 0.7]), np.array([-0.5, 0.4, 2.0])
+    expected = np.cross(first, second)
+    np.testing.assert_allclose(so3.hat_of(first) @ second, expected, atol=1e-15)
+    np.testing.assert_allclose(so3.hat(first) @ second, expected, atol=1e-15)
+
+
 @given(axes, angles)
 def test_quaternion_is_that_of_scipy_with_positive_w(axis, angle):
     matrix = so3.exp(vector(axis, angle))

@@ -3,12 +3,13 @@
 """What is refused, reason by reason: posteriors that are right but for one thing."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from rs_localizer.core.reasons import Reason
-from rs_localizer.estimation.acceptance import refusal, uncertain
+from rs_localizer.estimation.acceptance import refusal, speeding, uncertain
 from rs_localizer.estimation.posterior import Mirror, maximum_a_posteriori
 from rs_localizer.estimation.prior import motion_terms
 from rs_localizer.localizer import Localizer
@@ -124,3 +125,16 @@ def test_an_orientation_that_is_hardly_known(scene):
     refused = Localizer(camera, max_orientation_deviation=max(0.001, 0.9 * still))
     if still > 0.0012:
         assert refused.localize(points, measured).reason is Reason.UNCERTAIN
+
+
+def test_speeding_counts_what_the_configuration_expects():
+    state, information = np.zeros(24), np.zeros((18, 18))
+    state[12:15], state[15:18] = (0.2, 0.0, -0.1), (0.0, 0.03, 0.0)
+    np.fill_diagonal(information[6:9, 6:9], 0.1**-2)
+    np.fill_diagonal(information[9:12, 9:12], 0.01**-2)
+    observed = SimpleNamespace(
+        sighted=SimpleNamespace(turn=None), terms=SimpleNamespace(informations=[information])
+    )
+    assert speeding(observed, state) == pytest.approx(5.0 + 9.0)
+    observed.sighted.turn = "of a gyroscope"
+    assert speeding(observed, state) == pytest.approx(9.0)
