@@ -33,7 +33,7 @@ if WORKING:
     from scipy.spatial.transform import Rotation
     from tqdm import tqdm
 
-    from rs_localizer.config import DetectorConfig, NodeConfig
+    from rs_localizer.config import CalibrationErrors, DetectorConfig, NodeConfig
     from rs_localizer.core.camera import Camera, DistortionModel
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
@@ -478,9 +478,12 @@ def _write(
         f"    scan_direction: {verdict.scan_direction(found)}\n" + imu_parameters(found, config)
     )
     writers: dict[Path, Callable[[Path], object]] = {}
-    if intrinsics:
-        values = found.lens._asdict().items()
-        text += "".join(f"    calibration.{name}: {value:.4g}\n" for name, value in values)
+    # Those of a lens that was given hold on.
+    errors = found.lens if intrinsics else config.calibration
+    for name in found.lens._fields:
+        value = getattr(errors, name)
+        if intrinsics or value != getattr(CalibrationErrors(), name):
+            text += f"    calibration.{name}: {value:.4g}\n"
     if marker_map is not None:
         if verdict.shape_is_free(found):
             places = verdict.moved(found, marker_map.points)

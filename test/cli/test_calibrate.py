@@ -141,6 +141,19 @@ def test_faults(flight, tmp_path, capsys):
     assert earlier.read_text() == "mine"
 
 
+def test_what_a_lens_is_off_by_stays_with_it(flight, tmp_path):
+    """Found with one recording, and the shutter anew with another."""
+    lens, both = tmp_path / "lens.yaml", tmp_path / "both.yaml"
+    assert main(["calibrate", str(flight), "--intrinsics", "--out", str(lens)]) == 0
+    assert main(["calibrate", str(flight), "--camera", str(lens), "--out", str(both)]) == 0
+    off = [
+        {name: value for name, value in load_params_file(file).items() if "calibration." in name}
+        for file in (lens, both)
+    ]
+    assert len(off[0]) == 3
+    assert off[0] == off[1]
+
+
 def test_smooth(flight, tmp_path, capsys):
     out, words = tmp_path / "out", ["replay", str(flight), "--smooth", "--out"]
     params = ["--params", str(flight / "parameters.yaml")]
