@@ -33,6 +33,8 @@ class Calibration:
         Raises:
             MessageError: for a calibration that no camera can have, saying what was found.
         """
+        if self.K[0] == 0.0:
+            raise MessageError("the camera is not calibrated: K[0] is 0")
         try:
             return Camera(
                 width=self.width,
@@ -69,7 +71,7 @@ def read_camera_info(message: Any) -> Calibration:
     Binning 0 means 1, and a region of interest of zeros the whole image, as the message says.
 
     Raises:
-        MessageError: for an uncalibrated or impossible camera, saying what was found.
+        MessageError: for an impossible camera, saying what was found.
     """
     frame = frame_id(message, "the camera's optical frame")
     ros1 = hasattr(message, "K")
@@ -80,8 +82,6 @@ def read_camera_info(message: Any) -> Calibration:
         raise MessageError(f"the image size must be given, found {width} x {height}")
     if len(K) != 9:
         raise MessageError(f"K must have 9 values, found {len(K)}")
-    if K[0] == 0.0:
-        raise MessageError("the camera is not calibrated: K[0] is 0")
     binning = (int(message.binning_x) or 1, int(message.binning_y) or 1)
     if binning[0] > width or binning[1] > height:
         raise MessageError(
@@ -91,7 +91,7 @@ def read_camera_info(message: Any) -> Calibration:
     model, D = _lens(str(message.distortion_model), D)
     roi = _roi(message.roi, width, height)
     found = Calibration(frame, width, height, K, D, model, binning, roi)
-    if binning != (1, 1) or roi is not None:
+    if K[0] != 0.0 and (binning != (1, 1) or roi is not None):
         _check_binned(K, (width, height), found)
     return found
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from rs_localizer import matching
 from rs_localizer.config import Matching
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import BagReader
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.clouds import Correspondences, read_correspondences, read_keypoints, read_map
@@ -60,6 +61,7 @@ def read_recording(
         try:
             if name == CAMERA_INFO:
                 read = read_camera_info(message)
+                read.camera(0.0, ScanDirection.TOP_TO_BOTTOM)  # refuses what is not calibrated
                 if calibration is not None and read != calibration:
                     raise RecordingError(
                         f"{bag.path}: camera_info changes within the recording; cut it there"

@@ -345,5 +345,9 @@ def test_the_lens_of_a_camera_file_takes_the_place_of_camera_info(tmp_path, make
     frames.load_files()
     frames.calibrate(read_camera_info(make_camera_info(width=640, height=480)))
     assert tuple(K.ravel()) == frames.calibrations[""].K
+    binned = make_camera_info(width=640, height=480, k=np.zeros(9), binning_x=2, binning_y=2)
+    frames.calibrate(read_camera_info(binned))  # a driver that knows no lens
+    assert frames.calibrations[""].binning == (2, 2)
+    assert tuple(K.ravel()) == frames.calibrations[""].K
     with pytest.raises(MessageError, match="camera_file is of an image of 640x480, camera_info of"):
         frames.calibrate(read_camera_info(make_camera_info(width=320)))
