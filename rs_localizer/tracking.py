@@ -5,7 +5,7 @@
 A single image sees the camera's velocity only through the shutter, and the linear part badly; two
 poses a frame apart show it well. The tracker brings both together: its state is one trajectory
 through the last frames (:mod:`rs_localizer.estimation.motion_window`), whose accelerations fade
-within a tenth of a second while new ones come (Singer, "Estimating optimal tracking filter
+within an image or two while new ones come (Singer, "Estimating optimal tracking filter
 performance for manned maneuvering targets", 1970) and tell themselves how large they are. It
 predicts each frame, whose maximum a posteriori estimate has the prediction as prior; what the
 points say beside it joins the window. A gyroscope takes the place of the motion model's rotation

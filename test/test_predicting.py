@@ -20,7 +20,7 @@ from rs_localizer.estimation.refine import apply_step
 from rs_localizer.tracking import _innovation
 
 READOUT = 0.03
-FADING = 0.1  # s
+FADING = 0.03  # s
 # Of the cosines and sines of an in-frame turn: the faster, the smaller.
 SIZES = (1.0 / np.arange(1, 15)[:, None] ** np.array([1.0, 2.0])).ravel()
 ACCELERATIONS = np.array([0.02, -0.01, 0.015, 0.004, 0.003, -0.002])

@@ -24,7 +24,6 @@ from rs_localizer.core.rig import Rig
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.motion_model import FADING
 from rs_localizer.inertial.settings import SCALE_DEVIATION
 from rs_localizer.inertial.turning import MOST_ROUGH
 from rs_localizer.tools.adjust.fit import Fit, cheaper, solve
@@ -73,6 +72,8 @@ _BRIDGED = 1.5
 # Where images show how accelerations fade, that bridges the knots (s) between them: these need not
 # be as wide as a hand's motion would allow, and narrow ones follow all of it.
 _NARROW_SPACING = 0.025
+# s, in which accelerations fade: hands and drones change them about twice a second.
+_FADING = 0.1
 # A frame whose points lie this much farther from the smooth motion than from its own is shaken in a
 # way that knots cannot follow: by so many times the noise, and beyond the chance (so many standard
 # deviations) of its points. Where so much of the frames is, the motion between them is none.
@@ -396,7 +397,7 @@ def smooth_rig(rig: Rig, frames: list[RigFrame]) -> Smoothed:
 def _knots(times: Array) -> tuple[float, float]:
     """Spacing of the knots, and time in which accelerations fade (0: never), s, of times (f,)."""
     interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    fading = FADING if interval < 0.5 * FADING else 0.0
+    fading = _FADING if interval < 0.5 * _FADING else 0.0
     return min(_NARROW_SPACING if fading else LONGEST_SPACING, interval), fading
 
 

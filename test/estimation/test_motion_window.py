@@ -22,7 +22,7 @@ from rs_localizer.estimation.motion_window import (
 from rs_localizer.estimation.prior import Prior, motion_terms, with_motion
 from rs_localizer.estimation.refine import apply_step
 
-FADING, PERIOD = 0.1, 1.0 / 30.0  # s
+FADING, PERIOD = 0.03, 1.0 / 30.0  # s
 SPAN = 0.03
 STILL = np.concatenate([np.eye(3).ravel(), np.zeros(15)])
 # Motions small enough that turns add up.
