@@ -22,6 +22,8 @@ from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, TURN
 # Readouts within which accelerations fade by exp(-1): they stay what they are.
 _NO_FADING = 1e9
 
+# Where the shaking is asked how fast it is.
+_ROWS = np.linspace(-0.5, 0.5, 17)
 # Pixels at the rim lie a little beyond the first and the last row.
 _LAST_ROW = 0.55
 
@@ -191,6 +193,9 @@ class Estimate(Motion):
             transport[TURN, own] = values[k] * np.eye(3)
             transport[ANGULAR, own] = rates[k] * np.eye(3) if tau == within_rows(tau) else 0.0
         shared = transport[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
+        joint = transport @ self.joint_covariance @ transport.T
+        for part, variance in zip((TURN, ANGULAR), beyond_rows(self, tau), strict=True):
+            joint[part, part] += variance * np.eye(3)
         return replace(
             self,
             rotation=rotation,
@@ -199,7 +204,7 @@ class Estimate(Motion):
             linear_velocity=self.linear_velocity_at(tau),
             angular_acceleration=later[4],
             linear_acceleration=later[5],
-            joint_covariance=transport @ self.joint_covariance @ transport.T,
+            joint_covariance=joint,
             calibration_covariance=shared @ self.calibration_covariance @ shared.T,
             undetected_covariance=shared @ self.undetected_covariance @ shared.T,
             shake=np.zeros((0, 3)),
@@ -229,6 +234,30 @@ class Estimate(Motion):
             f"{self.residual_rms:.3g} px rms, {turn:.3g} deg and "
             f"{np.linalg.norm(self.linear_velocity):.3g} m per readout)"
         )
+
+
+def beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:
+    """Variances of the turn (rad^2) and of its rate, per readout, that no row has seen.
+
+    A camera that shakes within the rows shakes outside, too, in a phase that nobody knows: it is
+    taken to go on at one of the rates that it had. What gyroscopes have seen, is known.
+    """
+    beyond = abs(tau - within_rows(tau))
+    if beyond == 0.0:
+        return 0.0, 0.0
+    rates = shake_at(_ROWS, estimate.shake)[:, 3:]
+    variance = float(np.mean(rates**2))
+    turn, rate = variance * beyond**2, variance
+    if estimate.turn is not None:
+        first, last = float(estimate.turn.tau[0]), float(estimate.turn.tau[-1])
+        unknown = abs(tau - min(max(tau, first), last))
+        if unknown > 0.0:
+            rates_of_turn = estimate.turn.at_rows(_ROWS)[1]
+            # Of a rate that goes on as it changes, the distance from the mean at this row.
+            variance = float(np.mean((rates_of_turn - rates_of_turn.mean(axis=0)) ** 2))
+            variance *= 3.0 * (1.0 + 2.0 * beyond) ** 2
+            turn, rate = turn + variance * unknown**2, rate + variance
+    return turn, rate
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,27 +38,23 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.gyro_rotation import NO_TURN, Turning
 from rs_localizer.core.moment_kernels import pose_of, twist_of
-from rs_localizer.core.shake import shake_at, within_rows
 from rs_localizer.core.shutter import Numbers, numbers_of
 from rs_localizer.core.state import MOTION_PARAMETERS
-from rs_localizer.core.types import Estimate
+from rs_localizer.core.types import Estimate, beyond_rows
 from rs_localizer.io.outputs import Pose, Twist
-
-# Where the shaking is asked how fast it is.
-_ROWS = np.linspace(-0.5, 0.5, 17)
 
 
 def pose_at(estimate: Estimate, tau: float) -> Pose:
     """Pose of the camera in the map at row time ``tau``."""
     position, rotation, covariance = pose_of(
-        *_numbers(estimate, tau), _beyond_rows(estimate, tau)[0]
+        *_numbers(estimate, tau), beyond_rows(estimate, tau)[0]
     )
     return Pose(position=position, rotation=rotation, covariance=covariance)
 
 
 def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     """Twist of the camera at row time ``tau``, in its axes at that moment; readout_time in s."""
-    linear, angular, covariance = twist_of(*_numbers(estimate, tau), _beyond_rows(estimate, tau))
+    linear, angular, covariance = twist_of(*_numbers(estimate, tau), beyond_rows(estimate, tau))
     return Twist(
         linear=linear / readout_time,
         angular=angular / readout_time,
@@ -113,30 +109,6 @@ def either_twist(twist: Twist, other: Twist) -> Twist:
 def backwards(twist: Twist) -> Twist:
     """The opposite."""
     return replace(twist, linear=-twist.linear, angular=-twist.angular)
-
-
-def _beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:
-    """Variances of the turn (rad^2) and of its rate, per readout, that no row has seen.
-
-    A camera that shakes within the rows shakes outside, too, in a phase that nobody knows: it is
-    taken to go on at one of the rates that it had. What gyroscopes have seen, is known.
-    """
-    beyond = abs(tau - within_rows(tau))
-    if beyond == 0.0:
-        return 0.0, 0.0
-    rates = shake_at(_ROWS, estimate.shake)[:, 3:]
-    variance = float(np.mean(rates**2))
-    turn, rate = variance * beyond**2, variance
-    if estimate.turn is not None:
-        first, last = float(estimate.turn.tau[0]), float(estimate.turn.tau[-1])
-        unknown = abs(tau - min(max(tau, first), last))
-        if unknown > 0.0:
-            rates_of_turn = estimate.turn.at_rows(_ROWS)[1]
-            # Of a rate that goes on as it changes, the distance from the mean at this row.
-            variance = float(np.mean((rates_of_turn - rates_of_turn.mean(axis=0)) ** 2))
-            variance *= 3.0 * (1.0 + 2.0 * beyond) ** 2
-            turn, rate = turn + variance * unknown**2, rate + variance
-    return turn, rate
 
 
 def middle_row_ns(config: NodeConfig, camera: Camera, stamp_ns: int) -> int:

@@ -222,5 +222,8 @@ def test_what_no_row_has_seen_grows_with_the_distance(known):
         expected = seen * (tau - 0.5) ** 2
         if known:
             expected = 3.0 * seen * (1.0 + 2.0 * (tau - 0.5)) ** 2 * (tau - 0.6) ** 2
-        found = pose_at(motion, tau).covariance[3:, 3:]
-        np.testing.assert_allclose(found, expected * np.eye(3), rtol=1e-6, atol=1e-14)
+        moved = replace(motion, span=READOUT_TIME).at_time(tau * READOUT_TIME)
+        for there, at in ((motion, tau), (moved, 0.0)):
+            found = pose_at(there, at).covariance[3:, 3:]
+            np.testing.assert_allclose(found, expected * np.eye(3), rtol=1e-6, atol=1e-14)
+        assert (moved.covariance.diagonal()[6:9] > 0.5 * seen).all()
