@@ -82,8 +82,10 @@ def _words(numbers: tuple[float, ...]) -> str:
 
 def rig_of(args: Options) -> RigParts:
     """The rig of ``--rig``; UsageError for what it does not go with."""
-    if args.imu:
-        raise UsageError("--imu is for one camera: leave it out with --rig")
+    for name in ("camera", "readout_time", "scan_direction", "imu", "imu_offset"):
+        if getattr(args, name) != _DEFAULTS[name]:
+            option = f"--{name.replace('_', '-')}"
+            raise UsageError(f"{option} is for one camera: leave it out with --rig")
     assert args.rig is not None
     parts = read_camchain(args.rig)
     if unknown := [name for name, camera in parts.cameras.items() if camera.readout_time == 0.0]:

@@ -102,6 +102,8 @@ def test_the_recording_says_how_the_rig_is_mounted_and_set(recording):
     ("words", "said"),
     [
         ("--imu", "--imu is for one camera"),
+        ("--readout-time 0", "--readout-time is for one camera: leave it out with --rig"),
+        ("--camera other.yaml", "--camera is for one camera"),
         ("", "has no readout_time of cam0"),
     ],
 )
