@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer import matching
-from rs_localizer.config import CameraSettings, MatchBy, NodeConfig, PoseTime
+from rs_localizer.config import CameraSettings, Imu, ImuUse, MatchBy, NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -141,7 +141,10 @@ _BESIDE = frozenset({
 
 def _of_estimates(config: NodeConfig) -> tuple[object, ...]:
     rig = config.rig if config.of_cameras else type(config.rig)()
-    config = replace(config, imu=replace(config.imu, wait=0.0), rig=rig)
+    imu = replace(config.imu, wait=0.0)
+    if config.of_cameras or imu.use == ImuUse.NONE:  # nothing else of it is read
+        imu = Imu(use=ImuUse.NONE)
+    config = replace(config, imu=imu, rig=rig)
     return tuple(getattr(config, it.name) for it in fields(config) if it.name not in _BESIDE)
 
 

@@ -338,6 +338,14 @@ def test_what_one_camera_does_not_read_leaves_its_track():
     assert frames.change(build({"readout_time": 0.03, "min_inliers": 20}))
 
 
+def test_what_is_said_of_an_imu_that_is_not_used_leaves_the_track():
+    frames = FrameLocalizer(NodeConfig(readout_time=0.03))
+    noisy = {"readout_time": 0.03, "imu.gyroscope_noise": 1e-3}
+    assert frames.change(build({"readout_time": 0.03, "imu.use": "none"}))
+    assert not frames.change(build(noisy | {"imu.use": "none"}))
+    assert frames.change(build(noisy))
+
+
 def test_the_lens_of_a_camera_file_takes_the_place_of_camera_info(tmp_path, make_camera_info):
     file, K = tmp_path / "camera.yaml", np.array([[400.0, 0, 319], [0, 400, 239], [0, 0, 1]])
     file.write_text("/**:\n  ros__parameters:\n" + lens_parameters(Camera(640, 480, K)))
