@@ -75,7 +75,7 @@ if WORKING:
     from rs_localizer.tools.adjust.lens import LensErrors
     from rs_localizer.tools.adjust.observe import Observed, in_order
     from rs_localizer.tools.calibration import Calibration, calibrate
-    from rs_localizer.tools.first_lens import first_lens
+    from rs_localizer.tools.first_lens import covered, first_lens
     from rs_localizer.tools.imu import MountFound
     from rs_localizer.tools.rig import Mounted, Recording, calibrate_rig
 
@@ -271,10 +271,12 @@ def calibrate_one(args: Any) -> Figures:
 def _calibrated(args: Any, source: _Source, camera: Camera, config: NodeConfig) -> Calibration:
     """What the images of a camera say, printed."""
     intrinsics = args.intrinsics or source.new_lens
+    shown = covered(camera.size, (image.pixels for image in source.images))
+    print(f"all images together show the map in {shown:.0%} of the image")
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
         found = calibrate(
             camera, source.images, intrinsics=intrinsics, imu=source.imu,
-            own_stamps=source.own_stamps, done=bar.update,
+            own_stamps=source.own_stamps, done=bar.update, tell=print,
         )  # fmt: skip
     _tell(found, args.rate)
     image_input.tell_telemetry(

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -24,6 +25,20 @@ _LEAST_SHARE = 0.6
 _ODD = 3.0
 # Focal lengths by image width to begin with, before scenes that are no plane.
 _FOCAL_LENGTHS = (0.35, 0.7, 1.0, 1.4)
+
+
+_CELLS = 64  # along the longer side
+
+
+def covered(size: tuple[int, int], images: Iterable[Array]) -> float:
+    """Share of an image within what its pixels (n,2) enclose in any of some images."""
+    shape = np.maximum(np.ceil(_CELLS * np.array(size) / max(size)), 1.0).astype(int)
+    mask = np.zeros(shape[::-1], np.uint8)
+    for pixels in images:
+        if len(pixels):
+            cells = np.floor((pixels + 0.5) * shape / size).astype(np.int32)
+            cv2.fillConvexPoly(mask, cv2.convexHull(cells), 1)
+    return float(mask.mean())
 
 
 class _Candidate(NamedTuple):

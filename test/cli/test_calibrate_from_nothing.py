@@ -5,6 +5,7 @@ that is the test's own (rays through a distorted lens, three by three in a pixel
 """
 
 import argparse
+import re
 import shlex
 from fractions import Fraction
 from pathlib import Path
@@ -125,7 +126,12 @@ def test_a_film_gives_lens_readout_time_and_direction(film, tmp_path, capsys):
     r2 = np.array([0.1, 0.2])
     found = camera.D[0] * r2 + camera.D[1] * r2**2
     assert found == pytest.approx(K1 * r2 + K2 * r2**2, abs=0.005)
-    line = paste_next(capsys.readouterr().out)
+    said = capsys.readouterr().out
+    assert re.search(
+        r"show the map in \d+% of the image\na pose for each of \d+ images, then", said
+    )
+    assert "parts of the recording, against each other" in said
+    line = paste_next(said)
     assert "camera_map.yaml" in line
     # The board's shape was measured: better known than that of any paper (0.1 m rms: 0.2 mm).
     measured = read_marker_map(tmp_path / "camera_map.yaml").settings["map_deviation"]

@@ -21,7 +21,8 @@ from rs_localizer.tools.evaluation.comparison import (
     table,
     true_rates,
 )
-from rs_localizer.tools.evaluation.metrics import associate, pose_errors, twist_errors
+from rs_localizer.tools.evaluation.metrics import Errors, associate, pose_errors, twist_errors
+from rs_localizer.tools.evaluation.plots import errors
 
 MIDDLE_NS = 15_000_000
 
@@ -151,3 +152,12 @@ def test_twist_errors():
     np.testing.assert_allclose(
         errors.true_angular_rate, np.degrees(np.linalg.norm(angular, axis=1))
     )
+
+
+def test_errors_show_the_worst_frame():
+    values = np.full(400, 0.01)
+    values[77] = 30.0
+    figure = errors({"estimate": Errors(np.arange(400) * 10**8, values, values, values)}, {})
+    place, _ = figure.axes
+    assert place.get_ylim()[1] > 30_000.0
+    assert place.get_legend_handles_labels()[1] == ["estimate: median 10 mm, largest 3e+04"]

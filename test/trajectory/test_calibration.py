@@ -14,7 +14,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import Observed
 from rs_localizer.tools.calibration import Calibration, calibrate
-from rs_localizer.tools.first_lens import first_lens
+from rs_localizer.tools.first_lens import covered, first_lens
 from rs_localizer.tools.readout_belief import discrepancy, examine
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
@@ -223,3 +223,11 @@ def test_stamps_of_an_even_camera_with_missing_images():
     assert not found.irregular
     rng = np.random.default_rng(0)
     assert examine(times + 7e-4 * rng.normal(size=len(times))).irregular
+
+
+def test_what_images_cover_together():
+    left = np.array([[0.0, 0.0], [319.0, 0.0], [319.0, 479.0], [0.0, 479.0]])
+    assert covered((640, 480), [np.zeros((0, 2))]) == 0.0
+    assert covered((640, 480), [left]) == pytest.approx(0.5, abs=0.02)
+    right = left + np.array([320.0, 0.0])
+    assert covered((640, 480), [left, right]) == 1.0

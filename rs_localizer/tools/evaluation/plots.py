@@ -191,6 +191,8 @@ def errors(poses: Mapping[str, Errors], twists: Mapping[str, Errors]) -> Figure:
                 _draw_series(axes, _Series(name, style, one.stamps_ns, shown), start, unit)
         digits = [np.log10(np.maximum(values(one), _LEAST)) for one in series.values()]
         low, high = _range(digits, _ROOM_OF_DIGITS)
+        # The worst frame is what one looks for.
+        high = max([high, *(float(each.max()) + 0.1 for each in digits if len(each))])
         axes.set_ylim(10.0**low, 10.0**high)
         _plain_numbers(axes)
         axes.set_ylabel(f"{label} ({unit})")
@@ -226,6 +228,8 @@ def _draw_series(
     x, y = _broken(stamps_ns, t, running)
     counted = values if counted is None else counted
     label = f"{name}: median {np.median(counted):.3g} {unit}".rstrip() if len(counted) else name
+    if unit and len(counted):
+        label += f", largest {counted.max():.3g}"
     axes.plot(x, y, style.line, color=style.color, linewidth=2.0, zorder=style.layer, label=label)
 
 
