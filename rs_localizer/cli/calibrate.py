@@ -273,10 +273,12 @@ def _calibrated(args: Any, source: _Source, camera: Camera, config: NodeConfig) 
     intrinsics = args.intrinsics or source.new_lens
     shown = covered(camera.size, (image.pixels for image in source.images))
     print(f"all images together show the map in {shown:.0%} of the image")
+    gyro = "" if source.imu is None else ", the same with the gyroscope"
+    print(f"steps: a pose for each image, one motion through them{gyro}, and parts of it")
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
         found = calibrate(
             camera, source.images, intrinsics=intrinsics, imu=source.imu,
-            own_stamps=source.own_stamps, done=bar.update, tell=print,
+            own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
     _tell(found, args.rate)
     image_input.tell_telemetry(

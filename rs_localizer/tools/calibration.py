@@ -172,7 +172,6 @@ def calibrate(
     imu: ImuRecording | None = None,
     own_stamps: bool = True,
     done: Callable[[], object] = lambda: None,
-    tell: Callable[[str], object] = lambda text: None,
 ) -> Calibration:
     """Readout time, and lens, of a camera from a recording in which it moves.
 
@@ -186,7 +185,6 @@ def calibrate(
         own_stamps: stamps are the camera's; otherwise those of a file, which are the images' own
             only where they are uneven.
         done: called after each image.
-        tell: told what begins.
 
     Raises:
         ValueError: when the recording determines nothing, saying what was found.
@@ -196,7 +194,6 @@ def calibrate(
     if len(images) < _LEAST_IMAGES:
         raise ValueError(f"{len(images)} images show the map, at least {_LEAST_IMAGES} are needed")
     stamps = examine((taken - taken[0]) * 1e-9)
-    tell(f"a pose for each of {len(images)} images, then one motion through them")
     posed, fitted = _fitted(camera, images, stamps.interval, intrinsics, done)
     every, fits = sum(len(image.points) for image in images), np.count_nonzero(fitted.inliers)
     plain = fitted.camera.distortion_model == DistortionModel.PLUMB_BOB
@@ -210,7 +207,6 @@ def calibrate(
                 camera, (posed, fitted) = fisheye, other
     observations, no_mount = within(posed.observations, fitted.state.spline), ""
     if imu is not None:
-        tell("the same with the gyroscope")
         try:
             samples = gyro_samples(imu, posed.start_ns)
             observations, fitted = with_gyro(
@@ -218,7 +214,6 @@ def calibrate(
             )
         except (NoMount, Undetermined) as error:
             no_mount = str(error)
-    tell("parts of the recording, against each other")
     judged = _judged(camera, posed, observations, stamps, fitted, len(images))
     return replace(judged, no_mount=no_mount, own_stamps=own_stamps or stamps.irregular)
 
