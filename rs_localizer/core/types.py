@@ -192,6 +192,9 @@ class Estimate(Motion):
             own = slice(PARAMETERS + 3 * k, PARAMETERS + 3 * k + 3)
             transport[TURN, own] = values[k] * np.eye(3)
             transport[ANGULAR, own] = rates[k] * np.eye(3) if tau == within_rows(tau) else 0.0
+        turned = self.turned_beside(tau)  # the axes of then
+        for k in range(0, PARAMETERS, 3):
+            transport[k : k + 3] = turned @ transport[k : k + 3]
         shared = transport[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
         joint = transport @ self.joint_covariance @ transport.T
         for part, variance in zip((TURN, ANGULAR), beyond_rows(self, tau), strict=True):
@@ -202,8 +205,8 @@ class Estimate(Motion):
             translation=translation,
             angular_velocity=self.angular_velocity_at(tau),
             linear_velocity=self.linear_velocity_at(tau),
-            angular_acceleration=later[4],
-            linear_acceleration=later[5],
+            angular_acceleration=turned @ later[4],
+            linear_acceleration=turned @ later[5],
             joint_covariance=joint,
             calibration_covariance=shared @ self.calibration_covariance @ shared.T,
             undetected_covariance=shared @ self.undetected_covariance @ shared.T,
