@@ -12,7 +12,7 @@ import json
 import math
 import shlex
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -115,7 +115,8 @@ class Options(Settings, Inputs, Many):
         default=False,
     )
     rate: float | None = option(
-        "of --smooth: samples of the motion (default: one for each image)", "HZ",
+        "poses of the motion, as the frames until then tell it, or with --smooth all "
+        "(default: one for each image)", "HZ",
         limits=(0.0, math.inf), above=True,
     )  # fmt: skip
     parquet: Path | None = option(
@@ -125,8 +126,6 @@ class Options(Settings, Inputs, Many):
 
 
 def run(options: Options) -> Figures | None:
-    if options.rate is not None and not options.smooth:
-        raise UsageError("--rate is of --smooth: replay runs at full speed")
     _check_place(options)
     if len(options.recordings) > 1 or options.workers or options.scheduler:
         _replay_all(options)
@@ -341,6 +340,8 @@ def _replay(
             frames = (
                 (frame.input_stamp_ns, frame) for part in parts for frame in tally.smooth(part)
             )
+        elif options.rate is not None:
+            frames = _at_rate(frames, localizer, options.rate)
         for recorded_ns, frame in frames:
             tally.not_sent += not write_frame(writer, frame, localizer, recorded_ns)
             tally.track.add(frame)
@@ -363,6 +364,25 @@ def _replay(
     if (measured := localizer.readout_watch.measured) is not None:
         tally.readout = measured.readout_time, measured.deviation
     tally.repeated, tally.moving = tally.track.write(out, localizer.config.pose_time)
+
+
+def _at_rate(
+    frames: Iterable[tuple[int, Localized]], localizer: FrameLocalizer, rate: float
+) -> Iterator[tuple[int, Localized]]:
+    """The motion so many times a second until each frame; frames where it is not known."""
+    step_ns = max(round(1e9 / rate), 1)
+    last_ns: int | None = None
+    for recorded_ns, frame in frames:
+        now_ns = frame.input_stamp_ns
+        if not localizer.predicts:
+            yield recorded_ns, frame
+        elif last_ns is not None:
+            # A longer gap ends the track.
+            begin = max(last_ns, now_ns - 10**9) // step_ns + 1
+            for time_ns in range(begin * step_ns, now_ns + 1, step_ns):
+                if found := localizer.at(time_ns):
+                    yield time_ns, found
+        last_ns = now_ns
 
 
 def _tell(tally: Tally, config: NodeConfig, out: Path, timed: bool) -> None:
