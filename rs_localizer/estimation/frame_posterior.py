@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.scales import SPEEDS, VIBRATIONS
+from rs_localizer.core.scales import FACTORS, SPEEDS
 from rs_localizer.core.shake import MIDDLE_RATES, shake_at
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, POSE, POSE_SIZE
@@ -66,6 +66,8 @@ _STEADY_ODDS = REST_ODDS
 _HIDDEN_ODDS = math.log(10.0)
 # Logarithm of the evidence of an ordinary vibration against none from which it is fitted.
 _ASKS = -0.5
+# Of a steady camera one of the seven sizes is ahead by so much (logarithm).
+_BY_CHANCE = math.log(len(FACTORS))
 _FEWEST = 6
 # A smooth error that is found so many times larger than it was known to be.
 _LARGER = 1.5
@@ -235,11 +237,11 @@ def _with_turn(
     wide = look.near_outliers > 0
     if assumed.turn is not None and not wide:  # what a gyroscope leaves tells its offset
         return steady
-    gain, moments = hidden_turn(
+    gain, likelihoods, moments = hidden_turn(
         look.lines, best.state, steady.inliers, smooth, steady.shared, terms, steady.noise,
         steady.freedom, odds,
     )  # fmt: skip
-    if wide or gain > _ASKS or odds[1:].max() > odds[0]:
+    if wide or gain > _ASKS or odds[1:].max() - odds[0] > _BY_CHANCE:
         gate, noise = min(max(threshold, GATE * best.noise), WIDEST_GATE * threshold), best.noise
         if wide:
             gate = max(2.0 * WIDEST_GATE * threshold, _LARGEST_SHAKE * assumed.focal_length)
@@ -276,7 +278,7 @@ def _with_turn(
             return _either(steady, evidence, max(fit.evidence + ratio, evidence + gain), shaken)
     weight = 1.0 / (1.0 + math.exp(min(_HIDDEN_ODDS - TEMPER * gain, 700.0)))
     undetected = weight * moments[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
-    told = np.append(0.0, np.full(VIBRATIONS - 1, max(gain, LEAST_LIKELY)))
+    told = np.maximum(likelihoods - likelihoods.max(), LEAST_LIKELY)
     return steady._replace(undetected=undetected, scales=steady.scales._replace(vibrations=told))
 
 

@@ -304,19 +304,24 @@ def _joint(turned: _Turned, covariance: Array, variance: float) -> Array:
 def hidden_turn(
     lines: Lines, state: Array, inliers: BoolArray, smooth: SmoothError, size: float,
     terms: PriorTerms, noise: float, freedom: float, odds: Array,
-) -> tuple[float, Array]:  # fmt: skip
+) -> tuple[float, Array, Array]:  # fmt: skip
     """What vibration would explain and do at the best motion without it.
 
     Returns:
-        logarithm of its evidence, against none; (18,18) second moments of the motion by it.
+        logarithm of its evidence, against none, with the odds of before; (v,) logarithms of how
+        probable the frame is by each, without them; (18,18) second moments of the motion by it.
     """
     rows = _columns(lines, inliers, int(np.count_nonzero(inliers)))
     turned = _beside_motion(rows, smooth, size, noise, np.zeros(TURNS), terms, state)
     moments = np.zeros((PARAMETERS, PARAMETERS))
     if not np.all(np.isfinite(turned.own)):
-        return -np.inf, moments
+        return -np.inf, np.zeros(VIBRATIONS), moments
     found = _integrate(turned, noise, max(freedom, 1.0), odds, 1)
-    if found.gain > _MAY_SHAKE:
+    if found.gain <= _MAY_SHAKE:  # of the same size the others say as much
+        sizes = len(FACTORS)
+        for place in range(1 + sizes, VIBRATIONS):
+            found.log_likelihoods[place] = found.log_likelihoods[1 + (place - 1) % sizes]
+    else:
         found = _integrate(turned, noise, max(freedom, 1.0), odds, len(SPECTRA))
     pulled = np.zeros((PARAMETERS, TURNS))
     pulled[:] = -turned.inverse @ turned.crossed
@@ -325,7 +330,7 @@ def hidden_turn(
             pulled[axis, 3 * j + axis] += _VALUES[j]
             pulled[6 + axis, 3 * j + axis] += _RATES[j]
     second = found.covariance + found.turns.reshape(TURNS, 1) * found.turns.reshape(1, TURNS)
-    return found.gain, pulled @ second @ pulled.T
+    return found.gain, found.log_likelihoods, pulled @ second @ pulled.T
 
 
 @inlined

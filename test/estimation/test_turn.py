@@ -61,9 +61,16 @@ def test_hidden_vibration_is_integrated_as_over_dense_matrices():
         mean = -inner @ along
         second = rest * left / freedom / noise**2 * inner + np.outer(mean, mean)
         moments.append(pull @ second @ pull.T)
-    gain, found = hidden_turn(
+    gain, likelihoods, found = hidden_turn(
         lines, truth, chosen, nothing_shared(40), 0.0, PRIOR, noise, freedom, NONE
     )
+    # What is remembered of frames before is not what this one says: it would count twice.
+    calm = np.append(0.0, np.full(len(NONE) - 1, -9.0))
+    calmer, again, _ = hidden_turn(
+        lines, truth, chosen, nothing_shared(40), 0.0, PRIOR, noise, freedom, calm
+    )
+    assert calmer == pytest.approx(gain - 9.0)
+    np.testing.assert_array_equal(again, likelihoods)
     assert gain == pytest.approx(logsumexp(logs), abs=0.05)
     weights = np.exp(logs - logsumexp(logs))
     expected = np.einsum("k,kij->ij", weights, moments)
