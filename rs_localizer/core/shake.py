@@ -39,7 +39,7 @@ def _resolved() -> tuple[Array, Array]:
     shown = np.empty((len(tau), FUNCTIONS))
     shown[:, ::2] = np.cos(RATES * tau) * sizes[::2]
     shown[:, 1::2] = np.sin(RATES * tau) * sizes[1::2]
-    _, _, parts = np.linalg.svd(shown)
+    _, _, parts = np.linalg.svd(shown, full_matrices=False)
     return np.ascontiguousarray(sizes[:, None] * parts[:RESOLVED].T), parts[:RESOLVED] / sizes
 
 
