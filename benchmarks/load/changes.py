@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """``python -m benchmarks.load.changes``: what it costs a live node when a setting is changed.
 
-A hand-held camera, 30 images a second. Every parameter that a running node lets be set is set to
-another value, and back ten frames later. Of the ten frames after the first change: those without a
-pose, and the largest standard deviation of the turn rate beside that of the ten before.
+A hand-held camera, 30 images a second that wait for no answer. Every parameter that a running node
+lets be set is set to another value, and back ten frames later. Of the ten frames after the first
+change: those without a pose and the largest standard deviation of the turn rate, beside those of
+the ten before.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import argparse
 import os
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +26,14 @@ from rclpy.parameter import Parameter
 from benchmarks.frame_times import messages
 from benchmarks.hand_held import CAMERA, HandHeld
 from rs_localizer.io import topics
+from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.ros.graph.live import LiveNode
 from rs_localizer.settings import NODE_NAME, Setting, settings
 
 _POINTS, _RATE = 120, 30.0
 _FRAMES, _SETTLING = 10, 5
+_LATE = 1.0  # s after the last frame, from which a pose counts as lost
 # Moves the stamps of the poses, by which they are told apart here.
 _LEFT_OUT = "pose_time"
 _SETTINGS: dict[str, Any] = {"readout_time": CAMERA.readout_time}
@@ -52,7 +56,7 @@ def another(setting: Setting) -> Any:
 
 
 class Session:
-    """A live node, and the frames that it is sent one after the other."""
+    """A live node, and the frames that it is sent at the camera's rate."""
 
     def __init__(self, node: LiveNode, count: int) -> None:
         self._node, self._frame = node, 0
@@ -73,18 +77,29 @@ class Session:
     def send(self, count: int) -> tuple[int, float]:
         """Frames without a pose among so many, and the largest deviation (rad/s)."""
         self._deviations.clear()
-        lost = 0
-        for cloud in self._clouds[self._frame : self._frame + count]:
-            lost += self._node.localize(self._info, cloud) is None
+        clouds = self._clouds[self._frame : self._frame + count]
+        due = time.monotonic()
+        for cloud in clouds:
+            self._node.send(self._info, cloud)
+            due += 1.0 / _RATE
+            self._node._until(lambda: time.monotonic() >= due)  # noqa: B023
         self._frame += count
-        return lost, max(self._deviations, default=np.nan)
 
-    def set(self, name: str, value: Any) -> str:
-        """Set a parameter; why it was refused, or nothing."""
+        def lost() -> int:
+            return sum(stamp_ns(cloud) not in self._node._poses for cloud in clouds)
+
+        self._node._until(lambda: not lost() or time.monotonic() > due + _LATE)
+        return lost(), max(self._deviations, default=np.nan)
+
+    def set(self, name: str, value: Any) -> Any:
+        """Ask for a parameter to be set; a future of the answer."""
         request = SetParameters.Request(
             parameters=[Parameter(name, value=value).to_parameter_msg()]
         )
-        future = self._client.call_async(request)
+        return self._client.call_async(request)
+
+    def refusal(self, future: Any) -> str:
+        """Why it was not set, or nothing."""
         self._node._until(future.done)
         (result,) = future.result().results
         return "" if result.successful else str(result.reason)
@@ -102,7 +117,7 @@ def main() -> int:
         if not (one.read_only or one.fixed or name == _LEFT_OUT)
         and (value := another(one)) is not None
     }
-    head = ("poses lost", "deg/s before", "deg/s after")
+    head = ("lost before", "lost after", "deg/s before", "deg/s after")
     print(f"{'set':44}" + "".join(f"{name:>14}" for name in head))
     with (
         tempfile.TemporaryDirectory() as place,
@@ -113,13 +128,16 @@ def main() -> int:
         session = Session(node, count)
         session.send(_FRAMES)
         for name, value in changes.items():
-            _, before = session.send(_FRAMES)
+            lost_before, before = session.send(_FRAMES)
             default = _SETTINGS.get(name, settings()[name].default)
-            refused = session.set(name, value)
+            answer = session.set(name, value)
             lost, after = session.send(_FRAMES)
-            figures = f"{lost:14}{np.degrees(before):14.2f}{np.degrees(after):14.2f}"
+            refused = session.refusal(answer)
+            figures = (
+                f"{lost_before:14}{lost:14}{np.degrees(before):14.2f}{np.degrees(after):14.2f}"
+            )
             print(f"{f'{name}: {value}':44}{refused or figures}", flush=True)
-            session.set(name, default)
+            session.refusal(session.set(name, default))
             session.send(_SETTLING)
     return 0
 

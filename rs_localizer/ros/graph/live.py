@@ -149,6 +149,12 @@ class LiveNode:
         deadline = time.monotonic() + _SETTLING
         self._until(lambda: time.monotonic() > deadline)
 
+    def send(self, info: Any, cloud: Any) -> None:
+        """Publish a frame, and wait for nothing."""
+        to_info, to_cloud = self._publishers
+        to_info.publish(copy_message(info, "sensor_msgs/msg/CameraInfo"))
+        to_cloud.publish(copy_message(cloud, "sensor_msgs/msg/PointCloud2"))
+
     def localize(self, info: Any, cloud: Any) -> PoseStamped | None:
         """What the node answers to a frame; None: it has refused it.
 
@@ -156,14 +162,9 @@ class LiveNode:
             LiveError: as :meth:`wait`.
         """
         stamp, before = stamp_ns(cloud), self._unanswered
-        messages = (
-            copy_message(info, "sensor_msgs/msg/CameraInfo"),
-            copy_message(cloud, "sensor_msgs/msg/PointCloud2"),
-        )
         while True:
             received, words = self._count("Frames received"), self._words
-            for publisher, message in zip(self._publishers, messages, strict=True):
-                publisher.publish(message)
+            self.send(info, cloud)
 
             def answered() -> bool:
                 return stamp in self._poses or self._unanswered > before
