@@ -82,7 +82,8 @@ class Session:
         for cloud in clouds:
             self._node.send(self._info, cloud)
             due += 1.0 / _RATE
-            self._node._until(lambda: time.monotonic() >= due)  # noqa: B023
+            while (left := due - time.monotonic()) > 0.0:
+                self._node._executor.spin_once(timeout_sec=left)
         self._frame += count
 
         def lost() -> int:
