@@ -324,6 +324,7 @@ class FrameLocalizer:
 
     def _forget_motion(self) -> None:
         self._newest = None
+        self._waiting.clear()
         self.readout_watch.reset()
         self._tracker.reset()
 
