@@ -26,6 +26,8 @@ from rs_localizer.estimation.searching import GLOBAL_SHUTTER_SCALE, MotionSearch
 # Three quarters of the inliers say as much as they do. Two fifths of the matches that are
 # shifted alike leave two thirds; with 0.5 they were lost, and 3 of 1,080 wrong cameras less passed.
 _SHARE = 0.75
+# Of points that lie just beyond the gate, where inliers go on: no match is shifted so.
+_NEAR_SHARE = 0.5
 # Six points have a motion whatever they are.
 _SAMPLE = 6
 # Groups that chance makes of mismatches in one frame of 1,000 (Desolneux, Moisan and Morel, IJCV
@@ -66,16 +68,17 @@ def left_out(
     count, inliers = observed.observations.count, int(np.count_nonzero(posterior.inliers))
     if count - inliers < _SAMPLE:
         return LeftOut()
-    most = (1.0 if known else _SHARE) * math.exp(-0.5 * posterior.speeding) * inliers
+    counts = math.exp(-0.5 * posterior.speeding) * inliers
+    most, least = ((1.0 if known else share) * counts for share in (_SHARE, _NEAR_SHARE))
     near = _near(observed, posterior, threshold)
     found = LeftOut()
-    if near < max(most, 1.0):
+    if near < max(least, 1.0):
         found = _moved(search, observed, posterior, threshold, most)
         if found.failure is not None or known:  # what is matched near predictions is near them
             return found
         near = _not_strewn(observed, posterior)
-    if near < max(most, 1.0):
-        return found
+        if near < max(most, 1.0):
+            return found
     return LeftOut(Failure(
         Reason.MODEL_ERROR,
         f"{inliers} points fit to {posterior.noise:.2g} px (one sigma), and of the "
