@@ -162,4 +162,3 @@ def test_smooth(flight, tmp_path, capsys):
     assert (out / "bridged.txt").read_text() == ""
     assert main([*words, str(tmp_path / "none")]) == 1
     assert "--smooth needs the readout time" in capsys.readouterr().err
-    assert main(["replay", str(flight), "--rate", "10", "--out", str(tmp_path / "none")]) == 2

@@ -27,10 +27,10 @@ OVER, CENTRE = np.diag([-1.0, -1.0, 1.0]), np.array([0.1, 0.0, 0.0])
 
 
 SCENE = {
-    "alone": ("--camera", "camera.yaml"),
+    "alone": ("--readout-time", "0.03", "--camera", "camera.yaml"),
     "pair": ("--rig", "chain.yaml"),
 }
-ROOM = ("--trajectory", "tum_vi_room5", "--readout-time", "0.03")
+ROOM = ("--trajectory", "tum_vi_room5")
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +46,8 @@ def film(tmp_path_factory):
 
     def film(which: str, name: str, *words: str) -> Path:
         out = folder / f"{which}_{name}"
-        option, file = SCENE[which]
-        scene = (option, str(folder / file))
+        *options, file = SCENE[which]
+        scene = (*options, str(folder / file))
         if not out.exists():
             assert main(["simulate", str(out), *ROOM, *scene, *words]) == 0
         return out
