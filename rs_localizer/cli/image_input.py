@@ -40,8 +40,8 @@ if WORKING:
         from_bag,
         from_files,
         from_video,
-        have_times,
         image_files,
+        name_times,
         with_telemetry,
     )
 
@@ -307,7 +307,7 @@ def of_files(args: Any, path: Path, camera: Camera | None, start: float | None =
         clock = ImageClock(rate, start_ns)
         return Source(from_video(path, camera, clock), None, clock)
     files = image_files(path)
-    if rate is None and not have_times(files):
+    if rate is None and name_times(files) is None:
         raise UsageError("the names of the files are not times: give --rate")
     clock = ImageClock(rate, start_ns)
     return Source(from_files(files, camera, clock), len(files), clock)

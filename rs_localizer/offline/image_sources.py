@@ -3,7 +3,7 @@
 """Where images come from, offline: a video, a folder of files, a bag."""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,8 @@ LENSES = tuple(f"lens{k}" for k in range(1, 10))
 _UNITS = {10: 10**9, 13: 10**6, 16: 10**3, 18: 1, 19: 1}
 _TIME = re.compile(r"([1-9]\d*)(?:[._](\d{1,9}))?")
 _EARLIEST_NS, _LATEST_NS = 10**17, 2**31 * 10**9
+# Between two images of a video or a walk.
+_SHORTEST_NS, _LONGEST_NS = 10**6, 2 * 10**9
 
 
 class SourceError(ValueError):
@@ -107,9 +109,9 @@ def with_telemetry(
 
 def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> Iterator[Shot]:
     """JPEG and PNG files; their names are times in ns, or they follow each other at a rate."""
-    timed = have_times(files)
+    times = name_times(files)
     for file in files:
-        own = name_time(file) if timed else None
+        own = None if times is None else times[file]
         now = clock.relative(None) if own is None else clock.absolute(own)
         assert now is not None  # a clock without a rate has refused
         name = "png" if file.suffix.lower() == ".png" else "jpeg"
@@ -129,8 +131,8 @@ def image_files(folder: Path) -> list[Path]:
     files = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
     if not files:
         raise SourceError(f"{folder} has no images: no file ends in {', '.join(SUFFIXES)}")
-    if have_times(files):
-        return sorted(files, key=lambda file: name_time(file) or 0)
+    if (times := name_times(files)) is not None:
+        return sorted(files, key=times.__getitem__)
     if all(file.stem.isdecimal() for file in files):
         return sorted(files, key=lambda file: int(file.stem))
     return sorted(files)
@@ -151,8 +153,7 @@ def image_topics(bag: BagReader) -> list[str]:
     return sorted(topic for topic, kind in bag.topics.items() if kind in IMAGE_TYPES)
 
 
-def name_time(file: Path) -> int | None:
-    """The time, ns, that the name of an image file is; None: it is none."""
+def _since_1970(file: Path) -> int | None:
     match = _TIME.fullmatch(file.stem)
     unit = None if match is None else _UNITS.get(len(match[1]))
     if match is None or unit is None or (match[2] and unit != _UNITS[10]):
@@ -161,10 +162,19 @@ def name_time(file: Path) -> int | None:
     return time if _EARLIEST_NS <= time < _LATEST_NS else None
 
 
-def have_times(files: list[Path]) -> bool:
-    """Whether the names of image files are times, each of one image."""
-    times = [name_time(file) for file in files]
-    return None not in times and len(set(times)) == len(times)
+def name_times(files: Sequence[Path]) -> dict[Path, int] | None:
+    """The times, ns, that the names of image files are, each of one image; None: they are none.
+
+    Nanoseconds since a device was started have up to 16 digits, as microseconds since 1970 have:
+    the interval of the images tells them apart.
+    """
+    times = [_since_1970(file) for file in files]
+    if all(file.stem.isdecimal() for file in files) and len(files) > 1:
+        numbers = [int(file.stem) for file in files]
+        if _SHORTEST_NS <= float(np.median(np.diff(sorted(numbers)))) <= _LONGEST_NS:
+            times = list(numbers)
+    known = {file: time for file, time in zip(files, times, strict=True) if time is not None}
+    return known if len(set(known.values())) == len(files) else None
 
 
 def find_topic(bag: BagReader, types: tuple[str, ...], given: str | None, option: str) -> str:

@@ -20,7 +20,7 @@ if WORKING:
     from rs_localizer.io.calibration import read_calibration
     from rs_localizer.io.maps.colmap import read_model, write_model
     from rs_localizer.io.maps.landmarks import MapError
-    from rs_localizer.offline.image_sources import have_times, name_time
+    from rs_localizer.offline.image_sources import name_times
     from rs_localizer.settings import build
     from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, Shutter, undo_shutter
 
@@ -88,12 +88,13 @@ def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:
         UsageError: for names that are neither.
     """
     if rate is None:
-        if not have_times([Path(name) for name in names]):
+        times = name_times([Path(name) for name in names])
+        if times is None:
             raise UsageError(
                 f"the names of the images are not times (such as {names[0]}): give --rate, "
                 "the images per second of the numbers in them (1e9 for ns since a video's start)"
             )
-        return {name: name_time(Path(name)) or 0 for name in names}
+        return {name: times[Path(name)] for name in names}
     stamps = {}
     for name in names:
         numbers = _NUMBER.findall(Path(name).stem)

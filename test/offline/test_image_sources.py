@@ -1,0 +1,35 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Names of image files that are times."""
+
+from pathlib import Path
+
+import pytest
+
+from rs_localizer.offline.image_sources import name_times
+
+EVERY_33_MS = [0, 33_366_000, 66_733_000]
+
+
+@pytest.mark.parametrize(
+    ("first_ns", "unit"),
+    [
+        (1_403_636_579_763_000_000, 1),  # EuRoC's
+        (1_403_636_579_763_000_000, 10**3),  # us since 1970: 16 digits
+        (1_403_636_579_763_000_000, 10**6),
+        (1_403_636_579_763_000, 1),  # ns since a phone was started: 16 digits, too
+        (86_412_345_678_901, 1),
+    ],
+)
+def test_their_unit_is_that_of_the_interval(first_ns, unit):
+    files = [Path(f"{(first_ns + later) // unit}.png") for later in EVERY_33_MS]
+    found = name_times(files)
+    assert found is not None
+    assert list(found) == files
+    for file, later in zip(files, EVERY_33_MS, strict=True):
+        assert abs(found[file] - first_ns - later) < unit
+
+
+@pytest.mark.parametrize("names", [("0001", "0002", "0003"), ("10", "15", "20"), ("a", "b")])
+def test_numbers_of_frames_are_none(names):
+    assert name_times([Path(f"{name}.png") for name in names]) is None
