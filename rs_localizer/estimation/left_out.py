@@ -77,7 +77,7 @@ def left_out(
         if found.failure is not None or known:  # what is matched near predictions is near them
             return found
         near = _not_strewn(observed, posterior)
-        if near < max(most, 1.0):
+        if near < _SHARE * inliers:  # however fast: a few that lie near are seen from a car, too
             return found
     return LeftOut(Failure(
         Reason.MODEL_ERROR,
