@@ -28,7 +28,7 @@ PAGES = {
     "Understand": "limits solvers estimator honesty benchmarks architecture api",
 }
 OTHERS = (
-    *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README", "benchmarks/honesty"),
+    *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README"),
     "examples/README",
     *("QUALITY_DECLARATION", "CHANGELOG", "docs/adr/0001-compiled-kernels"),
 )

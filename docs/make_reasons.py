@@ -20,9 +20,9 @@ _REASONS_INTRODUCTION = """\
 
 ## Why a frame has no pose
 
-Written by `python docs/make_reasons.py` from `rs_localizer/pipeline/refusal.py`. The reasons are
-the same in the library (`Failure.reason`), in `replay`, in the log and in `/diagnostics`.
-*Settings*: {settings}
+The same in the library (`Failure.reason`), in `replay`, in the log and in `/diagnostics`.
+*Settings*:
+{settings}
 
 | reason | means | look at |
 |---|---|---|

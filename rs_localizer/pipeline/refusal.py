@@ -60,17 +60,14 @@ class Meaning(NamedTuple):
     look_at: str
 
 
-SETTINGS = (
-    "is the readout time in seconds, the scan direction right, are the pixels raw (not rectified)?"
-)
+SETTINGS = "is readout_time in seconds, scan_direction right, are the pixels raw (not rectified)?"
 
 REASONS: dict[str, Meaning] = {
     Reason.TOO_FEW_POINTS: Meaning(
-        "fewer points than min_inliers can be used",
-        "show more of the map: three markers, or a larger part of it",
+        "fewer usable points than min_inliers", "show three markers, or a larger part of the map"
     ),
     Reason.TOO_FEW_INLIERS: Meaning(
-        "no motion fits min_inliers points to within inlier_threshold",
+        "no motion fits min_inliers points",
         f"do map and calibration belong to these images; {SETTINGS}",
     ),
     Reason.NO_HYPOTHESIS: Meaning(
@@ -80,40 +77,33 @@ REASONS: dict[str, Meaning] = {
         "most points would lie behind the camera", "is the map mirrored, or another one?"
     ),
     Reason.RESIDUAL: Meaning(
-        "inlier residuals are as large as inlier_threshold allows; no pose fits",
-        f"calibration, map, or a too small inlier_threshold; {SETTINGS}",
+        "inlier residuals are as large as inlier_threshold allows", f"calibration, map; {SETTINGS}"
     ),
     Reason.DEGENERATE: Meaning(
         "the points do not determine the motion, e.g. a frontoparallel plane",
-        "look at it from an angle, show points at other depths, leave tracking and velocity_prior "
-        "on",
+        "look from an angle, show other depths, leave tracking and velocity_prior on",
     ),
     Reason.IMPLAUSIBLE: Meaning(
         "the motion exceeds what a camera can do", f"mostly chance matches; {SETTINGS}"
     ),
     Reason.MIRRORED: Meaning(
-        "planar pose ambiguity: two poses, mirrored about the line of sight, fit equally well",
-        "come nearer, look from an angle, use a larger board or markers on several walls",
+        "planar pose ambiguity: two mirrored poses fit equally well",
+        "come nearer, look from an angle, use markers on several walls",
     ),
     Reason.MODEL_ERROR: Meaning(
-        "errors that no motion explains: of neighbouring rows, of points just beyond the inlier "
-        "gate, or smooth over the image",
-        f"vibration (a stiffer mounting, an IMU), calibration, map; {SETTINGS}",
+        "errors that no motion explains, of rows or smooth over the image",
+        f"vibration (stiffer mounting, IMU), calibration, map; {SETTINGS}",
     ),
     Reason.UNCERTAIN: Meaning(
-        "orientation uncertainty exceeds max_orientation_deviation, as before a small plane",
-        "come nearer, use a larger board or markers on several walls; leave tracking on, or raise "
-        "the limit where a filter weighs each pose",
+        "orientation uncertainty exceeds max_orientation_deviation",
+        "come nearer, show more of the map, leave tracking on, or raise the limit",
     ),
     Reason.SCAN_AXIS: Meaning(
-        "the shutter scans columns instead of rows, or rows instead of columns: scan_direction "
-        "names the wrong axis",
-        "set scan_direction to the direction that the message names; a driver that rotates images "
-        "rotates the scan, too",
+        "scan_direction names the wrong axis: columns, or rows",
+        "set the direction that the message names (drivers may rotate images)",
     ),
     Reason.AWAITS_FRAMES: Meaning(
-        "output_lag holds results back until so many later frames have come",
-        "nothing is wrong: the first frames have none yet",
+        "output_lag holds results back until later frames have come", "nothing is wrong"
     ),
     Reason.NO_CAMERA_INFO: Meaning(
         "no usable camera_info came before it", "is it recorded, is its topic the right one?"
@@ -137,16 +127,16 @@ REASONS: dict[str, Meaning] = {
         "a message on imu cannot be used", "its units: rad/s and m/s^2; what its driver fills in"
     ),
     Reason.BAD_DETECTIONS: Meaning(
-        "a message on detections cannot be used, or its corners come in another order",
-        "lower left, lower right, upper right, upper left, as apriltag has them",
+        "detections cannot be used, or have another order of corners",
+        "apriltag's order: lower left, lower right, upper right, upper left",
     ),
     Reason.NO_MAP: Meaning(
         "keypoints came before a map, or detections without marker_map",
-        "give map_file, or publish map_points; marker_map for detections",
+        "map_file or map_points; marker_map for detections",
     ),
     Reason.NO_MATCHES: Meaning(
-        "no keypoint matches a landmark, or no detected tag is in marker_map",
-        "are descriptors, or ids, of map and camera of one kind?",
+        "no keypoint matches a landmark, or no tag is in marker_map",
+        "are descriptors, or ids, of one kind?",
     ),
     Reason.BAD_IMAGE: Meaning(
         "an image cannot be read", "its encoding: mono, color, Bayer, YUV, JPEG, PNG"
@@ -160,19 +150,19 @@ REASONS: dict[str, Meaning] = {
     ),
     Reason.REPEATED_STAMP: Meaning(
         "a frame with this stamp has come already",
-        "does a second node, or a recording, publish on this topic; does the driver stamp anew?",
+        "two publishers on this topic, or a driver that stamps anew?",
     ),
     Reason.LATE_FRAME: Meaning(
-        "a newer frame came before it; from half a second on, the previous frames are forgotten",
-        "nothing, if it is rare; otherwise, do two senders use this topic?",
+        "a newer frame came before it; from half a second on, tracking restarts",
+        "nothing, if it is rare; else, do two senders use this topic?",
     ),
     Reason.COMPILING: Meaning(
-        "kernels of this frame are being compiled, at the first start on a machine",
+        "kernels of this frame are being compiled (first start)",
         "it ends within minutes; `rs_localizer warm` beforehand",
     ),
     Reason.NO_TRANSFORM: Meaning(
         "TF has no transform from the camera to base_frame",
-        "record /tf and /tf_static, too; a robot_state_publisher has to run",
+        "record /tf and /tf_static, run a robot_state_publisher",
     ),
 }
 """By the reason as it is counted, logged and published."""
@@ -181,15 +171,15 @@ IMU_REASONS: dict[str, Meaning] = {
     ImuReason.NEVER: Meaning("no message has come on imu", "is its topic remapped, does it run?"),
     ImuReason.LATE: Meaning(
         "IMU messages arrive later than imu.wait or use another clock",
-        "a larger imu.wait, imu.time_offset, the driver of the IMU",
+        "a larger imu.wait, imu.time_offset, its driver",
     ),
     ImuReason.STOPPED: Meaning(
         "the last message is older than the image by half a second or more",
-        "does the IMU still run; do camera and IMU have one clock?",
+        "does it still run, by the camera's clock?",
     ),
     ImuReason.BEGINS_LATER: Meaning(
-        "the first message that is remembered is younger than the image",
-        "nothing, at the beginning; otherwise, do camera and IMU have one clock?",
+        "the first remembered message is younger than the image",
+        "nothing, at the beginning; else, is there one clock?",
     ),
     ImuReason.GAP: Meaning(
         "messages of the exposure are lost", "a reliable publisher, a machine with less to do"
@@ -202,31 +192,30 @@ IMU_REASONS: dict[str, Meaning] = {
     ),
     ImuReason.TWO_FRAMES: Meaning(
         "messages on imu alternate between two frame_ids",
-        "two IMUs, or two drivers, publish on one topic: remap one of them",
+        "two IMUs or drivers publish: remap one of them",
     ),
     ImuReason.NO_TRANSFORM: Meaning(
         "TF has no transform from the IMU to the camera",
-        "publish, or record, their transform on /tf_static; ROS needs tf2_ros for it",
+        "publish it on /tf_static; ROS needs tf2_ros for it",
     ),
     ImuReason.NO_READOUT_TIME: Meaning(
-        "readout_time is 0 (unknown), and with it which message belongs to which row",
+        "readout_time is 0: unknown which message belongs to which row",
         "set readout_time; rs_localizer calibrate finds it",
     ),
     ImuReason.NOT_TRACKING: Meaning("the solver is for global shutters", "another solver"),
     ImuReason.DOUBTED: Meaning(
-        "the points of this image fit better without the gyroscope, or its stamps have stepped",
-        "nothing, if it is rare; otherwise imu.gyroscope_noise, imu.time_offset",
+        "this image fits better without the gyroscope, or its stamps have stepped",
+        "nothing, if rare; imu.gyroscope_noise, imu.time_offset",
     ),
     ImuReason.DISAGREES: Meaning(
         "the gyroscope's rates disagree with the camera's motion",
-        "is it on the same body; imu.time_offset, the frame_id of its messages, their units",
+        "one body? imu.time_offset, its frame_id and units",
     ),
     ImuReason.TURNED: Meaning(
-        "the gyroscope's axes disagree with TF",
-        "the transform between the two frame_ids; the angle is in the diagnostics",
+        "the gyroscope's axes disagree with TF", "the transform between the two frame_ids"
     ),
     ImuReason.COMPILING: Meaning(
-        "kernels for an IMU are being compiled, at the first start on a machine",
+        "kernels for an IMU are being compiled (first start)",
         "it ends within minutes; `rs_localizer warm` beforehand",
     ),
 }

@@ -124,5 +124,5 @@ def test_every_reason_to_go_without_the_imu_has_its_sentence():
     assert set(IMU_REASONS) == set(ImuReason)
     assert not set(IMU_REASONS) & set(REASONS)
     assert "which message belongs to which row" in explained(ImuReason.NO_READOUT_TIME)
-    assert "look at it from an angle" in explained("degenerate")
+    assert "look from an angle" in explained("degenerate")
     assert explained("unheard_of") == ""
