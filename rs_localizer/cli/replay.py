@@ -59,7 +59,6 @@ if WORKING:
         Figures,
         Outcome,
         Task,
-        compiled_elsewhere,
         finished,
         perform_all,
         tasks_of,
@@ -484,11 +483,5 @@ def _summarize(tasks: list[Task], outcomes: dict[Path, Outcome]) -> None:
 
 
 def _replay_of_many(options: Options, recording: Path, out: Path) -> Figures:
-    kernels = f"replay {_settings(options).solver}"
-    compiled_elsewhere(kernels, _warm, options)
     alone = options if options.parquet is None else replace(options, parquet=out / TABLE)
     return figures(_replay_one(alone, recording, out, timed=False))
-
-
-def _warm(options: Options) -> None:
-    FrameLocalizer(_settings(options)).warm_up()

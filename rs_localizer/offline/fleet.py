@@ -5,19 +5,15 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import functools
 import hashlib
 import io
 import json
 import logging
 import os
-import pickle
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import uuid
 from collections import Counter
@@ -26,9 +22,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numba
-
-from rs_localizer.core.simd.jit import cache_directory
 from rs_localizer.io.atomic_files import write_errors
 
 Figures = dict[str, float | int | str]
@@ -38,10 +31,6 @@ MARKER, LOG = "fleet.json", "log.txt"
 """In each complete result: what it is of, written last; and what the command would have said."""
 
 _PACKAGE = Path(__file__).parents[1]
-_WARM = (
-    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
-    "warm, argument = pickle.load(sys.stdin.buffer); warm(argument)"
-)
 # How often a recording may take its worker with it until it counts as failed.
 _DEATHS = 3
 # Scheduler that answers nothing for so long is none, s.
@@ -265,28 +254,3 @@ def _local(workers: int) -> Iterator[Any]:
 def dask_setup(worker: Any) -> None:
     """Leave Ctrl-C, which a terminal sends to all processes, to the one that started them."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def compiled_elsewhere(kernels: str, warm: Callable[[Any], None], argument: Any) -> None:
-    """Compile in another process, unless this machine has compiled it before.
-
-    A process that has compiled kernels itself rounds differently than those that load them.
-
-    Args:
-        kernels: names what ``warm(argument)`` compiles.
-        warm: a function that another process can import.
-        argument: can be pickled.
-    """
-    said = f"{program()} {kernels} {numba.__version__} {sys.implementation.cache_tag}"
-    done = cache_directory() / "fleet" / hashlib.sha256(said.encode()).hexdigest()[:16]
-    if done.exists():
-        return
-    given = pickle.dumps(sys.path) + pickle.dumps((warm, argument))
-    with contextlib.suppress(OSError):  # nothing can be kept there: each compiles for itself
-        done.parent.mkdir(parents=True, exist_ok=True)
-        with done.with_suffix(".lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            if not done.exists():
-                words = [sys.executable, "-c", _WARM]
-                if not subprocess.run(words, input=given, capture_output=True).returncode:
-                    done.touch()

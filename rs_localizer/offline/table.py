@@ -20,7 +20,6 @@ from rs_localizer.io.atomic_files import atomic_files, write_errors
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.calibration import pixel_intrinsics
 from rs_localizer.io.outputs import Localized
-from rs_localizer.offline.fleet import compiled_elsewhere
 from rs_localizer.offline.replay import NO_FRAMES, prepare, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at
@@ -243,17 +242,12 @@ def localize_recording(
         raise ValueError("a table is of one camera: leave the setting cameras out")
     with open_bag(Path(source)) as bag:
         topics, localizer = prepare(bag, config)
-        compiled_elsewhere(f"replay {config.solver}", _warm_up, config)
         localizer.warm_up()
         rows = FrameTable(source, localizer)
         for frame in replay(bag, topics, localizer):
             if frame.result or frame.result.reason not in NO_FRAMES:
                 rows.add(frame.stamp_ns, frame.result)
     return rows.table()
-
-
-def _warm_up(config: NodeConfig) -> None:
-    FrameLocalizer(config).warm_up()
 
 
 def _config(
