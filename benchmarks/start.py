@@ -121,10 +121,10 @@ def plain() -> Start:
 def measure(settings: Mapping[str, Any], imu: bool) -> Start:
     """Start the localizer and send it frames until it has a pose."""
     from rs_localizer import data
+    from rs_localizer.cli.demo import read_frames
     from rs_localizer.ros.graph.live import LiveNode
-    from rs_localizer.tools.evaluation.comparison import load_recording
 
-    recording = load_recording(data.path(data.WEBCAM))
+    frames = read_frames(data.path(data.WEBCAM))
     with tempfile.TemporaryDirectory() as place:
         began = time.monotonic()
         log = Path(place) / "log"
@@ -135,10 +135,10 @@ def measure(settings: Mapping[str, Any], imu: bool) -> Start:
                 active, work = time.monotonic() - began, watch.work()
                 refused, pose = 0, None
                 while pose is None:
-                    for k, info in enumerate(recording.camera_infos):
+                    for stamp_ns, info, cloud in frames:
                         if imu:
-                            _send_imu(node, recording.stamps_ns[k])
-                        pose = node.localize(info, recording.clouds[k])
+                            _send_imu(node, stamp_ns)
+                        pose = node.localize(info, cloud)
                         if pose is not None:
                             break
                         refused += 1

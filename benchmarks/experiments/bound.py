@@ -20,7 +20,7 @@ from benchmarks.experiments.views import GROSS, Outcome, outcome, synthetic_view
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
 from rs_localizer.localizer import Localizer
-from rs_localizer.tools.evaluation.plots import BLUE, ORANGE
+from rs_localizer.tools.errors import BLUE, ORANGE
 
 _REGION = 0.95
 _COVERED = (0.93, 0.97)

@@ -21,7 +21,7 @@ from benchmarks.experiments.errors import METRICS
 from benchmarks.experiments.methods import Method
 from benchmarks.experiments.sweeps import Curves
 from rs_localizer.core.arrays import Array
-from rs_localizer.tools.evaluation.plots import BLUE, ORANGE
+from rs_localizer.tools.errors import BLUE, ORANGE
 
 _DPI = 110
 _LEGEND_MARGIN, _LEGEND_ROW = 0.1, 0.21  # inches

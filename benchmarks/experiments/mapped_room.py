@@ -38,13 +38,14 @@ from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.tools.evaluation.cube_clip import CAMERA, SENSOR
+from rs_localizer.tools.cube_clip import CAMERA
 from rs_localizer.tools.mapping.report import rows
 from rs_localizer.tools.simulation.frames import middle_stamp
+from rs_localizer.tools.simulation.settings import ImageSettings
 
 _WALK = Piece(28.0, 11.8, 15.0)
 _FLIGHTS = {"another walk": Piece(40.0, 8.0), "quick turns": Piece(54.8, 6.0)}
-_KEYPOINTS = 1000
+_KEYPOINTS, _SENSOR = 1000, ImageSettings(exposure=0.005, noise=2.0)
 _OURS, _P3P = "r6p_vcwt", "p3p"
 # What issue and README promise.
 _MOST_POSITION, _MOST_ANGLE, _LEAST_SHARE, _LEAST_GAIN = 0.01, 0.15, 0.95, 3.0
@@ -61,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
-    room = Room(read_tum(HAND_MOTION), CAMERA, SENSOR, _KEYPOINTS)
+    room = Room(read_tum(HAND_MOTION), CAMERA, _SENSOR, _KEYPOINTS)
     with TemporaryDirectory() as images, TemporaryDirectory() as folder:
         with _bar("look", len(room.stamps(_WALK))) as step:
             views = room.look(_WALK, Path(images), lambda: step(1))

@@ -8,8 +8,7 @@ import shlex
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,49 +18,41 @@ import numpy as np
 from rs_localizer.cli import WORKING, import_ros, stage
 from rs_localizer.cli.options import option
 from rs_localizer.config import NodeConfig
-from rs_localizer.core.camera import Camera
 from rs_localizer.tools.simulation.settings import FrameSettings
 
 if WORKING:
     from scipy.spatial.transform import Rotation
 
     from rs_localizer import data
+    from rs_localizer.cli.replay_result import Track
+    from rs_localizer.core.camera import Camera
     from rs_localizer.core.shutter import Motion
     from rs_localizer.core.simd import compiler
     from rs_localizer.core.simd.jit import cache_directory
-    from rs_localizer.io.bags import BagWriter
+    from rs_localizer.io.bags import open_bag
     from rs_localizer.io.camera_info import read_camera_info
-    from rs_localizer.io.recording import write_frame
-    from rs_localizer.io.trajectories import read_tum
-    from rs_localizer.io.video import Image
+    from rs_localizer.io.messages import stamp_ns
+    from rs_localizer.io.outputs import Localized
+    from rs_localizer.io.recording import (
+        CAMERA_INFO_TOPIC,
+        CORRESPONDENCES_TOPIC,
+        make_camera_info,
+        make_correspondences,
+    )
+    from rs_localizer.io.trajectories import Motions, Trajectory, Twists, read_tum
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.settings import build, load_params_file
-    from rs_localizer.tools.evaluation import cube_clip, plots
-    from rs_localizer.tools.evaluation.comparison import (
-        Answer,
-        Recording,
-        Result,
-        compare,
-        load_recording,
-        table,
-    )
-    from rs_localizer.tools.simulation.frames import frame_stamps, simulate_frames
-    from rs_localizer.tools.simulation.recording import write_simulated, write_truth
+    from rs_localizer.tools import cube_clip, errors
+    from rs_localizer.tools.simulation.frames import frame_stamps, middle_stamp, simulate_frames
     from rs_localizer.tools.simulation.scene import room
-    from rs_localizer.tools.simulation.true_motion import RecordedMotion
+    from rs_localizer.tools.simulation.true_motion import RecordedMotion, TrueMotion
 
 # The part of the hand's motion that is flown (s): it begins slowly and ends in quick turns.
 _FLIGHT_START, _FLIGHT_DURATION = 8.0, 18.0
-_CAMERA = Camera(
-    640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]),
-    readout_time=0.03,
-)  # fmt: skip
 _QUICK_FRAMES = 12
 _SEEN = FrameSettings()
-CUBE = "cube.gif"
-# What the first run on a machine takes: s of the machine on which a loop of _LOOP takes _LOOP_TIME.
-_FIRST, _EACH, _LOOP, _LOOP_TIME = 150.0, 40.0, 1_000_000, 0.05
-# s between two lines that say how far it is, where no terminal shows a bar.
+_METHODS = (NodeConfig().solver, "p3p")
+# s between two lines that say what is compiled, where no terminal shows it.
 _PERIOD = 15.0
 
 _AFTERWARDS = """
@@ -72,245 +63,212 @@ Your own camera, next:
 """
 
 
-_SOLVER = NodeConfig().solver
-
-
 @dataclass(frozen=True, kw_only=True)
 class Options:
     out: Path = option("for the pictures", "DIR", Path("out"))
     quick: bool = option("a few frames of each recording only", default=False)
 
 
-class Act(NamedTuple):
-    """One recording, and what was found of it by each method, the rolling shutter's first."""
+class Frame(NamedTuple):
+    """Messages of a frame."""
 
-    recording: Recording
-    readout_time: float
-    results: dict[str, Result]
+    stamp_ns: int
+    info: Any  # sensor_msgs/CameraInfo
+    cloud: Any  # sensor_msgs/PointCloud2
+
+
+Answers = Mapping[str, Mapping[int, "Localized"]]
+"""Localized frames by method, the rolling shutter's first, and stamp."""
 
 
 def run(options: Options) -> None:
     started = time.monotonic()
     options.out.mkdir(parents=True, exist_ok=True)
-    methods = {_SOLVER: _SOLVER, "p3p (one pose per image)": "p3p"}
     most = _QUICK_FRAMES if options.quick else None
     print(
-        f"{_minutes(_FIRST)} at the first time on this machine, {_minutes(_EACH)} later; 0.5 GB of "
-        f"memory, 40 MB of disk for compiled code in {cache_directory()}, 5 MB in {options.out}. "
-        "If it is stopped, the same command goes on with what has been compiled.",
+        "about 4 min at the first time on a machine, 1 min later; 0.5 GB of memory, 40 MB of disk "
+        f"for compiled code in {cache_directory()}, 5 MB in {options.out}. If it is stopped, the "
+        "same command goes on with what has been compiled.",
         flush=True,
     )
-    with tempfile.TemporaryDirectory() as directory, compiler.told(_compiling()):
-        place = Path(directory)
-        flight = _act(_fly(place, most), _CAMERA.readout_time, methods, "Simulated flight")
-        _draw(options.out, **_of_flight(flight))
-        webcam = load_recording(data.path(data.WEBCAM), most)
-        shown = build(load_params_file(data.path(data.WEBCAM) / "parameters.yaml"))
-        board = _act(webcam, shown.readout_time, methods, "Webcam over a board")
-        residuals = plots.residual_picture(webcam, board.results, board.readout_time)
-        _draw(options.out, webcam_residuals=residuals)
-        _cube(place, most, methods, options.out / CUBE)
-        _live(flight, _SOLVER, place)
+    with tempfile.TemporaryDirectory() as directory, compiler.told(_Compiling()):
+        camera, hand = cube_clip.CAMERA, read_tum(data.path(data.HAND_MOTION))
+        motion = RecordedMotion(hand)
+        flight = _fly(camera, motion, most)
+        true = _true(camera, motion, flight)
+        answers = _localized("Simulated flight", flight, camera.readout_time, true)
+        picture = options.out / "flight_errors.png"
+        errors.draw({name: _errors(found, true) for name, found in answers.items()}, picture)
+        print(picture, flush=True)
+        webcam = read_frames(data.path(data.WEBCAM), most)
+        settings = build(load_params_file(data.path(data.WEBCAM) / "parameters.yaml"))
+        _localized("Webcam over a board", webcam, settings.readout_time, None)
+        _cube(cube_clip.Walls(hand), most, options.out / "cube.gif")
+        _live(flight, answers[_METHODS[0]], camera.readout_time, Path(directory) / "node.log")
     print(f"done in {time.monotonic() - started:.0f} s\n{_AFTERWARDS}", end="")
 
 
-def _minutes(seconds: float) -> str:
-    """How long work takes on this machine, as busy as it is, by a short loop."""
-    began = time.monotonic()
-    for _ in range(_LOOP):
-        pass
-    speed = (time.monotonic() - began) / _LOOP_TIME
-    return f"about {max(1, round(speed * seconds / 60.0))} min"
-
-
-def _compiling() -> Callable[[int, str], None]:
+class _Compiling:
     """Says which kernel is compiled: on a terminal in one line, elsewhere now and then."""
-    last = -_PERIOD
 
-    def tell(count: int, name: str) -> None:
-        nonlocal last
+    def __init__(self) -> None:
+        self._last = -_PERIOD
+
+    def __call__(self, count: int, name: str) -> None:
         if sys.stderr.isatty():
             print(f"\r\033[Kcompiling {count}: {name}\r", end="", file=sys.stderr, flush=True)
-        elif time.monotonic() - last > _PERIOD:
-            last = time.monotonic()
+        elif time.monotonic() - self._last > _PERIOD:
+            self._last = time.monotonic()
             print(f"compiling {count}: {name}", flush=True)
 
-    return tell
+
+def read_frames(path: Path, most: int | None = None) -> list[Frame]:
+    """The frames, or the first ones, of a recording of correspondences.
+
+    Raises:
+        BagError: when it cannot be read.
+    """
+    frames, info = list[Frame](), None
+    with open_bag(path) as bag:
+        for topic, _, message in bag.messages({CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC}):
+            if topic == CAMERA_INFO_TOPIC:
+                info = message
+            else:
+                frames.append(Frame(stamp_ns(message), info, message))
+    return frames[:most]
 
 
-@contextmanager
-def _stage(name: str, total: int) -> Iterator[Callable[[], object]]:
-    """A bar on a terminal, elsewhere lines; what moves it on."""
-    if sys.stderr.isatty():
-        with stage(name, total) as step:
-            yield lambda: step(1)
-        return
-    print(name, flush=True)
-    done, last = 0, time.monotonic()
-
-    def step_on() -> None:
-        nonlocal done, last
-        done += 1
-        if time.monotonic() - last > _PERIOD:
-            last = time.monotonic()
-            print(f"{name}: {done} of {total}", flush=True)
-
-    yield step_on
+def _fly(camera: Camera, motion: RecordedMotion, most: int | None) -> list[Frame]:
+    start_ns = motion.intervals_ns[0][0] + round(_FLIGHT_START * 1e9)
+    first, last = np.searchsorted(
+        stamps := frame_stamps(motion, camera, _SEEN.rate),
+        [start_ns, start_ns + round(_FLIGHT_DURATION * 1e9)],
+    )
+    path = motion.state(start_ns, np.linspace(0.0, _FLIGHT_DURATION, 200)).positions
+    scene, frames = room(path, np.random.default_rng(0)), list[Frame]()
+    stamps = stamps[first:last][:most]
+    with stage("Simulating a flight along a hand's motion", len(stamps)) as step:
+        for seen in simulate_frames(camera, motion, scene, _SEEN, stamps_ns=stamps):
+            cloud = make_correspondences(seen.stamp_ns, seen.points, seen.pixels, seen.ids)
+            frames.append(Frame(seen.stamp_ns, make_camera_info(camera, seen.stamp_ns), cloud))
+            step(1)
+    return frames
 
 
-def _act(recording: Recording, readout_time: float, methods: Mapping[str, str], title: str) -> Act:
-    """Localize all frames by all methods, and print what came of it."""
-    results = {}
-    for name, solver in methods.items():
-        with _stage(f"{title}, {solver}", len(recording.clouds)) as step:
-            answers = _localized(recording, _settings(solver, readout_time), step)
-        results[name] = compare(answers, recording.truth)
-    print(f"\n{table(title, recording, results)}\n", flush=True)
-    return Act(recording, readout_time, results)
+def _true(camera: Camera, motion: TrueMotion, frames: Sequence[Frame]) -> Motions:
+    """The camera at the middle rows."""
+    stamps = np.array([middle_stamp(camera, frame.stamp_ns) for frame in frames], np.int64)
+    state = motion.state(int(stamps[0]), 1e-9 * (stamps - stamps[0]))
+    quaternions = Rotation.from_matrix(state.rotations).as_quat()
+    return Motions(
+        Trajectory(stamps, state.positions, quaternions),
+        Twists(stamps, state.angular, state.linear),
+    )
+
+
+def _localized(
+    title: str, frames: Sequence[Frame], readout_time: float, true: Motions | None
+) -> Answers:
+    """The frames by all methods, as a node localizes them, and a table of what came of it."""
+    answers, rows = dict[str, dict[int, Localized]](), dict[str, np.ndarray]()
+    for solver in _METHODS:
+        localizer = FrameLocalizer(build(_settings(solver, readout_time)))
+        localizer.warm_up()
+        answers[solver] = found = dict[int, Localized]()
+        with stage(f"{title}, {solver}", len(frames)) as step:
+            for stamp, info, cloud in frames:
+                localizer.calibrate(read_camera_info(info))
+                if frame := localizer.localize(cloud):
+                    found[stamp] = frame
+                step(1)
+        values = [frame.inliers["residual"].astype(float) for frame in found.values()]
+        rows[f"inliers, {solver}"] = np.array([len(each) for each in values])
+        rows[f"residual (px rms), {solver}"] = np.array(
+            [np.sqrt(np.mean(each**2)) for each in values]
+        )
+        for kind, each in (_errors(found, true) if true else {}).items():
+            rows[f"{kind} ({errors.UNITS[kind]}), {solver}"] = each.values
+    order = sorted(rows, key=lambda name: list(rows).index(name.replace("p3p", _METHODS[0])))
+    title = f"{title}, {len(frames)} frames"
+    print(f"\n{errors.table({name: rows[name] for name in order}, title)}\n", flush=True)
+    return answers
+
+
+def _errors(found: Mapping[int, Localized], true: Motions) -> dict[str, errors.Errors]:
+    track = Track()
+    for frame in found.values():
+        track.add(frame)
+    return errors.errors_of(track.motions(), true)
 
 
 def _settings(solver: str, readout_time: float) -> dict[str, Any]:
     return {"solver": solver, "readout_time": readout_time, "pose_time": "mid_frame"}
 
 
-def _localized(
-    recording: Recording, settings: Mapping[str, Any], step: Callable[[], object]
-) -> dict[int, Answer]:
-    """The answers by the stamp of the frame, as those of a node with these settings."""
-    localizer, answers = FrameLocalizer(build(settings)), {}
-    localizer.warm_up()
-    for stamp, info, cloud in zip(
-        recording.stamps_ns, recording.camera_infos, recording.clouds, strict=True
-    ):
-        localizer.calibrate(read_camera_info(info))
-        began = time.perf_counter()
-        frame = localizer.localize(cloud)
-        latency = time.perf_counter() - began
-        step()
-        if frame:
-            twist = frame.twist
-            answers[stamp] = Answer(
-                stamp, latency, frame.stamp_ns, frame.pose.position,
-                Rotation.from_matrix(frame.pose.rotation).as_quat(),
-                None if twist is None else twist.angular,
-                None if twist is None else twist.linear,
-                frame.inliers["residual"].astype(np.float64),
-            )  # fmt: skip
-    return answers
-
-
-def _fly(directory: Path, most: int | None) -> Recording:
-    motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
-    start_ns = motion.intervals_ns[0][0] + round(_FLIGHT_START * 1e9)
-    end_ns = start_ns + round(_FLIGHT_DURATION * 1e9)
-    all_stamps = frame_stamps(motion, _CAMERA, _SEEN.rate)
-    stamps = [stamp for stamp in all_stamps if start_ns <= stamp < end_ns][:most]
-    path = motion.state(start_ns, np.linspace(0.0, _FLIGHT_DURATION, 200)).positions
-    scene = room(path, np.random.default_rng(0))
-    with (
-        BagWriter(directory / "flight") as bag,
-        _stage("Simulating a flight along a hand's motion", len(stamps)) as step,
-    ):
-        for frame in simulate_frames(_CAMERA, motion, scene, _SEEN, stamps_ns=stamps):
-            write_simulated(bag, _CAMERA, frame)
-            step()
-    return load_recording(directory / "flight")
-
-
-def _of_flight(flight: Act) -> dict[str, Any]:
-    recording, results = flight.recording, flight.results
-    true_matches = np.array([(1.0 - _SEEN.outliers) * cloud.width for cloud in recording.clouds])
-    return {
-        "flight_inliers": plots.inlier_picture(recording, results, true_matches),
-        "flight_trajectories": plots.trajectory_picture(recording, results),
-        "flight_errors": plots.error_picture(results),
-    }
-
-
-def _draw(out: Path, **figures: Any) -> None:
-    for name, figure in figures.items():
-        if figure is not None:
-            plots.save(figure, out / f"{name}.png")
-            print(out / f"{name}.png", flush=True)
-
-
-def _cube(directory: Path, most: int | None, methods: Mapping[str, str], out: Path) -> None:
-    """Walls of markers, rendered and detected, and the cube there by the poses of both methods."""
-    walls = cube_clip.MarkerWalls(read_tum(data.path(data.HAND_MOTION)), 0, cube_clip.CLIP_SENSOR)
-    stamps, now = cube_clip.clip_stamps(walls, most), np.zeros(1)
-    camera, images, middles = cube_clip.CAMERA, list[Image](), list[int]()
-    with (
-        BagWriter(directory / "cube") as bag,
-        _stage("Rendering walls of markers", len(stamps)) as step,
-    ):
-        for frame, image in walls.frames(stamps):
+def _cube(walls: cube_clip.Walls, most: int | None, out: Path) -> None:
+    """Walls of markers, filmed and detected, and the cube there by the poses of both methods."""
+    stamps, camera = walls.stamps(most), cube_clip.CAMERA
+    images, frames = [], list[Frame]()
+    with stage("Rendering walls of markers", len(stamps)) as step:
+        for stamp, (image, seen) in zip(stamps, walls.film(stamps), strict=True):
             images.append(image)
-            middles.append(frame.middle_ns)
-            ids = np.arange(len(frame.points))
-            write_frame(bag, camera, frame.stamp_ns, frame.points, frame.pixels, ids)
-            for moment in (frame.stamp_ns, frame.middle_ns):
-                write_truth(bag, moment, walls.motion.state(moment, now))
-            step()
-    recording = load_recording(directory / "cube")
-    results = list(
-        _act(recording, camera.readout_time, methods, "Walls of markers").results.values()
+            cloud = make_correspondences(stamp, seen.points, seen.pixels, seen.ids)
+            frames.append(Frame(stamp, make_camera_info(camera, stamp), cloud))
+            step(1)
+    true = _true(camera, walls.motion, frames)
+    answers = _localized("Walls of markers", frames, camera.readout_time, true)
+    ours, p3p = (
+        [found.get(stamp) for stamp in stamps[cube_clip.RUN_UP :]] for found in answers.values()
     )
-
-    def motion(result: Result, stamp: int) -> Motion | None:
-        answer = result.answers.get(stamp)
-        return None if answer is None else answer.motion(camera.readout_time)
-
     shown = slice(cube_clip.RUN_UP, None)
-    ours, p3p = cube_clip.OURS, cube_clip.P3P
-    motions = [
-        {p3p: motion(results[1], stamp), ours: motion(results[0], stamp)} for stamp in stamps[shown]
-    ]
-    clip = cube_clip.draw_clip(walls, middles[shown], images[shown], motions)
-    out.write_bytes(clip.animation)
-    medians = {name: np.median(errors) for name, errors in clip.errors.items()}
+    motions: dict[str, list[Motion | None]] = {
+        "P3P: one pose per image": [frame and frame.estimate for frame in p3p],
+        "ours: a pose for every row": [frame and frame.estimate for frame in ours],
+    }
+    animation, off = cube_clip.clip(walls, images[shown], stamps[shown], motions)
+    out.write_bytes(animation)
+    theirs, own = (np.median(each) for each in off.values())
     print(
-        f"The cube's farthest corner is off by {medians[ours]:.2f} px in the median, by "
-        f"{medians[p3p]:.1f} px with P3P.\n{out}",
+        f"The cube's farthest corner is off by {own:.2f} px in the median, by {theirs:.1f} px with "
+        f"P3P.\n{out}",
         flush=True,
     )
 
 
-def _live(flight: Act, solver: str, directory: Path) -> None:
+def _live(
+    frames: Sequence[Frame], answers: Mapping[int, Localized], readout_time: float, log: Path
+) -> None:
     """The flight once more through a live node, which says the same."""
     try:
         live = import_ros("live", "a live node")
     except ValueError as error:
         print(f"left out: {error}")
         return
-    recording, readout_time = flight.recording, flight.readout_time
-    settings, delay_ns = _settings(solver, readout_time), round(0.5e9 * readout_time)
-    answers = next(iter(flight.results.values())).answers
     known, same, late = 0, 0, list[float]()
     print("Starting a live node", flush=True)
     try:
-        with live.LiveNode(settings, directory / "node.log", delay_ns) as node:
+        with live.LiveNode(
+            _settings(_METHODS[0], readout_time), log, round(0.5e9 * readout_time)
+        ) as node:
             node.wait(lambda line: print(f"  {line}", flush=True))
-            with _stage("The flight through a live node", len(recording.clouds)) as step:
-                for stamp, info, cloud in zip(
-                    recording.stamps_ns, recording.camera_infos, recording.clouds, strict=True
-                ):
-                    began = time.perf_counter()
+            with stage("The flight through a live node", len(frames)) as step:
+                for stamp, info, cloud in frames:
+                    began, answer = time.perf_counter(), answers.get(stamp)
                     pose = node.localize(info, cloud)
-                    step()
-                    if pose is None or stamp not in answers:
-                        same += pose is None and stamp not in answers
-                        continue
                     late.append(time.perf_counter() - began)
-                    known += 1
-                    position = pose.pose.position
-                    there = position.x, position.y, position.z
-                    same += tuple(answers[stamp].position.tolist()) == there
+                    step(1)
+                    known += pose is not None
+                    if pose is None or answer is None:
+                        same += pose is answer
+                        continue
+                    there = pose.pose.position
+                    same += answer.pose.position.tolist() == [there.x, there.y, there.z]
     except live.LiveError as error:
         again = shlex.join(["rs_localizer", *sys.argv[1:]])
         print(error)
         raise ValueError(f"no live node; tables and pictures are there; again: {again}") from error
-    p50, p95 = np.percentile(1e3 * np.array(late or [np.nan]), [50, 95])
+    p50, p95 = np.percentile(1e3 * np.array(late), [50, 95])
     print(
-        f"The live node has answered {known} of {len(recording.clouds)} frames, {same} as above to "
-        f"the last bit; {p50:.1f} ms from message to pose, 95 % within {p95:.1f} ms"
+        f"The live node has answered {known} of {len(frames)} frames, {same} as above to the last "
+        f"bit; {p50:.1f} ms from message to pose, 95 % within {p95:.1f} ms"
     )

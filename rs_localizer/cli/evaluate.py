@@ -4,11 +4,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rs_localizer.cli import WORKING
+from rs_localizer.cli import WORKING, write_all
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.recording import CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC
@@ -17,24 +16,19 @@ if WORKING:
     import numpy as np
     from scipy.spatial.transform import Rotation
 
-    from rs_localizer.io.atomic_files import atomic_files
-    from rs_localizer.io.trajectories import Motions, Trajectory, Twists, read_motions, read_twists
+    from rs_localizer.io.trajectories import Trajectory, read_motions
     from rs_localizer.offline.fleet import Figures
-    from rs_localizer.tools.evaluation import metrics
-    from rs_localizer.tools.evaluation.metrics import associate
+    from rs_localizer.tools import errors
 
 _TOPICS = ("pose", "twist", "truth_pose", "truth_twist")
 # Deg: less is an error, not another frame. And what is left once a rotation explains the rest.
 _ANOTHER_FRAME, _EXPLAINED = 10.0, 0.2
-# Largest difference of times that are compared: rounding, where both are of one image.
-_TOLERANCE_NS = 1_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
     estimate: Path = argument("TUM text, a directory of replay, or a recording", "EST")
     truth: Path = argument("likewise", "TRUTH")
-    truth_twists: Path | None = option("true twists as text", "FILE")
     remaps: list[str] = option(
         f"a topic of recordings, NAME one of {', '.join(_TOPICS)}; may be repeated (default: the "
         "only one of its type)", "NAME:=TOPIC", list, flag="-r",
@@ -47,103 +41,77 @@ class Options:
 
 
 def run(options: Options) -> Figures:
-    topics = _topics(options)
+    topics = dict[str, str]()
+    for text in options.remaps:
+        name, _, topics[name] = text.partition(":=")
+        if name not in _TOPICS or not topics[name]:
+            raise UsageError(f"-r: expected NAME:=TOPIC of {', '.join(_TOPICS)}; got {text!r}")
     estimate = read_motions(options.estimate, topics.get("pose"), topics.get("twist"))
     truth = read_motions(options.truth, topics.get("truth_pose"), topics.get("truth_twist"))
-    if options.truth_twists is not None:
-        truth = Motions(truth.poses, read_twists(options.truth_twists))
-    estimate = _moved(estimate, round(options.offset * 1e9))
-    tolerance_ns = _TOLERANCE_NS
-    poses = metrics.pose_errors(estimate.poses, truth.poses, tolerance_ns)
-    if len(poses.stamps_ns) == 0:
+    for part in (estimate.poses, estimate.twists):
+        if part is not None:
+            part.stamps_ns[:] += round(options.offset * 1e9)
+    found = errors.errors_of(estimate, truth)
+    count = len(found["position"].values)
+    if count == 0:
         raise ValueError(
-            f"no pose of {options.estimate} is within {1e-9 * _TOLERANCE_NS:g} s of one of "
+            f"no pose of {options.estimate} is within {1e-9 * errors.TOLERANCE_NS:g} s of one of "
             f"{options.truth}: {_span(estimate.poses)} against {_span(truth.poses)}"
         )
-    rows = [("position", "m", poses.linear), ("orientation", "deg", poses.angular)]
-    if estimate.twists is not None and truth.twists is not None:
-        twists = metrics.twist_errors(estimate.twists, truth.twists, tolerance_ns)
-        rows.append(("angular velocity", "deg/s", twists.angular))
-        rows.append(("linear velocity", "m/s", twists.linear))
-    print(f"{len(poses.stamps_ns)} of {len(estimate.poses)} poses compared")
-    print(_coverage(options.truth, estimate.poses, truth.poses, tolerance_ns))
-    if text := _other_frames(estimate.poses, truth.poses, tolerance_ns):
+    print(f"{count} of {len(estimate.poses)} poses compared")
+    rows, true_rows = errors.associate(estimate.poses.stamps_ns, truth.poses.stamps_ns)
+    print(_coverage(options.truth, len(rows), len(np.unique(true_rows)), len(truth.poses)))
+    if text := _other_frames(estimate.poses.part(rows), truth.poses.part(true_rows)):
         print(f"warning: {text}")
-    print(f"\n{'error':26}{'count':>8}{'median':>11}{'mean':>11}{'95 %':>11}{'largest':>11}")
-    figures: Figures = {"poses": len(poses.stamps_ns)}
-    for name, unit, values in rows:
-        of = metrics.summarize(values)
-        columns = "".join(f"{each:11.5f}" for each in (of.median, of.mean, of.p95, of.maximum))
-        print(f"{f'{name} ({unit})':26}{of.count:8}{columns}")
-        known, suffix = name.replace(" ", "_"), unit.replace("/", "_per_")
-        figures |= {f"{known}_median_{suffix}": of.median, f"{known}_p95_{suffix}": of.p95}
+    of = {f"{kind} ({errors.UNITS[kind]})": each.values for kind, each in found.items()}
+    print(f"\n{errors.table(of)}")
+    figures: Figures = {"poses": count}
+    for kind, each in found.items():
+        known, suffix = kind.replace(" ", "_"), errors.UNITS[kind].replace("/", "_per_")
+        median, _, p95, _ = errors.summary(each.values).values()
+        figures |= {f"{known}_median_{suffix}": median, f"{known}_p95_{suffix}": p95}
     if options.ate:
-        figures |= _by_evo(estimate.poses, truth.poses, tolerance_ns)
+        for name, value in errors.by_evo(estimate.poses, truth.poses).items():
+            print(f"{name:34}{value:11.5f}")
+            figures[f"{name[:3].lower()}_{name.split('(')[1].split()[0]}"] = value
     if options.plot is not None:
-        from rs_localizer.tools.evaluation import plots  # half a second
-
-        of_twists = {"estimate": twists} if len(rows) > 2 else {}
-        options.plot.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_files(options.plot) as (part,):
-            plots.save(plots.errors({"estimate": poses}, of_twists), part)
-        print(f"written: {options.plot}")
+        write_all({options.plot: lambda part: errors.draw({"estimate": found}, part)})
     return figures
 
 
-def _topics(options: Options) -> Mapping[str, str]:
-    pairs = [text.partition(":=") for text in options.remaps]
-    for name, _, topic in pairs:
-        if name not in _TOPICS or not topic:
-            raise UsageError(f"-r: expected NAME:=TOPIC of {', '.join(_TOPICS)}; got {name!r}")
-    return {name: topic for name, _, topic in pairs}
-
-
-def _moved(motions: Motions, offset_ns: int) -> Motions:
-    """The same at other times."""
-    poses, twists = motions.poses, motions.twists
-    poses = Trajectory(poses.stamps_ns + offset_ns, poses.positions, poses.quaternions)
-    if twists is not None:
-        twists = Twists(twists.stamps_ns + offset_ns, twists.angular, twists.linear)
-    return Motions(poses, twists)
-
-
-def _other_frames(estimate: Trajectory, truth: Trajectory, tolerance_ns: int) -> str:
-    """What to say of orientations that all differ by one rotation; empty: nothing."""
-    rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns, tolerance_ns)
-    if len(rows) < 2:
+def _other_frames(estimate: Trajectory, truth: Trajectory) -> str:
+    """What to say of orientations of the same times that all differ by one rotation, or ''."""
+    before = np.median(errors.angles(estimate.quaternions, truth.quaternions))
+    shifted = truth.quaternions[:, [1, 2, 3, 0]]
+    after = np.median(errors.angles(estimate.quaternions, shifted))
+    if len(truth) < 2 or before <= _ANOTHER_FRAME:
         return ""
-    estimated = Rotation.from_quat(estimate.quaternions[rows])
-    true = Rotation.from_quat(truth.quaternions[true_rows])
-    before = float(np.degrees(np.median((true.inv() * estimated).magnitude())))
-    shifted = Rotation.from_quat(truth.quaternions[true_rows][:, [1, 2, 3, 0]])
-    after = float(np.degrees(np.median((shifted.inv() * estimated).magnitude())))
-    if before > _ANOTHER_FRAME and after < _EXPLAINED * before:
+    if after < _EXPLAINED * before:
         return (
             f"are quaternions of TRUTH given w first? Read so, orientations differ by {after:.3f} "
             f"deg and not {before:.3f} (TUM's lines are t x y z qx qy qz qw)"
         )
+    estimated, true = (Rotation.from_quat(each.quaternions) for each in (estimate, truth))
     for whose, between in (
         ("body (base_frame, optical axes)", true.inv() * estimated),
         ("map", estimated * true.inv()),
     ):
         turn = between.mean()
-        after = float(np.degrees(np.median((turn.inv() * between).magnitude())))
-        if before > _ANOTHER_FRAME and after < _EXPLAINED * before:
-            angle = float(np.degrees(turn.magnitude()))
+        after = np.degrees(np.median((turn.inv() * between).magnitude()))
+        if after < _EXPLAINED * before:
             axis = turn.as_rotvec() / turn.magnitude()
             x, y, z, w = turn.as_quat(canonical=True)
             return (
-                f"the poses are given in different frames of the {whose}: a turn of {angle:.2f} "
-                f"deg about ({axis[0]:.3f}, {axis[1]:.3f}, {axis[2]:.3f}) (quaternion x y z w "
-                f"{x:.4f} {y:.4f} {z:.4f} {w:.4f}) explains all but {after:.3f} deg of "
-                f"{before:.3f} deg"
+                f"the poses are given in different frames of the {whose}: a turn of "
+                f"{np.degrees(turn.magnitude()):.2f} deg about ({axis[0]:.3f}, {axis[1]:.3f}, "
+                f"{axis[2]:.3f}) (quaternion x y z w {x:.4f} {y:.4f} {z:.4f} {w:.4f}) explains all "
+                f"but {after:.3f} deg of {before:.3f} deg"
             )
     return ""
 
 
-def _coverage(path: Path, estimate: Trajectory, truth: Trajectory, tolerance_ns: int) -> str:
+def _coverage(path: Path, posed: int, met: int, true: int) -> str:
     """How much of what the truth knows has been localized."""
-    rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns, tolerance_ns)
     try:
         with open_bag(path) as bag:
             topics = (CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC)
@@ -152,38 +120,8 @@ def _coverage(path: Path, estimate: Trajectory, truth: Trajectory, tolerance_ns:
     except BagError:  # a text file, or a directory of them
         frames = 0
     if frames > 0:  # their truth may stand there for several instants of each
-        return f"{len(rows)} of {frames} frames have a pose"
-    return f"{len(set(true_rows.tolist()))} of {len(truth)} true poses have an estimate"
-
-
-def _by_evo(estimate: Trajectory, truth: Trajectory, tolerance_ns: int) -> Figures:
-    """ATE and RPE, printed, after Umeyama's alignment of the positions."""
-    try:
-        from evo.core import metrics as evo
-        from evo.core import trajectory
-    except ImportError as error:
-        raise ValueError("--ate needs evo: pip install 'rs_localizer[evo]'") from error
-    rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns, tolerance_ns)
-    true, estimated = (
-        trajectory.PoseTrajectory3D(
-            part.positions,
-            np.roll(part.quaternions, 1, axis=1),  # evo puts w first
-            (part.stamps_ns - estimate.stamps_ns[0]) * 1e-9,
-        )
-        for part in (truth.part(true_rows), estimate.part(rows))
-    )
-    estimated.align(true)
-    parts, figures = evo.PoseRelation, Figures()
-    for name, key, metric in (
-        ("ATE (m rms)", "ate_m", evo.APE(parts.translation_part)),
-        ("ATE (deg rms)", "ate_deg", evo.APE(parts.rotation_angle_deg)),
-        ("RPE, next frame (m rms)", "rpe_m", evo.RPE(parts.translation_part)),
-        ("RPE, next frame (deg rms)", "rpe_deg", evo.RPE(parts.rotation_angle_deg)),
-    ):
-        metric.process_data((true, estimated))
-        figures[key] = float(metric.get_statistic(evo.StatisticsType.rmse))
-        print(f"{name:34}{figures[key]:11.5f}")
-    return figures
+        return f"{posed} of {frames} frames have a pose"
+    return f"{met} of {true} true poses have an estimate"
 
 
 def _span(poses: Trajectory) -> str:

@@ -24,13 +24,13 @@ from rs_localizer.cli import WORKING
 if WORKING:
     from rs_localizer.config import NodeConfig, PoseTime
     from rs_localizer.core import so3
-    from rs_localizer.core.arrays import Array, IntArray
+    from rs_localizer.core.arrays import Array
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.bags import BagWriter
     from rs_localizer.io.image_clock import readout_fault
     from rs_localizer.io.outputs import Localized, messages
     from rs_localizer.io.topics import TF
-    from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
+    from rs_localizer.io.trajectories import Motions, Trajectory, Twists, write_tum, write_twists
     from rs_localizer.io.transforms import TransformError, make_transform
     from rs_localizer.offline.fleet import LOG, MARKER, Figures
     from rs_localizer.offline.replay import TF_TYPE
@@ -67,10 +67,13 @@ class Track:
         self._bodies.add(repr(frame.body_frame))
         self._maps.add(repr(frame.map_frame))
 
-    def once(self) -> tuple[IntArray, Array]:
-        """Stamps in order, and the first pose and twist of each (n,13)."""
+    def motions(self) -> Motions:
+        """In the order of their stamps, the first of each; twists where there are any."""
         stamps, first = np.unique(np.array(self._stamps_ns, np.int64), return_index=True)
-        return stamps, np.array(self._rows).reshape(-1, 13)[first]
+        rows = np.array(self._rows).reshape(-1, 13)[first]
+        poses, moving = Trajectory(stamps, rows[:, :3], rows[:, 3:7]), np.isfinite(rows[:, 7])
+        twists = Twists(stamps[moving], rows[moving, 7:10], rows[moving, 10:])
+        return Motions(poses, twists if len(twists) else None)
 
     def write(self, out: Path, pose_time: str) -> tuple[int, bool]:
         """Write poses and twists; how many stamps were repeated, and if there are twists."""
@@ -80,26 +83,25 @@ class Track:
             PoseTime.STAMP.value: "the stamp of the image (pose_time: stamp)",
             PoseTime.MID_FRAME.value: "the exposure of its middle row (pose_time: mid_frame)",
         }[pose_time]
-        stamps, rows = self.once()
+        motions = self.motions()
         write_tum(
             out / POSES,
-            Trajectory(stamps, rows[:, :3], rows[:, 3:7]),
+            motions.poses,
             [
                 f"pose of {bodies} in {maps}, map_from_body; t: s, {when}",
                 "x y z: m, its origin; qx qy qz qw: unit quaternion from its axes to the map's",
             ],
         )
-        moving = np.isfinite(rows[:, 7])
-        if moving.any():
+        if motions.twists is not None:
             write_twists(
                 out / TWISTS,
-                Twists(stamps[moving], rows[moving, 7:10], rows[moving, 10:]),
+                motions.twists,
                 [
                     f"velocity of {bodies} with respect to {maps}, in its own axes; t: s, {when}",
                     "wx wy wz: rad/s; vx vy vz: m/s, of its origin",
                 ],
             )
-        return len(self._stamps_ns) - len(stamps), bool(moving.any())
+        return len(self._stamps_ns) - len(motions.poses), motions.twists is not None
 
 
 RESULT, BRIDGED = "result", "bridged.txt"

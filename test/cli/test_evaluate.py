@@ -27,9 +27,11 @@ def files(tmp_path) -> Path:
     estimate = Trajectory(
         STAMPS + 400_000, TRUTH.positions + np.array([0.06, 0.0, 0.08]), off.as_quat()
     )
+    for folder in ("replayed", "truth"):
+        (tmp_path / folder).mkdir()
     write_tum(tmp_path / "truth.txt", TRUTH)
-    write_twists(tmp_path / "truth_twists.txt", TWISTS)
-    (tmp_path / "replayed").mkdir()
+    write_tum(tmp_path / "truth" / "poses.txt", TRUTH)
+    write_twists(tmp_path / "truth" / "twists.txt", TWISTS)
     write_tum(tmp_path / "replayed" / "poses.txt", estimate)
     twists = Twists(
         STAMPS,
@@ -51,7 +53,10 @@ def rows(text: str) -> dict[str, list[float]]:
 
 
 def test_table(files, capsys):
-    assert evaluate(files, "--truth-twists", str(files / "truth_twists.txt")) == 0
+    picture = files / "errors.png"
+    words = ["evaluate", str(files / "replayed"), str(files / "truth"), "--plot", str(picture)]
+    assert main(words) == 0
+    assert picture.is_file()
     text = capsys.readouterr().out
     assert "40 of 40 poses compared" in text
     assert "different frames" not in text

@@ -6,7 +6,7 @@ import numpy as np
 
 from rs_localizer.cli.main import main
 from rs_localizer.io.trajectories import read_motions
-from rs_localizer.tools.evaluation.metrics import pose_errors
+from rs_localizer.tools.errors import errors_of
 from rs_localizer.tools.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC
 
 # Two walls and the floor come by while the hand shakes the camera, at 60 deg/s and more.
@@ -25,7 +25,7 @@ def test_poses_of_images_are_those_of_the_truth(tmp_path):
         assert (
             main(["replay", markers, *shutter, "-p", f"solver:={solver}", "--out", str(out)]) == 0
         )
-        found[solver] = pose_errors(read_motions(out).poses, truth.poses, 1000).linear
+        found[solver] = errors_of(read_motions(out), truth)["position"].values
     assert len(found["r6p_vcwt"]) == 24
     assert np.median(found["r6p_vcwt"]) < 0.02
     assert 3.0 * np.median(found["r6p_vcwt"]) < np.median(found["p3p"])

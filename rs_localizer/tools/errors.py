@@ -1,0 +1,163 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of poses and twists against the truth: a table, a picture, and ATE and RPE by evo."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.trajectories import Motions, Trajectory
+
+Stamps = NDArray[np.int64]
+TOLERANCE_NS = 1_000_000
+"""Largest difference of times that are compared: rounding, where both are of one image."""
+UNITS = {
+    "position": "m",
+    "orientation": "deg",
+    "angular velocity": "deg/s",
+    "linear velocity": "m/s",
+}
+# They differ for everyone, and in lightness.
+BLUE, ORANGE = "#0b3c8c", "#b8540a"
+_STYLES = ((BLUE, "."), (ORANGE, "x"))
+# Frames of the running median that is drawn through the single errors; zero has no logarithm.
+_WINDOW, _LEAST = 15, 1e-9
+
+
+class Errors(NamedTuple):
+    """Errors of n poses or twists at the times of their estimates."""
+
+    stamps_ns: Stamps  # (n,)
+    values: Array  # (n,)
+
+
+def associate(estimated: Stamps, true: Stamps) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of times (n,), and for each the row of the nearest of (m,), increasing, if it is near.
+
+    Both ns.
+    """
+    after = np.minimum(np.searchsorted(true, estimated), len(true) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.abs(true[after] - estimated) < np.abs(estimated - true[before])
+    nearest = np.where(nearer, after, before)
+    rows = np.flatnonzero(np.abs(true[nearest] - estimated) <= TOLERANCE_NS)
+    return rows, nearest[rows]
+
+
+def errors_of(estimate: Motions, truth: Motions) -> dict[str, Errors]:
+    """Errors by what they are of, in :data:`UNITS`; of twists where both have them."""
+    rows, true_rows = associate(estimate.poses.stamps_ns, truth.poses.stamps_ns)
+    poses, true = estimate.poses.part(rows), truth.poses.part(true_rows)
+    found = {
+        "position": Errors(poses.stamps_ns, _lengths(poses.positions - true.positions)),
+        "orientation": Errors(poses.stamps_ns, angles(poses.quaternions, true.quaternions)),
+    }
+    if estimate.twists is not None and truth.twists is not None:
+        rows, true_rows = associate(estimate.twists.stamps_ns, truth.twists.stamps_ns)
+        twists, moving = estimate.twists.part(rows), truth.twists.part(true_rows)
+        turns = np.degrees(_lengths(twists.angular - moving.angular))
+        found["angular velocity"] = Errors(twists.stamps_ns, turns)
+        found["linear velocity"] = Errors(twists.stamps_ns, _lengths(twists.linear - moving.linear))
+    return found
+
+
+def _lengths(vectors: Array) -> Array:
+    return np.asarray(np.linalg.norm(vectors, axis=1), np.float64)
+
+
+def angles(quaternions: Array, others: Array) -> Array:
+    """Angles (n,) in degrees between rotations given as quaternions (n,4), x y z w."""
+    if len(quaternions) == 0:
+        return np.zeros(0)
+    between = Rotation.from_quat(quaternions).inv() * Rotation.from_quat(others)
+    return np.degrees(np.asarray(between.magnitude(), np.float64))
+
+
+def table(series: Mapping[str, Array], title: str = "error") -> str:
+    """Count, median, mean, 95 % and largest of values (n,), by name."""
+    width = max(26, *(len(name) + 2 for name in (title, *series)))
+    lines = [f"{title:{width}}{'count':>6}" + "".join(f"{name:>11}" for name in SUMMARY)]
+    for name, values in series.items():
+        columns = "".join(f"{value:11.5f}" for value in summary(values).values())
+        lines.append(f"{name:{width}}{len(values):6}{columns}")
+    return "\n".join(lines)
+
+
+SUMMARY = ("median", "mean", "95 %", "largest")
+
+
+def summary(values: Array) -> dict[str, float]:
+    """What errors (n,) come to, by :data:`SUMMARY`; NaN for none."""
+    if len(values) == 0:
+        return dict.fromkeys(SUMMARY, np.nan)
+    of = np.median(values), np.mean(values), np.percentile(values, 95), np.max(values)
+    return dict(zip(SUMMARY, map(float, of), strict=True))
+
+
+def draw(methods: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
+    """Errors of one or two methods over time, on logarithmic scales, with running medians."""
+    from matplotlib.figure import Figure  # half a second
+
+    kinds = [kind for kind in UNITS if any(kind in of for of in methods.values())]
+    start = min(stamp for of in methods.values() for stamp in of["position"].stamps_ns[:1])
+    figure = Figure((10.0, 0.6 + 2.1 * len(kinds)), dpi=130, layout="constrained")
+    panels = figure.subplots(len(kinds), 1, sharex=True, subplot_kw={"yscale": "log"})
+    for axes, kind in zip(panels, kinds, strict=True):
+        for (name, of), (color, marker) in zip(methods.items(), _STYLES, strict=False):
+            if kind not in of or len(of[kind].values) == 0:
+                continue
+            t = (of[kind].stamps_ns - start) * 1e-9
+            values = np.maximum(of[kind].values, _LEAST)
+            axes.plot(t, values, marker, color=color, markersize=3.0, alpha=0.35)
+            running = median_filter(values, min(_WINDOW, len(values)), mode="mirror")
+            label = f"{name}: median {np.median(values):.3g}, largest {values.max():.3g}"
+            axes.plot(t, running, color=color, label=label)
+        axes.set_ylabel(f"{kind}\n({UNITS[kind]})")
+        axes.grid(color="#e6e6e6")
+        axes.legend(
+            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False, borderaxespad=0.1
+        )
+    panels[-1].set_xlabel("time (s)")
+    figure.savefig(path)
+
+
+def by_evo(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
+    """ATE and RPE after Umeyama's alignment of the positions, by name and unit.
+
+    Raises:
+        ValueError: where evo is not installed.
+    """
+    try:
+        from evo.core import metrics, trajectory
+    except ImportError as error:
+        raise ValueError("--ate needs evo: pip install 'rs_localizer[evo]'") from error
+    rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns)
+    true, estimated = (
+        trajectory.PoseTrajectory3D(
+            part.positions,
+            np.roll(part.quaternions, 1, axis=1),  # evo puts w first
+            (part.stamps_ns - estimate.stamps_ns[0]) * 1e-9,
+        )
+        for part in (truth.part(true_rows), estimate.part(rows))
+    )
+    estimated.align(true)
+    found = {}
+    for name, metric in (("ATE", metrics.APE), ("RPE, next frame", metrics.RPE)):
+        for unit, part in (
+            ("m", metrics.PoseRelation.translation_part),
+            ("deg", metrics.PoseRelation.rotation_angle_deg),
+        ):
+            measured = metric(part)
+            measured.process_data((true, estimated))
+            found[f"{name} ({unit} rms)"] = float(
+                measured.get_statistic(metrics.StatisticsType.rmse)
+            )
+    return found
