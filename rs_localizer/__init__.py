@@ -22,7 +22,6 @@ if TYPE_CHECKING:
         read_camchain,
         read_rig_config,
         write_camchain,
-        write_rig_config,
     )
     from rs_localizer.localizer import Localizer
     from rs_localizer.offline.table import localize_recording
@@ -58,7 +57,6 @@ __all__ = [
     "rectify",
     "solve_minimal",
     "write_camchain",
-    "write_rig_config",
 ]
 
 if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all others
@@ -76,10 +74,7 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
         "core.units": ("CameraState", "camera_state"),
         "estimation.prior": ("Prior",),
         "io.calibration": ("read_calibration",),
-        "io.rigs": (
-            *("RigParts", "read_camchain", "read_rig_config"),
-            *("write_camchain", "write_rig_config"),
-        ),
+        "io.rigs": ("RigParts", "read_camchain", "read_rig_config", "write_camchain"),
         "localizer": ("Localizer",),
         "offline.table": ("localize_recording",),
         "solvers.minimal": ("solve_minimal",),

@@ -357,11 +357,6 @@ class Rig:
         "time, in s; cameras that run freely need half their period",
         (0.0, 1.0),
     )
-    estimate_time_offsets: bool = setting(
-        False,
-        "Estimate the clock offset of each camera against the first from the motion, and follow "
-        "clocks that drift or jump",
-    )
 
     def __post_init__(self) -> None:
         check(self, "rig.")

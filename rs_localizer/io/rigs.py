@@ -30,7 +30,6 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.calibration import (
     calibration_faults,
-    colmap_parameters,
     kalibr_camera,
     kalibr_fields,
 )
@@ -99,34 +98,6 @@ def read_rig_config(path: Path | str) -> dict[str, tuple[Array, Array]]:
         CalibrationError: for anything else, or several rigs.
     """
     return _load(Path(path), _rig_config)
-
-
-def write_rig_config(path: Path, parts: RigParts) -> None:
-    """Write COLMAP's ``rig_config.json``, whose reference is the first camera.
-
-    Raises:
-        ValueError: for a lens that COLMAP has no model for.
-    """
-    entries: list[dict[str, Any]] = []
-    reference: Transform | None = None
-    for name, camera in parts.cameras.items():
-        lens = colmap_parameters(camera)
-        entry = {
-            "image_prefix": f"{name}/",
-            "camera_model_name": lens["model"],
-            "camera_params": lens["params"],
-        }
-        pose = Transform(*parts.camera_from_rig[name])
-        if reference is None:
-            reference = pose
-            entry["ref_sensor"] = True
-        else:
-            relative = pose @ reference.inverse()
-            x, y, z, w = so3.quaternion(np.ascontiguousarray(relative.rotation)).tolist()
-            entry["cam_from_rig_rotation"] = [w, x, y, z]
-            entry["cam_from_rig_translation"] = relative.translation.tolist()
-        entries.append(entry)
-    path.write_text(json.dumps([{"cameras": entries}], indent=2) + "\n", "utf-8")
 
 
 def _load(path: Path, reader: Callable[[Any], T]) -> T:

@@ -504,10 +504,10 @@ class FrameLocalizer:
             self._notice(notice, f"{name}: {text}")
         cloud = thinned(cloud, self._config.max_points // len(self._config.cameras), camera.size)
         watch, frame = self.rig_watch, self.camera_frame
-        start_ns = watch.start_ns(name, cloud.stamp_ns + round(own.stamp_offset * 1e9))
+        start_ns = cloud.stamp_ns + round(own.stamp_offset * 1e9)
         middle_ns = start_ns - round(camera.first_row_time * own.readout_time * 1e9)
         image = Image(name, start_ns, middle_ns, cloud)
-        for images in self._assembler.add(image) if watch.is_usable(name) else []:
+        for images in self._assembler.add(image):
             yield self._localize_frame(images)
         fixed = {
             each: mount
@@ -714,10 +714,8 @@ class FrameLocalizer:
         """Pose and twist of the rig's axes at the published moment."""
         config, cloud = self._config, images[0].cloud
         time_ns = origin_ns + round(1e9 * result.time)
-        # What is published has stamps of that camera's clock.
-        own_ns = self.rig_watch.offset_ns(images[0].camera)
-        stamp_ns = time_ns - own_ns if config.pose_time == PoseTime.MID_FRAME else cloud.stamp_ns
-        tau = (stamp_ns + own_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
+        stamp_ns = time_ns if config.pose_time == PoseTime.MID_FRAME else cloud.stamp_ns
+        tau = (stamp_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
         moving = find_solver(config.solver).rolling_shutter
         table = _table(config.cameras, images)
         return Localized(

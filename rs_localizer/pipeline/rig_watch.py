@@ -53,12 +53,10 @@ _CHANGED = 5
 _WALK = 1e-4
 # m and rad, of extrinsics of which nothing is known yet.
 _ANY = 1.0
-# s, deviation of an offset with which a camera has a part in the frames: half a pixel at 1 rad/s.
-_USABLE = 1e-3
-# Images in a row by which a jump of a clock is measured, and the periods by which it is one.
-_JUMPED, _PERIODS = 5, 3.0
-# As long as mountings agree and offsets are not asked for, a third of the frames is compared; a
-# track does not outlast a gap of half a second.
+# s, of a clock that is off: half a pixel at 1 rad/s.
+_LEAST_OFFSET = 1e-3
+# As long as mountings agree, a third of the frames is compared; a track does not outlast a gap of
+# half a second.
 _ON, _CYCLE = 4, 12
 # s between two images of the reference that are interpolated.
 _LONGEST = 0.25
@@ -74,25 +72,12 @@ class _Sight(NamedTuple):
 class _Fit:
     """What one camera lacks: translation and turn in its axes, offset; and their covariance."""
 
-    offset: float  # s, with its deviation: what is known from elsewhere
-    deviation: float
-    mean: Array = field(init=False)  # (7,)
-    covariance: Array = field(init=False)  # (7,7)
+    covariance: Array  # (7,7)
+    mean: Array = field(default_factory=lambda: np.zeros(7))
     floor: Array = field(default_factory=lambda: np.zeros((6, 6)))  # of the lenses
     count: int = 0
     contradicted: int = 0  # in a row
-    restarted: int = -1  # count when the clock was last forgotten
     time_ns: int = 0
-
-    def __post_init__(self) -> None:
-        self.mean = np.r_[np.zeros(6), self.offset]
-        self.covariance = np.diag(np.r_[np.full(6, _ANY), self.deviation]) ** 2
-
-    def restart_clock(self, offset: float, deviation: float) -> None:
-        """Forget the offset; the extrinsics stay."""
-        self.mean[6], self.contradicted, self.restarted = offset, 0, self.count
-        self.covariance[6], self.covariance[:, 6] = 0.0, 0.0
-        self.covariance[6, 6] = deviation**2
 
     def add(self, time_ns: int, difference: Array, velocity: Array, noise: Array) -> bool:
         """Take a difference (6,); whether it agrees."""
@@ -142,18 +127,6 @@ class _Fit:
         return " and ".join(texts)
 
 
-@dataclass(slots=True, eq=False)
-class _Clock:
-    """What the stamps of one camera do."""
-
-    applied_ns: int = 0  # that is added to them
-    last_ns: int | None = None  # as it came
-    steps: deque[int] = field(default_factory=lambda: deque(maxlen=15))
-    others_ns: int | None = None  # the latest of the others then
-    # How far it is behind the others since a step that none of its images has; None: none was.
-    behind: list[int] | None = None
-
-
 class RigWatch:
     """Tracks each camera of a rig alone, and says what contradicts.
 
@@ -164,7 +137,7 @@ class RigWatch:
 
     def __init__(self, config: NodeConfig, notice: Notify) -> None:
         self._config, self._notice = config, notice
-        self._names, self._applies = config.cameras, config.rig.estimate_time_offsets
+        self._names = config.cameras
         self._rolling = find_solver(config.solver).rolling_shutter
         # Orientations that are not worth publishing still say something.
         self._alone = replace(config, max_orientation_deviation=10.0)
@@ -174,10 +147,7 @@ class RigWatch:
         """Forget all frames, and what came of them."""
         self._trackers: dict[str, Tracker] = {}
         self._sights: dict[str, deque[_Sight]] = {n: deque(maxlen=8) for n in self._names}
-        half = 0.5 * self._config.rig.window  # beyond it images are not of one frame anyway
-        self._fits = {name: _Fit(0.0, half) for name in self._names[1:]}
-        self._clocks = {name: _Clock() for name in self._names}
-        self._lost: set[str] = set()  # whose clocks have jumped to where nobody knows exactly
+        self._fits = {name: self._fresh() for name in self._names[1:]}
         self._said: set[tuple[Notice, str]] = set()
         self._refused, self._frames = True, 0
         self.values: dict[str, str] = {}
@@ -185,19 +155,9 @@ class RigWatch:
         self.faults: dict[str, str] = {}
         """What contradicts, by the name of its notice."""
 
-    def start_ns(self, name: str, time_ns: int) -> int:
-        """When the first row was exposed, by the clock of all, of its time by the camera's own."""
-        if self._applies:
-            self._follow_clock(name, time_ns)
-        return time_ns + self._clocks[name].applied_ns
-
-    def offset_ns(self, name: str) -> int:
-        """What is added to the stamps of a camera beside its setting."""
-        return self._clocks[name].applied_ns
-
-    def is_usable(self, name: str) -> bool:
-        """Whether the clock of a camera is known well enough for a part in the frames."""
-        return self._clocks[name].behind is None and name not in self._lost
+    def _fresh(self) -> _Fit:
+        """Nothing is known; beyond half a window images are not of one frame anyway."""
+        return _Fit(np.diag(np.r_[np.full(6, _ANY), 0.5 * self._config.rig.window]) ** 2)
 
     def judge(self, localized: bool) -> None:
         """Take note of whether a frame of all was localized."""
@@ -208,13 +168,12 @@ class RigWatch:
         name, reference = image.camera, self._names[0]
         self._frames += name == reference
         sure = all(fit.count >= _ENOUGH and not fit.off for fit in self._fits.values())
-        idle = sure and not (self._applies or self._refused) and self._frames % _CYCLE >= _ON
+        idle = sure and not self._refused and self._frames % _CYCLE >= _ON
         if idle or not self._rolling or len(self._names) < 2:
             return
         if name not in self._trackers:
             self._trackers[name] = Tracker(Localizer(camera, self._alone))
-        time_ns = image.middle_ns - self._clocks[name].applied_ns
-        cloud = image.cloud
+        time_ns, cloud = image.middle_ns, image.cloud
         result = self._trackers[name].localize(time_ns, cloud.points, cloud.pixels, cloud.scores)
         if not result:
             return
@@ -226,24 +185,20 @@ class RigWatch:
 
     def _compare(self, name: str, extrinsics: Transform) -> None:
         """Compare all images of a camera between two of the reference."""
-        waiting, offset_ns = self._sights[name], self._clocks[name].applied_ns
-        shift_ns = offset_ns - self._clocks[self._names[0]].applied_ns
-        others = list(self._sights[self._names[0]])
-        while waiting and others and waiting[0].time_ns + shift_ns <= others[-1].time_ns:
+        waiting, others = self._sights[name], list(self._sights[self._names[0]])
+        while waiting and others and waiting[0].time_ns <= others[-1].time_ns:
             sight = waiting.popleft()
-            time_ns = sight.time_ns + shift_ns
+            time_ns = sight.time_ns
             later = next(i for i, other in enumerate(others) if other.time_ns >= time_ns)
             pair = others[max(later - 1, 0) : later + 1]
             if others[later].time_ns == time_ns:
                 pair = [others[later]]
             span_ns = pair[-1].time_ns - pair[0].time_ns
             if pair[0].time_ns <= time_ns and span_ns < _LONGEST * 1e9:
-                self._take(name, sight, time_ns, pair, extrinsics)
+                self._take(name, sight, pair, extrinsics)
 
-    def _take(
-        self, name: str, sight: _Sight, time_ns: int, pair: list[_Sight], extrinsics: Transform
-    ) -> None:
-        fit, clock = self._fits[name], self._clocks[name]
+    def _take(self, name: str, sight: _Sight, pair: list[_Sight], extrinsics: Transform) -> None:
+        fit, time_ns = self._fits[name], sight.time_ns
         span_ns = pair[-1].time_ns - pair[0].time_ns
         difference, covariance, floor = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
         for other in pair:
@@ -254,22 +209,16 @@ class RigWatch:
             covariance = covariance + share * noise
         twist = twist_at(sight.estimate, 0.0, sight.estimate.span)
         velocity = np.r_[twist.linear, twist.angular]
-        applied = 1e-9 * clock.applied_ns
         # What is not known of the offset times that of the velocity, and the motion's curvature.
-        off = (fit.mean[6] - applied) ** 2 + fit.covariance[6, 6]
+        off = fit.mean[6] ** 2 + fit.covariance[6, 6]
         expected = self._config.acceleration
         curved = np.repeat([expected.linear, expected.angular], 3) * 0.5 * off
         covariance = covariance + off * twist.covariance + np.diag(curved**2)
-        if fit.add(time_ns, difference + applied * velocity, velocity, covariance):
+        if fit.add(time_ns, difference, velocity, covariance):
             fit.floor = floor
             self._conclude(name, fit)
         elif fit.contradicted >= _CHANGED:
-            if self._applies and fit.count > fit.restarted:  # most likely the clock alone
-                fit.restart_clock(fit.mean[6], 0.5e-9 * self._far_ns(clock))
-                self._lost.add(name)
-            else:
-                self._fits[name] = _Fit(fit.mean[6], fit.deviation)
-                self._lost.discard(name)
+            self._fits[name] = self._fresh()
             self._said = {said for said in self._said if said[1] != name}
             self._say(
                 Notice.CLOCK, name,
@@ -279,23 +228,18 @@ class RigWatch:
 
     def _conclude(self, name: str, fit: _Fit) -> None:
         """What a difference more says, and what of it is applied."""
-        reference, clock = self._names[0], self._clocks[name]
+        reference = self._names[0]
         offset, deviation = float(fit.mean[6]), fit.offset_deviation
         self.values = self.values | {
             f"Extrinsics of {name} off by": fit.described(),
             f"Clock offset of {name} (ms)": f"{1e3 * offset:.2f} +- {1e3 * deviation:.2f}",
         }
-        if self._applies:
-            if deviation < _USABLE:
-                clock.applied_ns = round(1e9 * offset)
-                self._lost.discard(name)
-        elif fit.count >= _ENOUGH and abs(offset) > max(_SURELY_ONE * deviation, _USABLE):
+        if fit.count >= _ENOUGH and abs(offset) > max(_SURELY_ONE * deviation, _LEAST_OFFSET):
             own = self._config.of_cameras[name].stamp_offset + offset
             self._say(
                 Notice.CLOCK, name,
                 f"the clock of {name} is {1e3 * offset:.2f} +- {1e3 * deviation:.2f} ms off that "
-                f"of {reference}: set {name}.stamp_offset to {own:.5f}, or "
-                "rig.estimate_time_offsets",
+                f"of {reference}: set {name}.stamp_offset to {own:.5f}",
             )  # fmt: skip
         if fit.off:
             others = [other for other in self._fits.values() if other.count]
@@ -306,52 +250,6 @@ class RigWatch:
             self.faults = self.faults | {str(Notice.EXTRINSICS): text}
         elif not any(other.off for other in self._fits.values()):
             self.faults = {}
-
-    def _follow_clock(self, name: str, time_ns: int) -> None:
-        """Notice a jump of a clock, and follow it as far as the order of images tells."""
-        clock = self._clocks[name]
-        others = [
-            (o.behind is None, o.last_ns + o.applied_ns)
-            for n, o in self._clocks.items() if n != name and o.last_ns is not None
-        ]  # fmt: skip
-        latest_ns = max(others)[1] if others else None  # of those that are in doubt if all are
-        last_ns, clock.last_ns = clock.last_ns, time_ns
-        step_ns = 0 if last_ns is None else time_ns - last_ns
-        far_ns = self._far_ns(clock)
-        if clock.steps and not 0 < step_ns < far_ns:
-            clock.behind = []
-        elif last_ns is not None:
-            clock.steps.append(step_ns)
-        if clock.behind is None:
-            clock.others_ns = latest_ns
-            return
-        # The others have to go on: it may be they that have stopped.
-        if latest_ns is None or latest_ns == clock.others_ns:
-            clock.behind.append(0)
-        else:
-            clock.behind.append(latest_ns - time_ns - clock.applied_ns)
-            if abs(clock.behind[-1]) < far_ns:  # both made a pause, or its images were lost
-                clock.behind = None
-        clock.others_ns = latest_ns
-        if clock.behind is None or len(clock.behind) < _JUMPED:
-            return
-        behind_ns, clock.behind = float(np.median(clock.behind)), None
-        if abs(behind_ns) < far_ns:
-            return
-        clock.applied_ns += round(behind_ns)
-        for other in [name] if name in self._fits else self._fits:
-            offset = 1e-9 * self._clocks[other].applied_ns
-            self._fits[other].restart_clock(offset, 0.5e-9 * far_ns)
-            self._lost.add(other)
-        self._sights[name].clear()
-        self._said.discard((Notice.CLOCK, name))
-        text = f"the clock of {name} jumped by about {-1e-9 * behind_ns:.2f} s: followed"
-        self._say(Notice.CLOCK, name, text)
-
-    def _far_ns(self, clock: _Clock) -> float:
-        """A difference of stamps that is no loss of an image or two."""
-        usual_ns = float(np.median(clock.steps)) if clock.steps else 0.0
-        return _PERIODS * max(usual_ns, 1e9 * self._config.rig.window)
 
     def _say(self, notice: Notice, name: str, text: str) -> None:
         if (notice, name) not in self._said:

@@ -14,7 +14,6 @@ from rs_localizer.io.rigs import (
     read_camchain,
     read_rig_config,
     write_camchain,
-    write_rig_config,
 )
 
 # cam1 stands 0.2 m to the right of cam0 and looks to the right (its z is the x of cam0); cam2 hangs
@@ -146,22 +145,6 @@ def test_rig_config_of_colmap(tmp_path):
     # By a quarter about y, z becomes x.
     np.testing.assert_allclose(rotation @ [0, 0, 1], [1, 0, 0], atol=1e-12)
     np.testing.assert_array_equal(translation, [0.1, 0.2, 0.3])
-
-
-def test_a_written_rig_config_comes_back_relative_to_its_first_camera(tmp_path):
-    given, file = rig(), tmp_path / "rig_config.json"
-    cameras = {name: given.cameras[name] for name in ("right", "front")}
-    write_rig_config(file, given._replace(cameras=cameras))
-    rotation, translation = read_rig_config(file)["front"]
-    point = np.array([0.4, 0.1, -2.0])
-    moved = rotation @ seen(given, "right", point) + translation
-    np.testing.assert_allclose(moved, seen(given, "front", point), atol=1e-12)
-    entry = json.loads(file.read_text())[0]["cameras"][0]
-    assert (entry["ref_sensor"], entry["camera_model_name"]) == (True, "OPENCV")
-    np.testing.assert_allclose(entry["camera_params"][:4], [400, 402, 320.5, 241.5])
-    other = given._replace(cameras={"left": given.cameras["left"]})
-    with pytest.raises(ValueError, match="COLMAP has no lens eucm"):
-        write_rig_config(file, other)
 
 
 @pytest.mark.parametrize(
