@@ -14,7 +14,6 @@ other; besides what Kalibr writes, each may have ``readout_time`` (s) and ``scan
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -6,11 +6,11 @@ from typing import Any
 
 from rs_localizer.config import FeatureConfig
 from rs_localizer.features.extraction import draw_features
+from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
-from rs_localizer.ros.detector.debug import Drawn
-from rs_localizer.ros.detector.node import Finder, ImageNode, Sight
+from rs_localizer.ros.detector.node import Finder, ImageNode, Picture, Sight
 from rs_localizer.settings import FEATURES_NAME
 
 
@@ -36,9 +36,8 @@ class FeatureDetectorNode(ImageNode[FeatureConfig, Extracted]):
     def make_cloud(self, extracted: Extracted, make: Make) -> Any:
         return keypoints(extracted, make)
 
-    def draw(self, extracted: Extracted) -> Drawn:
-        picture = draw_features(extracted.image.pixels, extracted.features)
-        return extracted.image, picture, extracted.features.pixels
+    def draw(self, extracted: Extracted) -> tuple[Image, Picture]:
+        return extracted.image, draw_features(extracted.image.pixels, extracted.features)
 
     def describe(self, finder: Finder[Extracted]) -> str:
         return f"{self.config.features}, at most {self.config.max_keypoints} keypoints an image"

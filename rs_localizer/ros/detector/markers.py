@@ -8,12 +8,12 @@ import numpy as np
 
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.reasons import Notice
+from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import CORRESPONDENCES
 from rs_localizer.markers.overlay import draw_detections
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.ros.detector.debug import Drawn
-from rs_localizer.ros.detector.node import Finder, ImageNode, Sight
+from rs_localizer.ros.detector.node import Finder, ImageNode, Picture, Sight
 from rs_localizer.ros.node.views import MapView
 from rs_localizer.settings import DETECTOR_NAME
 
@@ -80,10 +80,8 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
     def make_cloud(self, detected: Detected, make: Make) -> Any:
         return correspondences(detected, make)
 
-    def draw(self, detected: Detected) -> Drawn:
-        detections = detected.detections
-        picture = draw_detections(detected.image.pixels, detections)
-        return detected.image, picture, detections.pixels
+    def draw(self, detected: Detected) -> tuple[Image, Picture]:
+        return detected.image, draw_detections(detected.image.pixels, detected.detections)
 
     def describe(self, finder: Finder[Detected]) -> str:
         assert isinstance(finder, FrameDetector)

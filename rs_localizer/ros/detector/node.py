@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
@@ -24,9 +26,8 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.io import topics
 from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make, make_header
-from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE, INLIERS
+from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.ros.detector.debug import DebugPictures, Drawn, Picture
 from rs_localizer.ros.node.conversion import create_output, make_message
 from rs_localizer.ros.node.health import (
     Health,
@@ -41,9 +42,9 @@ from rs_localizer.ros.node.inputs import Silence, Topic
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.statistics import WINDOW, Summary
 from rs_localizer.ros.node.worker import Worker
-from rs_localizer.settings import NODE_NAME
 
 Result = TypeVar("Result")
+Picture = NDArray[np.uint8]  # (h,w,3) blue, green, red
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +81,6 @@ def judge(
 
 # Types of the topics whose messages are looked at.
 _IMAGES = {IMAGE: ImageMessage, COMPRESSED_IMAGE: CompressedImage}
-_INLIERS = f"{NODE_NAME}/{INLIERS}"  # of the localizer, for debug pictures
 # How often the node looks whether somebody listens, in s.
 _LOOK_PERIOD = 0.2
 
@@ -101,17 +101,13 @@ class Finder(Protocol[Result_co]):
 
 
 @dataclass(slots=True)
-class Work(Generic[Settings, Result]):
+class Work(Generic[Result]):
     """What the worker alone touches."""
 
     finder: Finder[Result]
-    config: Settings
-    pictures: DebugPictures[Result] | None = None  # as soon as one has been wanted
 
 
-class ImageNode(
-    ManagedNode[Settings, Work[Settings, Result], Result, Sight], Generic[Settings, Result]
-):
+class ImageNode(ManagedNode[Settings, Work[Result], Result, Sight], Generic[Settings, Result]):
     """Looks at images; see :class:`rs_localizer.ros.node.managed.ManagedNode`.
 
     A node says what it looks for by overriding :meth:`make_finder`, :meth:`make_cloud`,
@@ -145,8 +141,8 @@ class ImageNode(
         """The sensor_msgs/PointCloud2 of an image."""
         raise NotImplementedError
 
-    def draw(self, result: Result) -> Drawn:
-        """The debug picture of an image, in the worker's thread."""
+    def draw(self, result: Result) -> tuple[Image, Picture]:
+        """An image and its debug picture, in the worker's thread."""
         raise NotImplementedError
 
     def describe(self, finder: Finder[Result]) -> str:
@@ -166,28 +162,9 @@ class ImageNode(
 
     def open(self, config: Settings) -> None:
         finder = self.make_finder(config)
-        self._outputs = outputs = ImageOutputs(self, self.output, self.make_cloud)
-        work: Work[Settings, Result] = Work(finder, config)
-
-        def publish(result: Result) -> None:
-            outputs.publish(result)
-            if outputs.pictures_wanted():
-                if work.pictures is None:
-                    work.pictures = DebugPictures(self.draw, outputs.show)
-                work.pictures.add(result)
-
-        worker = self.employ(work, publish)
-        self._topics = _image_topics(worker)
-
-        def take_inliers(message: PointCloud2) -> None:
-            worker.update(INLIERS, lambda work: self._take_inliers(work, message))
-
-        self._topics[_INLIERS] = Topic(PointCloud2, take_inliers)
+        self._outputs = outputs = ImageOutputs(self, self.output, self.make_cloud, self.draw)
+        self._topics = _image_topics(self.employ(Work(finder), outputs.publish))
         self._description = self.describe(finder)
-
-    def _take_inliers(self, work: Work[Settings, Result], message: PointCloud2) -> None:
-        if work.pictures is not None:
-            work.pictures.take_inliers(message)
 
     def close(self) -> None:
         self._topics = {}
@@ -215,9 +192,8 @@ class ImageNode(
         if self.worker is not None:
             self.worker.update("settings", lambda work: self._change(work, config))
 
-    def _change(self, work: Work[Settings, Result], config: Settings) -> None:
+    def _change(self, work: Work[Result], config: Settings) -> None:
         work.finder = self.make_finder(config)
-        work.config = config
 
     def examine(self) -> tuple[Health, str]:
         summary = self.statistics.summary()
@@ -226,8 +202,7 @@ class ImageNode(
             message = f"no subscription to the {self.output} or the debug image"
             judgement = Health(Level.OK, State.IDLE, message)
         if judgement is None:
-            silence = {name: item for name, item in self.silence.items() if name in _IMAGES}
-            judgement = judge(summary, silence, self.refusals.recent(self.odd, WINDOW))
+            judgement = judge(summary, self.silence, self.refusals.recent(self.odd, WINDOW))
         return judgement.with_values(values_of(summary)), ""
 
     # -- who listens ------------------------------------------------------------------------
@@ -235,11 +210,7 @@ class ImageNode(
     def _look(self) -> None:
         """Listen to what is needed just now."""
         assert self._outputs is not None
-        wanted: tuple[str, ...] = ()
-        if self._outputs.pictures_wanted():
-            wanted = (_INLIERS, self._image_topic())
-        elif self._outputs.clouds_wanted():
-            wanted = (self._image_topic(),)
+        wanted = (self._image_topic(),) if self._outputs.wanted else ()
         if wanted != self._listening:
             self.listen({name: self._topics[name] for name in wanted})
             self._listening = wanted
@@ -255,7 +226,7 @@ class ImageNode(
         return self._listening[-1] if self._listening else IMAGE
 
 
-def _image_topics(worker: Worker[Work[Settings, Result], Result]) -> dict[str, Topic]:
+def _image_topics(worker: Worker[Work[Result], Result]) -> dict[str, Topic]:
     """Both topics of images, whose messages go to the worker."""
 
     def images(topic: str) -> Callable[[Any], None]:
@@ -279,13 +250,18 @@ class ImageOutputs(Generic[Result]):
         node: creates the publishers, which publish while it is active.
         topic: of the clouds.
         make_cloud: the sensor_msgs/PointCloud2 of what was found in an image.
+        draw: the image, and its picture.
     """
 
     def __init__(
-        self, node: LifecycleNode, topic: str, make_cloud: Callable[[Result, Make], Any]
+        self,
+        node: LifecycleNode,
+        topic: str,
+        make_cloud: Callable[[Result, Make], Any],
+        draw: Callable[[Result], tuple[Image, Picture]],
     ) -> None:
         self._node = node
-        self._make_cloud = make_cloud
+        self._make_cloud, self._draw = make_cloud, draw
         self._clouds = create_output(node, PointCloud2, topic)
         self._pictures = create_output(node, ImageMessage, f"~/{topics.DEBUG_IMAGE}")
         self._jpegs = create_output(node, CompressedImage, f"~/{topics.COMPRESSED_DEBUG_IMAGE}")
@@ -298,34 +274,35 @@ class ImageOutputs(Generic[Result]):
         """Full names of the topic of clouds and of the debug image."""
         return self._clouds.topic_name, self._pictures.topic_name
 
-    def clouds_wanted(self) -> bool:
-        return not self._closed and self._clouds.get_subscription_count() > 0
+    @property
+    def _publishers(self) -> tuple[Any, ...]:
+        return self._clouds, self._pictures, self._jpegs
 
-    def pictures_wanted(self) -> bool:
-        publishers = (self._pictures, self._jpegs)
-        return not self._closed and any(p.get_subscription_count() > 0 for p in publishers)
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody listens."""
+        return not self._closed and any(p.get_subscription_count() for p in self._publishers)
 
     def publish(self, result: Result) -> None:
-        """The cloud of an image."""
-        with self._lock:
-            if self.clouds_wanted():
-                self._clouds.publish(self._make_cloud(result, make_message))
-
-    def show(self, image: Image, picture: Picture) -> None:
-        """The debug picture of an image."""
-        header = make_header(make_message, image.stamp_ns, image.frame)
+        """What is wanted of an image."""
         with self._lock:
             if self._closed:
                 return
-            if self._pictures.get_subscription_count():
-                self._pictures.publish(_raw(header, picture))
-            if self._jpegs.get_subscription_count():
-                self._jpegs.publish(_compressed(header, picture))
+            clouds, raw, compressed = (p.get_subscription_count() for p in self._publishers)
+            if clouds:
+                self._clouds.publish(self._make_cloud(result, make_message))
+            if raw or compressed:
+                image, picture = self._draw(result)
+                header = make_header(make_message, image.stamp_ns, image.frame)
+                if raw:
+                    self._pictures.publish(_raw(header, picture))
+                if compressed:
+                    self._jpegs.publish(_compressed(header, picture))
 
     def close(self) -> None:
         with self._lock:
             self._closed = True
-            for publisher in (self._clouds, self._pictures, self._jpegs):
+            for publisher in self._publishers:
                 self._node.destroy_lifecycle_publisher(publisher)
 
 
