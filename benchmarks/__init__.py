@@ -1,3 +1,3 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Experiments, a second simulator to judge by, fuzzing, profiling and load; not installed."""
+"""Experiments, a second simulator to judge by, fuzzing and load; not installed."""

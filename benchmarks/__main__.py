@@ -18,11 +18,8 @@ from typing import TypeVar
 from tqdm import tqdm
 
 from benchmarks.experiments import (
-    bound,
     convergence,
-    features,
     linearisation,
-    matching,
     motion,
     noise,
     p3p_initialisation,
@@ -33,8 +30,6 @@ from benchmarks.experiments import (
 )
 from benchmarks.experiments.report import SUMMARY, count_verdicts, write_result, write_summary
 from benchmarks.experiments.results import Context, Result, Verdict
-from benchmarks.honesty import experiment as honesty
-from benchmarks.inertial import experiment as inertial
 
 T = TypeVar("T")
 
@@ -45,12 +40,7 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "convergence": convergence.run,
     "linearisation": linearisation.run,
     "p3p-initialisation": p3p_initialisation.run,
-    "bound": bound.run,
-    "honesty": honesty.run,
-    "inertial": inertial.run,
     "timings": timings.run,
-    "matching": matching.run,
-    "features": features.run,
     "readout-time": readout_time.run,
     "real": real.run,
 }
@@ -63,18 +53,13 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   rigs                             several cameras, against their bounds
   real                             videos of real cameras
   gross                            grossly wrong lenses and maps: what is published
-  honesty                          against P3P, a real global shutter, rendered walls
+  honesty                          against P3P, and a real global shutter
   mutants                          planted bugs, and whether tests catch them
   mapping                          refined maps and surveyed markers
-  experiments.mapped_room          a map of a rendered room by markers, and poses in it
   fuzzing                          wrong input for everything that reads
-  profiling, frame_times           where the time of a frame goes
   load, load.changes               live nodes under load, and set anew
-  load.signals                     live nodes stopped at random moments
-  image_flight                     rendered flights through live nodes
   signals                          commands that are stopped at random moments
   start                            memory and time of a start of the node
-  fusion                           estimates in the filter of robot_localization
 """
 
 

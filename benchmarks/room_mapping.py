@@ -8,20 +8,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.config import FeatureConfig
+import numpy as np
+
+from benchmarks.experiments.errors import angles
+from rs_localizer.config import FeatureConfig, NodeConfig, PoseTime
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.images import Image
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.io.recording import CAMERA_FRAME
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
 from rs_localizer.io.trajectories import Trajectory
+from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.tools.mapping.anchors import Anchors
 from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map
 from rs_localizer.tools.mapping.colmap import Effort, Stage
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.views import Looker, View
-from rs_localizer.tools.simulation.frames import frame_stamps
+from rs_localizer.tools.simulation.frames import frame_stamps, middle_stamp
 from rs_localizer.tools.simulation.renderer import Renderer, in_order
 from rs_localizer.tools.simulation.settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
@@ -67,20 +74,10 @@ class Room:
 
         return in_order(render, self.stamps(piece))
 
-    def look(
-        self,
-        piece: Piece,
-        images: Path,
-        done: Callable[[], object] = lambda: None,
-        markers: bool = True,
-    ) -> list[View]:
-        """The views of a piece, with the markers or without; their images go to a folder."""
-        looker = Looker(self._most, images, self.marker_map if markers else None)
-        views = []
-        for image in self.images(piece):
-            views.append(looker.look(image))
-            done()
-        return views
+    def look(self, piece: Piece, images: Path) -> list[View]:
+        """The views of a piece; their images go to a folder."""
+        looker = Looker(self._most, images, self.marker_map)
+        return [looker.look(image) for image in self.images(piece)]
 
     def build(
         self,
@@ -96,14 +93,42 @@ class Room:
         )  # fmt: skip
         return build_map(given, Workshop(folder, effort or Effort(), stage or _silent))
 
-    def clouds(self, piece: Piece, done: Callable[[], object] = lambda: None) -> list[Any]:
+    def clouds(self, piece: Piece) -> list[Any]:
         """The keypoints of a piece, as the node ``feature_detector`` sends them."""
         extractor = FrameExtractor(FeatureConfig(max_keypoints=self._most))
-        clouds = []
-        for image in self.images(piece):
-            clouds.append(keypoints(extractor.extract(image), make_message))
-            done()
-        return clouds
+        return [keypoints(extractor.extract(image), make_message) for image in self.images(piece)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Errors:
+    """How far poses are from the truth."""
+
+    frames: int
+    positions: Array  # (k,) m, of the localized frames
+    angles: Array  # (k,) deg
+
+    @property
+    def share(self) -> float:
+        return len(self.positions) / self.frames
+
+
+def localized(room: Room, clouds: Sequence[Any], landmarks: Map, solver: str) -> Errors:
+    """Of the poses of the middle rows, as ``replay`` gives them."""
+    config = NodeConfig(
+        solver=solver, readout_time=room.camera.readout_time, pose_time=PoseTime.MID_FRAME
+    )
+    localizer = FrameLocalizer(config)
+    localizer.use_map(landmarks)
+    positions, turns = [], []
+    for cloud in clouds:
+        stamp = stamp_ns(cloud)
+        localizer.calibrate(read_camera_info(make_camera_info(room.camera, stamp)))
+        answer = localizer.localize_keypoints(cloud)
+        if answer:
+            true = room.motion.state(middle_stamp(room.camera, stamp), np.zeros(1))
+            positions.append(np.linalg.norm(answer.pose.position - true.positions[0]))
+            turns.append(angles(answer.pose.rotation, true.rotations[0]))
+    return Errors(len(clouds), np.array(positions), np.array(turns))
 
 
 def without_refinement(built: Built) -> Map:

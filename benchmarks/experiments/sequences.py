@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.data import HAND_MOTION, WEBCAM
-from benchmarks.experiments.views import direction, seen_at, uniform_pixels
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -153,19 +152,39 @@ def _fly(camera: Camera, frames: int, seed: int, noise: float, speed: float) -> 
 
 def _single(camera: Camera, rng: np.random.Generator, noise: float) -> Frame:
     motion = Motion(
-        so3.exp(rng.uniform(0.0, np.pi) * direction(rng)),
+        so3.exp(rng.uniform(0.0, np.pi) * _direction(rng)),
         rng.normal(size=3),
-        np.radians(_HARD_TURN) * direction(rng),
-        _HARD_WAY * direction(rng),
+        np.radians(_HARD_TURN) * _direction(rng),
+        _HARD_WAY * _direction(rng),
     )
-    pixels = uniform_pixels(camera, _POINTS, rng)
-    points = seen_at(motion, camera, pixels, rng.uniform(*_DEPTH, _POINTS))
+    pixels = _uniform_pixels(camera, _POINTS, rng)
+    points = _seen_at(motion, camera, pixels, rng.uniform(*_DEPTH, _POINTS))
     pixels += noise * rng.normal(size=pixels.shape)
     wrong = round(_OUTLIERS * _POINTS)
-    pixels[:wrong] = uniform_pixels(camera, wrong, rng)
+    pixels[:wrong] = _uniform_pixels(camera, wrong, rng)
     return Frame(points, pixels)
 
 
 def _evenly(count: int, wanted: int) -> list[int]:
     """So many indices below ``count``, spread evenly."""
     return [int(i) for i in np.unique(np.linspace(0, count - 1, min(wanted, count)).astype(int))]
+
+
+def _uniform_pixels(view: Camera, count: int, rng: np.random.Generator) -> Array:
+    """Pixels (count,2) anywhere in the image."""
+    return rng.uniform(-0.5, np.array(view.size) - 0.5, (count, 2))
+
+
+def _seen_at(motion: Motion, view: Camera, pixels: Array, depth: Array) -> Array:
+    """Points (n,3) in the map that are seen at pixels (n,2), each at the time of its row."""
+    rotations, translations = motion.at_rows(view.row_time(pixels))
+    local = depth[:, None] * np.column_stack([view.rays(pixels), np.ones(len(pixels))])
+    points: Array = np.einsum("nji,nj->ni", rotations, local - translations)
+    return points
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    """Any unit vector (3,)."""
+    vector = rng.normal(size=3)
+    unit: Array = vector / np.linalg.norm(vector)
+    return unit

@@ -13,7 +13,6 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks.experiments.uncertainty import IntArray, Interval, bootstrap
 from benchmarks.frames.judged import REGION
 from benchmarks.honesty.estimating import believed, estimate, frames_of, scored
 from benchmarks.honesty.scores import Scores, percent
@@ -21,18 +20,21 @@ from benchmarks.independent.cameras import Camera
 from benchmarks.independent.motions import hand
 from benchmarks.independent.scenes import Board
 from rs_localizer.config import LocalizerConfig
-from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.localizer import Localizer
 
-NOISES = (0.1, 0.5)  # px
-READOUTS = (0.0, 0.005, 0.011, 0.03)  # s
+_NOISES = (0.1, 0.5)  # px
+_READOUTS = (0.0, 0.005, 0.011, 0.03)  # s
 # Share of the distortion that the calibration lacks, and bend (m) that the map does not know.
-FAULTS = ((0.0, 0.0), (0.1, 0.0), (0.3, 0.0), (0.0, 2e-4), (0.0, 5e-4), (0.0, 2e-3), (0.1, 5e-4))
+_FAULTS = ((0.0, 0.0), (0.1, 0.0), (0.3, 0.0), (0.0, 2e-4), (0.0, 5e-4), (0.0, 2e-3), (0.1, 5e-4))
 # 12 deg/s, as one who films a board.
-_SLOWER = 67.0 / 12.0
+_FILMING = partial(hand, slower=67.0 / 12.0)
 # A user who sets a readout time for a global shutter.
 _WRONG_READOUT = 0.02
-MOST_RATIO = 1.1
+
+COLUMNS = (
+    "condition", "frames", "deg", "deg_p3p", "ratio", "deg_95", "deg_95_p3p", "ratio_95",
+    "mm", "mm_p3p", "mm_95", "mm_95_p3p", "insignificant", "refused", "refused_p3p", "reasons",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,52 +59,34 @@ class Condition:
         return f"{target}/{faults}/{self.noise:g}px/{1e3 * self.readout:g}ms/{self.told}"
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
-    """Both on the same frames, at the middle row."""
-
-    ours: Scores
-    p3p: Scores
-
-    @property
-    def both(self) -> BoolArray:
-        """Frames (n,) that both localize."""
-        both: BoolArray = self.ours.localized & self.p3p.localized
-        return both
-
-    def ratio(
-        self, quantile: float, column: str = "orientation", confidence: float = 0.95
-    ) -> Interval:
-        """Quantile of our errors in units of P3P's, of the frames that both localize."""
-        ours, theirs = (scores.of(column)[self.both] for scores in (self.ours, self.p3p))
-
-        def of(chosen: IntArray) -> float:
-            return _quantile(ours[chosen], quantile) / _quantile(theirs[chosen], quantile)
-
-        return bootstrap(of, len(ours), self.ours.recordings[self.both], confidence)
-
-    @property
-    def insignificant(self) -> BoolArray:
-        """Of our localized frames (k,), those whose velocities' 95 % region contains zero."""
-        within: BoolArray = self.ours.of("moving")[self.ours.localized] < REGION
-        return within
-
-
 def conditions() -> Sequence[Condition]:
-    grid = product((False, True), FAULTS, NOISES, READOUTS)
     return [
         Condition(markers, *fault, noise, readout, told)
-        for markers, fault, noise, readout in grid
+        for markers, fault, noise, readout in product((False, True), _FAULTS, _NOISES, _READOUTS)
         for told in (("unset", "set", "tracked") if readout > 0.0 else ("unset", "set"))
     ]
 
 
-def measure(condition: Condition, frames: int, seed: int) -> Pair:
-    """Both methods on the frames of a condition."""
-    default = LocalizerConfig().solver
+def row(condition: Condition, frames: int, seed: int) -> tuple[str | float | int, ...]:
+    """Errors of the frames that both localize, at the middle row; shares in %."""
     tracking = condition.told == "tracked"
-    ours = _scores(condition, default, tracking, frames, seed)
-    return Pair(ours, _of_p3p(replace(condition, told="unset"), frames, seed))
+    ours = _scores(condition, LocalizerConfig().solver, tracking, frames, seed)
+    theirs = _of_p3p(replace(condition, told="unset"), frames, seed)
+    both = ours.localized & theirs.localized
+    figures: list[float] = []
+    for column, factor in (("orientation", 1.0), ("position", 1e3)):
+        for quantile in (0.5, 0.95):
+            pair = [factor * _quantile(one.of(column)[both], quantile) for one in (ours, theirs)]
+            figures += [*pair, pair[0] / pair[1]] if column == "orientation" else pair
+    return (
+        condition.name,
+        len(ours),
+        *figures,
+        percent(ours.of("moving")[ours.localized] < REGION),
+        100.0 * ours.refused,
+        100.0 * theirs.refused,
+        ours.reasons(),
+    )
 
 
 @lru_cache(maxsize=1)
@@ -121,33 +105,5 @@ def _scores(condition: Condition, solver: str, tracking: bool, frames: int, seed
     return scored(seen, results, camera).middle
 
 
-_FILMING = partial(hand, slower=_SLOWER)
-
-COLUMNS = (
-    "condition", "frames", "deg", "deg_p3p", "ratio", "deg_95", "deg_95_p3p", "ratio_95",
-    "mm", "mm_p3p", "mm_95", "mm_95_p3p", "insignificant", "refused", "refused_p3p", "reasons",
-)  # fmt: skip
-
-
-def row(name: str, pair: Pair) -> tuple[str | float | int, ...]:
-    both = pair.both
-    figures: list[float] = []
-    for column, factor in (("orientation", 1.0), ("position", 1e3)):
-        errors = [factor * scores.of(column)[both] for scores in (pair.ours, pair.p3p)]
-        for quantile in (0.5, 0.95):
-            ours, theirs = (_quantile(each, quantile) for each in errors)
-            figures += [ours, theirs, ours / theirs] if column == "orientation" else [ours, theirs]
-    return (
-        name,
-        len(pair.ours),
-        *figures,
-        percent(pair.insignificant),
-        100.0 * pair.ours.refused,
-        100.0 * pair.p3p.refused,
-        pair.ours.reasons(),
-    )
-
-
-def _quantile(values: Array, at: float) -> float:
-    # Of so few values sorting is ten times faster than NumPy's own quantile.
-    return float(np.sort(values)[round(at * (len(values) - 1))]) if len(values) else np.nan
+def _quantile(values: np.ndarray, at: float) -> float:
+    return float(np.quantile(values, at)) if len(values) else np.nan

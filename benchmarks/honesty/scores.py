@@ -7,10 +7,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.frames.judged import FIVE_SIGMA, REGION, normalised
 from benchmarks.independent.rotations import logarithm
@@ -112,10 +110,6 @@ class Scores:
         return np.array([getattr(one, name) for one in self.scores], dtype=np.float64)
 
     @property
-    def recordings(self) -> NDArray[np.int64]:
-        return np.array([one.recording for one in self.scores], dtype=np.int64)
-
-    @property
     def localized(self) -> BoolArray:
         return np.array([one.reason == "" for one in self.scores], dtype=np.bool_)
 
@@ -138,10 +132,6 @@ class Scores:
         """Of the localized frames (k,), which are beyond five standard deviations."""
         beyond: BoolArray = ~(self.of(name)[self.localized] < FIVE_SIGMA)
         return beyond
-
-    def groups(self) -> NDArray[Any]:
-        """Recordings (k,) of the localized frames."""
-        return self.recordings[self.localized]
 
     def median(self, name: str) -> float:
         """Of the localized frames."""

@@ -5,19 +5,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from benchmarks.data import GLOBAL_SHUTTER_TAGS
-from benchmarks.experiments.uncertainty import IntArray, Interval, bootstrap
 from benchmarks.frames.judged import REGION
 from benchmarks.honesty.scores import motion_evidence, percent
 from benchmarks.independent.rotations import logarithm
 from rs_localizer.config import NodeConfig
-from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized
@@ -26,9 +24,10 @@ from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.solvers.table import find_solver
 
-CAMERA_INFO, CORRESPONDENCES = "/camera/camera_info", "/camera/correspondences"
-FRAMES = 450
-_BLOCK_NS = 1_000_000_000  # frames of one second are not independent
+_INFO, _CLOUD = "/camera/camera_info", "/camera/correspondences"
+COLUMNS = (
+    "condition", "frames", "jitter_deg", "jitter_deg_95", "insignificant", "refused", "reasons",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,27 +36,6 @@ class Condition:
 
     name: str
     config: NodeConfig
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Replayed:
-    """What came of it."""
-
-    frames: int
-    localized: int
-    jitter: Array  # (n,) deg, second differences of the orientation
-    seconds: IntArray  # (n,) of the recording, in which each was
-    # (m,) whether the 95 % region of the velocities contains zero; without any, where none are.
-    insignificant: BoolArray
-    reasons: str
-
-    def interval(self, quantile: float) -> Interval:
-        """Of the jitter."""
-
-        def of(chosen: IntArray) -> float:
-            return float(np.quantile(self.jitter[chosen], quantile))
-
-        return bootstrap(of, len(self.jitter), self.seconds)
 
 
 def conditions() -> Sequence[Condition]:
@@ -69,64 +47,33 @@ def conditions() -> Sequence[Condition]:
     ]
 
 
-def measure(condition: Condition, frames: int = FRAMES) -> Replayed:
-    """Replay the first frames of the recording as the node would see them."""
+def row(condition: Condition, frames: int, seed: int) -> tuple[str | float | int, ...]:
+    """Second differences of the orientation, and frames whose velocities' 95 % region contains
+    zero, in %; always of the whole recording.
+    """
     localizer = FrameLocalizer(condition.config)
     results: list[Localized | Refusal] = []
     with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
-        for topic, _, message in bag.messages((CAMERA_INFO, CORRESPONDENCES)):
-            if topic == CAMERA_INFO:
+        for topic, _, message in bag.messages((_INFO, _CLOUD)):
+            if topic == _INFO:
                 localizer.calibrate(read_camera_info(message))
-            elif len(results) < frames:
+            else:
                 results.append(localizer.localize(message))
     found = [result for result in results if isinstance(result, Localized)]
     reasons = Counter(result.reason for result in results if isinstance(result, Refusal))
-    moving = []
+    still = []
     if find_solver(condition.config.solver).rolling_shutter:
         # Per readout: a readout time is not always set.
-        moving = [motion_evidence(twist_at(frame.estimate, 0.0, 1.0)) < REGION for frame in found]
-    jitter, seconds = _second_differences(found)
-    return Replayed(
-        len(results),
-        len(found),
-        jitter,
-        seconds,
-        np.array(moving, dtype=np.bool_),
-        ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()),
-    )
-
-
-def _second_differences(frames: Iterable[Localized]) -> tuple[Array, IntArray]:
-    """Angles (n,) in deg between a turn and the next one, and the second of each."""
+        still = [motion_evidence(twist_at(frame.estimate, 0.0, 1.0)) < REGION for frame in found]
     turns = [
-        (after.input_stamp_ns, logarithm(before.pose.rotation.T @ after.pose.rotation))
-        for before, after in pairwise(frames)
+        logarithm(before.pose.rotation.T @ after.pose.rotation) for before, after in pairwise(found)
     ]
-    jitter, seconds = [], []
-    for (_, first), (stamp_ns, second) in pairwise(turns):
-        jitter.append(float(np.degrees(np.linalg.norm(second - first))))
-        seconds.append(stamp_ns // _BLOCK_NS)
-    return np.array(jitter), np.array(seconds, dtype=np.int64)
-
-
-COLUMNS = (
-    "condition",
-    "frames",
-    "jitter_deg",
-    "jitter_deg_95",
-    "insignificant",
-    "refused",
-    "reasons",
-)
-
-
-def row(name: str, found: Replayed) -> tuple[str | float | int, ...]:
-    """Shares in %."""
+    jitter = np.degrees(np.linalg.norm(np.diff(turns, axis=0), axis=1))
     return (
-        name,
-        found.frames,
-        *(float(np.quantile(found.jitter, quantile)) for quantile in (0.5, 0.95)),
-        percent(found.insignificant),
-        100.0 * (1.0 - found.localized / found.frames),
-        found.reasons,
+        condition.name,
+        len(results),
+        *np.quantile(jitter, [0.5, 0.95]).tolist(),
+        percent(np.array(still, dtype=np.bool_)),
+        100.0 * (1.0 - len(found) / len(results)),
+        ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()),
     )

@@ -23,8 +23,7 @@ from geometry_msgs.msg import TwistWithCovarianceStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
-from benchmarks.frame_times import messages
-from benchmarks.hand_held import CAMERA, HandHeld
+from benchmarks.load.frames import CAMERA, messages
 from rs_localizer.io import topics
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import make_camera_info
@@ -60,7 +59,7 @@ class Session:
 
     def __init__(self, node: LiveNode, count: int) -> None:
         self._node, self._frame = node, 0
-        self._clouds = messages(HandHeld(_POINTS, 0.2, _RATE, count), 0.0).clouds
+        self._clouds = messages(_POINTS, 0.2, _RATE, count)
         self._info = make_camera_info(CAMERA, 0)
         self._deviations: list[float] = []
         own = f"{node.namespace}/{NODE_NAME}"

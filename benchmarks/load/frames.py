@@ -4,23 +4,29 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from rclpy.serialization import serialize_message
 
-from benchmarks.hand_held import CAMERA, HandHeld
-from rs_localizer.io.bags import BagWriter, open_bag
-from rs_localizer.io.recording import CAMERA_FRAME, CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
+from benchmarks.data import HAND_MOTION
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_correspondences
+from rs_localizer.io.trajectories import read_tum
 from rs_localizer.ros.node.conversion import copy_message
-from rs_localizer.tools.simulation.recording import write_simulated
+from rs_localizer.tools.simulation.frames import simulate_frames
+from rs_localizer.tools.simulation.imu import Lever, make_imu, simulate_imu
+from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.settings import FrameSettings, ImuSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 
-READOUT_TIME = CAMERA.readout_time
-"""s of the simulated camera."""
-
+_K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+READOUT_TIME = 0.02  # s
+CAMERA = Camera(640, 480, _K, np.array([-0.2, 0.05, 0.0, 0.0, 0.0]), readout_time=READOUT_TIME)
+_NOISE = 0.7  # px
+_LANDMARKS = 20_000
 # After these the motion starts over: a jump to which the tracker has to find again.
 _DIFFERENT = 500
 # Late enough for frames before the first one.
@@ -83,36 +89,50 @@ class Frames:
         return round((seconds * 1_000_000_000 + nanoseconds - _FIRST_NS) * 1e-9 * self.rate)
 
 
-def simulated(
-    points: int,
-    outliers: float,
-    rate: float,
-    different: int = _DIFFERENT,
-    imu_rate: float = 0.0,
-) -> Frames:
-    """Frames of a camera that is moved by hand through a room, so many before it starts over.
+def messages(points: int, outliers: float, rate: float, count: int) -> list[Any]:
+    """Correspondences of a camera that a hand moves through a room (TUM VI room5), so many frames.
 
-    With a rate (Hz) of its own there is an IMU, too, in the axes of the camera.
+    Args:
+        points: of each frame.
+        outliers: share of them.
+        rate: Hz.
     """
-    flight = HandHeld(points, outliers, rate, different)
-    infos: list[bytearray] = []
-    clouds: list[bytearray] = []
-    with tempfile.TemporaryDirectory() as directory:
-        path = Path(directory) / "frames"
-        with BagWriter(path) as bag:
-            for frame in flight.simulate():
-                write_simulated(bag, CAMERA, frame)
-        with open_bag(path) as recording:
-            topics = (CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC)
-            for topic, _, message in recording.messages(topics):
-                serialized = serialize_message(copy_message(message, message.__msgtype__))
-                (infos if topic == CAMERA_INFO_TOPIC else clouds).append(bytearray(serialized))
-    readings = flight.readings(imu_rate, CAMERA_FRAME) if imu_rate else ()
-    imus = [
-        bytearray(serialize_message(copy_message(message, message.__msgtype__)))
-        for _, message in readings
-    ]
-    return Frames(rate, bytes(infos[0]), clouds, imus)
+    motion = RecordedMotion(read_tum(HAND_MOTION))
+    world = room(sampled_states(motion).positions, np.random.default_rng(0), count=_LANDMARKS)
+    start = motion.intervals_ns[0][0]
+    stamps = [start + round(k * 1e9 / rate) for k in range(count)]
+    settings = FrameSettings(points, _NOISE, outliers, rate)
+    frames = simulate_frames(CAMERA, motion, world, settings, stamps_ns=stamps, seed=0)
+    return [make_correspondences(f.stamp_ns, f.points, f.pixels, f.ids) for f in frames]
+
+
+def simulated(
+    points: int, outliers: float, rate: float, different: int = _DIFFERENT, imu_rate: float = 0.0
+) -> Frames:
+    """Such frames, so many before they start over; with a rate (Hz) of its own there is an IMU."""
+    clouds = map(_serialized, messages(points, outliers, rate, different))
+    imus = map(_serialized, _readings(imu_rate, different / rate)) if imu_rate else ()
+    info = bytes(_serialized(make_camera_info(CAMERA, 0)))
+    return Frames(rate, info, list(clouds), list(imus))
+
+
+def _readings(rate: float, seconds: float) -> list[Any]:
+    """sensor_msgs/Imu of the same motion, in the axes of the camera."""
+    motion = RecordedMotion(read_tum(HAND_MOTION))
+    settings, lever = ImuSettings(rate=rate), Lever(np.eye(3), np.zeros(3))
+    track = simulate_imu(motion, settings, lever, np.random.default_rng(0))
+    first = int(np.searchsorted(track.times_ns, motion.intervals_ns[0][0]))
+    return [
+        make_imu(
+            int(track.times_ns[i]), track.angular_velocities[i], track.specific_forces[i],
+            settings, CAMERA_FRAME,
+        )
+        for i in range(first, first + round(seconds * rate))
+    ]  # fmt: skip
+
+
+def _serialized(message: Any) -> bytearray:
+    return bytearray(serialize_message(copy_message(message, message.__msgtype__)))
 
 
 def _stamped(message: bytearray, stamp_ns: int) -> bytes:

@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.experiments.results import Verdict
 from benchmarks.honesty import __main__ as command
-from benchmarks.honesty.estimating import Found
-from benchmarks.honesty.experiment import rendered_claims
 from benchmarks.honesty.scores import Score, Scores, Truth, score
 from rs_localizer.io.outputs import Pose, Twist
 
@@ -51,14 +48,10 @@ def test_truths_drawn_from_the_covariance_lie_inside():
     assert not honest.far_off().any()
 
 
-@pytest.mark.parametrize(
-    ("wider", "verdict"), [(1.0, Verdict.HELD), (0.5, Verdict.NOT_HELD), (3.0, Verdict.NOT_HELD)]
-)
-def test_too_small_and_too_large_covariances_are_seen(wider, verdict):
-    some = scores(wider)
-    found = {f"{motion}/all": Found(some, some) for motion in ("rest", "hand")}
-    judged = {claim.name: claim.verdict for claim in rendered_claims(found)}
-    assert judged == {"honesty.rendered_pose": verdict, "honesty.rendered_twist": verdict}
+@pytest.mark.parametrize(("wider", "least", "most"), [(0.5, 0.5, 0.7), (3.0, 0.99, 1.0)])
+def test_too_small_and_too_large_covariances_are_seen(wider, least, most):
+    for part in ("pose", "twist"):
+        assert least < np.mean(scores(wider).inside(part)) <= most
 
 
 def test_the_command(tmp_path, capsys, monkeypatch):

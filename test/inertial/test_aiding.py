@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from benchmarks.honesty.estimating import believed
+from benchmarks.honesty.recordings import follow, record
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, shaken_hand
 from benchmarks.independent.scenes import Rich
-from benchmarks.inertial.recordings import follow, record
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import Alone
 from rs_localizer.localizer import Localizer

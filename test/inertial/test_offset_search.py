@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from benchmarks.honesty.estimating import believed, truth_of
+from benchmarks.honesty.recordings import record
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, rest, shaken_hand
 from benchmarks.independent.scenes import Rich
-from benchmarks.inertial.recordings import record
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import twist_at

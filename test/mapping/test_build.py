@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.experiments.mapped_room import Errors, localized
-from benchmarks.room_mapping import Piece, Room, without_refinement
+from benchmarks.room_mapping import Errors, Piece, Room, localized, without_refinement
 from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.core.arrays import Array

@@ -7,7 +7,7 @@ who listen.
 """
 
 import runpy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,8 +16,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import fusion
 from benchmarks.honesty.estimating import believed
+from benchmarks.independent.cameras import Camera
+from benchmarks.independent.frames import Frames, simulate
+from benchmarks.independent.motions import Motions, States, hand
+from benchmarks.independent.scenes import Rich
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
@@ -34,6 +37,35 @@ LENGTH = 45
 SETTLED = slice(5, None)  # the tracker's first frames are coarser
 ENU_TO_NED = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 FLU_TO_FRD = np.diag([1, -1, -1])
+
+
+NOISE = 1.0  # px
+# The camera looks forward on a body with x forward, y left, z up.
+BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+CAMERA_FROM_BASE = Transform(BODY_FROM_CAMERA.T, np.array([0.05, 0.1, -0.2]))
+
+
+def level(count: int, rng: np.random.Generator) -> Motions:
+    """A level body that is carried half as fast as a hand."""
+    yaw = np.outer(rng.uniform(-np.pi, np.pi, count), [0.0, 0.0, 1.0])
+    rotation = Rotation.from_rotvec(yaw).as_matrix() @ BODY_FROM_CAMERA
+    return replace(hand(count, rng, 2.0), rotation=rotation)
+
+
+def fly(seed: int) -> Frames:
+    return simulate(Camera(), level, Rich(), 1, LENGTH, seed)
+
+
+def true_states(camera: States) -> tuple[Array, Array, Array, Array]:
+    """Position, rotation, linear and angular velocity of the body, from those of its camera."""
+    lever = CAMERA_FROM_BASE.translation
+    linear = camera.linear + np.cross(camera.angular, lever)
+    return (
+        camera.position + camera.rotation @ lever,
+        camera.rotation @ BODY_FROM_CAMERA.T,
+        linear @ BODY_FROM_CAMERA.T,
+        camera.angular @ BODY_FROM_CAMERA.T,
+    )
 
 
 @dataclass(frozen=True)
@@ -58,17 +90,17 @@ def write_tf(
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory) -> Flight:
     path = tmp_path_factory.mktemp("flight") / "flight"
-    frames = fusion.fly(1, LENGTH, 3)
-    truth = fusion.true_states(frames.first)
+    frames = fly(3)
+    truth = true_states(frames.first)
     turned = Rotation.from_euler("z", 50.0, degrees=True).as_matrix()
     odometry = []
     with BagWriter(path) as bag:
         start = int(frames.stamp_ns[0])
-        mounting = fusion.MOUNTING.camera_from_base.inverse()
+        mounting = CAMERA_FROM_BASE.inverse()
         write_tf(bag, start, "/tf_static", ("base_link", CAMERA_FRAME), mounting)
         for index in range(LENGTH):
             stamp_ns = int(frames.stamp_ns[index])
-            points, pixels = frames.seen(index, fusion.NOISE)
+            points, pixels = frames.seen(index, NOISE)
             write_frame(
                 bag, believed(frames.camera), stamp_ns, points, pixels, np.arange(len(points))
             )

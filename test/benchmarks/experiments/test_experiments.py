@@ -7,7 +7,7 @@ verdicts that need the default number of trials (differences of a few per cent) 
 which are not the code's alone.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import pytest
@@ -17,17 +17,10 @@ from benchmarks.__main__ import EXPERIMENTS
 from benchmarks.experiments import readout_time
 from benchmarks.experiments.results import Context, Result, Verdict
 from benchmarks.experiments.trials import Setting, Trials, draw_trials
-from benchmarks.experiments.views import View, synthetic_views
-from benchmarks.honesty import against_p3p
-from benchmarks.inertial import experiment as inertial
-from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.estimation.refine import apply_step
 
 TRIALS = 200
 # Of many conditions; what they measure is held by tests of their own.
 FEW = {
-    "honesty": 2,
-    "inertial": 4,
     "readout-time": 40,
 }
 
@@ -46,12 +39,6 @@ HELD = _names(
         "p3p-initialisation": "r6p_vcwt_equals_r6p relinearized",
         "readout-time": "coverage direction faults global",
         "real": "vcwt_equals_r6p vcwt_ahead_of_p3p vct_often_more r9p_hardest localizer_most",
-        "bound": (
-            "fast fast_gross outliers outliers_gross faster faster_gross slow slow_gross "
-            "rest_gross none_hidden"
-        ),
-        "matching": "localized alike scores",
-        "features": "localized better",
     }
 )
 NOT_HELD = _names(
@@ -67,20 +54,11 @@ def untracked(items: Iterable, total: int) -> Iterator:
     return iter(items)
 
 
-def some(whole: Callable[[], Sequence], every: int) -> Callable[[], Sequence]:
-    """Every so manieth condition only."""
-    chosen = whole()[::every]
-    return lambda: chosen
-
-
 def result(name: str) -> Result:
     context = Context(FEW.get(name, TRIALS), 0, untracked)
     with pytest.MonkeyPatch.context() as patch:
-        # Of some 500 conditions even a single frame takes long.
-        patch.setattr(against_p3p, "conditions", some(against_p3p.conditions, 9))
         patch.setattr(readout_time, "_LEAST", 4)
         patch.setattr(readout_time, "_GLOBAL", 4)  # one of them
-        patch.setattr(inertial, "_TEN_SECONDS", 150)
         return EXPERIMENTS[name](context)
 
 
@@ -135,46 +113,3 @@ def test_points_are_seen_at_their_own_row(drifting):
     trials = draw_trials(5, 0, Setting(25.0, 0.2, 0.0, drifting))
     for i in range(5):
         np.testing.assert_allclose(trials.rays[i], bearings(trials, i, drifting), atol=1e-9)
-
-
-MOVING = Setting(angular=15.0, linear=0.15, noise=1.0)
-
-
-def moved(motion: Motion, step: np.ndarray) -> Motion:
-    """The motion one step (12,) further on."""
-    state = np.concatenate(
-        [motion.rotation.ravel(), motion.translation, motion.angular_velocity,
-         motion.linear_velocity, motion.angular_acceleration, motion.linear_acceleration]
-    )  # fmt: skip
-    state = apply_step(state, step)
-    return Motion(state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18],
-                  angular_acceleration=state[18:21], linear_acceleration=state[21:])  # fmt: skip
-
-
-def view() -> View:
-    return next(synthetic_views(1, 5, MOVING, outliers=0.4))
-
-
-def test_views_are_seen_at_their_own_row():
-    one = view()
-    pixels, _ = project_rolling(one.camera, one.motion.at_rows, one.points)
-    np.testing.assert_allclose(one.true_pixels, pixels, atol=1e-6)
-    off = (one.pixels - one.true_pixels)[one.inliers]
-    assert 0.7 < off.std() < 1.3
-    assert np.count_nonzero(~one.inliers) == 20
-    assert np.abs(one.pixels - one.true_pixels)[~one.inliers].max() > 100.0
-
-
-def test_the_bound_is_that_of_finite_differences():
-    one = view()
-    h, columns = 1e-5, []
-    for k in range(12):
-        ahead, behind = (
-            project_rolling(one.camera, moved(one.motion, s * h * np.eye(12)[k]).at_rows,
-                            one.points[one.inliers])[0]
-            for s in (1.0, -1.0)
-        )  # fmt: skip
-        columns.append(((ahead - behind) / (2.0 * h)).ravel())
-    jacobian = np.column_stack(columns)
-    expected = jacobian.T @ jacobian
-    np.testing.assert_allclose(one.information(), expected, rtol=1e-4, atol=1e-5 * expected.max())
