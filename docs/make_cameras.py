@@ -48,10 +48,10 @@ _PAGE = """\
 From the first row to the last.{note} Modes, firmware and stabilization change it: measure yours
 with a chessboard or any printed markers,
 
-    rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --out shutter.yaml --share "{name}"
+    rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --out shutter.yaml
 
 and give it to the localizer: `--params shutter.yaml`, or `-p readout_time:={median}`
-([camera.md](../camera.md)). `--share` writes a row for this table. [More]({sources}).
+([camera.md](../camera.md)). [More]({sources}).
 """
 _BOUND = (
     " A value near the whole interval between images (marked *) is rather an upper bound than a"

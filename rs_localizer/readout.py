@@ -10,10 +10,7 @@ from __future__ import annotations
 
 import csv
 import difflib
-import io
-import math
 import re
-from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 
@@ -31,7 +28,6 @@ MEASURE = (
     "measure it: film a printed chessboard for 20 s, the camera moving as it will, and run "
     "rs_localizer calibrate VIDEO --board 9x6 --square 0.025 --out camera.yaml"
 )
-_QUARTILE = 0.6745  # of a normal distribution, in standard deviations
 # Of the interval between images: who writes this much has rather an upper bound than a measurement.
 _UPPER_BOUND = 0.95
 
@@ -98,41 +94,6 @@ def find_readout(name: str, mode: str = "") -> list[Known]:
         modes = ", ".join(f"{entry.name}: {entry.mode}" for entry in named)
         raise ValueError(f"no mode {mode!r} of {name!r} is known, but {modes}")
     return matching
-
-
-def measured(
-    name: str, mode: str, values: Sequence[tuple[float, float]], firmware: str = ""
-) -> Known:
-    """An entry of the table, from recordings of one mode: their weighted mean.
-
-    Its deviation is what they claim together or, where they differ by more, what they differ by.
-
-    Args:
-        name: of the camera.
-        mode: as ``1920x1080 30 Hz``.
-        values: readout time and deviation of each recording, s.
-        firmware: of the camera; empty: not known.
-    """
-    weights = [1.0 / deviation**2 for _, deviation in values]
-    sums = sum(weights)
-    mean = sum(w * time for w, (time, _) in zip(weights, values, strict=True)) / sums
-    apart = sum(w * (time - mean) ** 2 for w, (time, _) in zip(weights, values, strict=True))
-    deviation = math.sqrt(max(1.0, apart / max(1, len(values) - 1)) / sums)
-    half = _QUARTILE * deviation
-    about = f", firmware {firmware}" if firmware else ""
-    source = f"rs_localizer calibrate (+- {1e3 * deviation:.3f} ms{about})"
-    return Known(name, mode, mean, mean - half, mean + half, len(values), source)
-
-
-def as_rows(entries: Iterable[Known]) -> str:
-    """Rows of the table, under its columns."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for one in entries:
-        milliseconds = [f"{1e3 * value:.3f}" for value in (one.median, one.low, one.high)]
-        writer.writerow([one.name, one.mode, *milliseconds, one.number, one.source])
-    return text.getvalue()
 
 
 def as_json(entry: Known) -> dict[str, object]:

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of readout times, and the conventions."""
 
-import csv
 import json
 import re
 import runpy
@@ -11,18 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.readout import (
     COMMON,
+    Known,
     StampAt,
     as_json,
-    as_rows,
     find_readout,
     from_all_rows,
     from_line_time,
     known_cameras,
-    measured,
     stamp_offset,
 )
 
@@ -77,31 +74,10 @@ def test_conventions():
         from_line_time(1e-5, 1)
 
 
-def test_a_shared_row_fits_the_table():
-    one = measured('Maker "One", 2', "1920x1080 30 Hz", [(0.0206, 0.0001)], "2.10")
-    (row,) = csv.DictReader(as_rows([one]).splitlines())
-    with data.path("readout_times/table.csv").open(encoding="utf-8") as file:
-        assert list(row) == next(csv.reader(file))
-    assert (row["name"], row["mode"], row["number"]) == ('Maker "One", 2', "1920x1080 30 Hz", "1")
-    # Quartiles of a normal distribution.
-    assert [row[f"{name}_ms"] for name in ("low", "median", "high")] == [
-        "20.533", "20.600", "20.667"
-    ]  # fmt: skip
-    assert row["source"] == "rs_localizer calibrate (+- 0.100 ms, firmware 2.10)"
-
-
-def test_recordings_count_by_their_deviations_and_by_what_they_differ():
-    alike = measured("One", "640x480", [(0.02, 1e-4), (0.0201, 1e-4), (0.03, 1.0)])
-    assert (alike.number, alike.median) == (3, pytest.approx(0.02005, abs=1e-9))
-    assert alike.source.endswith("(+- 0.071 ms)")  # 0.1 / sqrt(2)
-    apart = measured("One", "640x480", [(0.02, 1e-4), (0.022, 1e-4)])
-    assert apart.source.endswith("(+- 1.000 ms)")  # sample deviation 1.414, over sqrt(2)
-
-
 def test_other_programs_have_their_own_units():
-    told = as_json(measured("One", "640x480 30 Hz", [(0.0479, 1e-4)]))
+    told = as_json(Known("One", "640x480 30 Hz", 0.0479, 0.047, 0.048, 1, ""))
     assert (told["odm"], told["gyroflow"], told["kalibr"]) == (48.0, 48.0, 0.0001)
-    photos = as_json(measured("One", "photos", [(0.0479, 1e-4)]))
+    photos = as_json(Known("One", "photos", 0.0479, 0.047, 0.048, 1, ""))
     assert (photos["odm"], photos["kalibr"]) == (47.9, None)
 
 

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shlex
 import sys
@@ -35,7 +34,6 @@ if WORKING:
 
     from rs_localizer.config import CalibrationErrors, DetectorConfig, NodeConfig
     from rs_localizer.core.camera import Camera, DistortionModel
-    from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
     from rs_localizer.io.calibration import (
         kalibr_fields,
@@ -69,7 +67,6 @@ if WORKING:
     )
     from rs_localizer.offline.replay import find_topics, has_frames
     from rs_localizer.pipeline.images import FrameDetector
-    from rs_localizer.readout import Known, as_json, as_rows, measured
     from rs_localizer.settings import write_parameters
     from rs_localizer.tools import verdict
     from rs_localizer.tools.adjust.lens import LensErrors
@@ -158,7 +155,6 @@ def imu_parameters(found: Calibration, config: NodeConfig) -> str:
 # Beside FILE.yaml, as FILE_...
 _LENS, _MAP = "camera_info.yaml", "map.yaml"
 _TRANSFORMS, _CAMCHAIN = "transforms.launch.xml", "camchain.yaml"
-_SHARED = ("share.csv", "share.json")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,10 +178,6 @@ class Options(TargetOptions, Settings, Inputs):
         "find how the IMU of a bag or of a video goes with the camera: offset of its stamps, "
         "rotation, bias", default=False,
     )  # fmt: skip
-    no_telemetry: bool = option(
-        "ignore the gyroscope and the readout time inside a video, or in its log file",
-        default=False,
-    )
     rate: float | None = option(
         "images per second of a video or of files", "HZ", limits=(0.0, math.inf), above=True
     )
@@ -196,14 +188,6 @@ class Options(TargetOptions, Settings, Inputs):
     camera_info: Path | None = option("also the lens alone, for ROS drivers", "FILE")
     overwrite: bool = option("replace an earlier result", default=False)
     plot: Path | None = option("directory for pictures", "DIR")
-    force: bool = option(
-        "write the readout time although it is refused (the exit code stays 1)", default=False
-    )
-    share: str | None = option(
-        "also write a row of this camera for the table of readout times, to send as a pull "
-        "request: FILE_share.csv beside --out, and FILE_share.json for other programs", "CAMERA",
-    )  # fmt: skip
-    firmware: str = option("for --share: the camera's", "TEXT", "")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,8 +220,7 @@ def _finds_lens(args: Any, recording: Path) -> bool:
 def calibrate_one(args: Any) -> Figures:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
-        beside = {_MAP: args.map or args.board} | dict.fromkeys(_SHARED, args.share)
-        refuse_existing(args, *(name for name, written in beside.items() if written))
+        refuse_existing(args, *([_MAP] if args.map or args.board else []))
     if args.camera_info is not None:
         refuse_existing(with_values(args, out=args.camera_info))
     config = _config(args)
@@ -246,18 +229,15 @@ def calibrate_one(args: Any) -> Figures:
     camera = replace(source.camera, scan_direction=config.scan_direction)
     found = _calibrated(args, source, camera, config)
     refusal = verdict.refusal(found)
-    if args.out is not None and (args.force or not verdict.lens_refusal(found)):
-        refused = "" if args.force else refusal
-        written = _write(args, found, source.map, intrinsics, config, refused)
-        if refused and written:
+    if args.out is not None and not verdict.lens_refusal(found):
+        written = _write(args, found, source.map, intrinsics, config, refusal)
+        if refusal and written:
             refusal += (
                 f"; written to {args.out} and beside it: lens, map; not written: readout time and "
-                "scan direction, which stay unknown: no twists (--force writes them, too)"
+                "scan direction, which stay unknown: no twists"
             )
     if refusal:
         raise ValueError(refusal)
-    if args.share:
-        _share(args, found)
     return {
         "readout_time_ms": 1e3 * verdict.readout_time(found),
         "deviation_ms": 1e3 * found.deviation,
@@ -298,35 +278,9 @@ def _calibrated(args: Any, source: _Source, camera: Camera, config: NodeConfig) 
     return found
 
 
-def _share(args: Any, found: Calibration) -> None:
-    width, height = found.fit.camera.size
-    mode = f"{width}x{height} {1.0 / found.stamps.interval:.4g} Hz"
-    values = [(verdict.readout_time(found), found.deviation)]
-    _write_shared(
-        args.out.with_name(f"{args.out.stem}_share"),
-        [measured(args.share, mode, values, args.firmware)],
-        deviation=found.deviation,
-        scan_direction=str(verdict.scan_direction(found)),
-    )
-
-
-def _write_shared(path: Path, entries: Sequence[Known], **more: float | str) -> None:
-    files = path.with_name(f"{path.name}.csv"), path.with_name(f"{path.name}.json")
-    told = json.dumps([as_json(entry) | more for entry in entries], indent=1) + "\n"
-    with atomic_files(*files) as parts:
-        for part, text in zip(parts, (as_rows(entries), told), strict=True):
-            part.write_text(text, encoding="utf-8")
-    print(
-        f"written: {files[0]}, for rs_localizer/data/readout_times/table.csv: send it to us; and "
-        f"{files[1].name}, for other programs"
-    )
-
-
 def _config(args: Any) -> NodeConfig:
     if args.out is not None and args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
-    if args.share and args.out is None:
-        raise UsageError("--share needs --out FILE.yaml")
     return given_settings(args)
 
 
@@ -356,7 +310,7 @@ def _read(args: Any, config: NodeConfig) -> _Source:
 def _imu_of_video(args: Any, path: Path) -> ImuRecording | None:
     if args.imu is None:
         return None
-    telemetry = image_input.telemetry_of(path, args)
+    telemetry = image_input.telemetry_of(path)
     if args.imu or telemetry is None or args.rate is not None:
         raise UsageError(
             "-r imu:=TOPIC is for bags, and --imu for videos with a gyroscope of their own clock "
@@ -525,9 +479,8 @@ def _next(args: Any, out: Path, intrinsics: bool, shape: Path | None) -> str:
 
 def _calibrate_rig(args: Any) -> None:
     """Calibrate each camera alone, then all together, and say what was found."""
-    for name in ("imu", "share"):
-        if getattr(args, name) is not None:
-            raise UsageError(f"--{name} is for one camera: leave it out with --rig")
+    if args.imu is not None:
+        raise UsageError("--imu is for one camera: leave it out with --rig")
     # Cameras by name need a readout time; what it is does not matter where it is estimated.
     args.assignments = ["readout_time:=0.03", *args.assignments]
     config, recordings, maps = _config(args), dict[str, Recording](), list[MarkerMap]()
@@ -549,7 +502,7 @@ def _calibrate_rig(args: Any) -> None:
         recordings[name] = Recording(camera, _calibrated(of_args, source, camera, config))
     refusals = {name: verdict.refusal(each.calibration) for name, each in recordings.items()}
     refusals = {name: text for name, text in refusals.items() if text}
-    if refusals and not args.force:
+    if refusals:
         raise ValueError("; ".join(f"{name}: {text}" for name, text in refusals.items()))
     rig = calibrate_rig(recordings)
     first, comments = next(iter(rig)), list[str]()
@@ -563,8 +516,8 @@ def _calibrate_rig(args: Any) -> None:
             )
         if len(args.recordings) == 1 and is_bag(args.recordings[0]):
             _tell_tf(args.recordings[0], mounted, cameras[name].frame, cameras[first].frame)
-    refusals |= {name: text for name, one in rig.items() if (text := one.undetermined)}
-    if args.out is not None and (args.force or not refusals):
+    refusals = {name: text for name, one in rig.items() if (text := one.undetermined)}
+    if args.out is not None and not refusals:
         frames = {name: own.frame for name, own in cameras.items()}
         values = _of_maps(config, maps) | (_of_lenses(recordings) if intrinsics else {})
         _write_rig(args.out, _parts(rig, recordings, config), frames, values, comments, intrinsics)

@@ -71,7 +71,6 @@ class Options(TargetOptions, ImageOptions):
     out: Path = option("bag directory to create", "DIR", required=True)
     overwrite: bool = option("replace an earlier result", default=False)
     with_images: bool = option("copy compressed images, too", default=False, flag="--images")
-    timing: bool = option("say how long it took, and how much of it OpenCV did", default=False)
 
 
 def run(args: Options) -> Figures | None:
@@ -95,7 +94,7 @@ def detect_one(args: Options) -> Figures:
 
     def look(
         shots: Shots, bag: BagWriter, options: offline.Options, bar: Any
-    ) -> tuple[Recorded, Counter[str], tuple[float, float]]:
+    ) -> tuple[Recorded, Counter[str]]:
         notices: Counter[str] = Counter()
         detector = FrameDetector(config, lambda _, text: notices.update([text]), marker_map)
         detector.warm_up()
@@ -103,20 +102,13 @@ def detect_one(args: Options) -> Figures:
             shots, detector, bag, options, done=bar.update,
             tell=lambda text: bar.write(f"note: {text}", file=sys.stderr),
         )  # fmt: skip
-        return recorded, notices, detector.seconds
+        return recorded, notices
 
     every = []
-    for name, (recorded, notices, seconds), clock in _look(args, look, marker_map.settings):
+    for name, (recorded, notices), clock in _look(args, look, marker_map.settings):
         _tell(_place(args, name), recorded, notices)
         for fault in (*recorded.faults, *time_faults(args, clock, recorded.period, name)):
             print(f"warning: {fault}")
-        if args.timing:
-            whole, in_opencv = seconds
-            print(
-                f"time per image: {1e3 * whole / recorded.images:.2f} ms, of which OpenCV's search "
-                f"took {1e3 * in_opencv / recorded.images:.2f} ms and all else "
-                f"{100 * (1 - in_opencv / whole):.1f} %"
-            )
         every.append(recorded)
     tell_telemetry(args)
     return {
@@ -145,11 +137,12 @@ def _look(
                 rig = cameras_of(with_values(args, recordings=[args.images]), settings)
                 cameras = {name: own.args for name, own in rig.items()}
                 if args.calibration is not None and not is_bag(args.images):
-                    start = DEFAULT_START_NS if args.start is None else round(1e9 * args.start)
-                    bag.write(TF_STATIC, make_mounts(read_camchain(args.calibration)), start)
+                    bag.write(
+                        TF_STATIC, make_mounts(read_camchain(args.calibration)), DEFAULT_START_NS
+                    )
             for name, own in cameras.items():
                 with (
-                    opened(own, args.images, args.start) as source,
+                    opened(own, args.images) as source,
                     tqdm(total=source.total, unit="image", desc="detect", disable=None) as bar,
                 ):
                     shots: Shots = source.shots
@@ -190,7 +183,7 @@ def detect_features(args: Options) -> None:
     config = FeatureConfig(features=kind)
     if args.max_keypoints is not None:
         config = FeatureConfig(features=kind, max_keypoints=args.max_keypoints)
-    extractor, images = FrameExtractor(config), 0
+    extractor = FrameExtractor(config)
 
     def look(shots: Shots, bag: BagWriter, options: offline.Options, bar: Any) -> Extraction:
         return record_features(shots, extractor, bag, options, bar.update)
@@ -206,8 +199,4 @@ def detect_features(args: Options) -> None:
         tell_left_out(extraction.refused, extraction.carried)
         for fault in time_faults(args, clock, extraction.period, name):
             print(f"warning: {fault}")
-        images += len(extraction.stamps_ns)
     tell_telemetry(args)
-    if args.timing:
-        milliseconds = 1e3 * extractor.seconds / images
-        print(f"time per image: {milliseconds:.1f} ms, {1e3 / milliseconds:.0f} images/s")

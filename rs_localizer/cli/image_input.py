@@ -58,18 +58,9 @@ class ImageOptions(Settings, Inputs):
         f"as calibrate writes it, lens and shutter; or {CALIBRATION_KINDS} (default: the bag's "
         "camera_info)", "FILE", flag=CAMERA_FLAGS,
     )  # fmt: skip
-    no_telemetry: bool = option(
-        "ignore the gyroscope and the readout time inside a video, or in its log file",
-        default=False,
-    )
     rate: float | None = option(
         "images per second, instead of the presentation times of a video, or for files whose names "
         "are not times in ns", "HZ", limits=(0.0, math.inf), above=True,
-    )  # fmt: skip
-    start: float | None = option(
-        "time of the first image of a video or folder, s (default: "
-        f"{DEFAULT_START_NS * 1e-9:g}, since ROS takes 0 for none; of names that are times, their "
-        "own)", "S", limits=(0.0, math.inf),
     )  # fmt: skip
 
 
@@ -80,7 +71,7 @@ def shutter_values(args: Any) -> dict[str, Any]:
     if not given and is_bag(args.images) and beside.exists():
         return given_values(with_values(args, params=beside))
     values = given_values(args)
-    telemetry = telemetry_of(args.images, args)
+    telemetry = telemetry_of(args.images)
     if telemetry is not None and telemetry.readout_time is not None:
         values.setdefault("readout_time", telemetry.readout_time)
     if calibration is not None and not {"readout_time", "cameras"} & set(values):
@@ -89,13 +80,13 @@ def shutter_values(args: Any) -> dict[str, Any]:
     return values
 
 
-def telemetry_of(path: Path, args: Any) -> Telemetry | None:
-    """What a video says of its camera; None: nothing, or it is not to be used.
+def telemetry_of(path: Path) -> Telemetry | None:
+    """What a video says of its camera; None: nothing, or what stabilization has made wrong.
 
     Raises:
         ValueError: for telemetry that cannot be read.
     """
-    telemetry = None if getattr(args, "no_telemetry", True) else _telemetry(path)
+    telemetry = _telemetry(path)
     return None if telemetry is None or telemetry.stabilizer else telemetry
 
 
@@ -110,9 +101,9 @@ def _can_read() -> bool:
     return all(importlib.util.find_spec(name) is not None for name in ("telemetry_parser", "av"))
 
 
-def video_imu(telemetry: Telemetry, start_ns: int = DEFAULT_START_NS) -> ImuRecording:
-    """The readings of a video whose first image has this stamp."""
-    stamps = start_ns + np.round(1e9 * telemetry.times).astype(np.int64)
+def video_imu(telemetry: Telemetry) -> ImuRecording:
+    """The readings of a video."""
+    stamps = DEFAULT_START_NS + np.round(1e9 * telemetry.times).astype(np.int64)
     return ImuRecording(stamps, telemetry.rates, np.eye(3))
 
 
@@ -123,14 +114,12 @@ def tell_telemetry(
     """Say what a video knows of its camera, and what is not used of it.
 
     Args:
-        args: with ``images`` and ``no_telemetry``.
+        args: with ``images``.
         used: the readout time that was measured, s; None: that of the settings is used.
         measured: the camera, if it was measured.
         lens: whether a lens profile takes the place of a calibration.
     """
     path = args.images
-    if args.no_telemetry:
-        return
     is_rig = measured is None and bool(build(shutter_values(args)).of_cameras)
     if path.suffix == ".insv" and importlib.util.find_spec("av") is not None:
         names = LENSES[: count_lenses(path)]
@@ -169,7 +158,7 @@ def tell_telemetry(
                         f" (its focal length is {profile.K[0, 0]:.0f} px, {focal:.0f} px was "
                         "measured: of another mode?)"
                     )
-    print(f"{telemetry.camera}: {', '.join(said)}; --no-telemetry ignores them")
+    print(f"{telemetry.camera}: {', '.join(said)}")
 
 
 def write_shutter(args: Any, out: Path, of_map: Mapping[str, float] | None = None) -> None:
@@ -232,14 +221,13 @@ class Source:
 
 @contextlib.contextmanager
 def opened(
-    args: Any, path: Path, start: float | None = None, calibrated: bool = True,
+    args: Any, path: Path, calibrated: bool = True,
 ) -> Iterator[Source]:  # fmt: skip
     """Images with the lens of ``args.calibration`` or, of a bag, its camera_info.
 
     Args:
         args: with ``rate``, and the ``remaps`` of topics of a bag.
         path: of the images.
-        start: time of the first one, s; not of a bag.
         calibrated: refuse images without a calibration.
 
     Raises:
@@ -255,23 +243,22 @@ def opened(
                 raise UsageError(
                     "cameras in one file: --camera FILE_camchain.yaml of calibrate --rig"
                 )
-            yield of_files(args, path, read_calibration(args.calibration), start)
+            yield of_files(args, path, read_calibration(args.calibration))
             return
-        telemetry = telemetry_of(path, args)
+        telemetry = telemetry_of(path)
         camera = None if args.calibration is None else read_calibration(args.calibration)
         if camera is None and calibrated:
             camera = None if telemetry is None else telemetry.profile
             if camera is None:
                 raise UsageError("a video or folder has no camera_info: give --camera")
-        source = of_files(args, path, camera, start)
+        source = of_files(args, path, camera)
         if telemetry is not None and source.clock is not None:
             moving = with_telemetry(source.shots, telemetry, source.clock)
             source = replace(source, shots=moving)
         yield source
         return
-    for name, value in (("rate", args.rate), ("start", start)):
-        if value is not None:
-            raise UsageError(f"--{name} is for videos and folders; a bag has its own times")
+    if args.rate is not None:
+        raise UsageError("--rate is for videos and folders; a bag has its own times")
     with open_bag(path) as bag:
         if bag.fault is not None:
             print(f"warning: {bag.fault}")
@@ -289,27 +276,26 @@ def of_bag(bag: BagReader, camera: Camera | None, args: Any, calibrated: bool = 
     return Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
 
 
-def of_files(args: Any, path: Path, camera: Camera | None, start: float | None = None) -> Source:
+def of_files(args: Any, path: Path, camera: Camera | None) -> Source:
     """The images of a folder, of a video, or of its lens ``args.lens``, if there is one.
 
     Raises:
         UsageError: when they have no times, and there is no ``args.rate``.
     """
     rate, lens = args.rate, getattr(args, "lens", None)
-    start_ns = None if start is None else round(start * 1e9)
     if lens is not None:  # their common zero is the first image of the first one
-        clock = ImageClock(None, start_ns, zero_ns=0)
+        clock = ImageClock()
         return Source(from_video(path, camera, clock, lens), None, clock)
     if not path.is_dir():
         if rate is None and not has_times(path):
             raise UsageError("this video has no presentation times: give --rate; the readout time "
                              "scales with it")  # fmt: skip
-        clock = ImageClock(rate, start_ns)
+        clock = ImageClock(rate)
         return Source(from_video(path, camera, clock), None, clock)
     files = image_files(path)
     if rate is None and name_times(files) is None:
         raise UsageError("the names of the files are not times: give --rate")
-    clock = ImageClock(rate, start_ns)
+    clock = ImageClock(rate)
     return Source(from_files(files, camera, clock), len(files), clock)
 
 

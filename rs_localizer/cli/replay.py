@@ -104,10 +104,6 @@ class Options(Settings, Inputs, Many):
     calibration: Path | None = option(
         "as calibrate writes it: lens and shutter; or a lens alone", "FILE", flag=CAMERA_FLAGS
     )
-    no_telemetry: bool = option(
-        "ignore the gyroscope and the readout time inside a video, or in its log file",
-        default=False,
-    )
     smooth: bool = option(
         "one motion through all images, from those before and after each; images without a pose "
         f"are bridged where their neighbours determine them, and listed in {BRIDGED}",
@@ -220,7 +216,7 @@ def _detection(options: Options, recording: Path, out: Path) -> detect.Options:
     return detect.Options(
         images=recording, out=out, map=place if by_markers else None, features=features,
         calibration=calibration, params=params, assignments=options.assignments,
-        remaps=options.remaps, no_telemetry=options.no_telemetry,
+        remaps=options.remaps,
     )  # fmt: skip
 
 

@@ -21,15 +21,10 @@ class ImageClock:
 
     Args:
         rate: images per second instead of the file's own times; None: these.
-        start_ns: stamp of the first image; None: its own where the file has absolute times,
-            otherwise :data:`DEFAULT_START_NS` and its time in the file.
-        zero_ns: own time that becomes ``start_ns``; None: that of the first image.
         missing: what is to be said of images that could not be read.
     """
 
     rate: float | None = None
-    start_ns: int | None = None
-    zero_ns: int | None = None
     missing: str | None = None
     _images: int = 0
     _first_ns: int = 0  # own time of the first image
@@ -43,40 +38,42 @@ class ImageClock:
         Raises:
             TimesError: when the file has no times and no rate was given.
         """
-        return self._stamp(own_ns, DEFAULT_START_NS)
+        return self._stamp(own_ns)
 
     def absolute(self, own_ns: int) -> int:
         """Stamp of the next file of a folder whose names are times."""
         self._absolute = True
-        stamp = self._stamp(own_ns, own_ns)
+        stamp = self._stamp(own_ns)
         assert stamp is not None
         return stamp
 
-    def _stamp(self, own_ns: int | None, default_start_ns: int) -> int | None:
+    @property
+    def _zero_ns(self) -> int:
+        """Stamp of the zero of the file's clock."""
+        return 0 if self._absolute else DEFAULT_START_NS
+
+    @property
+    def _start_ns(self) -> int:
+        """Stamp of the first image, of those that come at a rate."""
+        return self._first_ns if self._absolute else DEFAULT_START_NS
+
+    def _stamp(self, own_ns: int | None) -> int | None:
         index = self._images
         self._images += 1
         if own_ns is not None:
             if self._timed == 0:
                 self._first_ns = own_ns
-            if self.zero_ns is None:
-                starts_at_zero = self.start_ns is None and not self._absolute
-                self.zero_ns = 0 if starts_at_zero else own_ns
             self._last_ns = own_ns
             self._timed += 1
-        if index == 0 and self.start_ns is None:
-            self.start_ns = default_start_ns
-        assert self.start_ns is not None
         if self.rate is not None:
-            return self.start_ns + round(index * 1e9 / self.rate)
+            return self._start_ns + round(index * 1e9 / self.rate)
         if own_ns is None and index <= 1:  # the first is at 0 in a file without times, too
             raise TimesError("the images have no times of their own: give --rate")
-        return None if own_ns is None else self.start_ns + own_ns - (self.zero_ns or 0)
+        return None if own_ns is None else self._zero_ns + own_ns
 
     def at(self, own_ns: int) -> int | None:
         """Stamp of a moment of a video's clock, after its first image; None: with a rate."""
-        if self.rate is not None or self.start_ns is None:
-            return None
-        return self.start_ns + own_ns - (self.zero_ns or 0)
+        return self._zero_ns + own_ns if self.rate is None and self._images else None
 
     @property
     def own_rate(self) -> float | None:
@@ -90,9 +87,8 @@ class ImageClock:
         source = own if self.rate is None else f"--rate {self.rate:g}"
         own_rate = self.own_rate
         pace = f", {own_rate:.4g} images/s on average" if own_rate and self.rate is None else ""
-        first_ns = 0 if self.rate is not None else self._first_ns - (self.zero_ns or 0)
-        start = round(((self.start_ns or 0) + first_ns) * 1e-9, 3)
-        return f"times: {source}{pace}; the first image at {start:.14g} s (--start sets it)"
+        first_ns = self._zero_ns + self._first_ns if self.rate is None else self._start_ns
+        return f"times: {source}{pace}; the first image at {round(first_ns * 1e-9, 3):.14g} s"
 
     def fault(self) -> str | None:
         """What speaks against the images, or else against a given rate."""

@@ -110,7 +110,8 @@ def read_telemetry(path: Path) -> Telemetry | None:
         return interpreted(run_limited(_SCRIPT, {"path": str(path)}, memory, seconds))
     except (LimitedError, TelemetryError) as error:
         raise TelemetryError(
-            f"{path}: its telemetry cannot be read, --no-telemetry goes on without: {error}"
+            f"{path}: its telemetry cannot be read (ffmpeg -i IN -map 0:v -c copy OUT goes on "
+            f"without): {error}"
         ) from error
 
 

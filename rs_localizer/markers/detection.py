@@ -5,7 +5,6 @@
 The node and the offline command run this one class, so the same images give the same corners.
 """
 
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -78,8 +77,6 @@ class MarkerDetector:
 
     def __init__(self, marker_map: MarkerMap, min_side: float = 0.0) -> None:
         self.map = marker_map
-        # Spent so far: altogether, and in OpenCV's search for markers and chessboards.
-        self.seconds = self.opencv_seconds = 0.0
         self._min_side = min_side
         self._points = marker_map.points
         self._finders = _finders(marker_map)
@@ -116,7 +113,6 @@ class MarkerDetector:
         """
         if image.dtype != np.uint8 or image.ndim != 2 or 0 in image.shape:
             raise ValueError(f"an image must be (h,w) uint8, got {image.dtype} {image.shape}")
-        started = time.perf_counter()
         image = np.ascontiguousarray(image)
         everything = self._images < _FIRST_IMAGES or self._images % _ONE_IN == 0
         self._images += 1
@@ -127,15 +123,12 @@ class MarkerDetector:
         boards = []
         self._faults: list[str] = []
         for row, board in self._boards:
-            looking = time.perf_counter()
             rows, pixels = self._board(image, board, observations, stamp_ns)
-            if not isinstance(board, Charuco):
-                self.opencv_seconds += time.perf_counter() - looking
             if len(rows):
                 parts.append((row + rows, pixels, _spacings(pixels)))
                 boards.append((board.name, pixels))
         rows = np.concatenate([np.empty(0, np.int64), *(part[0] for part in parts)])
-        detections = Detections(
+        return Detections(
             ids=rows,
             points=self._points[rows],
             pixels=np.concatenate([np.empty((0, 2)), *(part[1] for part in parts)]),
@@ -153,14 +146,10 @@ class MarkerDetector:
             ),
             faults=tuple(self._faults),
         )
-        self.seconds += time.perf_counter() - started
-        return detections
 
     def _quads(self, finder: MarkerFinder, image: Gray) -> MarkerQuads:
         family = finder.family
-        started = time.perf_counter()
         ids, quads = finder.find(image)
-        self.opencv_seconds += time.perf_counter() - started
         order = np.argsort(ids, kind="stable")  # OpenCV's threads may give any order
         ids, quads = ids[order], np.ascontiguousarray(quads[order])
         large = _sides(quads) >= self._min_side

@@ -85,11 +85,6 @@ class FrameDetector:
         """Compile the kernels."""
         warm_up()
 
-    @property
-    def seconds(self) -> tuple[float, float]:
-        """Spent looking for markers so far: altogether, and of that in OpenCV's search."""
-        return self._detector.seconds, self._detector.opencv_seconds
-
     def take(self, message: Any) -> Detected | Refusal:
         """Look for markers in a sensor_msgs/Image or CompressedImage."""
         image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)

@@ -5,7 +5,6 @@
 The node and the offline ``rs_localizer detect --features`` run this one class.
 """
 
-import time
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -54,7 +53,6 @@ class FrameExtractor:
 
     def __init__(self, config: FeatureConfig) -> None:
         self._extractor = FeatureExtractor(config.features, config.max_keypoints)
-        self.seconds = 0.0  # spent so far
 
     def warm_up(self) -> None:
         """Nothing is compiled: OpenCV does the work."""
@@ -66,7 +64,4 @@ class FrameExtractor:
 
     def extract(self, image: Image) -> Extracted:
         """Look for keypoints in an image."""
-        start = time.perf_counter()
-        features = self._extractor.extract(image.pixels)
-        self.seconds += time.perf_counter() - start
-        return Extracted(image, features)
+        return Extracted(image, self._extractor.extract(image.pixels))

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``rs_localizer calibrate``, ``readout`` and ``replay --smooth``: the real recording, faults."""
 
-import csv
-import json
 import re
 from pathlib import Path
 
@@ -32,7 +30,7 @@ def flight(tmp_path_factory) -> Path:
 
 
 def test_the_webcam(tmp_path, capsys):
-    """Its images have no times of their own: refused, and written on request only."""
+    """Its images have no times of their own: the readout time is refused, the lens is written."""
     out, plots = tmp_path / "webcam.yaml", tmp_path / "plots"
     recording = str(data.path(data.WEBCAM))
     words = ["calibrate", recording, "--out", str(out)]
@@ -42,13 +40,10 @@ def test_the_webcam(tmp_path, capsys):
     assert "off their stamps" in said.err
     assert "times less likely" not in said.out
     assert not out.exists()
-    assert main([*words, "--intrinsics", "--plot", str(plots), "--force", *alone]) == 1
+    assert main([*words, "--intrinsics", "--plot", str(plots), *alone]) == 1
     assert [file.name for file in plots.iterdir()] == ["readout_time.png"]
     values = load_params_file(out)
-    # A third of the interval, by single poses (see ATTRIBUTION.md).
-    assert 0.010 < values["readout_time"] < 0.015
-    assert 0.0 < values["readout_time_deviation"] < 2e-3
-    assert values["scan_direction"] == "top_to_bottom"
+    assert "readout_time" not in values
     camera = read_calibration(out)
     assert camera.K[0, 0] == pytest.approx(529.0, rel=0.02)
     np.testing.assert_allclose(read_calibration(tmp_path / "lens.yaml").D, camera.D)
@@ -66,9 +61,8 @@ def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path, caps
 
         monkeypatch.setattr(calibration_plots, name, drawn)
     words = ["-p", "scan_direction:=bottom_to_top", "--out", str(out)]
-    share = ["--share", "Maker One", "--firmware", "2.10"]
     pictures = ["--plot", str(tmp_path / "plots")]
-    assert main(["calibrate", str(flight), *words, *share, *pictures]) == 0
+    assert main(["calibrate", str(flight), *words, *pictures]) == 0
     parts = re.findall(r" to +[\d.]+ s +([-+][\d.]+) \+- ", capsys.readouterr().out)
     assert parts
     assert all(10.0 < float(part) < 30.0 for part in parts), parts
@@ -77,15 +71,7 @@ def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path, caps
     assert 10.0 < blocks.y0 < blocks.y1 < 30.0
     values = load_params_file(out)
     assert values["scan_direction"] == "top_to_bottom"
-    (row,) = csv.DictReader((tmp_path / "camera_share.csv").read_text().splitlines())
-    assert (row["name"], row["mode"]) == ("Maker One", "640x480 30 Hz")
-    assert float(row["median_ms"]) == pytest.approx(1e3 * values["readout_time"], abs=6e-4)
-    assert row["source"].endswith(" ms, firmware 2.10)")
     assert abs(values["readout_time"] - 0.02) < 4.0 * values["readout_time_deviation"]
-    (told,) = json.loads((tmp_path / "camera_share.json").read_text())
-    assert told["median"] == pytest.approx(values["readout_time"], rel=1e-5)
-    assert told["gyroflow"] == pytest.approx(1e3 * told["median"] * 480 / 479, rel=1e-5)
-    assert told["scan_direction"] == "top_to_bottom"
 
 
 def test_an_imu(flight, tmp_path, capsys):
@@ -120,8 +106,7 @@ def test_faults(flight, tmp_path, capsys):
     board = ["--board", "5x4", "--square", "0.1"]
     for code, words in (
         (1, [str(tmp_path / "none")]), (2, [str(flight), "--out", str(tmp_path / "x.txt")]),
-        (2, [str(flight), "--share", "Maker One"]), (2, [str(flight), *board]),
-        (2, [str(video), *board]), (1, [str(nothing), *board]),
+        (2, [str(flight), *board]), (2, [str(video), *board]), (1, [str(nothing), *board]),
     ):  # fmt: skip
         assert main(["calibrate", *words]) == code
     earlier = tmp_path / "earlier.yaml"

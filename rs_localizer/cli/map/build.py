@@ -90,7 +90,7 @@ def look_at_images(args: Any, looker: Looker) -> Looked:
     size = None
     images, stamps = 0, list[int]()
     refused, named = dict[str, str](), dict[float, int]()
-    with opened(args, args.images, args.start, calibrated=False) as source, tqdm(
+    with opened(args, args.images, calibrated=False) as source, tqdm(
         total=source.total, unit="image", desc="look", disable=None
     ) as bar:  # fmt: skip
         for shot in source.shots:
