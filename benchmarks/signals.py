@@ -24,10 +24,10 @@ from typing import NamedTuple
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PROGRAM = (sys.executable, "-m", "rs_localizer")
 # Commands by name, and their inputs; each writes to out, or to files that begin so.
-_FLIGHT = "simulate flight --duration 4 --points 60 --rate 20".split()
+_FLIGHT = "simulate flight --duration 4 --points 60".split()
 _FILM = (
-    "simulate film --images --walls marked_room --duration 1 --rate 6 "
-    "--angular-velocity 0 0.1 0 --linear-velocity 0.5 0 0"
+    "simulate film --images --walls marked_room --duration 0.2 "
+    "--angular-velocity 0 0.5 0 --linear-velocity 2.5 0 0"
 ).split()
 COMMANDS = {
     "replay": "replay flight --params flight/parameters.yaml --out out",

@@ -30,11 +30,10 @@ from rs_localizer.tools.adjust.problem import LIMIT
 from rs_localizer.tools.adjust.variables import Extrinsics, Mounting
 from rs_localizer.tools.mapping.survey import Survey, survey, survey_rig
 from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
-from rs_localizer.tools.simulation.planes import TexturedPlane
 from rs_localizer.tools.simulation.renderer import Renderer
 from rs_localizer.tools.simulation.settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import TrueState
-from rs_localizer.tools.simulation.walls import PAPER_AND_INK, printed
+from rs_localizer.tools.simulation.walls import PAPER_AND_INK, TexturedPlane, printed
 
 _CELL_TEXELS = 24
 _GREY_NOISE = 2.0

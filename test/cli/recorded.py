@@ -14,13 +14,13 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
+from benchmarks.simulation.imu import ImuSettings, make_imu
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.telemetry import CAMERA_FROM_SENSOR
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.tools.simulation.imu import make_imu
-from rs_localizer.tools.simulation.settings import FrameSettings, ImuSettings
+from rs_localizer.tools.simulation.settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03

@@ -11,6 +11,7 @@ import pytest
 from recorded import tf
 from scipy.spatial.transform import Rotation
 
+from benchmarks.simulation.__main__ import record
 from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, open_bag
@@ -78,7 +79,7 @@ def test_an_imu(flight, tmp_path, capsys):
     """Its stamps are 5 ms early, and TF is 20 degrees off."""
     true, off, out = (tmp_path / name for name in ("true", "off", "camera.yaml"))
     words = [*MOVING.split(), "--imu", "--imu-offset", "0.005"]
-    assert main(["simulate", str(true), *words]) == 0
+    record(true, *words)
     with open_bag(true) as bag, BagWriter(off) as copy:
         for topic, stamp_ns, message in bag.messages(tuple(bag.topics)):
             if topic == "/tf_static":

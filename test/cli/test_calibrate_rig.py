@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.simulation.__main__ import record
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.rigs import RigParts, read_camchain, write_camchain
@@ -21,6 +22,7 @@ K = np.array([[420.0, 0.0, 320.0], [0.0, 422.0, 240.0], [0.0, 0.0, 1.0]])
 LENS = [-0.12, 0.04, 0.001, -0.0015]
 # The second camera looks back, 10 cm to the right; its stamps are 30 ms late.
 AXES = Rotation.from_euler("yx", [175.0, 10.0], degrees=True).as_matrix()
+MOVING = "--trajectory tum_vi_room5 --duration 3 --points 60".split()
 CENTRE, OFFSET = np.array([0.1, -0.02, -0.05]), 0.03
 
 
@@ -36,18 +38,15 @@ def rig(tmp_path_factory):
     )
 
 
-def record(folder, rig, *words):
+def recorded(folder, rig, *words):
     write_camchain(folder / "chain.yaml", rig)
-    out = folder / "pair"
-    simulate = ["simulate", str(out), "--rig", str(folder / "chain.yaml"), "--noise", "0.3", *words]
-    assert main(simulate) == 0
-    return str(out)
+    record(folder / "pair", "--rig", folder / "chain.yaml", "--noise", "0.3", *words)
+    return str(folder / "pair")
 
 
 @pytest.fixture(scope="module")
 def pair(rig, tmp_path_factory):
-    words = "--trajectory tum_vi_room5 --duration 3 --points 60".split()
-    return record(tmp_path_factory.mktemp("pair"), rig, *words)
+    return recorded(tmp_path_factory.mktemp("pair"), rig, *MOVING)
 
 
 def test_a_pair(pair, tmp_path, capsys):
@@ -87,7 +86,7 @@ def test_cameras_are_chosen_with_an_axis_of_their_own(rig, tmp_path):
         "rear": Camera(640, 480, K, LENS, "plumb_bob", 0.03, "right_to_left"),
     }
     sideways = RigParts(cameras, rig.camera_from_rig, rig.time_offset)
-    pair = record(tmp_path, sideways, *"--trajectory tum_vi_room5 --duration 3 --points 60".split())
+    pair = recorded(tmp_path, sideways, *MOVING)
     settings = ("cameras:=[rear, front]", "rear.scan_direction:=left_to_right",
                 "rear.stamp_offset:=0.5")  # fmt: skip
     words = [word for setting in settings for word in ("-p", setting)]
@@ -102,7 +101,7 @@ def test_cameras_are_chosen_with_an_axis_of_their_own(rig, tmp_path):
 
 def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
     words = "--duration 2 --points 40 --angular-velocity 0 0 0 --linear-velocity 0 0 0".split()
-    pair = record(tmp_path, rig, *words)
+    pair = recorded(tmp_path, rig, *words)
     assert main(["calibrate", "--rig", pair, "--out", str(tmp_path / "rig.yaml")]) == 1
     (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
     assert "front: not observable" in line

@@ -30,7 +30,7 @@ SHUTTER = ["-p", "readout_time:=0.03"]
 def recordings(tmp_path_factory) -> list[str]:
     """Two flights of one name, and a file that is none."""
     path = tmp_path_factory.mktemp("bags")
-    words = ["--rate", "10", "--duration", "0.65", "--angular-velocity", "0", "1.2", "0.6"]
+    words = ["--duration", "0.26", "--angular-velocity", "0", "1.2", "0.6"]
     for seed, folder in enumerate(("a", "b")):
         out = str(path / folder / "flight")
         assert main(["simulate", out, *words, "--seed", str(seed)]) == 0

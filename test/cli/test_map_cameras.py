@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from benchmarks.simulation.__main__ import record
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
@@ -49,7 +50,7 @@ def film(tmp_path_factory):
         *options, file = SCENE[which]
         scene = (*options, str(folder / file))
         if not out.exists():
-            assert main(["simulate", str(out), *ROOM, *scene, *words]) == 0
+            record(out, *ROOM, *scene, *words)
         return out
 
     return film
@@ -59,7 +60,7 @@ def film(tmp_path_factory):
 def images(film):
     """Of the walls."""
     words = ("--images", "--start", "20", "--duration", "0.8", "--exposure", "0.002")
-    return lambda which: film(which, "images", *words, "--grey-noise", "2")
+    return lambda which: film(which, "images", *words, "--noise", "2")
 
 
 def test_poses_of_a_detector_of_each_camera(images, tmp_path, capsys):

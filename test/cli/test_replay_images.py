@@ -24,7 +24,7 @@ READOUT = 0.02
 def walls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bag of images, and beside it the same as a video with its calibration."""
     path = tmp_path_factory.mktemp("images") / "walls"
-    words = ["--images", "--duration", "0.4", "--format", "png", "--readout-time", str(READOUT)]
+    words = ["--images", "--duration", "0.4", "--readout-time", str(READOUT)]
     assert main(["simulate", str(path), *words, "--trajectory", "tum_vi_room5"]) == 0
     with open_bag(path) as bag:
         (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("Image"))

@@ -7,13 +7,15 @@ import recorded
 from numpy.lib.recfunctions import repack_fields
 from recorded import SHUTTER
 
+from benchmarks.simulation.__main__ import record
+from benchmarks.simulation.keypoints import keypoint_rows, random_descriptors
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map, map_rows
 from rs_localizer.io.trajectories import read_motions, read_tum
 from rs_localizer.tools.simulation.recording import write_simulated
-from rs_localizer.tools.simulation.scene import keypoint_rows, random_descriptors, room
+from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.settings import FrameSettings
 
 FRAMES = 8
@@ -57,18 +59,13 @@ def test_a_recording_of_everything(tmp_path, capsys):
         np.testing.assert_allclose(found[name], found["clouds"][2:], atol=0.01)
 
 
-def test_a_simulated_recording_and_its_map(tmp_path, monkeypatch, capsys):
-    """The line that simulate prints as the next one works, and gives the true poses."""
-    monkeypatch.chdir(tmp_path)
-    assert main(["simulate", "flight", "--keypoints", "--duration", "0.4", "--points", "200"]) == 0
-    said = capsys.readouterr().out
-    following = said.splitlines()[-1].removeprefix("next: rs_localizer ").split()
-    assert following[-4:] == ["--map", "flight/map.npz", "--out", "flight_poses"]
-    assert main(following) == 0
-    found = read_tum(tmp_path / "flight_poses" / "poses.txt")
-    truth = read_motions(tmp_path / "flight", "/truth/pose", "/truth/twist").poses
+def test_a_recording_beside_its_map(tmp_path):
+    flight, out = tmp_path / "flight", tmp_path / "poses"
+    record(flight, "--keypoints", "--duration", "0.4", "--points", "200")
+    words = ["--params", f"{flight}/parameters.yaml", "--map", f"{flight}/map.npz"]
+    assert main(["replay", str(flight), *words, "--out", str(out)]) == 0
+    found = read_tum(out / "poses.txt")
+    truth = read_motions(flight, "/truth/pose", "/truth/twist").poses
     assert len(found) == 12
     off = found.positions - truth.positions[np.isin(truth.stamps_ns, found.stamps_ns)]
     assert np.median(np.linalg.norm(off, axis=1)) < 0.02
-    assert main(["simulate", "other", "--keypoints", "--images"]) == 2
-    assert "--keypoints is for points" in capsys.readouterr().err

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.simulation.__main__ import record
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
@@ -99,7 +100,7 @@ def test_markers_are_where_map_and_truth_put_them(tmp_path):
     file.write_text(shutter + lens_parameters(Camera(640, 480, K, D)))
     words = ("--images", *TURN, "--camera", str(file), "--duration", "0.1")
     words += ("--scan-direction", "right_to_left")
-    noise = ("--format", "png", "--exposure", "0.002", "--grey-noise", "1")
+    noise = ("--exposure", "0.002", "--noise", "1")
     assert simulate(tmp_path / "bag", *words, *noise) == 0
     corners = {m.id: m.corners for m in read_marker_map(tmp_path / "bag/marker_map.yaml").markers}
     truth = read_motions(tmp_path / "bag", "/truth/pose", "/truth/twist")
@@ -142,7 +143,7 @@ def detect(image: np.ndarray) -> dict[int, np.ndarray]:
 
 
 def test_a_recording_holds_readings_and_where_they_were_taken(tmp_path):
-    assert simulate(tmp_path / "bag", *SHORT, *TURN, "--imu", "--imu-offset", "0.004") == 0
+    record(tmp_path / "bag", *SHORT, *TURN, "--imu", "--imu-offset", "0.004")
     with open_bag(tmp_path / "bag") as bag:
         assert bag.topics["/imu"] == "sensor_msgs/msg/Imu"
         messages = list(bag.messages(["/imu", "/correspondences", "/camera_info"]))
@@ -170,7 +171,7 @@ def test_a_recording_holds_readings_and_where_they_were_taken(tmp_path):
 
 
 def test_replay_uses_it_and_says_so(tmp_path, capsys):
-    assert simulate(tmp_path / "bag", *SHORT, *TURN, "--imu") == 0
+    record(tmp_path / "bag", *SHORT, *TURN, "--imu")
     replay = ["replay", str(tmp_path / "bag"), "-p", "readout_time:=0.03"]
     capsys.readouterr()
     poses = []

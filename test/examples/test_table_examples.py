@@ -21,10 +21,9 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.tools.simulation.frames import middle_stamp
-from rs_localizer.tools.simulation.planes import TexturedPlane
 from rs_localizer.tools.simulation.renderer import Renderer
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
-from rs_localizer.tools.simulation.walls import collage
+from rs_localizer.tools.simulation.walls import TexturedPlane, collage
 
 SLOW = ["--angular-velocity", "0.2", "0.5", "-0.3", "--linear-velocity", "0.3", "0.1", "0.1"]
 SHOTS = ["--duration", "0.2", "--noise", "0.001", "--outliers", "0", "--readout-time", "0.02"]

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from benchmarks.honesty.scores import Truth, score
+from benchmarks.simulation.__main__ import record
 from rs_localizer.cli.main import main
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
@@ -125,7 +126,7 @@ def test_a_vibrating_camera_is_smoothed_beside_what_its_gyroscope_knows(tmp_path
     path = tmp_path / "shaken"
     words = "--trajectory tum_vi_room5 --start 20 --duration 3 --points 80 --outliers 0"
     shaking = "--vibration 0.3 60 --imu --seed 4".split()
-    assert main(["simulate", str(path), *words.split(), *shaking]) == 0
+    record(path, *words.split(), *shaking)
     with open_bag(path) as bag:
         topics = find_topics(bag)
         localizer = FrameLocalizer(CONFIG, transforms=find_transforms(bag, topics, CONFIG))

@@ -9,6 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.simulation.rig import (
+    RigFrame,
+    camera_stamps,
+    rig_parameters,
+    simulate_rig,
+    write_rig_frame,
+)
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
@@ -16,13 +23,6 @@ from rs_localizer.io.rigs import RigParts, make_mounts
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import write_parameters
 from rs_localizer.tools.simulation.frames import simulate_frames
-from rs_localizer.tools.simulation.rig import (
-    RigFrame,
-    camera_stamps,
-    rig_parameters,
-    simulate_rig,
-    write_rig_frame,
-)
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from rs_localizer.cli.main import main
+from benchmarks.simulation.__main__ import record
 from rs_localizer.config import Imu, NodeConfig
 from rs_localizer.core.reasons import ImuReason
 from rs_localizer.inertial.buffer import Readings
@@ -62,7 +62,7 @@ class Flight:
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory) -> Flight:
     path = tmp_path_factory.mktemp("bags") / "flight"
-    assert main(["simulate", str(path), *FLIGHT]) == 0
+    record(path, *FLIGHT)
     return Flight(path)
 
 
@@ -223,7 +223,7 @@ def test_a_gyroscope_at_the_end_of_its_range(tmp_path):
     path = tmp_path / "swung"
     poses = swinging(tmp_path / "poses.txt")
     words = ("--trajectory", str(poses), "--points", "80", "--noise", "0.3", "--imu")
-    assert main(["simulate", str(path), *words]) == 0
+    record(path, *words)
     flight = Flight(path)
     flown = fly(flight, lambda message, time: (clipped(message, 2.2),))
     flown.assert_none_is_lost_or_wrong(count(flight))

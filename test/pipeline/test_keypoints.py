@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import rs_localizer.pipeline.landmarks
+from benchmarks.simulation.keypoints import keypoint_rows, random_descriptors
 from rs_localizer.config import Matching, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
@@ -21,7 +22,7 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.landmarks import read_landmarks
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.tools.simulation.scene import keypoint_rows, random_descriptors, room
+from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 

@@ -70,7 +70,7 @@ def array(kind: str, header: Any, tags: list[tuple[str, int, np.ndarray]]) -> An
 @pytest.fixture(scope="module")
 def walls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("tags") / "walls"
-    words = ["--images", "--duration", "0.2", "--readout-time", str(READOUT), "--format", "png"]
+    words = ["--images", "--duration", "0.2", "--readout-time", str(READOUT)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rs_localizer.tools.simulation.walls, "_FAMILY", "apriltag_36h11")
         assert main(["simulate", str(path), *words, "--trajectory", "tum_vi_room5"]) == 0

@@ -15,7 +15,7 @@ FLIGHT = "--images --trajectory tum_vi_room5 --start 21 --duration 0.8 --exposur
 
 def test_poses_of_images_are_those_of_the_truth(tmp_path):
     images, markers = str(tmp_path / "images"), str(tmp_path / "markers")
-    assert main(["simulate", images, *FLIGHT, "--grey-noise", "2"]) == 0
+    assert main(["simulate", images, *FLIGHT, "--noise", "2"]) == 0
     assert main(["detect", images, "--map", f"{images}/marker_map.yaml", "--out", markers]) == 0
     truth = read_motions(tmp_path / "images", TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC)
     shutter = ["--params", f"{markers}/parameters.yaml", "-p", "pose_time:=mid_frame"]

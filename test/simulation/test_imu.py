@@ -8,16 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.simulation.imu import ImuSettings, Lever, Shaken, shaken, simulate_imu
 from rs_localizer import data
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.tools.simulation.imu import Lever, simulate_imu
-from rs_localizer.tools.simulation.settings import ImuSettings
-from rs_localizer.tools.simulation.true_motion import (
-    ConstantVelocity,
-    RecordedMotion,
-    Shaken,
-    shaken,
-)
+from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion
 
 PERFECT = ImuSettings(2000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 CAMERA_FROM_IMU = Rotation.from_euler("xyz", [20.0, -70.0, 140.0], degrees=True).as_matrix()

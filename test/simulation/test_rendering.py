@@ -12,10 +12,10 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
-from rs_localizer.tools.simulation.planes import TexturedPlane
 from rs_localizer.tools.simulation.renderer import Renderer, in_order
 from rs_localizer.tools.simulation.settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
+from rs_localizer.tools.simulation.walls import TexturedPlane
 
 K = np.array([[80.0, 0.0, 47.0], [0.0, 82.0, 36.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(96, 72, K, readout_time=0.04)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.cli.main import main
+from benchmarks.simulation.__main__ import record
+from benchmarks.simulation.rig import MountedMotion
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.rigs import RigParts, write_camchain
 from rs_localizer.io.transforms import TransformTree
 from rs_localizer.settings import build, load_params_file
-from rs_localizer.tools.simulation.rig import MountedMotion
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 K = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 240.0], [0.0, 0.0, 1.0]])
@@ -47,8 +47,9 @@ def recording(tmp_path_factory):
     parts = RigParts(cameras, poses, {"front": 0.0, "rear": -0.25})
     write_camchain(folder / "chain.yaml", parts)
     out = folder / "seen"
-    words = f"simulate {out} --rig {folder / 'chain.yaml'} --duration 1 --noise 0 --outliers 0"
-    assert main([*words.split(), "--angular-velocity", "0.4", "0.8", "-0.5", "-q"]) == 0
+    still = ("--duration", 1, "--noise", 0, "--outliers", 0)
+    turn = ("--angular-velocity", 0.4, 0.8, -0.5)
+    record(out, "--rig", folder / "chain.yaml", *still, *turn)
     return out, parts
 
 
@@ -96,20 +97,3 @@ def test_the_recording_says_how_the_rig_is_mounted_and_set(recording):
     assert (rear.readout_time, rear.scan_direction, rear.stamp_offset) == (
         0.02, "bottom_to_top", -0.25,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("--imu", "--imu is for one camera"),
-        ("--readout-time 0", "--readout-time is for one camera: leave it out with --rig"),
-        ("--camera other.yaml", "--camera is for one camera"),
-        ("", "has no readout_time of cam0"),
-    ],
-)
-def test_what_a_rig_does_not_go_with_is_refused(tmp_path, capsys, words, said):
-    parts = RigParts({"cam0": Camera(640, 480, K)}, {"cam0": (np.eye(3), np.zeros(3))}, {})
-    write_camchain(tmp_path / "c.yaml", parts)
-    call = f"simulate {tmp_path / 'out'} --rig {tmp_path / 'c.yaml'} {words}".split()
-    assert main(call) == 2
-    assert said in capsys.readouterr().err

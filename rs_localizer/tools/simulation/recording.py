@@ -2,18 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated frames and their truth as messages of a recording."""
 
-from typing import Any
-
-from numpy.typing import NDArray
-
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message
-from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import make_header, make_quaternion, make_vector
 from rs_localizer.io.recording import (
     CAMERA_FRAME,
     CAMERA_INFO_TOPIC,
-    KEYPOINTS_TOPIC,
     MAP_FRAME,
     RAW_IMAGE_TOPIC,
     make_camera_info,
@@ -21,36 +15,21 @@ from rs_localizer.io.recording import (
     write_frame,
 )
 from rs_localizer.tools.simulation.frames import SimulatedFrame
-from rs_localizer.tools.simulation.renderer import RenderedFrame
+from rs_localizer.tools.simulation.renderer import FORMAT, RenderedFrame
 from rs_localizer.tools.simulation.true_motion import TrueState
 
 TRUE_POSE_TOPIC = "/truth/pose"
 TRUE_TWIST_TOPIC = "/truth/twist"
 
 
-def write_simulated(
-    bag: BagWriter, camera: Camera, frame: SimulatedFrame, keypoints: NDArray[Any] | None = None
-) -> None:
-    """Camera info, correspondences, and the truth at the first and at the middle row.
-
-    With rows of keypoints (n,) these in the place of correspondences.
-    """
-    if keypoints is None:
+def write_simulated(bag: BagWriter, camera: Camera, frame: SimulatedFrame | RenderedFrame) -> None:
+    """Camera info, correspondences or image, and the truth at the first and the middle row."""
+    if isinstance(frame, SimulatedFrame):
         write_frame(bag, camera, frame.stamp_ns, frame.points, frame.pixels, frame.ids)
     else:
         bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, frame.stamp_ns), frame.stamp_ns)
-        cloud = make_cloud(make_message, frame.stamp_ns, CAMERA_FRAME, keypoints)
-        bag.write(KEYPOINTS_TOPIC, cloud, frame.stamp_ns)
-    write_truth(bag, frame.stamp_ns, frame.first_row)
-    if frame.middle_ns != frame.stamp_ns:
-        write_truth(bag, frame.middle_ns, frame.middle_row)
-
-
-def write_rendered(bag: BagWriter, camera: Camera, frame: RenderedFrame) -> None:
-    """Camera info, image, and the truth at the first and at the middle row."""
-    bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, frame.stamp_ns), frame.stamp_ns)
-    image = make_image(frame.stamp_ns, frame.format, frame.data)
-    bag.write(RAW_IMAGE_TOPIC, image, frame.stamp_ns)
+        image = make_image(frame.stamp_ns, FORMAT, frame.data)
+        bag.write(RAW_IMAGE_TOPIC, image, frame.stamp_ns)
     write_truth(bag, frame.stamp_ns, frame.first_row)
     if frame.middle_ns != frame.stamp_ns:
         write_truth(bag, frame.middle_ns, frame.middle_row)

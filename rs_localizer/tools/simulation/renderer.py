@@ -14,6 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,9 +23,42 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.io.video import Image
 from rs_localizer.tools.simulation.frames import middle_stamp
-from rs_localizer.tools.simulation.planes import TexturedPlane, pyramids
-from rs_localizer.tools.simulation.settings import Encoding, ImageSettings
+from rs_localizer.tools.simulation.settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
+from rs_localizer.tools.simulation.walls import TexturedPlane
+
+
+def pyramids(planes: Sequence[TexturedPlane]) -> tuple[Image, NDArray[np.int64]]:
+    """The pictures of several planes with all their reductions, for the kernel.
+
+    Returns:
+        texels (n,) and levels (planes, levels, 3): ``levels[p, l]`` is where level ``l`` of picture
+        ``p`` begins, its width and height; each level averages two by two texels of the one before.
+        Pictures with fewer levels repeat their last.
+    """
+    reduced = [_reductions(plane.texture) for plane in planes]
+    depth = max(len(images) for images in reduced)
+    levels = np.zeros((len(planes), depth, 3), np.int64)
+    start = 0
+    for p, images in enumerate(reduced):
+        for level, image in enumerate(images):
+            levels[p, level:] = start, image.shape[1], image.shape[0]
+            start += image.size
+    return np.concatenate([image.ravel() for images in reduced for image in images]), levels
+
+
+def _reductions(texture: Image) -> list[Image]:
+    images = [np.ascontiguousarray(texture)]
+    while min(images[-1].shape) > 1:
+        image = images[-1]
+        # Texels stay squares of 2^level: an odd last row or column stands for a pair.
+        even = np.pad(image, [(0, size % 2) for size in image.shape], mode="edge")
+        half = cv2.resize(
+            even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA
+        )
+        images.append(np.asarray(half, np.uint8).reshape(even.shape[0] // 2, even.shape[1] // 2))
+    return images
+
 
 # Walls that meet in an edge overlap by this many texels, so that no ray slips between them.
 _OVERLAP = np.float32(0.02)
@@ -238,6 +272,9 @@ def _rays(camera: Camera, sideways: bool) -> NDArray[np.float32]:
     return rays.astype(np.float32).reshape(size, other, 4, 2)
 
 
+FORMAT = "jpeg"
+"""As sensor_msgs/CompressedImage says it."""
+_QUALITY = 95  # its artefacts stay below the noise of a corner
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -248,8 +285,7 @@ class RenderedFrame:
 
     stamp_ns: int
     middle_ns: int
-    format: str
-    data: bytes
+    data: bytes  # JPEG
     first_row: TrueState  # one instant: at stamp_ns
     middle_row: TrueState  # one instant: at middle_ns
 
@@ -258,7 +294,6 @@ def rendered_frames(
     renderer: Renderer,
     motion: TrueMotion,
     stamps_ns: Sequence[int],
-    encoding: Encoding,
     seed: int = 0,
 ) -> Iterator[RenderedFrame]:
     """The frames of a camera along a motion.
@@ -275,13 +310,18 @@ def rendered_frames(
         return RenderedFrame(
             stamp_ns=stamp_ns,
             middle_ns=middle_ns,
-            format=encoding.format,
-            data=encoding(renderer.image(motion, stamp_ns, (seed, index))),
+            data=_jpeg(renderer.image(motion, stamp_ns, (seed, index))),
             first_row=motion.state(stamp_ns, now),
             middle_row=motion.state(middle_ns, now),
         )
 
     yield from in_order(frame, enumerate(stamps_ns))
+
+
+def _jpeg(image: Image) -> bytes:
+    done, data = cv2.imencode(f".{FORMAT}", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    assert done
+    return bytes(data.tobytes())
 
 
 def in_order(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:

@@ -18,10 +18,64 @@ from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
-from rs_localizer.tools.simulation.planes import TexturedPlane
 
 if TYPE_CHECKING:
     from rs_localizer.tools.simulation.true_motion import TrueState
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TexturedPlane:
+    """A rectangle with a grey picture on both of its sides.
+
+    Texel (row i, column j) covers the square from ``j`` to ``j + 1`` texels along ``right`` and
+    from ``i`` to ``i + 1`` along ``down``, counted from ``corner``.
+    """
+
+    corner: Array  # (3,) m, map frame: where the picture's first texel begins
+    right: Array  # (3,) unit vector along the picture's rows
+    down: Array  # (3,) unit vector along its columns
+    texel: float  # m
+    texture: Image  # (height, width)
+
+    @property
+    def normal(self) -> Array:
+        """(3,) unit vector, away from a viewer who reads the picture unmirrored."""
+        return np.cross(self.right, self.down)
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height, m."""
+        height, width = self.texture.shape
+        return width * self.texel, height * self.texel
+
+    def points(self, texels: Array) -> Array:
+        """Points (n,3) of the map at texel coordinates (n,2), which count from the corner."""
+        across, along = self.texel * np.asarray(texels, float).T
+        points: Array = self.corner + across[:, None] * self.right + along[:, None] * self.down
+        return points
+
+    def homographies(self, rotations: Array, positions: Array) -> Array:
+        """Bearings to texels, for n cameras: (n,3,3).
+
+        The third coordinate of ``H (a, b, 1)`` is the inverse depth of the plane along that
+        bearing, negative behind the camera; the first two over it are the texel coordinates.
+
+        Args:
+            rotations: (n,3,3) map_from_camera.
+            positions: (n,3) camera centres.
+        """
+        normal = self.normal
+        from_corner = positions - self.corner
+        # Along the bearing d the plane is met at c + d / q with q = -n d / n (c - corner).
+        distance = from_corner @ normal
+        with np.errstate(divide="ignore", invalid="ignore"):  # a camera in the plane sees no plane
+            inverse_depth = -(normal @ rotations) / distance[:, None]
+        rows = [
+            (axis @ rotations + (from_corner @ axis)[:, None] * inverse_depth) / self.texel
+            for axis in (self.right, self.down)
+        ]
+        return np.stack([*rows, inverse_depth], axis=1)
+
 
 # Shapes per square of this many texels, of all sizes between a few texels and a few hundred.
 _SHAPES_PER = 9000
@@ -82,7 +136,6 @@ _NEAR, _OPEN, _BELOW, _ABOVE = 1.5, 3.1, 0.9, 1.8
 _LIGHTS = ((235, 26), (200, 22), (172, 18))
 # Of pictures that are no markers (m).
 _PICTURE_TEXEL = 0.003
-_POSTER_DISTANCE = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,15 +196,6 @@ def three_walls(path: TrueState) -> Scene:
         planes.append(_marker_plane(pose, columns, rows, size, len(markers), light))
         markers += made
     return Scene(tuple(planes), MarkerMap(tuple(markers)))
-
-
-def poster(path: TrueState) -> Scene:
-    """One large picture upright before the camera."""
-    box = _box(path, turned=0.0)
-    size = np.array([box.high[1] - box.low[1], box.high[2] - box.low[2]]) + 2.0 * _POSTER_DISTANCE
-    middle = 0.5 * (box.low + box.high)
-    top = np.array([box.high[0] + _POSTER_DISTANCE, *(middle[1:] + 0.5 * size)])
-    return Scene((_picture(box.axes, top, np.array([0.0, -1.0, 0.0]), [0.0, 0.0, -1.0], size, 0),))
 
 
 def room(path: TrueState) -> Scene:
@@ -240,7 +284,7 @@ def marked_room(path: TrueState) -> Scene:
     return Scene(tuple(planes), MarkerMap(tuple(markers)))
 
 
-SCENES = {"three": three_walls, "poster": poster, "room": room, "marked_room": marked_room}
+SCENES = {"three": three_walls, "room": room, "marked_room": marked_room}
 """All scenes by name, the first one unless another is wanted."""
 
 

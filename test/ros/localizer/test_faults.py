@@ -34,13 +34,13 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Imu, PointCloud2, PointField
 from std_srvs.srv import Trigger
 
+from benchmarks.simulation.keypoints import random_descriptors
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map, map_rows
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.managed import spin
 from rs_localizer.ros.node.statistics import Event
-from rs_localizer.tools.simulation.scene import random_descriptors
 
 from .robot import READOUT_TIME, inputs, record, tf2_ros
 

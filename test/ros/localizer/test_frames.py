@@ -13,7 +13,7 @@ import pytest
 from geometry_msgs.msg import TransformStamped
 from rclpy.time import Time
 
-from rs_localizer.cli.main import main as command_line
+from benchmarks.simulation import __main__ as simulated
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES
@@ -56,7 +56,7 @@ def stamped(make: Callable[..., Any], sample: Sample) -> Any:
 
 def record(folder: Path) -> Path:
     """A flight with an IMU, of a robot that knows where its camera is, and has odometry."""
-    assert command_line(["simulate", str(folder / "flight"), *FLIGHT]) == 0
+    simulated.record(folder / "flight", *FLIGHT)
     with open_bag(folder / "flight") as bag:
         items = list(bag.messages((*KINDS, "/tf_static")))
     stamps = [stamp_ns(message) for topic, _, message in items if topic == "/correspondences"]

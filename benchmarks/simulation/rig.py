@@ -26,7 +26,7 @@ from rs_localizer.io.recording import (
 from rs_localizer.io.rigs import RIG_FRAME, RigParts, node_parameters, optical_frame
 from rs_localizer.tools.simulation.frames import SimulatedFrame, frame_stamps
 from rs_localizer.tools.simulation.recording import write_truth
-from rs_localizer.tools.simulation.renderer import RenderedFrame
+from rs_localizer.tools.simulation.renderer import FORMAT, RenderedFrame
 from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
 # How far the rates of cameras' oscillators are off, as a part of themselves: common quartz.
@@ -139,7 +139,7 @@ def write_rig_frame(
     info = make_camera_info(camera, stamp_ns, optical)
     bag.write(f"/{image.name}/{topics.CAMERA_INFO}", info, recorded_ns)
     if isinstance(frame, RenderedFrame):
-        picture = make_image(stamp_ns, frame.format, frame.data, optical)
+        picture = make_image(stamp_ns, FORMAT, frame.data, optical)
         bag.write(f"/{image.name}{RAW_IMAGE_TOPIC}", picture, recorded_ns)
     elif keypoints is None:
         cloud = make_correspondences(stamp_ns, frame.points, frame.pixels, frame.ids)

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What an IMU on a camera's true motion measures, and its messages in a recording.
+"""A motion that vibrates, and what an IMU on a camera measures of one, as messages of a recording.
 
 Every reading is of one instant: the body rate of the motion, and the specific force ``R' (a - g)``
 at the IMU's own place, ``a`` by the difference of the true velocities around that instant. Nothing
@@ -15,18 +15,80 @@ from typing import Any
 
 import numpy as np
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io import topics
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.imu import make_reading
 from rs_localizer.io.recording import CAMERA_FRAME
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.tools.simulation.settings import BODY_FROM_CAMERA, ImuSettings
-from rs_localizer.tools.simulation.true_motion import TrueMotion
+from rs_localizer.tools.simulation.settings import BODY_FROM_CAMERA
+from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])  # m/s^2, in a map with z up
 _STEP = 1e-5  # s, of the difference that gives accelerations
 _CHUNK = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSettings:
+    """How good an IMU is: that of a phone or a drone."""
+
+    rate: float = 400.0  # Hz
+    gyroscope_noise: float = math.radians(0.01)  # rad/s/sqrt(Hz)
+    gyroscope_bias: float = math.radians(0.5)  # rad/s, in any direction
+    gyroscope_bias_walk: float = math.radians(0.002)  # rad/s^2/sqrt(Hz)
+    accelerometer_noise: float = 2e-3  # m/s^2/sqrt(Hz)
+    accelerometer_bias: float = 0.05  # m/s^2, in any direction
+    time_offset: float = 0.0  # s to be added to its stamps to get the camera's time
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shaken:
+    """A camera that swings to and fro about an axis of its own, while it moves.
+
+    With the angle ``a(t) = A sin(2 pi f t + p)`` about the unit vector ``n`` its rotation is
+    ``R exp(a n)``; its body rate ``exp(-a n) w + a' n``, its velocity in its own axes
+    ``exp(-a n) v``. Several vibrations are one around the other.
+    """
+
+    motion: TrueMotion
+    amplitude: float  # rad
+    frequency: float  # Hz
+    axis: Array  # (3,) unit vector, camera axes
+    phase: float = 0.0  # rad, at the motion's start
+
+    @property
+    def intervals_ns(self) -> list[tuple[int, int]]:
+        return self.motion.intervals_ns
+
+    def state(self, stamp_ns: int, offsets: Array) -> TrueState:
+        base = self.motion.state(stamp_ns, offsets)
+        # The whole seconds apart, or the phase would drown in the size of today's stamps.
+        since_ns = stamp_ns - self.intervals_ns[0][0]
+        t = since_ns * 1e-9 + np.asarray(offsets, float)
+        pulse = 2.0 * math.pi * self.frequency
+        angle = self.amplitude * np.sin(pulse * t + self.phase)
+        rate = self.amplitude * pulse * np.cos(pulse * t + self.phase)
+        turn = so3.exp_many(angle[:, None] * self.axis)
+        return TrueState(
+            base.rotations @ turn,
+            base.positions,
+            np.einsum("nji,nj->ni", turn, base.angular) + rate[:, None] * self.axis,
+            np.einsum("nji,nj->ni", turn, base.linear),
+        )
+
+
+def shaken(
+    motion: TrueMotion, vibrations: list[tuple[float, float]], rng: np.random.Generator
+) -> TrueMotion:
+    """A motion with vibrations (degrees, Hz), each about any axis and from any phase."""
+    for degrees, hertz in vibrations:
+        axis = rng.normal(size=3)
+        phase = float(rng.uniform(0.0, 2.0 * math.pi))
+        unit = axis / np.linalg.norm(axis)
+        motion = Shaken(motion, math.radians(degrees), hertz, unit, phase)
+    return motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
