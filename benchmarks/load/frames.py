@@ -12,14 +12,14 @@ import numpy as np
 from rclpy.serialization import serialize_message
 
 from benchmarks.data import HAND_MOTION
+from benchmarks.simulation.imu import ImuSettings, Lever, make_imu, simulate_imu
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_correspondences
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.ros.node.conversion import copy_message
 from rs_localizer.tools.simulation.frames import simulate_frames
-from rs_localizer.tools.simulation.imu import Lever, make_imu, simulate_imu
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings, ImuSettings
+from rs_localizer.tools.simulation.settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 
 _K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
