@@ -28,8 +28,14 @@ from benchmarks.experiments import (
     timings,
     translation,
 )
-from benchmarks.experiments.report import SUMMARY, count_verdicts, write_result, write_summary
-from benchmarks.experiments.results import Context, Result, Verdict
+from benchmarks.experiments.results import (
+    SUMMARY,
+    Context,
+    Result,
+    verdicts,
+    write_result,
+    write_summary,
+)
 
 T = TypeVar("T")
 
@@ -45,8 +51,6 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "real": real.run,
 }
 
-# All experiments with so many trials take about a quarter of an hour on two cores.
-_TRIALS = 2000
 _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   frames                           regions, errors and times of frames; two versions compared
   integrity                        the chance of a wrong pose or map: reliability, ROC
@@ -72,7 +76,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         epilog=_TOOLS,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_arguments(parser)
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME",
+        help=f"which ones, of {', '.join(EXPERIMENTS)} (default: all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--trials", type=int, default=2000, metavar="N",
+        help="simulated frames per point of a curve; recordings and timings are cut in proportion "
+        "(default: %(default)s, some minutes)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, help="of all random numbers (default: 0)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("experiments"), metavar="DIR",
+        help=f"directory for tables (CSV), figures (PNG) and {SUMMARY} (default: %(default)s)",
+    )  # fmt: skip
     args = parser.parse_args(argv)
     unknown = [name for name in args.names if name not in EXPERIMENTS]
     if unknown:
@@ -89,62 +106,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "names",
-        nargs="*",
-        metavar="NAME",
-        help=f"which ones, of {', '.join(EXPERIMENTS)} (default: all)",
-    )
-    parser.add_argument(
-        "--trials",
-        type=int,
-        default=_TRIALS,
-        metavar="N",
-        help="simulated frames per point of a curve; recordings and timings are cut in proportion, "
-        "and below 500 compile times are left out (default: %(default)s, a quarter of an hour in "
-        "all on two cores)",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of all random numbers (default: 0)")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("experiments"),
-        metavar="DIR",
-        help=f"directory for tables (CSV), figures (PNG) and {SUMMARY} (default: %(default)s)",
-    )
-
-
 def run(args: argparse.Namespace) -> None:
-    names = args.names or list(EXPERIMENTS)
     args.out.mkdir(parents=True, exist_ok=True)
     results: dict[str, Result] = {}
-    seconds: dict[str, float] = {}
-    for name in dict.fromkeys(names):
+    for name in dict.fromkeys(args.names or EXPERIMENTS):
         start = time.perf_counter()
-        results[name] = EXPERIMENTS[name](Context(args.trials, args.seed, partial(_track, name)))
-        seconds[name] = time.perf_counter() - start
+        context = Context(args.trials, args.seed, partial(_track, name))
+        results[name] = EXPERIMENTS[name](context)
         write_result(args.out, results[name])
         # After each, so that an interrupted run leaves what it found.
-        write_summary(args.out, results, seconds, args.trials, args.seed)
-        _print(name, results[name], seconds[name])
+        write_summary(args.out, results, context)
+        print(f"{name} ({time.perf_counter() - start:.0f} s)")
+        for one in results[name].claims:
+            print(f"  {one.verdict:13} {one.statement}: {one.finding} ({one.criterion})")
+        print(*(f"\n{note}\n" for note in results[name].notes), sep="")
     claims = [claim for result in results.values() for claim in result.claims]
-    print(f"{count_verdicts(claims)}; written to {args.out / SUMMARY}")
+    print(f"{verdicts(claims)}; written to {args.out / SUMMARY}")
 
 
 def _track(name: str, items: Iterable[T], total: int) -> Iterator[T]:
     # The bar is for a person who waits: none in a log file.
     yield from tqdm(items, total=total, desc=name, leave=False, disable=None)
-
-
-def _print(name: str, result: Result, seconds: float) -> None:
-    print(f"{name} ({seconds:.0f} s)")
-    for claim in result.claims:
-        print(f"  {claim.verdict:13} {claim.statement}: {claim.finding}")
-        if claim.verdict is Verdict.NOT_HELD:
-            print(f"  {'':13}   expected: {claim.criterion}")
-    for note in result.notes:
-        print(f"\n{note}\n")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.experiments.errors import angles
+from benchmarks.experiments.trials import angles
 from rs_localizer.config import FeatureConfig, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera

@@ -9,21 +9,19 @@ the paper: the pose whose orientation is nearest to the truth, which no real met
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
-from benchmarks.experiments.errors import angles
 from benchmarks.experiments.kernels import best_solutions, refine_frames
-from benchmarks.experiments.trials import POINTS, Motions, Trials, camera
+from benchmarks.experiments.trials import POINTS, Motions, Trials, angles, camera
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.estimation.prior import assumptions
 from rs_localizer.solvers.minimal import solve_minimal
-from rs_localizer.solvers.table import SOLVERS, find_solver
+from rs_localizer.solvers.table import find_solver
 
 _SIX = 6
 _TRIPLETS = np.array(list(combinations(range(_SIX), 3)))
@@ -64,11 +62,6 @@ PAPERS = (P3P, R6P, VC_WT, VCT_W, VCT_WT, VCWT, R9P)
 TWO_STEP = (VC_WT, VCT_W, VCT_WT)
 OURS = (VCWT_OURS, R9P_OURS, JOINT, REFINED)
 ALL = PAPERS + OURS
-
-
-def available(methods: Iterable[Method]) -> tuple[Method, ...]:
-    """Those whose solver is part of this version."""
-    return tuple(method for method in methods if method.solver in SOLVERS)
 
 
 def estimate(

@@ -1,28 +1,21 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What an experiment returns: tables, figures, and claims with their verdicts."""
+"""Tables, figures and claims of an experiment, and how they are written."""
 
 from __future__ import annotations
 
+import csv
+import json
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import StrEnum
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Protocol, TypeVar
 
 from matplotlib.figure import Figure
 
-from benchmarks.experiments.uncertainty import Interval
-
 T = TypeVar("T")
-
-
-class Verdict(StrEnum):
-    """What our figures say of a claim."""
-
-    HELD = "held"
-    NOT_HELD = "did not hold"
-    UNDECIDED = "undecided"  # too few trials to tell
-    NOT_TESTED = "not tested"
+SUMMARY, SUMMARY_DATA = "summary.md", "summary.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,54 +23,30 @@ class Claim:
     """A sentence that figures can contradict."""
 
     name: str  # experiment.claim
-    source: str  # who says so
     statement: str
     criterion: str  # what would have to be measured for it to hold
     finding: str  # what was measured
-    verdict: Verdict
+    held: bool
     why: str = ""  # where it does not hold
 
+    @property
+    def verdict(self) -> str:
+        return "held" if self.held else "did not hold"
 
-@dataclass(frozen=True, slots=True)
-class Statement:
-    """What somebody says, before figures judge it; the fields are those of a claim."""
 
-    name: str
-    source: str
-    statement: str
-    criterion: str
-
-    def judged(self, finding: str, held: bool, why: str = "") -> Claim:
-        """By a fact; ``why`` is kept where it does not hold."""
-        if held:
-            return self._claim(finding, Verdict.HELD)
-        return self._claim(finding, Verdict.NOT_HELD, why)
-
-    def judged_by(
-        self,
-        finding: str,
-        intervals: Sequence[Interval],
-        limits: tuple[float, float],
-        why: str = "",
-    ) -> Claim:
-        """By figures that have to lie between limits, as well as they are known.
-
-        It holds where all intervals lie within, does not where one lies outside, and is undecided
-        between.
-        """
-        if any(interval.outside(*limits) for interval in intervals):
-            return self._claim(finding, Verdict.NOT_HELD, why)
-        if all(interval.within(*limits) for interval in intervals):
-            return self._claim(finding, Verdict.HELD)
-        trials = min(interval.trials for interval in intervals)
-        return self._claim(f"{finding}; undecided at {trials} trials", Verdict.UNDECIDED)
-
-    def not_tested(self, reason: str) -> Claim:
-        """This run says nothing of it."""
-        return self._claim(reason, Verdict.NOT_TESTED)
-
-    def _claim(self, finding: str, verdict: Verdict, why: str = "") -> Claim:
-        return Claim(self.name, self.source, self.statement, self.criterion, finding, verdict, why)
+def limited(
+    name: str, statement: str, what: str, found: float | Iterable[float],
+    least: float = -math.inf, most: float = math.inf, why: str = "",
+) -> Claim:  # fmt: skip
+    """A claim that a figure lies within limits; of several, all of them."""
+    every = [float(found)] if isinstance(found, int | float) else [float(x) for x in found]
+    limits = [f"at least {least:.3g}"] if math.isfinite(least) else []
+    limits += [f"at most {most:.3g}"] if math.isfinite(most) else []
+    finding = " to ".join(f"{x:.3g}" for x in sorted({min(every), max(every)}))
+    held = least <= min(every) and max(every) <= most
+    return Claim(
+        name, statement, f"{what}: {', '.join(limits)}", finding, held, "" if held else why
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,13 +56,17 @@ class Table:
     columns: tuple[str, ...]
     rows: Sequence[Sequence[str | float | int]]
 
+    def text(self) -> str:
+        cells = [self.columns, *([_cell(x) for x in row] for row in self.rows)]
+        widths = [max(len(row[k]) for row in cells) + 2 for k in range(len(self.columns))]
+        return "\n".join(
+            "".join(x.rjust(width) for x, width in zip(row, widths, strict=True)) for row in cells
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """All that an experiment found; the keys of tables and figures become file names.
-
-    ``files`` are animated pictures, by their names, already encoded.
-    """
+    """All that an experiment found; the keys of tables and figures become file names."""
 
     title: str
     setting: str  # a paragraph: what was done
@@ -101,7 +74,6 @@ class Result:
     tables: Mapping[str, Table]
     figures: Mapping[str, Figure] = field(default_factory=dict)
     notes: Sequence[str] = ()  # further paragraphs
-    files: Mapping[str, bytes] = field(default_factory=dict)
 
 
 class Track(Protocol):
@@ -121,3 +93,53 @@ class Context:
     trials: int
     seed: int
     track: Track
+
+
+def write_result(folder: Path, result: Result) -> None:
+    """Tables and figures of one experiment."""
+    for name, table in result.tables.items():
+        with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows(
+                [table.columns, *([_cell(x) for x in r] for r in table.rows)]
+            )
+    for name, figure in result.figures.items():
+        figure.suptitle(result.title)
+        figure.savefig(folder / f"{name}.png")
+
+
+def write_summary(folder: Path, results: Mapping[str, Result], context: Context) -> None:
+    """Every claim with our figure and its verdict, for people (md) and programs (json)."""
+    claims = [claim for result in results.values() for claim in result.claims]
+    lines = [
+        f"# Experiments\n\n{context.trials} trials, seed {context.seed}; **{verdicts(claims)}**.",
+        "The paper: Kukelova and others, *Linear solution to the minimal absolute pose ...*, 2018.",
+    ]
+    for name, result in results.items():
+        lines += [f"## {result.title}\n\n`python -m benchmarks {name}`", result.setting]
+        rows = ["| claim | holds if | our figure | verdict |\n|---|---|---|---|"]
+        rows += [
+            f"| {one.statement} | {one.criterion} | {one.finding} | {one.verdict} |"
+            for one in result.claims
+        ]
+        lines.append("\n".join(rows))
+        lines += [f"Why not *{one.statement}*: {one.why}." for one in result.claims if one.why]
+        lines += [f"```\n{note}\n```" if "\n" in note else note for note in result.notes]
+        lines += [f"![{figure}]({figure}.png)" for figure in result.figures]
+        lines.append("Data: " + ", ".join(f"[{x}.csv]({x}.csv)" for x in result.tables))
+    (folder / SUMMARY).write_text("\n\n".join(lines) + "\n", encoding="utf-8")
+    data = {
+        "trials": context.trials,
+        "seed": context.seed,
+        "claims": [asdict(claim) for claim in claims],
+    }
+    (folder / SUMMARY_DATA).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def verdicts(claims: Sequence[Claim]) -> str:
+    """``12 held, 3 did not hold``."""
+    held = sum(claim.held for claim in claims)
+    return f"{held} held, {len(claims) - held} did not hold"
+
+
+def _cell(value: str | float | int) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

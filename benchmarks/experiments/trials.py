@@ -104,6 +104,13 @@ def random_rotations(count: int, seed: int, degrees: float) -> Array:
     return so3.exp_many(math.radians(degrees) * _directions(count, rng))
 
 
+def angles(rotations: Array, others: Array) -> Array:
+    """Angles in degrees between rotations (...,3,3); accurate near zero, NaN for NaN."""
+    apart = np.linalg.norm(rotations - others, axis=(-2, -1))
+    between: Array = np.degrees(2.0 * np.arcsin(np.minimum(apart / np.sqrt(8.0), 1.0)))
+    return between
+
+
 def _draw(count: int, rng: np.random.Generator, setting: Setting) -> Trials:
     """Up to ``count`` frames: those that see enough points."""
     view = camera()

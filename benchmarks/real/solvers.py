@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.experiments import methods as m
-from benchmarks.experiments.methods import available
 from benchmarks.experiments.plain_ransac import Best, PlainRansac
 from benchmarks.real.options import add_settings, settings_of
 from benchmarks.real.peers import PEERS
@@ -34,13 +33,13 @@ Errors = list[Array]
 
 def minimal(recording: Recording, frames: Sequence[Frame]) -> dict[str, Errors]:
     """The best minimal model of each solver."""
-    found: dict[str, Errors] = {method.solver: [] for method in available(m.PAPERS)}
+    found: dict[str, Errors] = {method.solver: [] for method in m.PAPERS}
     for seed, frame in enumerate(frames):
         search = PlainRansac.of(
             recording.camera, frame.points, frame.pixels, _SAMPLES, _THRESHOLD, seed
         )
         start = search.best(m.P3P)
-        for method in available(m.PAPERS):
+        for method in m.PAPERS:
             best = start if method is m.P3P else search.best(method, start.rotation)
             found[method.solver].append(_errors(recording.camera, frame, best))
     return found
