@@ -3,7 +3,6 @@
 """The readout time that the camera's own motion shows, beside the one that is set."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,6 +66,23 @@ class Watched:
     config: NodeConfig  # by which it was localized
     camera: Camera
 
+    def tell(self, estimate: ReadoutEstimate) -> MeasuredReadout | None:
+        """What the readout time is with this frame, which has a pose."""
+        assert self.result
+        seen = self.cloud.points, self.cloud.pixels
+        estimate.add(self.time_ns, self.camera, self.result, *seen)
+        return estimate.measured
+
+    def cost(self, most: float, noise: float) -> float:
+        """Negative logarithm of the likelihood; residuals (px) are cut off at ``most``."""
+        result, pixels = self.result, self.cloud.pixels
+        if not result:
+            return len(pixels) * most**2 / (2.0 * noise**2)
+        cut = np.fmin(result.residuals, most)  # NaN: unusable along either axis
+        turns = shake_at(self.camera.row_time(pixels[result.inliers]), result.shake)[:, :2]
+        moved = float(np.sum((self.camera.focal_length * turns) ** 2)) / (2.0 * noise**2)
+        return float(cut @ cut) / (2.0 * noise**2) + min(moved, _OF_TURNS)
+
 
 class ScanAxis:
     """Odds that the shutter moves over columns where rows are set, or over rows.
@@ -79,11 +95,12 @@ class ScanAxis:
     def __init__(self) -> None:
         self._localizer: Localizer | None = None  # by the other axis
         self._estimate = ReadoutEstimate()
-        self._evidence = 0.0  # logarithm of the odds of the other axis
-        self._moves = 0.0  # of those that its motions agree from frame to frame
+        self._odds = 0.0  # logarithm, of the other axis
+        self._moves = 0.0  # likewise, that its motions agree from frame to frame
+        self._enough = _CERTAIN  # odds that make it wrong; until as much speaks against it
         self._dense = _TRIED_FIRST  # frames that are still to be tried, each
         self._skipped = 0  # since the last one that was
-        self._suspected = self._confirmed = self._certain = False
+        self._suspected = self._confirmed = False
         # What the last frame is by the other axis, if that may be the right one.
         self.other: Estimate | None = None
         # Along the other axis: how long the readout takes (positive), and its direction.
@@ -91,14 +108,9 @@ class ScanAxis:
         self.direction: ScanDirection | None = None
 
     @property
-    def leans(self) -> bool:
-        """Whether frames fit the other axis better."""
-        return self._evidence > _DOUBT
-
-    @property
     def doubtful(self) -> bool:
-        """Whether they do, and its motions do not contradict: errors of map and lens may do it."""
-        return self.leans and not self._contradicted
+        """Whether frames fit the other axis better: errors of map and lens may do it, too."""
+        return self._odds > _DOUBT and not self._contradicted
 
     @property
     def _contradicted(self) -> bool:
@@ -106,16 +118,9 @@ class ScanAxis:
 
     @property
     def wrong(self) -> bool:
-        """Whether it must be the other axis.
-
-        Its motions also agree from frame to frame, which errors of map and lens do not.
-        """
-        return self.direction is not None and (self._certain or self._evidence > _CERTAIN)
-
-    @property
-    def undecided(self) -> bool:
-        """Whether it probably is the other axis: few motions agree yet."""
-        return self._evidence > _CERTAIN and not self.wrong and self._moves > _AGREES
+        """Whether it must be the other axis: its motions also agree from frame to frame."""
+        agrees = self.direction is not None or self._moves > _AGREES
+        return agrees and self._odds > self._enough
 
     def suspect(self) -> None:
         """Look closely for a while: the axis that is set shows no motion."""
@@ -124,7 +129,7 @@ class ScanAxis:
 
     def confirm(self) -> None:
         """Look no more: the motion along the axis that is set agrees from frame to frame."""
-        self._confirmed = not self.leans
+        self._confirmed = self._odds <= _DOUBT
 
     def add(self, frame: Watched) -> None:
         """Compare a frame."""
@@ -132,8 +137,8 @@ class ScanAxis:
         self.other = None
         # The wrong axis makes in-frame turns, and refusals.
         odd = not frame.result or len(frame.result.shake) > 0
-        due = self.leans or self._dense > 0 or self._skipped >= _EVERY
-        due |= odd and self._evidence > _LEAST
+        due = self._odds > _DOUBT or self._dense > 0 or self._skipped >= _EVERY
+        due |= odd and self._odds > _LEAST
         if self._confirmed or not due:
             return
         self._skipped, self._dense = 0, self._dense - 1
@@ -143,18 +148,21 @@ class ScanAxis:
             self._localizer = Localizer(replace(frame.camera, scan_direction=other), config)
         found = self._localizer.find(cloud.points, cloud.pixels, cloud.scores)
         sideways = replace(frame, result=found, camera=self._localizer.camera)
-        ours, others = _costs((frame, sideways), _TRUNCATED * config.inlier_threshold)
+        rms = [result.residual_rms for result in (frame.result, found) if result]
+        noise = max(min(rms, default=math.inf) / math.sqrt(2.0), _LEAST_NOISE)
+        ours, others = (it.cost(_TRUNCATED * config.inlier_threshold, noise)
+                        for it in (frame, sideways))  # fmt: skip
         ratio = min(max(ours - others, -_MOST_OF_A_FRAME), _MOST_OF_A_FRAME)
-        self._evidence = max(_MEMORY * self._evidence + ratio, _LEAST)
-        if found and self.leans:
-            self._measure(sideways, found)
-        self._certain = self.wrong and self._evidence > 0.0  # stays until as much speaks against it
-        if found and self._evidence > 0.0 and not self._contradicted:
+        self._odds = max(_MEMORY * self._odds + ratio, _LEAST)
+        if found and self._odds > _DOUBT:
+            self._measure(sideways)
+        known = self.direction is not None
+        self._enough = 0.0 if known and self.wrong else _CERTAIN
+        if found and self._odds > 0.0 and not self._contradicted:
             self.other = found
 
-    def _measure(self, frame: Watched, estimate: Estimate) -> None:
-        _look(self._estimate, frame, estimate)
-        measured, usual = self._estimate.measured, frame.camera.readout_time
+    def _measure(self, frame: Watched) -> None:
+        measured, usual = frame.tell(self._estimate), frame.camera.readout_time
         if measured is None:
             return
         self._moves = max(measured.odds(value, 0.0) for value in (usual, -usual))
@@ -165,35 +173,6 @@ class ScanAxis:
             direction = ScanDirection(frame.camera.scan_direction)
             self.measured = replace(measured, readout_time=abs(measured.readout_time))
             self.direction = direction if measured.readout_time > 0.0 else REVERSED[direction]
-
-
-def _look(estimate: ReadoutEstimate, frame: Watched, found: Estimate) -> None:
-    """Let an estimate take a frame."""
-    cloud = frame.cloud
-    estimate.add(frame.time_ns, frame.camera, found, cloud.points, cloud.pixels)
-
-
-def _costs(frames: Sequence[Watched], most: float) -> list[float]:
-    """What results for the same points leave: negative logarithms of likelihoods.
-
-    Args:
-        most: px, where residuals are cut off.
-    """
-    estimates = [frame.result for frame in frames if frame.result]
-    if not estimates:
-        return [0.0] * len(frames)
-    noise = max(min(one.residual_rms for one in estimates) / math.sqrt(2.0), _LEAST_NOISE)
-
-    def cost(frame: Watched) -> float:
-        result, pixels = frame.result, frame.cloud.pixels
-        if not result:
-            return len(pixels) * most**2 / (2.0 * noise**2)
-        cut = np.fmin(result.residuals, most)  # NaN: unusable by either
-        turns = shake_at(frame.camera.row_time(pixels[result.inliers]), result.shake)[:, :2]
-        moved = float(np.sum((frame.camera.focal_length * turns) ** 2)) / (2.0 * noise**2)
-        return float(cut @ cut) / (2.0 * noise**2) + min(moved, _OF_TURNS)
-
-    return [cost(frame) for frame in frames]
 
 
 # A value is adopted when it is known to this share of itself, by so many frames.
@@ -244,8 +223,6 @@ class ReadoutWatch:
         self.global_shutter = self.surely_global = False
         # Whether rows may run the other way: then an image begins where it is said to end.
         self.may_be_reversed = False
-        # Whether the last frames move, but not as the setting says, and no measurement tells.
-        self.doubtful = False
         # Whether what the camera does from frame to frame tells what it does within them: after a
         # doubt not before frames show it. To and fro between both, poses jump.
         self.trusted = True
@@ -263,7 +240,7 @@ class ReadoutWatch:
     @property
     def wrong_axis(self) -> str:
         """Why no pose may be published: the shutter moves along the other axis; empty: it may."""
-        if self._axis.undecided:
+        if self._axis.wrong and self._axis.direction is None:
             return "the image fits a shutter along the other axis better than scan_direction"
         return self.fault if self._axis.wrong else ""
 
@@ -279,54 +256,26 @@ class ReadoutWatch:
             its settings, with the readout time and scan direction that were measured where they
             ask for it.
         """
-        config = frame.config
+        config, axis = frame.config, self._axis
         estimates = config.estimate_readout_time and config.readout_time == 0.0
         wanted = estimates or config.readout_time > 0.0
         if not (wanted and find_solver(config.solver).rolling_shutter):
             return config
-        adopted, shown = self._compare(frame, estimates)
-        if self.far_off or self.doubtful or (self._axis.leans and self.other_axis):
-            self.trusted = False
-        elif shown:
-            self.trusted = True
-        return adopted
-
-    def _compare(self, frame: Watched, estimates: bool) -> tuple[NodeConfig, bool]:
-        """The settings after a frame, and whether it shows the readout time that is set.
-
-        ``estimates``: the settings ask for what is found.
-        """
-        config = frame.config
-        self._axis.add(frame)
-        if self._axis.wrong:
-            return self._other_axis(config, estimates), False
+        axis.add(frame)
+        self.trusted &= not (axis.doubtful and axis.other)
+        if axis.wrong and axis.direction is not None:
+            return self._other_axis(config, estimates)
         if not frame.result:
-            return config, False
-        _look(self._estimate, frame, frame.result)
-        measured = self._estimate.measured
-        if self._axis.doubtful or measured is None:
-            return config, False
-        enough = measured.triples >= _LEAST_TRIPLES
-        if enough:
+            return config
+        measured = frame.tell(self._estimate)
+        if axis.doubtful or measured is None:
+            return config
+        if measured.triples >= _LEAST_TRIPLES:
             self.measured = measured
         if estimates:
-            adopts = enough and self.measured is measured
-            along = ScanDirection(config.scan_direction)
-            return (self._adopt(config, measured, along) if adopts else config), False
-        usual = config.readout_time
-        of_set = min(measured.odds(usual, value) for value in (0.0, -usual))
-        self._judge(config, measured, enough)
-        some = measured.readout_time - _SURELY * measured.deviation > FAR_OFF * usual
-        silent = self.fault == "" and not (enough and some)
-        self.doubtful = silent and of_set < -_SUSPICIOUS
-        self.may_be_reversed = measured.odds(-usual, usual) > 0.0 and (
-            self.doubtful or (self.far_off and not self.global_shutter)
-        )
-        if enough and some:
-            self._axis.confirm()
-        elif self.far_off or self.doubtful:
-            self._axis.suspect()
-        return config, of_set > _SUSPICIOUS
+            return self._adopt(config, measured, ScanDirection(config.scan_direction))
+        self._judge(config, measured)
+        return config
 
     def _other_axis(self, config: NodeConfig, estimates: bool) -> NodeConfig:
         """Say that the shutter moves along the other axis, or adopt it."""
@@ -341,25 +290,38 @@ class ReadoutWatch:
         )
         return self._adopt(config, measured, direction) if estimates else config
 
-    def _judge(self, config: NodeConfig, measured: MeasuredReadout, enough: bool) -> None:
+    def _judge(self, config: NodeConfig, measured: MeasuredReadout) -> None:
         """Whether the setting is contradicted, and by what."""
-        usual = config.readout_time
+        usual, found = config.readout_time, measured.readout_time
+        of_global, of_reversed = (measured.odds(value, usual) for value in (0.0, -usual))
+        doubt = max(of_global, of_reversed)
         sure = measured.misfit < _MOST_MISFIT and (
-            min(measured.odds(0.0, value) for value in (usual, -usual)) > _ALL_BUT_SURE
+            min(of_global, measured.odds(0.0, -usual)) > _ALL_BUT_SURE
         )
+        enough = measured.triples >= _LEAST_TRIPLES
         wrong, self.fault = _verdict(config, measured, sure) if sure or enough else ("", "")
         if wrong:
             self._contradict(wrong, self.fault)
-        off = math.hypot(measured.readout_time - usual, measured.deviation)
-        shorter = usual / max(abs(measured.readout_time), _GLOBAL * usual, measured.deviation)
+        off = math.hypot(found - usual, measured.deviation)
+        shorter = usual / max(abs(found), _GLOBAL * usual, measured.deviation)
         self.error = off * max(shorter, 1.0) if wrong else 0.0
         # A global shutter may be no worse.
-        short = measured.readout_time < FAR_OFF * usual
-        self.far_off = short and (self.far_off or bool(wrong))
+        self.far_off = found < FAR_OFF * usual and (self.far_off or bool(wrong))
         self.global_shutter = self.far_off and (
             wrong == _GLOBAL_SHUTTER if wrong else self.global_shutter
         )
         self.surely_global = self.global_shutter and (self.surely_global or sure)
+        doubtful = doubt > _SUSPICIOUS and not self.fault
+        self.may_be_reversed = of_reversed > 0.0 and (
+            doubtful or (self.far_off and not self.global_shutter)
+        )
+        if self.far_off or doubtful:
+            self.trusted = False
+            self._axis.suspect()
+        elif doubt < -_SUSPICIOUS:
+            self.trusted = True
+        if enough and found - _SURELY * measured.deviation > FAR_OFF * usual:
+            self._axis.confirm()
 
     def _contradict(self, kind: str, text: str) -> None:
         self.fault = text
