@@ -56,7 +56,6 @@ class ImuReason(StrEnum):
     GAP = "imu_gap"
     TOO_SLOW = "imu_too_slow"
     SATURATED = "imu_saturated"
-    TWO_FRAMES = "imu_two_frames"
     NO_TRANSFORM = "imu_no_transform"
     NO_READOUT_TIME = "imu_no_readout_time"
     NOT_TRACKING = "imu_not_tracking"

@@ -17,16 +17,18 @@ from rs_localizer.core.blocks import median
 from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Mounts, Rig
+from rs_localizer.core.shutter import Motion
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Failure
-from rs_localizer.estimation.prior import Assumed, PriorTerms
+from rs_localizer.estimation.prior import Assumed, PriorTerms, state_in
 from rs_localizer.estimation.residuals import (
     AXES,
     CENTRE,
     GRADIENT,
     POINT_SIZE,
     WEIGHT,
+    Lines,
     linearized,
     squared_errors,
 )
@@ -322,6 +324,22 @@ def relinearized(
         observations.points, observations.rays, observations.tau, by_ray, observations.mounts,
         observations.camera,
     )  # fmt: skip
+
+
+def lines_about(
+    exposure: Exposure,
+    points: Array,
+    pixels: Array,
+    motion: Motion,
+    turn: GyroRotation | None = None,
+) -> Lines:
+    """The sound ones of points (n,3) and pixels (n,2) of a camera alone, linearized at a motion."""
+    usable = find_usable(exposure, points, pixels, [len(pixels)], turn)
+    seen = packed(exposure, points, usable)
+    state, count = state_in(motion, usable.centre), len(seen)
+    lines = linearized(seen.packed, count, state, np.zeros((count, 6)))
+    sound = np.isfinite(lines.errors).all(axis=1)
+    return Lines(*(part[sound] for part in lines))
 
 
 def rays_of_lens(turn: GyroRotation | None, tau: Array, rays: Array) -> Array:

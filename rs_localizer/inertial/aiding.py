@@ -27,11 +27,13 @@ from rs_localizer.inertial.samples import ImuSamples, span_of
 from rs_localizer.inertial.settings import OFFSET_DEVIATION, InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.inertial.turning import TurnBetween, TurnWithin
-from rs_localizer.inertial.watch import GyroscopeWatch, contradicts
+from rs_localizer.inertial.watch import GyroscopeWatch
 
 # Of a step: what a gyroscope contradicts.
 _SEEN = np.r_[TURN, ANGULAR]
-_FIRST = np.arange(3)
+# Squared Mahalanobis length of what a frame changes in the predicted rotation and turn rate; a
+# chi-squared variable of six degrees of freedom exceeds this once in a million.
+_MOST_SURPRISE = 38.0
 # Points that fit with the gyroscope, beyond those that fit without it, that speak for it although
 # it contradicts what the camera sees.
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
@@ -102,7 +104,6 @@ class GyroscopeAid:
         span_of(times, 0, 1)
         offset_search.warm_up()
         within.known.at(0.0)
-        contradicts(np.zeros(3), np.eye(3), _FIRST)
         still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
         identity = np.eye(PARAMETERS)
         predicted = filter_.predict(still, identity, between, within, 1.0, 1.0)
@@ -329,9 +330,16 @@ def _step(foreseen: GyroPrediction, found: Estimate | Failure) -> Array | None:
 
 
 def _contradicts(foreseen: GyroPrediction, step: Array) -> bool:
+    """Whether a frame moved what the gyroscope says by more than its covariance allows."""
     if foreseen.predicted is None:
-        return contradicts(step[ANGULAR], foreseen.turn.error, _FIRST)
-    return contradicts(step, foreseen.predicted.covariance, _SEEN)
+        moved, covariance = step[ANGULAR], foreseen.turn.error[:3, :3]
+    else:
+        moved, covariance = step[_SEEN], foreseen.predicted.covariance[np.ix_(_SEEN, _SEEN)]
+    try:
+        distance = moved @ np.linalg.solve(covariance, moved)
+    except np.linalg.LinAlgError:
+        return True
+    return not distance <= _MOST_SURPRISE
 
 
 def without_gyro(prior: Prior | None, turn: GyroRotation) -> Prior | None:

@@ -15,10 +15,8 @@ from rs_localizer.core.rig import Rig
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import ACCELERATIONS, PARAMETERS, TURN, VELOCITIES
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.observations import find_usable, packed
-from rs_localizer.estimation.prior import state_in
+from rs_localizer.estimation.observations import lines_about
 from rs_localizer.estimation.refine import LEAST_NOISE
-from rs_localizer.estimation.residuals import linearized
 
 # More points take longer than they are worth, fewer say nothing.
 _MOST_POINTS, _LEAST_POINTS = 48, 12
@@ -57,16 +55,10 @@ def row_offset_likelihood(
     if len(chosen) < _LEAST_POINTS:
         return None
     given = np.asarray(points, float)[chosen], np.asarray(pixels, float)[chosen]
-    exposure = Rig.of(camera).exposure()
-    usable = find_usable(exposure, *given, [len(chosen)], found.turn)
-    seen = packed(exposure, given[0], usable)
-    count, motion = len(seen), found.without_gyro()
-    errors, by_motion, by_turn, tau, _ = linearized(
-        seen.packed, count, state_in(motion, usable.centre),
-        np.zeros((count, 6)),
-    )  # fmt: skip
-    sound = np.isfinite(errors).all(axis=1)
-    errors, by_motion, by_turn, tau = (part[sound] for part in (errors, by_motion, by_turn, tau))
+    motion = found.without_gyro()
+    errors, by_motion, by_turn, tau, _ = lines_about(
+        Rig.of(camera).exposure(), *given, motion, found.turn
+    )
     noise = max(float(np.sqrt(np.mean(errors**2))), LEAST_NOISE)
     free = by_motion.reshape(-1, PARAMETERS) / noise
     held = np.zeros(PARAMETERS)

@@ -18,8 +18,6 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.simd.jit import kernel
-from rs_localizer.estimation.refine import inverted
 from rs_localizer.inertial.filter import GyroscopeFilter
 from rs_localizer.inertial.offset_search import BY_TURNS, OffsetSearch, Orientation
 from rs_localizer.inertial.samples import ImuSamples
@@ -74,9 +72,6 @@ def fit_mounting(shown: Array, seen: Array) -> Mounting | None:
     return Mounting(rotation, float(np.sum((seen - shown @ rotation.T) ** 2) / np.sum(seen**2)))
 
 
-# Squared Mahalanobis length of what a frame changes in the predicted rotation and turn rate; a
-# chi-squared variable of six degrees of freedom exceeds this once in a million.
-_MOST_SURPRISE = 38.0
 # So many of the last frames that contradict the gyroscope are no chance.
 _WATCHED, _CONTRADICTIONS = 12, 6
 # Turns of the camera that are kept to find out why, and how often that is tried (frames).
@@ -202,19 +197,3 @@ class GyroscopeWatch:
             math.sqrt(offset),
             self.angle,
         )
-
-
-@kernel
-def contradicts(step: Array, covariance: Array, places: IntArray) -> bool:
-    """Whether a frame moved what stands at these places by more than its covariance allows."""
-    count = len(places)
-    block = np.empty((count, count))
-    for i in range(count):
-        for j in range(count):
-            block[i, j] = covariance[places[i], places[j]]
-    information = inverted(block)
-    distance = 0.0
-    for i in range(count):
-        for j in range(count):
-            distance += step[places[i]] * information[i, j] * step[places[j]]
-    return not distance <= _MOST_SURPRISE

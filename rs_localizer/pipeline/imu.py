@@ -7,7 +7,6 @@ localizes. What a frame gets depends on stamps alone, not on when a reading came
 recording gives the same poses live and offline.
 """
 
-import itertools
 import math
 from collections import Counter, deque
 from collections.abc import Callable
@@ -41,8 +40,6 @@ _BUNDLE = 0.05
 _MANY, _LONG = 100, 5
 # Frames whose accelerometer readings average a hand's accelerations out of gravity.
 _SOME = 30
-# Of the last readings, changes of the frame_id that are no restart of a driver.
-_ALTERNATES = 4
 
 # Hz: at less, a shaking of 30 Hz turns by half a cycle between two readings.
 _LEAST_RATE = 1e9 / LONGEST_PERIOD_NS
@@ -107,7 +104,6 @@ class ImuInput:
         self._notice = notice
         self._buffer = ReadingBuffer()
         self._recently: deque[Unused | None] = deque(maxlen=_MANY)
-        self._frames_of: deque[str] = deque(maxlen=_MANY)  # the last readings' axes
         self._force_in_map = np.zeros(3)  # mean of the last frames
         self._with_force = 0  # how many
         self._gravity: float | None = None
@@ -122,7 +118,6 @@ class ImuInput:
 
     def add(self, reading: ImuReading) -> None:
         """Take a reading."""
-        self._frames_of.append(reading.frame)
         self._buffer.add(
             reading.stamp_ns, reading.frame, reading.angular_velocity, reading.linear_acceleration
         )
@@ -237,8 +232,6 @@ class ImuInput:
         camera_frame: str,
         transforms: Transforms,
     ) -> ImuSamples | Unused:
-        if (two := self._two_frames()) is not None:
-            return two
         start_ns, end_ns = _exposure(config, time_ns, tracker)
         readings = self._buffer.between(
             start_ns, end_ns, start_ns - _BEFORE_NS, end_ns + _AROUND_NS
@@ -256,13 +249,6 @@ class ImuInput:
         except TransformError as error:
             text = f"from the IMU {self.frame!r} to the camera {camera_frame!r}: {error}"
             return Unused(ImuReason.NO_TRANSFORM, text)
-
-    def _two_frames(self) -> Unused | None:
-        """Whether the readings have two frames of axes in turns, each of which ends the other."""
-        of = list(self._frames_of)
-        if sum(a != b for a, b in itertools.pairwise(of)) < _ALTERNATES:
-            return None
-        return Unused(ImuReason.TWO_FRAMES, " and ".join(repr(name) for name in sorted(set(of))))
 
     def _count(self, config: NodeConfig, tracker: Tracker | None, unused: Unused | None) -> None:
         self._frames += 1

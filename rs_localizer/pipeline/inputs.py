@@ -74,8 +74,6 @@ class Input:
     needs: str = ""  # of frames: the input that has to come first, and that only they use
     latched: bool = False  # who comes late wants the last message, too
     lasting: bool = False  # one message is enough
-    # Of what comes with every image, and only its stamp is new: what the localizer has of it.
-    held: Callable[[FrameLocalizer], Any] | None = None
     also: tuple[str, ...] = ()  # other types with the same names of fields; none may be installed
 
     @property
@@ -112,7 +110,6 @@ _ROWS = (
         said="camera_info",
         necessary=True,
         latched=True,
-        held=lambda localizer: localizer.calibration,
     ),
     Input(
         topics.MAP_POINTS,
@@ -202,9 +199,5 @@ def _of_camera(item: Input, name: str) -> Input:
     """An input of a camera with a name."""
     own = replace(item, topic=f"{name}/{item.topic}", about=f"{name}: {item.about}")
     if item.topic == topics.CAMERA_INFO:
-        return replace(
-            own,
-            use=lambda localizer, found: localizer.calibrate(found, name),
-            held=lambda localizer: localizer.calibrations.get(name),
-        )
+        return replace(own, use=lambda localizer, found: localizer.calibrate(found, name))
     return replace(own, use=lambda localizer, message: localizer.add(name, item.topic, message))

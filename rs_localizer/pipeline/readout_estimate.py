@@ -40,9 +40,7 @@ from rs_localizer.core.rig import Exposure, Rig
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import MOTION_PARAMETERS, VELOCITIES
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.observations import find_usable, packed
-from rs_localizer.estimation.prior import state_in
-from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.observations import lines_about
 
 _SIDE = 6  # numbers of each side of an equation: angular and linear
 _MOST_POINTS = 200  # of a frame: more take longer than they are worth
@@ -254,21 +252,15 @@ def view(camera: Camera, estimate: Estimate, points: Array, pixels: Array) -> Vi
     """
     chosen = np.flatnonzero(estimate.inliers)
     chosen = chosen[:: 1 + len(chosen) // _MOST_POINTS]
-    exposure = _exposure(camera).ahead()
-    points, pixels = points[chosen], pixels[chosen]
-    usable = find_usable(exposure, points, pixels, [len(chosen)], None)
-    seen = packed(exposure, points, usable)
-    if len(seen) <= MOTION_PARAMETERS:
+    if len(chosen) <= MOTION_PARAMETERS:
         return None
     # Without accelerations and shaking: what a prior has wrong about the velocities, they mend.
     steady = Motion(
         estimate.rotation, estimate.translation, estimate.angular_velocity, estimate.linear_velocity
     )
-    state = state_in(steady, usable.centre)
-    lines = linearized(seen.packed, len(seen), state, np.zeros((len(seen), _SIDE)))
-    sound = np.isfinite(lines.errors).all(axis=1)
-    errors = lines.errors[sound].ravel()
-    rows = lines.by_motion[sound][:, :, :MOTION_PARAMETERS].reshape(-1, MOTION_PARAMETERS)
+    lines = lines_about(_exposure(camera), points[chosen], pixels[chosen], steady)
+    errors = lines.errors.ravel()
+    rows = lines.by_motion[:, :, :MOTION_PARAMETERS].reshape(-1, MOTION_PARAMETERS)
     if len(errors) <= 2 * MOTION_PARAMETERS:
         return None
     variance = max(float(errors @ errors) / (len(errors) - MOTION_PARAMETERS), _LEAST_NOISE**2)
@@ -293,7 +285,7 @@ def view(camera: Camera, estimate: Estimate, points: Array, pixels: Array) -> Vi
 
 @lru_cache(4)
 def _exposure(camera: Camera) -> Exposure:
-    return Rig.of(camera).exposure()
+    return Rig.of(camera).exposure().ahead()
 
 
 def equation(before: View, now: View, after: View, first: float, second: float) -> Equation:

@@ -190,10 +190,6 @@ IMU_REASONS: dict[str, Meaning] = {
     ImuReason.SATURATED: Meaning(
         "the camera turns faster than the gyroscope can measure", "a larger range of the gyroscope"
     ),
-    ImuReason.TWO_FRAMES: Meaning(
-        "messages on imu alternate between two frame_ids",
-        "two IMUs or drivers publish: remap one of them",
-    ),
     ImuReason.NO_TRANSFORM: Meaning(
         "TF has no transform from the IMU to the camera",
         "publish it on /tf_static; ROS needs tf2_ros for it",

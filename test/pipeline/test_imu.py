@@ -3,7 +3,6 @@
 """An IMU that stops, lies, is late or is lost now and then: no frame is lost, none is wrong."""
 
 import copy
-import itertools
 import math
 import re
 from collections import Counter
@@ -253,24 +252,6 @@ def test_a_wrong_mounting_is_noticed_and_told_with_its_angle(flight):
     assert flown.state.unused.reason == ImuReason.TURNED
     angle = re.search(r"by (\d+) degrees", str(flown.state.unused))
     assert 175 <= int(angle[1]) <= 180
-
-
-def alternating() -> Change:
-    names = itertools.cycle(("imu_a", "imu_b"))
-
-    def change(message: Any, time: float) -> Iterable[Any]:
-        result = copy.deepcopy(message)
-        result.header.frame_id = next(names)
-        return (result,)
-
-    return change
-
-
-def test_two_frame_ids_in_turns_are_named(flight):
-    flown = fly(flight, alternating(), most=30)
-    flown.assert_none_is_lost_or_wrong(30)
-    assert flown.state.mostly.reason == ImuReason.TWO_FRAMES
-    assert "'imu_a' and 'imu_b'" in str(flown.state.mostly)
 
 
 @pytest.mark.parametrize(("down", "degrees"), [((0.0, 0.0, -1.0), 0.0), ((0.0, 1.0, 0.0), 90.0)])

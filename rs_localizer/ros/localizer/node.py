@@ -49,9 +49,6 @@ from rs_localizer.ros.node.views import MapView, camera_marker
 from rs_localizer.ros.node.worker import Need, Worker, in_thread
 from rs_localizer.settings import NODE_NAME
 
-# In a serialized message, which begins with four bytes of CDR and the stamp of its header.
-_AFTER_STAMP = 12
-
 
 class Feed:
     """Reads messages where they come, so that a bad one never takes the place of a good one.
@@ -77,8 +74,6 @@ class Feed:
         self._refusals = refusals
         self._say = say
         self._needs_tf: Callable[[], None] | None = needs_tf
-        # The last that was handed on of what is repeated, and what it says; by topic.
-        self._repeated: dict[str, tuple[bytes, Any]] = {}
         self._wanted: NodeConfig | None = None  # settings whose kernels are being loaded
 
     def topics(self, config: NodeConfig) -> dict[str, Topic]:
@@ -153,7 +148,7 @@ class Feed:
     def _samples_topic(self, item: Input) -> Topic:
         """A topic whose messages are all used here; frames wait for them."""
         take = functools.partial(self._take_sample, item)
-        return Topic(message_class(item.type), take, FAST_DATA, raw=True)
+        return Topic(message_class(item.type), take, FAST_DATA, raw=True, single=True)
 
     def _take_sample(self, item: Input, serialized: bytes) -> None:
         if self._frames.config.imu.use == ImuUse.NONE:
@@ -172,32 +167,18 @@ class Feed:
         """A topic whose messages are read here; the worker uses them."""
         return Topic(
             message_class(item.type),
-            functools.partial(self._take if item.held is None else self._take_repeated, item),
+            functools.partial(self._take, item),
             LATCHED if item.latched else SENSOR_DATA,
             lasting=item.lasting,
-            raw=item.held is not None,
         )
 
-    def _take(self, item: Input, message: Any) -> Any:
-        """What the message says, which the worker will use; None if it cannot be read."""
+    def _take(self, item: Input, message: Any) -> None:
         try:
             content = item.read(message)
         except MessageError as error:
             self._refusals.add(item.refused, str(error))
-            return None
-        self._worker.update(item.topic, lambda frames: self._use(frames, item, content))
-        return content
-
-    def _take_repeated(self, item: Input, serialized: bytes) -> None:
-        # Drivers repeat it with every image, and only its stamp is new.
-        assert item.held is not None
-        rest = serialized[_AFTER_STAMP:]
-        last, said = self._repeated.get(item.topic, (b"", None))
-        if rest == last and said == item.held(self._frames):
             return
-        content = self._take(item, deserialize_message(serialized, message_class(item.type)))
-        if content is not None:
-            self._repeated[item.topic] = rest, content
+        self._worker.update(item.topic, lambda frames: self._use(frames, item, content))
 
     # -- in the worker's thread, between two frames ------------------------------------------
 
