@@ -179,14 +179,6 @@ def without(start: float, end: float) -> Change:
     return lambda message, time: () if start < time < end else (message,)
 
 
-def clipped(message: Any, limit: float) -> Any:
-    result = copy.deepcopy(message)
-    for axis in "xyz":
-        value = getattr(message.angular_velocity, axis)
-        setattr(result.angular_velocity, axis, float(np.clip(value, -limit, limit)))
-    return result
-
-
 # What a reading buffer by itself says of others is in test/inertial/test_buffer.py.
 FAULTS: dict[str, tuple[Change, ImuReason]] = {
     "stops": (without(1.0, 9.0), ImuReason.STOPPED),
@@ -217,30 +209,6 @@ def test_readings_that_come_after_their_frames_are_late(flight):
         assert np.array_equal(a.pose.position, b.pose.position)
 
 
-def test_a_gyroscope_at_the_end_of_its_range(tmp_path):
-    """A camera that is swung faster and faster: from some moment on its gyroscope lies."""
-    path = tmp_path / "swung"
-    poses = swinging(tmp_path / "poses.txt")
-    words = ("--trajectory", str(poses), "--points", "80", "--noise", "0.3", "--imu")
-    record(path, *words)
-    flight = Flight(path)
-    flown = fly(flight, lambda message, time: (clipped(message, 2.2),))
-    flown.assert_none_is_lost_or_wrong(count(flight))
-    assert flown.state.reasons[ImuReason.SATURATED] > 3
-    assert flown.state.used > 3
-
-
-def swinging(path: Path) -> Path:
-    """Poses that swing to and fro about the vertical at 1.5 Hz, up to 4 rad/s after 3 s."""
-    time = np.arange(0.0, 3.0, 0.01)
-    yaw = 0.14 * time * np.sin(2.0 * np.pi * 1.5 * time)
-    half = 0.5 * yaw
-    rows = [f"{100.0 + t:.6f} 0 0 0 0 0 {s:.9f} {c:.9f}"
-            for t, s, c in zip(time, np.sin(half), np.cos(half), strict=True)]  # fmt: skip
-    path.write_text("\n".join(rows) + "\n")
-    return path
-
-
 def test_a_wrong_mounting_is_noticed_and_told_with_its_angle(flight):
     upside_down = copy.deepcopy(flight.mounting)
     rotation = upside_down.transforms[0].transform.rotation
@@ -260,36 +228,6 @@ def test_gravity_is_compared_with_the_map(flight, down, degrees):
     config = NodeConfig(readout_time=READOUT_TIME, imu=imu, gravity_in_map=down)
     flown = fly(flight, config=config)
     assert math.degrees(flown.state.gravity) == pytest.approx(degrees, abs=5.0)
-
-
-@pytest.mark.bench
-def test_two_hundred_interruptions(flight):
-    rng = np.random.default_rng(0)
-    starts = np.sort(rng.uniform(0.0, 3.0, 200))
-    ends = starts + rng.choice([0.003, 0.01, 0.03, 0.1], 200, p=[0.55, 0.3, 0.1, 0.05])
-    kept = []
-
-    def change(message: Any, time: float) -> Iterable[Any]:
-        if np.any((starts < time) & (time < ends)):
-            return ()
-        kept.append(stamp_ns(message))
-        return (message,)
-
-    flown = fly(flight, change)
-    flown.assert_none_is_lost_or_wrong(count(flight))
-    assert flown.state.reasons[ImuReason.GAP] > 5
-    # What is free of gaps uses it at once, and no frame has to be searched anew.
-    longest = 2.5 * MS * 1000 / 400
-    used = 0
-    for topic, _, message in flight.items:
-        if topic == "/correspondences":
-            first, last = stamp_ns(message), stamp_ns(message) + round(1e9 * READOUT_TIME)
-            around = kept[
-                np.searchsorted(kept, first, "right") - 1 : np.searchsorted(kept, last) + 1
-            ]
-            used += bool(np.diff(around).max() <= longest)
-    assert flown.state.used == used > 0
-    assert sum(frame.estimate.tracked for frame in flown.frames) >= count(flight) - 2
 
 
 def test_frames_that_stand_alone_use_it_too(flight):
