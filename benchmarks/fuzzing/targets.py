@@ -28,8 +28,7 @@ from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum, read_twists
 from rs_localizer.io.video import Video, VideoError
-from rs_localizer.markers.formats import Unsaid, read_any
-from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.markers.map_files import Unsaid, read_any, read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import build, load_params_file, parse_assignment

@@ -21,7 +21,7 @@ if WORKING:
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap, wall
     from rs_localizer.markers.poses import Pose
-    from rs_localizer.markers.prints import Board, Charuco, Chessboard
+    from rs_localizer.markers.prints import Charuco, Chessboard
 
 # Six markers that fill a page of A4 or letter.
 _FAMILY, _GRID, _SIZE, _SQUARE = "4x4_50", "2x3", 0.06, 0.03
@@ -79,31 +79,27 @@ def run(options: Options) -> dict[str, object]:
     count = f"{len(pages)} page{'s' if len(pages) > 1 else ''} of {options.page}"
     print(f"{shown}: {count}; print at 100 % and measure the bar")
     print(f"{map_file}: {len(marker_map.points)} corners in {marker_map.map_frame}")
-    if marker_map.markers and len(pages) > 1:
+    if len(pages) > 1:
         print("the markers do not fit on a page together: mount each where the map has it")
     return {"pages": files, "map": map_file, "corners": len(marker_map.points)}
 
 
 def _map(options: Options) -> MarkerMap:
     pose = Pose(np.zeros(3), _STANDING if options.standing else np.eye(3))
-    boards = [name for name in ("grid", "chessboard", "charuco") if getattr(options, name)]
-    if len(boards) > 1:
-        raise UsageError(f"give one of {', '.join(f'--{name}' for name in boards)}")
-    if boards in ([], ["grid"]):
+    given = [name for name in ("grid", "chessboard", "charuco") if getattr(options, name)]
+    if len(given) > 1:
+        raise UsageError(f"give one of {', '.join(f'--{name}' for name in given)}")
+    what = given[0] if given else "grid"
+    counts = read_counts(getattr(options, what) or _GRID, f"--{what}")
+    if what == "grid":
         size = options.size or _SIZE
         gap = _GAP * size if options.gap is None else options.gap
-        grid = read_counts(options.grid or _GRID, "--grid")
-        return MarkerMap(
-            wall(options.family, grid, size, gap, first_id=options.first_id, pose=pose)
-        )
+        first = options.first_id
+        return MarkerMap(wall(options.family, counts, size, gap, first_id=first, pose=pose))
     if options.gap is not None:
         raise UsageError("--gap is for a grid")
     square = options.size or _SQUARE
-    if options.chessboard is not None:
-        counts = read_counts(options.chessboard, "--chessboard")
-        board: Board = Chessboard(*counts, square, pose=pose)
-    else:
-        counts = read_counts(options.charuco or "", "--charuco")
-        kind, marker = family(options.family), _MARKER * square
-        board = Charuco(*counts, square, marker, kind, options.first_id, pose=pose)
-    return MarkerMap(boards=(board,))
+    if what == "chessboard":
+        return MarkerMap(boards=(Chessboard(*counts, square, pose=pose),))
+    kind, marker = family(options.family), _MARKER * square
+    return MarkerMap(boards=(Charuco(*counts, square, marker, kind, options.first_id, pose=pose),))

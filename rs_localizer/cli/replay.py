@@ -54,7 +54,7 @@ if WORKING:
     from rs_localizer.io.outputs import Localized
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
     from rs_localizer.io.topics import IMU
-    from rs_localizer.markers.formats import is_marker_file
+    from rs_localizer.markers.map_files import is_marker_file
     from rs_localizer.offline.fleet import (
         Figures,
         Outcome,

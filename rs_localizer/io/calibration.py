@@ -10,7 +10,6 @@ Which program wrote a file, what it holds tells; what each calls a lens is a row
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,7 +20,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
-from rs_localizer.io.yaml_text import YamlError, check_tree, file_faults, load_yaml
+from rs_localizer.io.yaml_text import YamlError, file_faults, load_yaml
 
 # Order of OpenCV's coefficients, by their names.
 _ORDER = {
@@ -164,8 +163,6 @@ def _choose(cameras: Mapping[str, T], name: str | None) -> T:
     return cameras[name]
 
 
-# Values of a JSON file: PhotonVision's hold all corners that were seen.
-_MOST_JSON = 1_000_000
 # OpenCV writes "%YAML:1.0" where YAML has "%YAML 1.0", and a tag of its own before matrices, which
 # are plain mappings of rows, cols, dt and data.
 _DIRECTIVE = re.compile(r"\A%YAML[: ][0-9.]+\s*\n")
@@ -174,16 +171,8 @@ _TAG = re.compile(r"!!opencv[-_a-z]*")
 
 def _load_tree(text: str) -> Any:
     """Mappings, lists and plain values of a file's text; YamlError for any other."""
-    start = text.lstrip()[:1]
-    if start == "<":
+    if text.lstrip()[:1] == "<":
         return _load_xml(text)
-    if start == "{":
-        try:
-            tree = json.loads(text)
-        except (ValueError, RecursionError):
-            return load_yaml(text)  # flow style, and its message if that fails, too
-        check_tree(tree, _MOST_JSON)
-        return tree
     return load_yaml(_TAG.sub("", _DIRECTIVE.sub("", text)))
 
 

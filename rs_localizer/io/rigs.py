@@ -101,7 +101,7 @@ def read_rig_config(path: Path | str) -> dict[str, tuple[Array, Array]]:
 
 def _load(path: Path, reader: Callable[[Any], T]) -> T:
     with calibration_faults(path, "YAML or JSON", "no usable rig"):
-        return reader(load_yaml(path.read_text(encoding="utf-8")))  # JSON is YAML
+        return reader(load_yaml(path.read_text(encoding="utf-8")))
 
 
 def _camchain(tree: Any) -> RigParts:

@@ -1,8 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""YAML that people write: small, and a tree."""
+"""YAML and JSON that people and programs write: small, and a tree."""
 
 import contextlib
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,8 @@ from typing import Any
 import yaml
 
 # A file may name a part of itself again; counted at every place, so that few lines do not stand
-# for a thousand million values, or for endlessly many.
-_MOST_VALUES, _DEEPEST = 100_000, 50
+# for a thousand million values, or for endlessly many. Programs write more, as JSON.
+_MOST_VALUES, _MOST_JSON, _DEEPEST = 100_000, 1_000_000, 50
 # libyaml reads 5 MB a second, PyYAML alone a tenth of that.
 _MOST_CHARACTERS = 2_000_000
 # Of numbers; those of base 60 ("1:0:0 ...", YAML 1.1) take time that grows with its square.
@@ -49,29 +50,34 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 
 
 def load_yaml(text: str) -> Any:
-    """What the text holds: mappings, lists, and plain values.
+    """What the text, YAML or JSON, holds: mappings, lists, and plain values.
 
     Raises:
         YamlError: for anything else, saying what was found.
     """
+    if text.lstrip()[:1] in ("{", "["):
+        try:
+            tree = json.loads(text)
+        except (ValueError, RecursionError):
+            pass  # YAML's flow style, or its message if that fails, too
+        else:
+            return _checked(tree, _MOST_JSON)
     if len(text) > _MOST_CHARACTERS:
         raise YamlError(f"it has {len(text)} characters, more than {_MOST_CHARACTERS}")
     if text.count(",") + text.count("\n") > 2 * _MOST_VALUES:  # before they are made
         raise YamlError(f"it holds more than {_MOST_VALUES} values")
     try:
-        tree = yaml.load(text, _Loader)
+        return _checked(yaml.load(text, _Loader), _MOST_VALUES)
     except RecursionError:
         raise YamlError(f"it nests deeper than {_DEEPEST}") from None
     except YamlError:
         raise
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # dates and numbers that are none
         raise YamlError(" ".join(str(error).split())) from error
-    check_tree(tree)
-    return tree
 
 
-def check_tree(tree: Any, most: int = _MOST_VALUES) -> None:
-    """Refuse, with a YamlError, what is larger or deeper than anything that people write."""
+def _checked(tree: Any, most: int) -> Any:
+    """The tree; refused, with a YamlError, where it is larger or deeper than anything written."""
     waiting, count = [(tree, 0)], 0
     while waiting:
         value, depth = waiting.pop()
@@ -84,3 +90,4 @@ def check_tree(tree: Any, most: int = _MOST_VALUES) -> None:
             waiting += [(item, depth + 1) for item in value.values()]
         elif isinstance(value, list | set | tuple):
             waiting += [(item, depth + 1) for item in value]
+    return tree

@@ -1,17 +1,24 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of marker maps, in YAML; an example of all that they may hold is in docs/maps.md.
+"""Files of marker maps: our own YAML (an example is in docs/maps.md) and those of other programs.
 
-A pose is that of the print's frame: origin in its middle, x to the right, y up, z toward the
-viewer (the identity is a print that lies on the floor of a map whose z points up). Corners go from
-the top left one clockwise, as seen from the front.
+Which it is, what a file holds tells. Poses are of the print's frame: origin in its middle, x to the
+right, y up, z toward the viewer; corners go from the top left one clockwise, from the front.
+
+* WPILib's AprilTag fields, JSON: m; z is up, x of a tag comes out of it toward the viewer, y is to
+  the viewer's right. Sizes are not in the file.
+* Bundles of apriltag_ros (ROS 1), YAML: m; axes of a tag are those of a print
+  (AprilRobotics/apriltag_ros #156); what is missing of a pose is that of the origin.
+* Targets of Kalibr, YAML: of an AprilGrid in its frame, the lower left corner of tag 0.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
+import re
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,151 +27,196 @@ import yaml
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.yaml_text import file_faults, load_yaml
-from rs_localizer.markers.families import FAMILIES, family
+from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation
-from rs_localizer.markers.poses import rotation_of_quaternion as _rotation
+from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation, rotation_of_quaternion
 from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid, Marker
 
-# A pose stands for corners that it gives to within this share of a side.
-_SAME = 1e-9
-# Of a size that is given beside the corners.
-_SIZE_TOLERANCE = 0.05
-
-
+USUAL_FAMILY = FAMILIES["apriltag_36h11"]
+"""Of files of other programs that do not say it."""
+OWN, WPILIB, BUNDLES, _KALIBR = "rs_localizer", "wpilib", "apriltag_ros", "kalibr"
+FORMATS = (OWN, WPILIB, BUNDLES)
+"""What is written; Kalibr's targets are read, too."""
+_KEYS = {
+    OWN: ("markers", "boards", "map_frame"), WPILIB: ("tags",),
+    BUNDLES: ("tag_bundles", "standalone_tags"), _KALIBR: ("target_type",),
+}  # fmt: skip
+SUFFIXES = (".yaml", ".yml", ".json")
+# A parameter of apriltag_ros, which reads it beside the bundles; WPILib passes over it.
+_TAG_FAMILY = "tag_family"
+# Tag of WPILib from print: to the right is y, up z, out of the print x.
+_TAG_FROM_PRINT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+# A pose stands for corners that it gives to within this share of a side; of a size that is given
+# beside the corners; and of the sizes of a field, which does not say them.
+_SAME, _SIZE_TOLERANCE, _SAME_SIZE = 1e-9, 0.05, 1e-3
 _CHESSBOARD, _CIRCLES, _ASYMMETRIC, _CHARUCO = _BOARDS = (
-    "chessboard",
-    "circles",
-    "asymmetric_circles",
-    "charuco",
-)
+    "chessboard", "circles", "asymmetric_circles", "charuco",
+)  # fmt: skip
 
 
-def read_marker_map(path: Path | str) -> MarkerMap:
-    """Read a map file.
+@dataclass(frozen=True, slots=True)
+class Unsaid:
+    """What a file does not say of its markers."""
+
+    family: Family | None = None  # None: as the file says, or the usual one
+    size: float | None = None  # m
+    part: str = ""  # name of the bundle to take
+
+
+def is_marker_file(path: Path) -> bool:
+    """Whether a file is one of markers, by its name."""
+    return path.suffix.lower() in SUFFIXES
+
+
+def read_marker_map(path: Path | str, unsaid: Unsaid | None = None) -> MarkerMap:
+    """Read a map file of any format.
 
     Raises:
         MarkerMapError: for anything that cannot be used, saying where and what was found.
     """
-    path = Path(path)
-    with file_faults(path, MarkerMapError):
+    return read_any(Path(path), unsaid)[0]
+
+
+def read_any(path: Path, unsaid: Unsaid | None = None) -> tuple[MarkerMap, str]:
+    """A marker map of any format, and the name of the format; raises as above."""
+    with file_faults(path, MarkerMapError, "YAML or JSON"):
         tree = load_yaml(path.read_text(encoding="utf-8"))
     try:
-        return _map(tree)
+        file = _Entry(tree, "the map")
+        name = next((name for name, keys in _KEYS.items() if any(key in file for key in keys)), "")
+        if not name:
+            raise ValueError(f"its format is not known ({', '.join(FORMATS)}): it has {file.names}")
+        if name in (OWN, _KALIBR):
+            return (_own if name == OWN else _kalibr_target)(file), OWN
+        unsaid = unsaid or Unsaid()
+        kind = unsaid.family or family(file.take(_TAG_FAMILY, str, USUAL_FAMILY.name))
+        markers = (_wpilib if name == WPILIB else _bundle)(file, kind.name, unsaid)
+        return MarkerMap(tuple(markers)), name
     except ValueError as error:
         raise MarkerMapError(f"{path}: {error}") from error
 
 
-def _map(tree: Any) -> MarkerMap:
-    entry = Entry(tree, "the map")
-    if _KALIBR in entry:
-        return _kalibr_target(entry)
-    markers = [_marker(item) for item in entry.entries("markers", "marker")]
-    boards = [_board(item) for item in entry.entries("boards", "board")]
-    frame = entry.take("map_frame", str)
-    entry.finish()
+def _own(file: _Entry) -> MarkerMap:
+    markers = [_marker(item) for item in file.entries("markers", "marker")]
+    boards = [_board(item) for item in file.entries("boards", "board")]
+    frame = file.take("map_frame", str)
+    file.finish()
     return MarkerMap(tuple(markers), tuple(boards), frame)
 
 
-_KALIBR = "target_type"
-
-
-def _kalibr_target(entry: Entry) -> MarkerMap:
-    """A target file of Kalibr; of an AprilGrid in its frame, the lower left corner of tag 0."""
-    kind = entry.take(_KALIBR, str)
-    if kind == "aprilgrid":
-        columns, rows = entry.take("tagCols", int), entry.take("tagRows", int)
-        size, gap = entry.number("tagSize"), entry.number("tagSpacing")
-        name = FAMILIES["apriltag_36h11_border2"].name
-        places = [
-            (c * (1.0 + gap) + 0.5, r * (1.0 + gap) + 0.5)
-            for r in range(rows)
-            for c in range(columns)
-        ]
-        with entry.named():
-            return MarkerMap(tuple(
-                Marker.at(name, k, size, Pose(np.array([size * x, size * y, 0.0])))
-                for k, (x, y) in enumerate(places)
-            ))  # fmt: skip
-    if kind not in ("checkerboard", "circlegrid"):
-        raise EntryError(f"target_type must be aprilgrid, checkerboard or circlegrid, not {kind!r}")
-    columns, rows = entry.take("targetCols", int), entry.take("targetRows", int)
-    with entry.named():
-        if kind == "circlegrid":
-            asymmetric = entry.take("asymmetricGrid", bool, False)
-            spacing = entry.number("spacingMeters")
-            return MarkerMap(boards=(CircleGrid(columns, rows, spacing, asymmetric),))
-        square, other = entry.number("rowSpacingMeters"), entry.number("colSpacingMeters")
-        if square != other:
-            raise ValueError(f"squares must be as high as wide, found {square:g} and {other:g} m")
-        return MarkerMap(boards=(Chessboard(columns, rows, square),))
-
-
-def _marker(entry: Entry) -> Marker:
+def _marker(entry: _Entry) -> Marker:
     name, number = entry.take("family", str), entry.take("id", int)
     entry.where += f" ({name} {number})"
-    deviations = _deviations(entry)
-    if "corners" not in entry:
-        size, pose = entry.number("size"), _pose(entry)
-        entry.finish()
-        with entry.named():
-            return replace(Marker.at(name, number, size, pose), deviations=deviations)
-    corners = entry.take("corners", list)
-    stated = entry.number("size") if "size" in entry else None
-    entry.finish()
     with entry.named():
+        known = [entry.take(f"{of}_deviation", list, None) for of in ("position", "rotation")]
+        deviations = None if known == [None, None] else finite(known, (2, 3), "deviations").ravel()
+        corners = entry.take("corners", list, None)
+        size = entry.take("size", _NUMBER, *(() if corners is None else (None,)))
+        if corners is None:
+            pose = _pose(entry)
+            entry.finish()
+            return replace(Marker.at(name, number, size, pose), deviations=deviations)
+        entry.finish()
         marker = Marker(family(name), number, corners, deviations)
-        if stated is not None and abs(marker.size - stated) > _SIZE_TOLERANCE * abs(stated):
-            raise ValueError(f"its corners are {marker.size:.4g} m apart, but size is {stated:g}")
+        if size is not None and abs(marker.size - size) > _SIZE_TOLERANCE * abs(size):
+            raise ValueError(f"its corners are {marker.size:.4g} m apart, but size is {size:g}")
         return marker
 
 
-def _deviations(entry: Entry) -> Array | None:
-    """Of a surveyed marker: place (m) and turn (rad)."""
-    if "position_deviation" not in entry and "rotation_deviation" not in entry:
-        return None
-    with entry.named():
-        return np.concatenate([
-            finite(entry.take(name, list), (3,), name)
-            for name in ("position_deviation", "rotation_deviation")
-        ])  # fmt: skip
-
-
-def _board(entry: Entry) -> Board:
+def _board(entry: _Entry) -> Board:
     kind = entry.take("type", str)
     entry.where += f" ({kind})"
-    if kind not in _BOARDS:
-        raise EntryError(f"{entry.where}: type must be one of {', '.join(_BOARDS)}")
-    counts = entry.take("columns", int), entry.take("rows", int)
-    spacing = entry.number("spacing" if "circles" in kind else "square")
-    given: dict[str, Any] = {"pose": _pose(entry)}
-    if "shape" in entry:
-        given["shape"] = entry.take("shape", list)
-    if "deviation" in entry:
-        given["deviation"] = entry.number("deviation")
-    if kind == _CHARUCO:
-        marker, name = entry.number("marker"), entry.take("family", str)
-        given["first_id"] = entry.take("first_id", int, 0)
-        given["legacy"] = entry.take("legacy", bool, False)
-    else:
-        given["inverted"] = entry.take("inverted", bool, False)
-    entry.finish()
     with entry.named():
+        if kind not in _BOARDS:
+            raise ValueError(f"type must be one of {', '.join(_BOARDS)}")
+        counts = entry.take("columns", int), entry.take("rows", int)
+        spacing = float(entry.take("spacing" if "circles" in kind else "square", _NUMBER))
+        given = {
+            "pose": _pose(entry),
+            "shape": entry.take("shape", list, None),
+            "deviation": entry.take("deviation", _NUMBER, None),
+        }
         if kind == _CHARUCO:
-            return Charuco(*counts, spacing, marker, family(name), **given)
+            marker, name = float(entry.take("marker", _NUMBER)), entry.take("family", str)
+            own = entry.take("first_id", int, 0), entry.take("legacy", bool, False)
+            entry.finish()
+            return Charuco(*counts, spacing, marker, family(name), *own, **given)
+        given["inverted"] = entry.take("inverted", bool, False)
+        entry.finish()
         if kind == _CHESSBOARD:
             return Chessboard(*counts, spacing, **given)
         return CircleGrid(*counts, spacing, kind == _ASYMMETRIC, **given)
 
 
-def _pose(entry: Entry) -> Pose:
-    position = entry.take("position", list)
-    with entry.named():
-        if "rotation" not in entry:
-            return Pose(position, _rotation(entry.take("quaternion", list)))
-        if "quaternion" in entry:
-            raise ValueError("there are both a rotation and a quaternion")
-        return Pose(position, entry.take("rotation", list))
+def _pose(entry: _Entry) -> Pose:
+    position, rotation = entry.take("position", list), entry.take("rotation", list, None)
+    if rotation is None:
+        return Pose(position, rotation_of_quaternion(entry.take("quaternion", list)))
+    if "quaternion" in entry:
+        raise ValueError("there are both a rotation and a quaternion")
+    return Pose(position, rotation)
+
+
+def _kalibr_target(entry: _Entry) -> MarkerMap:
+    kind = entry.take("target_type", str)
+    if kind == "aprilgrid":
+        columns, rows = entry.take("tagCols", int), entry.take("tagRows", int)
+        size, gap = entry.take("tagSize", _NUMBER), entry.take("tagSpacing", _NUMBER)
+        name, pitch = FAMILIES["apriltag_36h11_border2"].name, size * (1.0 + gap)
+        return MarkerMap(tuple(
+            Marker.at(name, k, size, Pose(np.array([
+                pitch * (k % columns) + 0.5 * size, pitch * (k // columns) + 0.5 * size, 0.0
+            ])))
+            for k in range(columns * rows)
+        ))  # fmt: skip
+    if kind not in ("checkerboard", "circlegrid"):
+        raise ValueError(f"target_type must be aprilgrid, checkerboard or circlegrid, not {kind!r}")
+    counts = entry.take("targetCols", int), entry.take("targetRows", int)
+    if kind == "circlegrid":
+        asymmetric = entry.take("asymmetricGrid", bool, False)
+        spacing = float(entry.take("spacingMeters", _NUMBER))
+        return MarkerMap(boards=(CircleGrid(*counts, spacing, asymmetric),))
+    square, other = (float(entry.take(f"{of}SpacingMeters", _NUMBER)) for of in ("row", "col"))
+    if square != other:
+        raise ValueError(f"squares must be as high as wide, found {square:g} and {other:g} m")
+    return MarkerMap(boards=(Chessboard(*counts, square),))
+
+
+def _wpilib(file: _Entry, name: str, unsaid: Unsaid) -> Iterator[Marker]:
+    if unsaid.size is None:
+        raise ValueError(
+            "a field of WPILib does not say how large its tags are: give --size (m; 0.1651 of FRC)"
+        )
+    for tag in file.entries("tags", "tag"):
+        number = tag.identify("ID")
+        pose = tag.below("pose")
+        place = pose.below("translation").numbers("xyz")
+        turn = pose.below("rotation").below("quaternion").numbers("XYZW")
+        with tag.named():
+            rotation = rotation_of_quaternion(turn) @ _TAG_FROM_PRINT
+            yield Marker.at(name, number, unsaid.size, Pose(np.array(place), rotation))
+
+
+def _bundle(file: _Entry, name: str, unsaid: Unsaid) -> Iterator[Marker]:
+    bundles = {
+        str(bundle.take("name", (str, int), f"{index}")): bundle
+        for index, bundle in enumerate(file.entries("tag_bundles", "bundle"))
+    }
+    if not bundles:
+        raise ValueError("it has no tag_bundles: standalone tags have no place")
+    chosen = unsaid.part or next(iter(bundles))
+    if chosen not in bundles or (len(bundles) > 1 and not unsaid.part):
+        raise ValueError(
+            f"it has {len(bundles)} bundles, each in a frame of its own: choose one of "
+            f"{', '.join(bundles)} with --part"
+        )
+    for tag in bundles[chosen].entries("layout", "tag"):
+        number, size = tag.identify("id"), float(tag.take("size", _NUMBER))
+        place, turn = tag.numbers("xyz"), tag.numbers(("qx", "qy", "qz"))
+        turn.append(float(tag.take("qw", _NUMBER, 1.0)))
+        with tag.named():
+            pose = Pose(np.array(place), rotation_of_quaternion(turn))
+            yield Marker.at(name, number, size, pose)
 
 
 _EXPLANATION = """\
@@ -187,37 +239,90 @@ _EXPLANATION = """\
 """
 
 
+def write_any(path: Path, marker_map: MarkerMap, name: str) -> None:
+    """Write a marker map in one of :data:`FORMATS`.
+
+    Raises:
+        MarkerMapError: when the format cannot hold the map.
+    """
+    if name == OWN:
+        write_marker_map(path, marker_map)
+        return
+    what = "a field of WPILib" if name == WPILIB else name
+    if marker_map.boards:
+        raise MarkerMapError(f"{what} cannot hold boards: {marker_map.boards[0].name}")
+    kinds = sorted({marker.family.kind for marker in marker_map.markers})
+    if len(kinds) > 1:
+        raise MarkerMapError(f"{what} holds markers of one family, found {' and '.join(kinds)}")
+    largest = max((marker.family for marker in marker_map.markers), key=lambda of: of.count)
+    # AprilTag's own names, where there is one.
+    tree = {_TAG_FAMILY: re.sub(r"^apriltag_", "tag", largest.name)}
+    if name == WPILIB:
+        text = json.dumps(tree | _field(marker_map), indent=1) + "\n"
+    else:
+        text = _yaml(tree | _one_bundle(marker_map), 160)
+    path.write_text(text, encoding="utf-8")
+
+
+def _field(marker_map: MarkerMap) -> dict[str, Any]:
+    """Of WPILib; as large as its tags need, from the origin on."""
+    sizes = sorted(marker.size for marker in marker_map.markers)
+    if sizes[-1] > sizes[0] * (1.0 + _SAME_SIZE):
+        raise MarkerMapError(
+            f"a field of WPILib holds tags of one size, found {sizes[0]:g} to {sizes[-1]:g} m"
+        )
+    tags = []
+    for marker in marker_map.markers:
+        turn = quaternion_of_rotation(marker.pose.rotation @ _TAG_FROM_PRINT.T)
+        pose = {
+            "translation": _named("xyz", marker.pose.position),
+            "rotation": {"quaternion": _named("WXYZ", np.roll(turn, 1))},
+        }
+        tags.append({"ID": marker.id, "pose": pose})
+    length, width = np.round(np.maximum(marker_map.points.max(axis=0), 0.0)[:2], 6).tolist()
+    return {"tags": tags, "field": {"length": length, "width": width}}
+
+
+def _one_bundle(marker_map: MarkerMap) -> dict[str, Any]:
+    layout = [
+        {"id": marker.id, "size": _rounded([marker.size])[0]}
+        | _named("xyz", marker.pose.position)
+        | _named(("qx", "qy", "qz", "qw"), quaternion_of_rotation(marker.pose.rotation))
+        for marker in marker_map.markers
+    ]
+    bundle = {"name": marker_map.map_frame, "layout": layout}
+    return {"standalone_tags": [], "tag_bundles": [bundle]}
+
+
 def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:
-    """Write a map file that :func:`read_marker_map` reads."""
+    """Write a map file of our own."""
     tree: dict[str, Any] = {"map_frame": marker_map.map_frame}
     if marker_map.markers:
         tree["markers"] = [_marker_entry(marker) for marker in marker_map.markers]
     if marker_map.boards:
         tree["boards"] = [_board_entry(board) for board in marker_map.boards]
-    text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=100)
-    Path(path).write_text(f"{_EXPLANATION}{text}", encoding="utf-8")
+    Path(path).write_text(_EXPLANATION + _yaml(tree, 100), encoding="utf-8")
 
 
 def _marker_entry(marker: Marker) -> dict[str, Any]:
     entry: dict[str, Any] = {"family": marker.family.name, "id": marker.id}
-    deviations: dict[str, Any] = {}
-    if marker.deviations is not None:
-        deviations["position_deviation"] = _significant(marker.deviations[:3])
-        deviations["rotation_deviation"] = _significant(marker.deviations[3:])
     square = Marker.at(marker.family.name, marker.id, marker.size, marker.pose)
     if np.abs(square.corners - marker.corners).max() > _SAME * marker.size:
-        return entry | {"corners": [rounded(row) for row in marker.corners]} | deviations
-    return entry | {"size": rounded([marker.size])[0]} | _pose_entry(marker.pose) | deviations
+        entry["corners"] = [_rounded(row) for row in marker.corners]
+    else:
+        entry |= {"size": _rounded([marker.size])[0]} | _pose_entry(marker.pose)
+    if marker.deviations is not None:
+        digits = [float(f"{value:.3g}") for value in marker.deviations]  # no more are known
+        entry |= {"position_deviation": digits[:3], "rotation_deviation": digits[3:]}
+    return entry
 
 
 def _board_entry(board: Board) -> dict[str, Any]:
+    own: dict[str, Any]
     if isinstance(board, Charuco):
         kind, own = _CHARUCO, {
-            "square": float(board.square),
-            "marker": float(board.marker),
-            "family": board.family.name,
-            "first_id": board.first_id,
-            "legacy": board.legacy,
+            "square": float(board.square), "marker": float(board.marker),
+            "family": board.family.name, "first_id": board.first_id, "legacy": board.legacy,
         }  # fmt: skip
     elif isinstance(board, Chessboard):
         kind, own = _CHESSBOARD, {"square": float(board.square)}
@@ -229,7 +334,7 @@ def _board_entry(board: Board) -> dict[str, Any]:
     if not isinstance(board, Charuco) and board.inverted:
         entry["inverted"] = True
     if board.shape is not None:
-        entry["shape"] = [rounded(row) for row in np.round(board.shape, 7)]
+        entry["shape"] = [_rounded(row) for row in np.round(board.shape, 7)]
     if board.deviation is not None:
         entry["deviation"] = float(f"{board.deviation:.3g}")
     return entry
@@ -237,67 +342,83 @@ def _board_entry(board: Board) -> dict[str, Any]:
 
 def _pose_entry(pose: Pose) -> dict[str, Any]:
     quaternion = quaternion_of_rotation(pose.rotation)
-    return {"position": rounded(pose.position), "quaternion": rounded(quaternion)}
+    return {"position": _rounded(pose.position), "quaternion": _rounded(quaternion)}
 
 
-def rounded(values: Iterable[float]) -> list[float]:
+def _rounded(values: Iterable[float]) -> list[float]:
     """Without the rounding errors of a fitted pose: 0.16 and not 0.16000000000000003."""
     return [round(float(value), 12) + 0.0 for value in values]
 
 
-def _significant(values: Array) -> list[float]:
-    """Three digits: more are not known of a deviation."""
-    return [float(f"{value:.3g}") for value in values]
+def _named(names: Iterable[str], values: Array) -> dict[str, float]:
+    return dict(zip(names, _rounded(values), strict=True))
 
 
-class EntryError(ValueError):
+def _yaml(tree: dict[str, Any], width: int) -> str:
+    return str(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=width))
+
+
+_NUMBER = (int, float)
+
+
+class _EntryError(ValueError):
     """Says already which entry it is about."""
 
 
-class Entry:
+class _Entry:
     """A mapping of the file whose keys are taken one after the other; the rest is unknown."""
 
     def __init__(self, tree: Any, where: str) -> None:
         self.where = where
         if not isinstance(tree, dict):
-            raise EntryError(f"{where} must be a mapping, found {tree!r}")
+            raise _EntryError(f"{where} must be a mapping, found {str(tree)[:60]!r}")
         self._left = dict(tree)
 
     def __contains__(self, name: str) -> bool:
         return name in self._left
 
-    def names(self) -> list[str]:
+    @property
+    def names(self) -> str:
         """The keys that are left."""
-        return [str(name) for name in self._left]
+        return ", ".join(map(str, self._left)) or "nothing else"
 
     def take(self, name: str, kind: type | tuple[type, ...], *default: Any) -> Any:
-        if name not in self._left and default:
-            return default[0]
         if name not in self._left:
-            names = ", ".join(map(str, self._left)) or "nothing else"
-            raise EntryError(f"{self.where} has no {name}; it has {names}")
+            if default:
+                return default[0]
+            raise _EntryError(f"{self.where} has no {name}; it has {self.names}")
         value = self._left.pop(name)
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            raise EntryError(f"{self.where}: {name} cannot be {value!r}")
+            raise _EntryError(f"{self.where}: {name} cannot be {value!r}")
         return value
 
-    def number(self, name: str) -> float:
-        return float(self.take(name, (int, float)))
+    def identify(self, name: str) -> int:
+        """The id of a tag, which tells errors where they are."""
+        number: int = self.take(name, int)
+        self.where += f" (id {number})"
+        return number
 
-    def entries(self, name: str, one: str) -> list[Entry]:
+    def numbers(self, names: Iterable[str]) -> list[float]:
+        """What is missing is 0."""
+        return [float(self.take(name, _NUMBER, 0.0)) for name in names]
+
+    def below(self, name: str) -> _Entry:
+        return _Entry(self.take(name, dict), f"{self.where}: {name}")
+
+    def entries(self, name: str, one: str) -> list[_Entry]:
         listed = self.take(name, (list, type(None)), None) or []
-        return [Entry(item, f"{one} {index + 1}") for index, item in enumerate(listed)]
+        return [_Entry(item, f"{one} {index + 1}") for index, item in enumerate(listed)]
 
     def finish(self) -> None:
         if self._left:
-            raise EntryError(f"{self.where} has the unknown {', '.join(map(str, self._left))}")
+            raise _EntryError(f"{self.where} has the unknown {self.names}")
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
         """Faults within are about this entry."""
         try:
             yield
-        except EntryError:
+        except _EntryError:
             raise
         except ValueError as error:
-            raise EntryError(f"{self.where}: {error}") from error
+            raise _EntryError(f"{self.where}: {error}") from error

@@ -115,7 +115,10 @@ class _Board:
         shape = (points - self.pose(self.flat)) @ self.pose.rotation
         return replace(self, shape=shape, deviation=deviation)
 
-    def _check(self, *lengths: str) -> None:
+    def _check(self, least: tuple[int, int], wanted: str, *lengths: str) -> None:
+        """What every board is checked for, and the ``lengths`` by their names."""
+        if self.columns < least[0] or self.rows < least[1]:
+            raise ValueError(f"{wanted}, got {self.columns}x{self.rows}")
         if max(self.columns, self.rows) > _MOST_SQUARES:
             raise ValueError(
                 f"a board may be {_MOST_SQUARES} squares wide and high, got "
@@ -141,23 +144,11 @@ class Chessboard(_Board):
     inverted: bool = False  # white squares on black, with black paper around them
 
     def __post_init__(self) -> None:
-        if min(self.columns, self.rows) < 3:  # OpenCV's own limit
-            raise ValueError(f"a board needs 3x3 inner corners, got {self.columns}x{self.rows}")
-        self._check("square")
+        self._check((3, 3), "a board needs 3x3 inner corners", "square")  # OpenCV's own limit
 
     @property
     def flat(self) -> Array:
         return _grid(self.columns, self.rows, self.square)
-
-    @property
-    def spacing(self) -> float:
-        """From a corner to the next, m."""
-        return self.square
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Width and height of the squares, m."""
-        return (self.columns + 1) * self.square, (self.rows + 1) * self.square
 
     @property
     def name(self) -> str:
@@ -178,9 +169,7 @@ class CircleGrid(_Board):
     inverted: bool = False  # white circles on black
 
     def __post_init__(self) -> None:
-        if self.columns < 2 or self.rows < 3:
-            raise ValueError(f"a grid needs 2x3 circles, got {self.columns}x{self.rows}")
-        self._check("spacing")
+        self._check((2, 3), "a grid needs 2x3 circles", "spacing")
 
     @property
     def flat(self) -> Array:
@@ -190,12 +179,6 @@ class CircleGrid(_Board):
         x = 2.0 * column + row % 2.0 - 0.5 * (2 * self.columns - 1)
         flat = np.stack([x, 0.5 * (self.rows - 1) - row, np.zeros_like(x)], axis=-1)
         return np.asarray(flat.reshape(-1, 3) * self.spacing)
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Width and height with a rim of half a spacing, m."""
-        columns = 2 * self.columns if self.asymmetric else self.columns
-        return columns * self.spacing, self.rows * self.spacing
 
     @property
     def name(self) -> str:
@@ -219,11 +202,8 @@ class Charuco(_Board):
     legacy: bool = False
 
     def __post_init__(self) -> None:
-        if min(self.columns, self.rows) < 2 or self.columns * self.rows < 6:
-            raise ValueError(
-                f"a ChArUco board needs 2x3 squares or more, got {self.columns}x{self.rows}"
-            )
-        self._check("square", "marker")
+        least = (2, 3) if self.rows > 2 else (3, 2)
+        self._check(least, "a ChArUco board needs 2x3 squares or more", "square", "marker")
         if self.marker >= self.square:
             raise ValueError(
                 f"the markers of {self.marker} m do not fit into squares of {self.square} m"
@@ -256,16 +236,6 @@ class Charuco(_Board):
             corners = self.pose(self.marker * _UNIT_SQUARE + np.array([x, -y, 0.0]))
             made.append(Marker(self.family, self.first_id + index, corners))
         return made
-
-    @property
-    def spacing(self) -> float:
-        """From a corner to the next, m."""
-        return self.square
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Width and height of the squares, m."""
-        return self.columns * self.square, self.rows * self.square
 
     @property
     def name(self) -> str:

@@ -27,7 +27,7 @@ from rs_localizer.io.recording import (
 )
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.detection import recognized
-from rs_localizer.markers.map_check import LeaveOneOut, OtherReadings, Predict, rms, still_fit
+from rs_localizer.markers.map_check import MapCheck, Predict, rms, still_fit
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
@@ -141,8 +141,7 @@ class _Tally:
         self._residuals: list[float] = []
         self._empty: list[Image] = []  # some that show nothing
         self._empties = 0
-        self._markers = LeaveOneOut(marker_map, _RollingFit())
-        self._readings = OtherReadings(marker_map)
+        self._check = MapCheck(marker_map, _RollingFit())
 
     def add(self, camera: Camera, detected: Detected) -> None:
         detections = detected.detections
@@ -151,8 +150,7 @@ class _Tally:
         if len(detections.ids):
             self._found.counts.append(len(detections.ids))
             self._residuals.append(static_residual(camera, detected))
-            self._markers.add(camera, detections)
-            self._readings.add(camera, detections)
+            self._check.add(camera, detections)
             return
         self._empties += 1
         if self._empties.bit_count() == 1:  # the 1st, 2nd, 4th, 8th ...
@@ -192,8 +190,8 @@ class _Tally:
 
     def recorded(self) -> Recorded:
         known = [value for value in self._residuals if np.isfinite(value)]
-        faults = [] if (fault := self._markers.fault()) is None else [fault]
-        if (reading := self._readings.fault()) is not None:
+        faults = [] if (fault := self._check.misplaced()) is None else [fault]
+        if (reading := self._check.other_reading()) is not None:
             faults = [reading]
         elif known and (least := float(np.percentile(known, _STILL_PERCENT))) > _MOST_STILL:
             faults.append(

@@ -15,14 +15,13 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid, Marker
+from rs_localizer.markers.prints import Board, Chessboard, CircleGrid, Marker
 
 # Upright, in mm.
 PAGES = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 # mm: printers leave about 5 white; the foot holds a bar to measure and what is said.
 _MARGIN, _FOOT, _BAR = 10.0, 16.0, 100.0
 _MM, _INCH, _PNG_DPI = 1000.0, 25.4, 300
-_FLAT = 1e-6  # prints lie in one plane and face the same way to within this
 
 
 class PrintError(ValueError):
@@ -40,41 +39,30 @@ class Page:
 
 
 def plan(marker_map: MarkerMap, page: str = "a4") -> list[Page]:
-    """A page for each board, and one for all markers, or one for each where they do not fit.
+    """A page for a board or a wall of markers, or one for each marker where they do not fit.
 
     Args:
-        marker_map: what is printed; markers on one page face the same way.
+        marker_map: what is printed: one board, or markers in one plane that face the same way.
         page: one of :data:`PAGES`.
 
     Raises:
         PrintError: when something is larger than the page.
     """
-    pages = []
-    for board in marker_map.boards:
+    if marker_map.boards:
+        (board,) = marker_map.boards
         black, label = _board(board)
-        pages.append(_page(black, page, f"{label}; mount it on something flat", board.pose))
+        return [_page(black, page, f"{label}; mount it on something flat", board.pose)]
     markers = marker_map.markers
-    if not markers:
-        return pages
     first = markers[0].pose
-    places = [(marker.pose.position - first.position) @ first.rotation * _MM for marker in markers]
-    together = all(
-        abs(place[2]) <= _FLAT * _MM
-        and np.abs(marker.pose.rotation - first.rotation).max() <= _FLAT
-        for marker, place in zip(markers, places, strict=True)
-    )
-    parts = [_marker(marker) for marker in markers]
     of = f"{markers[0].family.name}, {markers[0].size * _MM:g} mm"
-    if together:
-        black = np.concatenate(
-            [
-                part + np.array([x, y, 0.0, 0.0])
-                for part, (x, y, _) in zip(parts, places, strict=True)
-            ]
-        )
-        if _paper(black, page) is not None:
-            name = f"{of}, {len(markers)} from id {markers[0].id} on"
-            return [*pages, _page(black, page, name, first)]
+    parts = [_marker(marker) for marker in markers]
+    places = [(marker.pose.position - first.position) @ first.rotation * _MM for marker in markers]
+    black = np.concatenate(
+        [part + np.array([x, y, 0.0, 0.0]) for part, (x, y, _) in zip(parts, places, strict=True)]
+    )
+    if _paper(black, page) is not None:
+        return [_page(black, page, f"{of}, {len(markers)} from id {markers[0].id} on", first)]
+    pages = []
     for marker, part in zip(markers, parts, strict=True):
         place = ", ".join(f"{value:g}" for value in np.round(marker.pose.position, 4) + 0.0)
         text = f"{of}, id {marker.id}: its middle goes to ({place}) m of the map"
@@ -93,7 +81,10 @@ def _page(black: Array, page: str, text: str, pose: Pose) -> Page:
             "room for; choose a larger page or a smaller size"
         )
     room = np.array([paper[0], paper[1] + _FOOT])
-    right, up, out = (_direction(pose.rotation[:, k]) for k in range(3))
+    axes = np.abs(pose.rotation).argmax(axis=0)
+    right, up, out = (
+        f"{'+' if pose.rotation[axis, k] > 0 else '-'}{'xyz'[axis]}" for k, axis in enumerate(axes)
+    )
     text += f"\nmap: {right} to the right, {up} up, {out} out of the paper"
     moved = black + np.array([*(0.5 * (room - low - high)), 0.0, 0.0])
     return Page(*paper, moved, text)
@@ -109,46 +100,30 @@ def _paper(black: Array, page: str) -> tuple[float, float] | None:
     return None
 
 
-def _direction(vector: Array) -> str:
-    """An axis of the map, or a direction between them."""
-    axis = int(np.argmax(np.abs(vector)))
-    if abs(vector[axis]) < 1.0 - _FLAT:
-        return "(" + " ".join(f"{value:.2g}" for value in vector) + ")"
-    return f"{'+' if vector[axis] > 0 else '-'}{'xyz'[axis]}"
-
-
 def _marker(marker: Marker) -> Array:
     """Rectangles around the middle of a marker."""
     side = marker.size * _MM
     black = _rectangles(pattern(marker.family, marker.id), side / marker.family.cells)
-    centred: Array = black - np.array([0.5 * side, 0.5 * side, 0.0, 0.0])
-    return centred
+    return np.asarray(black - np.array([0.5 * side, 0.5 * side, 0.0, 0.0]), np.float64)
 
 
 def _board(board: Board) -> tuple[Array, str]:
     """Rectangles of a board, and what it is."""
     if isinstance(board, CircleGrid):
         raise PrintError(f"a {board.name} can be detected, but not printed from here")
-    square = board.square * _MM
+    square, label = board.square * _MM, f"{board.name}, squares {board.square * _MM:g} mm"
     if isinstance(board, Chessboard):
-        columns, rows = board.columns + 1, board.rows + 1
-        first = 0 if board.inverted else 1
-        whites = [(c, r) for r in range(rows) for c in range(columns) if (c + r) % 2 == first]
-    else:
-        columns, rows, whites = board.columns, board.rows, board.cells
-    white = np.zeros((rows, columns), bool)
-    for column, row in whites:
-        white[row, column] = True
-    black, label = [_rectangles(white, square)], f"{board.name}, squares {square:g} mm"
-    if isinstance(board, Charuco):
-        label += f", markers {board.marker * _MM:g} mm"
-        side = board.marker * _MM
-        rim, cell = 0.5 * (square - side), side / board.family.cells
-        for index, (column, row) in enumerate(whites):
-            inside = _rectangles(pattern(board.family, board.first_id + index), cell)
-            x, y = column * square + rim, (rows - 1 - row) * square + rim
-            black.append(inside + np.array([x, y, 0.0, 0.0]))
-    return np.concatenate(black), label
+        places = np.indices((board.rows + 1, board.columns + 1)).sum(axis=0)
+        return _rectangles(places % 2 != board.inverted, square), label
+    white = np.zeros((board.rows, board.columns), bool)
+    white[tuple(np.transpose(board.cells)[::-1])] = True
+    black, side = [_rectangles(white, square)], board.marker * _MM
+    rim, cell = 0.5 * (square - side), side / board.family.cells
+    for index, (column, row) in enumerate(board.cells):
+        inside = _rectangles(pattern(board.family, board.first_id + index), cell)
+        x, y = column * square + rim, (board.rows - 1 - row) * square + rim
+        black.append(inside + np.array([x, y, 0.0, 0.0]))
+    return np.concatenate(black), f"{label}, markers {side:g} mm"
 
 
 def _rectangles(white: NDArray[np.bool_], cell: float) -> Array:
@@ -207,8 +182,7 @@ def _draw(page: Page, number: str) -> Any:
     axes.add_patch(PathPatch(outline, facecolor="black", edgecolor="none", snap=False))
     axes.plot([_MARGIN, _MARGIN + _BAR], [_MARGIN, _MARGIN], color="black", linewidth=0.5)
     for k in range(11):
-        x = _MARGIN + 0.1 * _BAR * k
-        tick = 2.0 if k % 5 else 3.0
+        x, tick = _MARGIN + 0.1 * _BAR * k, 2.0 if k % 5 else 3.0
         axes.plot([x, x], [_MARGIN, _MARGIN + tick], color="black", linewidth=0.5)
     said = f"{page.text}\nprint at 100 %: this bar is {_BAR:.0f} mm long; {number}"
     axes.text(_MARGIN, _MARGIN + 4.0, said, fontsize=6.0)

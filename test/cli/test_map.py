@@ -12,8 +12,7 @@ import pytest
 from rs_localizer.cli.main import main
 from rs_localizer.io.maps.files import read_map_file, write_map_file
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.markers.formats import read_any
-from rs_localizer.markers.map_files import read_marker_map, write_marker_map
+from rs_localizer.markers.map_files import read_any, read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.poses import Pose
 

@@ -271,7 +271,7 @@ def test_an_aprilgrid_of_kalibr(tmp_path):
 
 def test_exchanged_columns_and_rows_are_tried():
     true = CircleGrid(4, 5, 0.03, asymmetric=True)
-    image = render([(drawn(true), rectangle(*true.extent))], look(distance=0.5))
+    image = render([(drawn(true), rectangle(8 * 0.03, 5 * 0.03))], look(distance=0.5))
     said = recognized(image, (replace(true, columns=5, rows=4),))
     assert said == ["the asymmetric circle grid 4x5: its columns and rows are exchanged"]
 
@@ -313,7 +313,7 @@ def drawn(grid: CircleGrid) -> Any:
 )
 def test_centres_are_where_they_were_drawn(columns, rows, asymmetric, inverted):
     grid = CircleGrid(columns, rows, 0.03, asymmetric, inverted)
-    width, height = grid.extent
+    width, height = (2 * columns if asymmetric else columns) * 0.03, rows * 0.03
     detector = MarkerDetector(MarkerMap(boards=(grid,)))
     pose = look(5.0, 10.0, distance=0.4)
     black_on_white = drawn(grid) != inverted

@@ -11,7 +11,7 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.markers.families import FAMILIES
-from rs_localizer.markers.formats import FORMATS, OWN, Unsaid, read_any, write_any
+from rs_localizer.markers.map_files import FORMATS, OWN, Unsaid, read_any, write_any
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
@@ -111,7 +111,7 @@ FAR = json.dumps(FIELD).replace("7", "900")
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("{", "is not a JSON file"),
+        ("{", "is not a YAML or JSON file"),
         ("[" * 90 + "]" * 90, "nests deeper than 50"),
         ('{"tags": [{"ID": 3}]}', r"tag 1 \(id 3\) has no pose"),
         (FAR, "has the ids 0 to 586, found 900"),

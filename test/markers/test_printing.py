@@ -11,7 +11,6 @@ import pytest
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Charuco, Chessboard
 from rs_localizer.tools.printing import PAGES, PrintError, plan, write_pages
 
@@ -51,10 +50,6 @@ def test_markers_that_do_not_fit_together_get_pages_of_their_own(tmp_path):
     assert found.ids.tolist() == [4, 5, 6, 7]
     side = np.linalg.norm(found.pixels[0] - found.pixels[1]) * PIXEL
     assert side == pytest.approx(0.12, abs=3e-5)
-    # Those of another wall, which face another way, cannot share a page.
-    turned = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    other = wall("4x4_50", (2, 1), 0.05, 0.1, first_id=9, pose=Pose(np.zeros(3), turned))
-    assert len(plan(MarkerMap((*wall("4x4_50", (2, 1), 0.05, 0.1), *other)))) == 4
     with pytest.raises(PrintError, match="takes 400 x 400 mm, more than a4 has room for"):
         plan(MarkerMap(wall("4x4_50", (1, 1), 0.4, 0.1)))
 

@@ -14,7 +14,7 @@ from rs_localizer.cli import WORKING, refuse_existing
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.io.maps.files import SUFFIX, read_map_file
 from rs_localizer.io.recording import MAP_FRAME
-from rs_localizer.markers.formats import (
+from rs_localizer.markers.map_files import (
     FORMATS,
     OWN,
     SUFFIXES,
