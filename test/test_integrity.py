@@ -5,12 +5,10 @@
 from typing import Any
 
 import numpy as np
-import pytest
 
-from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.integrity import NAMES, Integrity
+from rs_localizer.integrity import Integrity
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform([-3.0, -3.0, 3.0], [3.0, 3.0, 9.0], (120, 3))
@@ -60,18 +58,3 @@ def test_doubt_falls_again():
     assert doubts[-1] < 0.05
     judge.reset()
     assert judge.add(judge.numbers(estimate(anywhere()), POINTS, PIXELS, None)) < 0.1
-
-
-@pytest.mark.parametrize(("off", "expected"), [(0.0, 0.0), (0.1, np.log1p(50.0 / 6.0))])
-def test_a_place_that_nobody_predicted(off, expected):
-    motion = Motion(np.eye(3), np.array([off, 0.0, 0.0]), np.zeros(3), np.zeros(3))
-    prior = Prior(motion=motion, covariance=1e-4 * np.eye(12))
-    numbers = Integrity().numbers(estimate(anywhere()), POINTS, PIXELS, prior)
-    assert numbers[NAMES.index("innovation")] == pytest.approx(expected, abs=1e-9)
-
-
-@pytest.mark.parametrize("count", [1, 4, 8])
-def test_few_points_give_a_number(count):
-    kept = np.ones(count, bool)
-    numbers = Integrity().numbers(estimate(kept), POINTS[:count], PIXELS[:count], None)
-    assert np.isfinite(numbers).all()

@@ -5,7 +5,6 @@ root finder that looks for the row which sees a point."""
 
 import copy
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,15 +12,12 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
-from rs_localizer.config import CalibrationErrors
-from rs_localizer.estimation.observations import checked
-from rs_localizer.solvers.table import SOLVERS, find_solver
+from rs_localizer.solvers.table import SOLVERS
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 590.0, 239.5], [0.0, 0.0, 1.0]])
 D = np.array([-0.1, 0.02, 0.001, 0.001, 0.0])
 DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
 READOUT = 0.03
-EXACT = CalibrationErrors(0.0, 0.0, 0.0)
 ROLLING = [name for name, row in SOLVERS.items() if row.rolling_shutter]
 
 
@@ -122,23 +118,6 @@ def test_every_rolling_shutter_solver_finds_inliers_and_pose(solver):
         assert result.global_shutter_inliers < 0.8 * inliers.sum()
 
 
-def test_a_second_global_shutter_solver_is_the_one_that_is_called(monkeypatch):
-    p3p, calls = find_solver("p3p"), []
-
-    def solve(*arguments):
-        calls.append(len(arguments[3]))
-        p3p.solve(*arguments)
-
-    monkeypatch.setattr(
-        "rs_localizer.localizer.find_solver", lambda name: replace(p3p, solve=solve)
-    )
-    cam = camera()
-    points, pixels, _ = frame(cam, Path(3, 0.0, 0.0), 100, noise=0.5, outliers=0.3)
-    result = rsl.Localizer(cam, solver="p3p").localize(points, pixels)
-    assert calls
-    assert sum(calls) == result.iterations
-
-
 def test_p3p_is_a_global_shutter_and_knows_no_motion():
     cam, still, moving = camera(), Path(3, 0.0, 0.0), Path(3, 3.0, 2.0)
     localizer = rsl.Localizer(cam, solver="p3p")
@@ -231,26 +210,6 @@ def test_no_input_crashes_or_warns(solver, points, pixels):
         assert np.isfinite(result.rotation).all()
 
 
-@pytest.mark.bench
-def test_the_larger_of_two_moving_groups_wins():
-    """Half of the points are the scene, three of 20 another object, the rest is strewn."""
-    cam = camera()
-    localizer = rsl.Localizer(cam)
-    wrong = 0
-    for seed in range(40):
-        scene, thing = Path(seed, 1.0, 1.0), Path(seed + 1000, 1.0, 1.0)
-        points, pixels, _ = frame(cam, scene, 100, 0.5, seed=seed)
-        others, seen, _ = frame(cam, thing, 30, 0.5, seed=seed)
-        rng = np.random.default_rng(seed)
-        strewn = rng.uniform([0, 0], [639, 479], (70, 2))
-        result = localizer.localize(
-            np.concatenate([points, others, rng.uniform(-2, 2, (70, 3))]),
-            np.concatenate([pixels, seen, strewn]),
-        )
-        wrong += not (result and result.inliers[:100].mean() > 0.95 and result.left_out)
-    assert wrong <= 1
-
-
 @pytest.mark.parametrize("distinct", [6, 20])
 def test_copies_of_points_are_no_further_evidence(distinct):
     points, pixels, _ = frame(camera(), Path(), count=distinct, noise=1.0)
@@ -261,23 +220,6 @@ def test_copies_of_points_are_no_further_evidence(distinct):
     if once and copied:
         np.testing.assert_allclose(copied.covariance, once.covariance, rtol=1e-9)
         assert np.array_equal(copied.inliers[::10], once.inliers)
-
-
-def test_what_an_estimate_says_of_scales_is_its_own():
-    points, pixels, _ = frame(camera(), Path(), count=60, noise=1.0)
-    first, second = (rsl.Localizer(camera()).localize(points, pixels) for _ in range(2))
-    for one, other in zip(first.scales, second.scales, strict=True):
-        assert not np.shares_memory(one, other)
-
-
-def test_read_only_arrays_need_no_kernels_of_their_own():
-    points, pixels, _ = frame(camera(), Path())
-    points.flags.writeable = pixels.flags.writeable = False
-    given = checked(points, pixels, None)
-    assert given[0].flags.writeable
-    assert given[1].flags.writeable
-    np.testing.assert_array_equal(given[0], points)
-    np.testing.assert_array_equal(given[1], pixels)
 
 
 def test_normalized_coordinates_are_not_taken_for_pixels():
@@ -310,17 +252,6 @@ def test_what_users_mistake_is_named():
     assert copy.deepcopy(failure) == failure
 
 
-def test_pixels_beyond_the_lens_are_left_out_and_marked():
-    cam = camera(D=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
-    points, pixels, _ = frame(camera(D=np.zeros(0)), Path(0, 0, 0), 40)
-    pixels[0] = (3000.0, 239.5)
-    result = rsl.Localizer(cam, inlier_threshold=500.0).localize(points, pixels)
-    assert result
-    assert not result.inliers[0]
-    assert np.isnan(result.residuals[0])
-    assert np.isfinite(result.residuals[1:]).all()
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -334,8 +265,3 @@ def test_pixels_beyond_the_lens_are_left_out_and_marked():
 def test_wrong_arrays_are_refused_with_what_was_found(arguments, said):
     with pytest.raises(ValueError, match=said):
         rsl.Localizer(camera()).localize(*arguments)
-
-
-def test_config_and_settings_exclude_each_other():
-    with pytest.raises(ValueError, match="either config or settings, got both: seed"):
-        rsl.Localizer(camera(), rsl.LocalizerConfig(), seed=1)

@@ -11,13 +11,10 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer.config import Acceleration
-from rs_localizer.core.scales import Scales
 from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.motion_model import acceleration_covariance, predict, unshaken
-from rs_localizer.estimation.prior import Prior
 from rs_localizer.estimation.refine import apply_step
-from rs_localizer.tracking import _innovation
 
 READOUT = 0.03
 FADING = 0.03  # s
@@ -169,106 +166,3 @@ def test_without_its_shaking_a_motion_is_what_the_shaking_goes_around():
         np.testing.assert_allclose(swing[part, part], size * np.eye(3), atol=1e-15)
         swing[part, part] = 0.0
     assert not swing.any()
-
-
-def test_without_its_shaking_the_covariance_knows_of_it():
-    estimate = shaking()
-    motion, covariance, _, _ = unshaken(estimate)
-
-    def moved(error):
-        s = apply_step(state(estimate), error[:18])
-        other = motion_of(s)
-        fields = {name: getattr(other, name) for name in (
-            "rotation", "translation", "angular_velocity", "linear_velocity",
-            "angular_acceleration", "linear_acceleration")}  # fmt: skip
-        shake = estimate.shake + error[18:].reshape(-1, 3)
-        changed = rsl.Estimate(
-            **fields, inliers=estimate.inliers, residuals=estimate.residuals, shake=shake,
-            joint_covariance=estimate.joint_covariance, global_shutter_inliers=0, iterations=0,
-        )  # fmt: skip
-        return step_between(state(motion), state(unshaken(changed)[0]))
-
-    jacobian = derivatives(moved, 102)
-    expected = jacobian @ estimate.joint_covariance @ jacobian.T
-    scale = np.sqrt(np.diag(expected))
-    # The turn back is of first order in the shaking, its part in the errors is left out.
-    np.testing.assert_allclose(
-        covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.005
-    )
-
-
-SCALES_SAID = Scales.nothing()._replace(size=np.array([-6.0, 1.0]))
-# Radians, metres, per readout and per readout squared.
-UNITS = np.repeat([1e-2, 3e-2, 1e-3, 2e-3, 1e-4, 3e-4], 3)
-START = Rotation.from_rotvec([0.4, -1.0, 0.2]).as_matrix()
-
-
-def covariance(rng, size=1.0):
-    root = rng.normal(size=(18, 18)) / np.sqrt(18) + np.eye(18)
-    return size**2 * np.outer(UNITS, UNITS) * (root @ root.T)
-
-
-def at(step, joint):
-    """The estimate that lies a step (18,) from the prediction: turned and moved in its own axes."""
-    turn = Rotation.from_rotvec(-step[:3]).as_matrix()
-    rest = step[6:].reshape(4, 3)
-    return Estimate(
-        turn @ START, turn @ ([0.1, 0.2, 3.0] - step[3:6]), rest[0], rest[1],
-        angular_acceleration=rest[2], linear_acceleration=rest[3],
-        inliers=np.ones(5, dtype=bool), residuals=np.zeros(5), joint_covariance=joint,
-        global_shutter_inliers=0, iterations=0,
-        scales=SCALES_SAID,
-    )  # fmt: skip
-
-
-def predicted(spread):
-    still = rsl.Motion(START, np.array([0.1, 0.2, 3.0]), np.zeros(3), np.zeros(3))
-    return Prior(motion=still, covariance=spread)
-
-
-def surprises(times, seen=slice(0, 18), frames=400, field=0.0):
-    """Of motions that change ``times`` as much as predicted, of which part is measured.
-
-    ``field``: error of a map, as many times the prediction's deviations, that the gain ignores.
-    """
-    rng = np.random.default_rng(0)
-    # Small steps: what is not linear in them is left out of the filter here.
-    prior, noise = (covariance(rng, size) for size in (1e-2, 5e-3))
-    measured = np.eye(18)[seen]
-    gain = prior @ measured.T @ np.linalg.inv(measured @ (prior + noise) @ measured.T)
-    off = field**2 * prior
-    posterior = prior - gain @ measured @ prior + gain @ measured @ off @ measured.T @ gain.T
-    # Shaking behind the motion is none of its business.
-    joint = np.eye(24)
-    joint[:18, :18] = posterior
-    found = []
-    for _ in range(frames):
-        truth = times * rng.multivariate_normal(np.zeros(18), prior)
-        error = rng.multivariate_normal(np.zeros(18), noise)
-        if field:
-            error += rng.multivariate_normal(np.zeros(18), off)
-        found.append(_innovation(predicted(prior), at(gain @ measured @ (truth + error), joint)))
-    return np.array(found)
-
-
-@pytest.mark.parametrize("seen", [slice(0, 18), slice(0, 6)], ids=["all", "pose"])
-def test_a_motion_as_predicted_surprises_by_one(seen):
-    assert np.mean(surprises(1.0, seen)) == pytest.approx(1.0, abs=0.1)
-
-
-def test_larger_changes_surprise_by_their_square():
-    calm, wild = (np.mean(surprises(times)) for times in (1.0, 5.0))
-    assert 0.7 * 25 < wild / calm < 25
-    assert np.mean(surprises(0.0)) < 0.5
-
-
-@pytest.mark.parametrize("field", [2.0, 5.0, 20.0])
-def test_a_map_that_is_off_hardly_surprises(field):
-    assert 0.9 < np.mean(surprises(1.0, field=field)) < 2.5
-
-
-def test_a_frame_that_decides_nothing_does_not_surprise():
-    spread = covariance(np.random.default_rng(1))
-    assert _innovation(predicted(spread), at(np.zeros(18), spread)) == pytest.approx(0.0, abs=1e-9)
-    # Rounding errors are not divided by the nothing that was expected.
-    assert np.all(_innovation(predicted(spread), at(1e-6 * UNITS, spread)) < 1e-6)

@@ -13,9 +13,7 @@ import pytest
 from rs_localizer.cli.main import main
 from rs_localizer.readout import (
     COMMON,
-    Known,
     StampAt,
-    as_json,
     find_readout,
     from_all_rows,
     from_line_time,
@@ -72,13 +70,6 @@ def test_conventions():
         stamp_offset(StampAt.MIDDLE, 0.01, middle_row=True)
     with pytest.raises(ValueError, match="2 rows"):
         from_line_time(1e-5, 1)
-
-
-def test_other_programs_have_their_own_units():
-    told = as_json(Known("One", "640x480 30 Hz", 0.0479, 0.047, 0.048, 1, ""))
-    assert (told["odm"], told["gyroflow"], told["kalibr"]) == (48.0, 48.0, 0.0001)
-    photos = as_json(Known("One", "photos", 0.0479, 0.047, 0.048, 1, ""))
-    assert (photos["odm"], photos["kalibr"]) == (47.9, None)
 
 
 def test_every_camera_has_a_page_and_the_json_the_whole_table(tmp_path):

@@ -11,7 +11,6 @@ import rs_localizer as rsl
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Mounts
-from rs_localizer.core.state import step_between
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.prior import PriorTerms, state_in
 from rs_localizer.estimation.refine import refine
@@ -19,7 +18,6 @@ from rs_localizer.estimation.residuals import linearized
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.solvers.table import SOLVERS
 from rs_localizer.tracking import Tracker
 
 # 0.33 of the assumed frame time; the video has no time stamps.
@@ -143,27 +141,6 @@ def squared_normalized(error, covariance):
     return np.einsum("...i,...i->...", error, np.linalg.solve(covariance, error[..., None])[..., 0])
 
 
-@pytest.mark.bench
-def test_frames_lie_where_the_frames_before_predict_them(recording):
-    calibration, clouds = recording
-    localizer = rsl.Localizer(calibration.camera(READOUT, "top_to_bottom"))
-    tracker, surprises = Tracker(localizer), []
-    for cloud in clouds:
-        time_ns = cloud.stamp_ns + round(READOUT / 2 * 1e9)
-        prediction = tracker.prediction(time_ns)
-        alone = localizer.localize(cloud.points, cloud.pixels)
-        assert tracker.localize(time_ns, cloud.points, cloud.pixels)
-        if prediction is not None:
-            step = step_between(state_of(prediction.motion), state_of(alone))[:6]
-            spread = (prediction.covariance + alone.joint_covariance[:18, :18])[:6, :6]
-            surprises.append(squared_normalized(step, spread))
-    assert len(surprises) > 115
-    # What board and lens are off by is in neither covariance, and pulls the two differently.
-    assert np.mean(np.array(surprises) < chi2.ppf(0.95, 6)) > 0.88
-    # Neither misled nor without an opinion; 6 are expected of 6 dimensions.
-    assert 1.5 < np.mean(surprises) < 7.0
-
-
 def test_corners_lie_where_those_of_other_rows_say(recording):
     calibration, clouds = recording
     camera = calibration.camera(READOUT, "top_to_bottom")
@@ -188,15 +165,3 @@ def test_corners_lie_where_those_of_other_rows_say(recording):
     squared = np.concatenate(squared)
     assert np.mean(squared < chi2.ppf(0.95, 2)) > 0.93
     assert 1.0 < np.mean(squared) < 2.4  # 2 are expected
-
-
-@pytest.mark.parametrize("solver", [name for name, row in SOLVERS.items() if row.rolling_shutter])
-def test_every_solver_localizes_every_frame_at_least_as_well_as_a_global_shutter(
-    recording, still, solver
-):
-    calibration, clouds = recording
-    localizer = rsl.Localizer(calibration.camera(READOUT, "top_to_bottom"), solver=solver)
-    some = slice(None, None, 3)
-    results = [localizer.localize(cloud.points, cloud.pixels) for cloud in clouds[some]]
-    assert all(results)
-    assert np.median([r.residual_rms for r in results]) < np.median(still[1][some])

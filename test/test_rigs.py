@@ -227,29 +227,6 @@ def test_opposed_shutters_know_the_motion_before_a_wall():
     assert np.all(np.median(off["alike"], axis=0)[:2] > 4.0 * middle[:2])
 
 
-def test_what_a_localizer_of_a_rig_takes():
-    mounted = pair()
-    localizer = rsl.Localizer(rig_of(mounted))
-    (parts,), _ = frames(mounted, hand, 1)
-    with pytest.raises(ValueError, match="one, other"):
-        localizer.localize(*parts["one"])
-    with pytest.raises(ValueError, match="no camera 'third'"):
-        localizer.localize({"third": parts["one"]})
-    with pytest.raises(ValueError, match="no image"):
-        localizer.localize({})
-    with pytest.raises(ValueError, match="other: points must be"):
-        localizer.localize({**parts, "other": (np.zeros((3, 2)), np.zeros((3, 2)))})
-    with pytest.raises(ValueError, match="several cameras: one, other"):
-        _ = localizer.camera
-    with pytest.raises(ValueError, match="Rig"):
-        rsl.Localizer(localizer.rig.cameras["one"]).localize(parts)
-    # A camera that is late or dead is left out.
-    alone = localizer.localize({"other": parts["other"]}, stamps={"other": 5.0})
-    assert alone, alone
-    assert alone.names == ("other",)
-    assert alone.span == TRUE.readout_time
-
-
 def test_tracking_carries_a_rig_from_frame_to_frame():
     """Frames whose cameras are now in step and now not, so that velocities are per other spans; the
     motion of one predicts the next, and before a wall makes it better.

@@ -5,14 +5,12 @@
 from pathlib import Path
 
 import pytest
-import yaml
 
 from rs_localizer.config import (
     DetectorConfig,
     FeatureConfig,
     NodeConfig,
     VelocityPrior,
-    localizer_config,
 )
 from rs_localizer.settings import SettingsError, build, load_params_file, parse_assignment, settings
 
@@ -125,22 +123,3 @@ def test_assignments(text, name, value):
 def test_wrong_values(values, fault):
     with pytest.raises(ValueError, match=fault):
         build(values)
-
-
-def test_a_misspelled_keyword_names_the_one_that_was_meant():
-    assert localizer_config({"seed": 3}).seed == 3
-    with pytest.raises(ValueError, match=r"'inlier_treshold' is not .*did you mean 'inlier_t"):
-        localizer_config({"inlier_treshold": 2.0})
-    with pytest.raises(
-        ValueError, match="'colour' is not a setting of the localizer; there are sol"
-    ):
-        localizer_config({"colour": 1})
-    with pytest.raises(ValueError, match="solver must be one of "):
-        localizer_config({"solver": "epnp"})
-
-
-@pytest.mark.parametrize("kind", [NodeConfig, DetectorConfig, FeatureConfig])
-def test_no_default_is_dumped_with_an_exponent(kind):
-    # `ros2 param dump` writes 2e-05, which `ros2 param load` takes for text.
-    for name, item in settings(kind).items():
-        assert "e-" not in yaml.safe_dump(item.default), name

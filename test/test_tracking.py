@@ -1,6 +1,5 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,8 +7,6 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.core.state import step_between
-from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tracking import FrameContext, Tracker
 
 READOUT = 0.03
@@ -103,34 +100,6 @@ def test_tracking_improves_weak_frames(points, count):
     assert tracked[1:].mean() > 0.95
 
 
-@pytest.mark.bench
-def test_the_prediction_is_covered_by_its_covariance():
-    hand = Hand()
-    tracker = Tracker(rsl.Localizer(CAMERA))
-    distances = []
-    for t in times(90):
-        prior = tracker.prediction(ns(t))
-        if prior is not None:
-            truth = hand.motion(t)
-            off = step_between(state(prior.motion), state(truth))
-            distances.append(off @ np.linalg.solve(prior.covariance, off))
-        assert tracker.localize(ns(t), *hand.frame(t, 60))
-    # The default accelerations are wider than this hand's: never too sure, and not absurdly wide.
-    # Of 18 dimensions: the median is 17.3, and 95 % lie below 28.87.
-    assert 3.0 < np.median(distances) < 18.0
-    assert np.mean(np.array(distances) < 28.87) > 0.95
-
-
-def state(motion):
-    return np.concatenate(
-        [
-            motion.rotation.ravel(), motion.translation,
-            motion.angular_velocity, motion.linear_velocity,
-            motion.angular_acceleration, motion.linear_acceleration,
-        ]
-    )  # fmt: skip
-
-
 def test_sharp_poses_do_not_make_the_velocity_ring():
     """Without noise nothing but the filter itself could swing from frame to frame."""
     hand = Hand()
@@ -215,54 +184,6 @@ def test_poses_and_twists_at_any_time_are_covered(after):
     assert np.all(np.median(lengths, axis=0) > 0.3)
 
 
-def test_there_is_no_motion_before_the_frames_nor_long_after_them():
-    hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA), max_prediction=0.02)
-    assert tracker.at(ns(0.0)) is None
-    for t in times(4, 1.0):
-        tracker.localize(ns(t), *hand.frame(t, 60))
-    assert tracker.at(ns(1.1) + 19_000_000) is not None
-    assert tracker.at(ns(1.1) + 21_000_000) is None
-    assert tracker.at(ns(0.9)) is None
-
-
-def test_there_is_a_motion_while_all_frames_that_are_kept_have_failed():
-    hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA), max_prediction=0.2)
-    for t in times(4, 1.0):
-        assert tracker.localize(ns(t), *hand.frame(t, 60))
-    nothing = np.zeros((0, 3)), np.zeros((0, 2))
-    for t in 1.1 + 0.01 * np.arange(1, 9):
-        assert not tracker.localize(ns(t), *nothing)
-    there = tracker.at(ns(1.19))
-    assert error(there, hand.motion(1.19))[0] < 3.0 * there.orientation_deviation
-    assert tracker.flush() == []
-    assert tracker.at(ns(1.1)) is not None
-
-
-def test_a_motion_that_is_too_uncertain_is_not_told():
-    most = np.radians(2.0)
-    localizer = rsl.Localizer(CAMERA, max_orientation_deviation=most)
-    hand, tracker = Hand(), Tracker(localizer, max_prediction=0.9)
-    for t in times(4, 1.0):
-        assert tracker.localize(ns(t), *hand.frame(t, 60))
-    ahead = [tracker.at(ns(1.1 + later)) for later in (0.01, 0.05, 0.3, 0.9)]
-    assert ahead[0] is not None
-    assert ahead[-1] is None
-    assert all(there.orientation_deviation <= most for there in ahead if there)
-
-
-def test_an_estimate_moves_on_with_its_own_velocities():
-    hand = Hand()
-    result = rsl.Localizer(CAMERA).localize(*hand.frame(1.0, 100, noise=0.01))
-    for seconds in (-0.015, 0.012):
-        there, truth = result.at_time(seconds), hand.motion(1.0 + seconds)
-        step = hand.pose(1.0 + seconds)[1] - hand.pose(1.0)[1]
-        np.testing.assert_allclose(there.position - result.position, step, atol=1e-3)
-        np.testing.assert_allclose(there.angular_velocity, truth.angular_velocity, atol=3e-3)
-        np.testing.assert_allclose(there.linear_velocity, truth.linear_velocity, atol=3e-3)
-    with pytest.raises(ValueError, match="finite seconds"):
-        result.at_time(np.nan)
-
-
 def test_results_of_a_frame_later_know_their_velocities_better():
     hand, errors = Hand(), {}
     for lag in (0, 1, 2):
@@ -277,35 +198,6 @@ def test_results_of_a_frame_later_know_their_velocities_better():
         errors[lag] = np.median(off[3:-3])
     assert errors[1] < 0.85 * errors[0]
     assert errors[2] < 1.1 * errors[1]
-
-
-def test_residuals_are_those_of_the_published_motion():
-    hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA))
-    for t in times(5):
-        points, pixels = hand.frame(t, 60)
-        tracked = tracker.localize(ns(t), points, pixels)
-    for found in (tracked, rsl.Localizer(CAMERA).localize(points, pixels)):
-        shown, _ = project_rolling(CAMERA, found.at_rows, points)
-        errors = np.linalg.norm(shown - pixels, axis=1)
-        np.testing.assert_allclose(found.residuals, errors, atol=1e-3)
-
-
-def test_a_prediction_that_is_rounding_errors_is_none():
-    hand = Hand()
-    localizer = rsl.Localizer(CAMERA)
-    tracker = Tracker(localizer)
-    soon, shown = ns(0.0) + 1, hand.frame(0.0, 100)
-    assert tracker.localize(ns(0.0), *shown)
-    assert tracker.prediction(soon) is not None
-    # All parameters known as one: beside this the accelerations of a nanosecond add nothing.
-    find = localizer.find
-    as_one = np.full((18, 18), 1e-4)
-    localizer.find = lambda *given: replace(find(*given), joint_covariance=as_one)
-    tracker.reset()
-    assert tracker.localize(ns(0.0), *shown)
-    assert tracker.prediction(soon) is None
-    localizer.find = find
-    assert tracker.localize(soon, *shown)
 
 
 @pytest.mark.parametrize("kind", ["gyroscope", "gravity"])
@@ -353,68 +245,6 @@ def test_with_a_readout_time_far_off_each_image_speaks_for_itself():
     by_doubt, by_trust, alone = np.median(errors[1:], axis=0)
     assert by_doubt < by_trust
     assert by_doubt < 1.05 * alone
-
-
-def test_rows_that_show_no_motion_leave_the_twist_as_unknown_as_frames_show_it():
-    hand, tracker, inside = Hand(), Tracker(rsl.Localizer(CAMERA)), []
-    unsure = FrameContext(readout_time_deviation=0.6 * READOUT)
-    for t in times(60):
-        truth, chosen = hand.motion(t), np.random.default_rng(round(t * 1e4)).choice(400, 60)
-        pixels = CAMERA.project(MAP[chosen] @ truth.rotation.T + truth.translation)  # all at once
-        noise = np.random.default_rng(round(t * 1e4)).normal(size=pixels.shape)
-        result = tracker.localize(ns(t), MAP[chosen], pixels + noise, context=unsure)
-        assert result, str(result)
-        off = result.angular_velocity - truth.angular_velocity
-        spread = result.covariance[6:9, 6:9]
-        inside.append(off @ np.linalg.solve(spread, off) < 7.8)
-    assert np.mean(inside[1:]) > 0.9  # of the first no frame before tells
-
-
-def test_where_the_readout_time_is_in_doubt_so_is_how_far_the_camera_goes():
-    hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA))
-    tracker.localize(ns(0.0), *hand.frame(0.0, 150, noise=0.3))
-    sure = tracker.prediction(ns(0.04))
-    known = FrameContext(readout_time_deviation=0.2 * CAMERA.readout_time)
-    unsure = tracker.prediction(ns(0.04), context=known)
-    added = unsure.covariance - sure.covariance
-    turn = 0.2 * 0.04 / CAMERA.readout_time * sure.motion.angular_velocity
-    np.testing.assert_allclose(added[:3, :3], np.outer(turn, turn), atol=1e-12)
-    assert not added[6:].any()
-
-
-class Drone(Hand):
-    """The same, shaken by 0.1 deg at 20 Hz."""
-
-    def pose(self, t):
-        rotation, place = super().pose(t)
-        swing = np.radians(0.1) * np.sin(40.0 * np.pi * t) * np.array([0.6, 0.64, 0.48])
-        return rotation @ Rotation.from_rotvec(swing).as_matrix(), place
-
-
-def test_turn_rates_of_a_shaken_camera_are_covered():
-    drone, tracker, lengths = Drone(), Tracker(rsl.Localizer(CAMERA)), []
-    for t in times(20):
-        found = tracker.localize(ns(t), *drone.frame(t, 100, WALL, noise=0.1))
-        twist = twist_at(found, 0.0, READOUT)
-        off = twist.angular - drone.motion(t).angular_velocity / READOUT
-        lengths.append(off @ np.linalg.solve(twist.covariance[3:, 3:], off))
-    assert np.mean(np.array(lengths[3:]) < 7.8) > 0.85  # 95 % of three degrees of freedom
-
-
-@pytest.mark.parametrize(
-    ("call", "said"),
-    [
-        (lambda: Tracker(CAMERA), "localizer must be an rs_localizer.Localizer, got Camera"),
-        (lambda: rsl.Localizer("left"), "camera must be an rs_localizer.Camera, got str"),
-        (
-            lambda: rsl.camera_state(rsl.Localizer(CAMERA).localize([[0, 0, 1]], [[1, 2]]), CAMERA),
-            "got Failure .too_few_points: 1 usable",
-        ),
-    ],
-)
-def test_what_was_given_instead_is_named(call, said):
-    with pytest.raises(ValueError, match=said):
-        call()
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e3])

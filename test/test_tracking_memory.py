@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 
 import rs_localizer as rsl
-from rs_localizer.config import NodeConfig
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scales import Scales
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.tracking import Memory, Tracker
 
 SAID = Scales.nothing()._replace(size=np.array([-6.0, 1.0]))
@@ -75,32 +73,3 @@ def test_what_was_learned_is_forgotten_where_a_frame_fits_only_without():
     frames = Tracker(localizer, memory=Memory.MAP_AND_LENS)
     assert all(frames.localize(0, POINTS, PIXELS) for _ in range(3))
     np.testing.assert_allclose(localizer.priors[-1].scales.size, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("settings", "memory"),
-    [
-        ({}, Memory.MAP_AND_LENS),
-        ({"readout_time": 0.02}, Memory.MOTION),
-        ({"tracking": False}, Memory.NOTHING),
-        ({"tracking": False, "readout_time": 0.02}, Memory.NOTHING),
-        ({"solver": "p3p"}, Memory.NOTHING),
-    ],
-)
-def test_the_settings_say_what_is_remembered(monkeypatch, settings, memory):
-    chosen = []
-
-    def make(localizer, inertial, memory, *lag):
-        chosen.append(memory)
-        return Tracker(localizer, inertial, memory)
-
-    monkeypatch.setattr("rs_localizer.pipeline.frames.Tracker", make)
-    FrameLocalizer(NodeConfig(**settings))
-    assert chosen == [memory]
-
-
-def test_only_a_remembered_motion_predicts():
-    frames = Tracker(rsl.Localizer(CAMERA), memory=Memory.MAP_AND_LENS)
-    assert frames.prediction(0) is None
-    with pytest.raises(ValueError, match="needs the readout time"):
-        Tracker(rsl.Localizer(CAMERA))

@@ -6,12 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
-import pytest
-
-import rs_localizer as rsl
-from rs_localizer.estimation import frame_posterior
-
 # In a process of its own: what other tests have compiled in this one is no longer missing.
 LATE = """
 import gc
@@ -34,23 +28,6 @@ assert len(after) > 50
 for late in sorted(after - before):
     print(*late)
 """
-K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-
-
-@pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
-def test_shaking_is_followed_once(direction, monkeypatch):
-    """Its kernels are those that an ordinary frame does not need."""
-    fits = []
-    fit = frame_posterior.fit_turn
-
-    def watched(*arguments):
-        fits.append(fit(*arguments))
-        return fits[-1]
-
-    monkeypatch.setattr(frame_posterior, "fit_turn", watched)
-    camera = rsl.Camera(640, 480, K, readout_time=0.02, scan_direction=direction)
-    rsl.Localizer(camera).warm_up()
-    assert any(one.finite and one.gain > 0.0 for one in fits)
 
 
 def test_no_frame_waits_for_the_compiler():

@@ -105,14 +105,3 @@ def test_points_beyond_90_degrees_are_as_good_as_others(lens):
     assert np.mean(used) > 0.95
     assert np.mean(np.array(squares) < chi2.ppf(0.95, 6)) > 0.8
     assert np.mean(squares) < 9.0  # 6 is as claimed
-
-
-def test_points_behind_the_image_plane_alone_give_the_pose():
-    rng = np.random.default_rng(8)
-    points, pixels, motion, _ = frame(rng, "equidistant", 200, 0.5, math.radians(91.0))
-    result = rsl.Localizer(camera("equidistant")).localize(points, pixels)
-    assert result
-    assert len(points) > 60
-    off = errors(result, motion)
-    assert np.degrees(np.linalg.norm(off[:3])) < 0.5
-    assert np.linalg.norm(off[3:6]) < 0.03

@@ -31,18 +31,6 @@ def test_a_mended_lens_draws_points_along_the_radius_and_aside():
     np.testing.assert_allclose(mended.distort(RAYS)[0], 420.0 * seen + (320.0, 240.0), atol=1e-9)
 
 
-def test_fisheyes_have_powers_of_the_angle():
-    given = camera("equidistant", [0.01, -0.002, 0.0, 0.0])
-    assert coefficients_of(given) == 6
-    mended = with_lens(given, FOUND[:2])
-    angle = np.arctan(np.hypot(*RAYS.T))
-    more = 420.0 * angle * (
-        FOUND[0] * (angle / corner_of(given)) ** 2 + FOUND[1] * (angle / corner_of(given)) ** 4
-    )  # fmt: skip
-    moved = mended.distort(RAYS)[0] - given.distort(RAYS)[0]
-    np.testing.assert_allclose(np.hypot(*moved.T), np.abs(more), atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("model", "D"),
     [

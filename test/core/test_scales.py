@@ -5,37 +5,12 @@
 import numpy as np
 import pytest
 
-from rs_localizer.core.scales import FACTORS, SPECTRA, SPEEDS, VIBRATIONS, Scales, joined
+from rs_localizer.core.scales import SPEEDS, VIBRATIONS, Scales, joined
 
 
 def says(mean, precision, shakes=0.0, speeds=0.0):
     vibrations = shakes * (np.arange(VIBRATIONS) > 0)
     return Scales(np.array([mean, precision]), vibrations, speeds * np.ones(len(SPEEDS)))
-
-
-def test_all_spectra_are_as_strong():
-    assert len(SPECTRA) * len(FACTORS) + 1 == VIBRATIONS
-    strengths = np.square(SPECTRA).sum(axis=1)
-    np.testing.assert_allclose(strengths, strengths[0])
-
-
-def test_no_frame_says_nothing_and_adds_nothing():
-    nothing = Scales.nothing()
-    for part in joined(nothing, nothing):
-        assert not part.any()
-    # One frame, and then frames that say nothing: the mean stays, as it is forgotten.
-    known = joined(nothing, says(-6.0, 2.0))
-    np.testing.assert_allclose(known.size, [-6.0, 0.3 * 2.0])  # frames of a second are alike
-    later = joined(known, nothing)
-    assert later.size[0] == pytest.approx(-6.0)
-    assert later.size[1] < known.size[1]
-
-
-def test_two_frames_are_weighed_by_their_precisions_the_newest_the_most():
-    first = joined(Scales.nothing(), says(-6.0, 2.0))
-    mean, precision = joined(first, says(-4.0, 2.0)).size
-    assert -5.0 < mean < -4.9
-    assert 0.6 < precision < 1.2
 
 
 def test_a_map_that_is_bent_is_soon_known_to_be_and_forgotten():

@@ -60,13 +60,6 @@ def test_the_tree_of_the_architecture_is_that_of_the_package():
     assert named == {name for name in parts if name not in ("__pycache__", "compiled", "py.typed")}
 
 
-def test_the_ten_files_to_read_first_are_short():
-    (table,) = [t for t in pages.tables("docs/architecture.md") if "you learn" in t.columns]
-    files = [pages.ROOT / "rs_localizer" / pages.names_in(name)[0] for name in table.column("file")]
-    assert len(files) == 10
-    assert sum(len(file.read_text().splitlines()) for file in files) < 3000
-
-
 def test_pictures_are_what_their_script_draws():
     drawn = runpy.run_path(str(pages.ROOT / "docs" / "pictures.py"))["PICTURES"]
     for name, draw in drawn.items():

@@ -2,17 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is refused, reason by reason: posteriors that are right but for one thing."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from rs_localizer.core.reasons import Reason
-from rs_localizer.estimation.acceptance import refusal, speeding, uncertain
+from rs_localizer.estimation.acceptance import refusal, speeding
 from rs_localizer.estimation.posterior import Mirror, maximum_a_posteriori
 from rs_localizer.estimation.prior import motion_terms
-from rs_localizer.localizer import Localizer
 
 PRIOR = motion_terms((0.18, 0.09), (0.009, 0.0036))
 THRESHOLD = 2.0
@@ -72,13 +70,6 @@ def test_what_is_wrong_with_a_posterior_is_its_reason(good, changes, expected):
     assert reason(observations, posterior._replace(**changes)) is expected
 
 
-def test_a_global_shutter_leaves_larger_errors_and_shares_them(good):
-    observations, posterior = good
-    for noise, expected in ((1.95, None), (2.05, Reason.RESIDUAL)):
-        assert reason(observations, posterior._replace(noise=noise), rolling=False) is expected
-    assert reason(observations, posterior._replace(agreement=4.3), rolling=False) is None
-
-
 @pytest.mark.parametrize("part", ["state", "covariance"])
 def test_what_cannot_be_computed_is_no_motion(good, part):
     observations, posterior = good
@@ -106,25 +97,6 @@ def test_motions_that_no_camera_makes(good, scene):
     height = camera.height / camera.focal_length
     along = [moving(posterior, turn, [rate, 0.0, 0.0]) for rate in (height, -height)]
     assert sorted(str(reason(observations, one)) for one in along) == ["None", "implausible"]
-
-
-def test_an_orientation_that_is_hardly_known(scene):
-    camera, _, points, _, measured = scene.frame(noise=0.3, count=40)
-    found = Localizer(camera).localize(points, measured)
-    assert found
-    known = found.orientation_deviation
-    worst = np.linalg.eigvalsh(found.covariance[:3, :3])[-1]
-    assert known == pytest.approx(np.sqrt(worst))
-    assert uncertain(found, 1.01 * known) is None
-    still = found.still_deviation
-    assert still < known
-    assert uncertain(found, 0.99 * still).reason is Reason.UNCERTAIN
-    told = replace(found, still_deviation=0.1 * known)  # but for what the motion leaves open
-    assert uncertain(told, 0.35 * known) is None
-    assert uncertain(told, 0.33 * known).reason is Reason.UNCERTAIN
-    refused = Localizer(camera, max_orientation_deviation=max(0.001, 0.9 * still))
-    if still > 0.0012:
-        assert refused.localize(points, measured).reason is Reason.UNCERTAIN
 
 
 def test_speeding_counts_what_the_configuration_expects():

@@ -129,24 +129,6 @@ def test_regions_hold_in_a_map_that_tells_which_errors_its_landmarks_share():
     )
 
 
-def test_a_map_that_is_known_to_a_centimetre_as_a_whole_tells_a_pose_no_better():
-    """To the last digit, but for what is known of the motion; the next frame is told nothing."""
-    points, pixels, _ = frame(3, 2.0)
-    localizer = rsl.Localizer(CAMERA, calibration=EXACT)
-    alone = localizer.localize(points, pixels)
-    shift = np.zeros((len(points), 3, 2))
-    shift[:, 0, 0], shift[:, 2, 1] = 0.01, 0.02
-    modes = ErrorModes(points + 1e-7, np.asarray(shift, np.float32))
-    found = localizer.find(points, pixels, error_modes=modes)
-    np.testing.assert_array_equal(found.joint_covariance, alone.joint_covariance)
-    expected = np.zeros((12, 12))
-    expected[3:6, 3:6] = found.rotation @ np.diag([1e-4, 0.0, 4e-4]) @ found.rotation.T
-    np.testing.assert_allclose(found.calibration_covariance, expected, atol=1e-8)
-    # Elsewhere is no landmark.
-    elsewhere = localizer.find(points, pixels, error_modes=ErrorModes(points + 0.01, shift))
-    np.testing.assert_array_equal(elsewhere.covariance, alone.covariance)
-
-
 @pytest.mark.parametrize(
     ("depth", "errors"),
     [
@@ -179,28 +161,6 @@ def test_the_next_frame_is_told_nothing_of_it():
     assert np.sqrt(more[0, 0]) == pytest.approx(1.0 / 450.0, rel=0.3)
 
 
-def test_tracking_does_not_average_it_away():
-    tracker = rsl.Tracker(rsl.Localizer(CAMERA))
-    points, pixels, motion = frame(2, 2.0)
-    still = replace(motion, angular_velocity=np.zeros(3), linear_velocity=np.zeros(3))
-    pixels, _ = project_rolling(CAMERA, still.at_rows, points)
-    rng = np.random.default_rng(0)
-    spread = []
-    for k in range(15):
-        noisy = pixels + rng.normal(scale=0.3, size=pixels.shape)
-        found = tracker.localize(33_000_000 * (k + 1), points, noisy)
-        spread.append((found.covariance[0, 0], found.joint_covariance[0, 0]))
-    (first, first_own), (last, last_own) = spread[0], spread[-1]
-    assert last_own < first_own
-    assert last > 0.9 * first
-
-
-def test_a_perfect_map_of_which_an_error_is_declared_is_not_refused():
-    """Nor is a bent one, below."""
-    localizer = rsl.Localizer(CAMERA, map_deviation=0.01)
-    assert sum(bool(localizer.localize(*frame(seed, 0.0)[:2])) for seed in range(20)) >= 19
-
-
 @pytest.mark.parametrize(("depth", "least"), [(2.0, 0.9), (0.0, 0.75)], ids=["room", "wall"])
 def test_regions_hold_before_a_bent_map_that_is_declared(depth, least):
     """A map is off in metres, so by more pixels where it is near: the smooth error has a depth.
@@ -211,25 +171,6 @@ def test_regions_hold_before_a_bent_map_that_is_declared(depth, least):
     declared = rsl.Localizer(CAMERA, map_deviation=0.01, calibration=EXACT)
     found = inside(declared, depth, 30, lambda points, seed: (bent(points, seed), None))
     assert found >= least
-
-
-def test_regions_before_a_wall_count_the_smooth_errors_of_all_modes():
-    """A calibration with distortion that the lens has not: 0.21 of 14 when the fastest counted.
-
-    It is 1 to 2 px off, so that half of the frames are refused; of 200, 0.69 of 72 are inside.
-    """
-    distorted = rsl.Localizer(replace(CAMERA, D=np.array([0.03, 0.0, 0.0, 0.0, 0.0])))
-    assert inside(distorted, 0.0, noise=1.0, least=0.4) >= 0.6
-
-
-def test_regions_hold_in_a_room_whose_bend_is_not_declared():
-    """The middle stands 3 cm out: 5 % are inside where a smooth error has no depth."""
-
-    def bowed(points, _):
-        out = 0.03 * (1.0 - (points[:, 0] / 2.0) ** 2)
-        return points + np.outer(out, [0.0, 0.0, 1.0]), None
-
-    assert inside(rsl.Localizer(CAMERA, calibration=EXACT), 2.0, 30, bowed) >= 0.9
 
 
 def test_points_of_a_curled_sheet_are_inliers_beside_its_bend():

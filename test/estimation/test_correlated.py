@@ -8,7 +8,6 @@ from scipy.special import logsumexp
 
 from rs_localizer.core.scales import SPEEDS
 from rs_localizer.estimation.correlated import (
-    ORDINARY,
     Noise,
     bend_of,
     over_sizes,
@@ -94,20 +93,3 @@ def test_sizes_are_integrated_as_over_dense_matrices(bent):
     assert found.evidence == pytest.approx(expected, abs=0.05)
     sizes = 0.2 * np.exp(SIZES)
     assert found.size == pytest.approx(np.sqrt(weights @ sizes**2), rel=0.05)
-
-
-def test_an_image_without_a_smooth_error_shows_an_ordinary_one():
-    sizes = []
-    for seed in range(10):
-        observations, truth = frame(seed, 0.05, 0.1, count=150)
-        chosen = np.ones(150, bool)
-        lines = linearized(observations.packed, 150, truth, np.zeros((150, 6)))
-        smooth = smooth_error(lines, chosen, np.zeros((150, 0)), np.log(ORDINARY), 1.0)
-        products = products_at(observations.packed, 150, truth, chosen, smooth.rows)
-        information, slope = np.zeros((18, 18)), np.zeros(18)
-        cost = add_prior(TERMS, truth, 1.0, information, slope)
-        found = over_sizes(
-            products, smooth, information, slope, cost, volume_of(TERMS), Noise(0.1, 1.0, 18.0)
-        )
-        sizes.append(found.size)
-    assert np.median(sizes) < 0.03

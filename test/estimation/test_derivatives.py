@@ -109,19 +109,3 @@ def test_lines_are_those_of_the_forward_projection(direction, coefficients, seat
         columns.append((ahead - behind) / (2 * h))
     expected = np.stack(columns, axis=-1)
     np.testing.assert_allclose(by_turn, expected, atol=near * np.abs(expected).max())
-
-
-def test_errors_beside_the_shaking_are_distances_of_pixels():
-    """Where a point was measured off its row, the shaking of that row is not its own."""
-    direction = "top_to_bottom"
-    state, points = scene(direction, seed=2)
-    rays, _ = project(state, points, direction, SHAKE)
-    off = 0.5 * np.random.default_rng(0).normal(size=rays.shape)
-    data, measured = packed(points, rays, direction, off)
-    h = 1e-5
-    rates = (shake(measured + h, SHAKE) - shake(measured - h, SHAKE)) / (2 * h)
-    errors, *_ = residuals.linearized(
-        data, len(points), state,
-        np.column_stack([shake(measured, SHAKE), rates]),
-    )  # fmt: skip
-    np.testing.assert_allclose(errors, -off, atol=5e-3)

@@ -5,13 +5,11 @@
 from itertools import pairwise
 
 import numpy as np
-import pytest
 
 from rs_localizer.config import LocalizerConfig, VelocityPrior
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Rig
-from rs_localizer.core.scales import Scales
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.prior import Prior, assumptions, told_speed
@@ -53,15 +51,6 @@ def test_images_tell_how_fast_cameras_move_within_them():
     assert np.abs(speeds_after(0.003, 0.005, 1.0).scales.speeds).max() < 0.3
 
 
-def test_they_forget_it():
-    calm = speeds_after(0.003, 0.005)
-    step = [estimate_at(np.zeros(3)), estimate_at(np.array([0.1, 0.0, 0.0]), turn=0.2)]
-    faster = calm
-    for _ in range(5):
-        faster = faster.moving(faster.scales.speeds, *step, 1.0 / 30.0, VelocityPrior())
-    assert np.argmax(faster.scales.speeds) == 4
-
-
 def test_what_frames_deny_is_no_prior_of_the_next():
     camera = Camera(640, 480, np.diag([500.0, 500.0, 1.0]), readout_time=0.02)
     terms, _ = assumptions(
@@ -77,14 +66,3 @@ def test_what_frames_deny_is_no_prior_of_the_next():
     assert prior.scales.speeds[4] < -4.0
     for same in (Prior(scales=speeds_after(0.1, 0.2).scales), Prior(), None):
         assert told_speed(terms, same) == (terms, same)
-
-
-def test_a_map_or_a_lens_is_said_to_be_off_where_many_frames_agree():
-    nothing = Scales.nothing()
-    said = {
-        (size, precision): Experience(
-            nothing._replace(size=np.array([np.log(size), precision]))
-        ).smooth_error
-        for size, precision in ((0.2, 100.0), (1.5, 100.0), (1.5, 1.0))
-    }
-    assert list(said.values()) == [0.0, pytest.approx(1.5), 0.0]

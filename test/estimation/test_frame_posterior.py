@@ -3,26 +3,18 @@
 """All that the points leave possible: rest and motion, in-frame turns, and wrong maps."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from benchmarks.honesty.estimating import believed, frames_of
-from benchmarks.independent.cameras import Camera
-from benchmarks.independent.motions import hand, vibration
-from benchmarks.independent.scenes import Rich
 from rs_localizer.core.scales import SPEEDS, VIBRATIONS, Scales
 from rs_localizer.core.shake import CYCLES, shake_at
-from rs_localizer.core.state import step_between
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.frame_posterior import frame_posterior
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import held_terms
-from rs_localizer.localizer import Localizer
-from rs_localizer.tracking import Tracker
 
 from .frames import ASSUMED, PRIOR, distance, frame, observe
 from .projection import disturbed, jacobian_of
@@ -31,23 +23,6 @@ from .projection import disturbed, jacobian_of
 def settled(seed, speed, noise=0.5, **more):
     observations, truth = frame(seed, speed, noise, **more)
     return frame_posterior(observations, truth, PRIOR, 2.0, ASSUMED), truth
-
-
-@pytest.mark.parametrize(
-    ("speed", "noise"),
-    [
-        (0.1, 0.1),
-        (0.01, 1.0),
-        pytest.param(0.01, 0.1, marks=pytest.mark.bench),
-        pytest.param(0.1, 1.0, marks=pytest.mark.bench),
-    ],
-)
-def test_thousands_of_points_of_a_right_map_show_no_error_of_map_or_lens(speed, noise):
-    """What a field has of the points' noise, and their errors, too, grows with their number."""
-    for seed in range(3):
-        found, truth = settled(seed, speed, noise, count=2500)
-        assert found.model_error < 0.25 * noise + 0.02  # up to 1 px once
-        assert distance(found, truth, slice(0, 12)) < chi2.ppf(0.9999, 12)
 
 
 @pytest.fixture(scope="module", params=[30, pytest.param(60, marks=pytest.mark.bench)])
@@ -63,22 +38,6 @@ def resting(request):
             (frame_posterior(observations, truth, PRIOR, 2.0, ASSUMED), moving, still, truth)
         )
     return found
-
-
-def test_at_rest_the_pose_is_nearly_as_good_as_with_six_parameters(resting):
-    settled_off, moving_off, still_off = (
-        np.sqrt(np.mean([step_between(case[k].state, case[3])[:6] ** 2 for case in resting], 0))
-        for k in range(3)
-    )
-    assert (settled_off < 1.3 * still_off).all()
-    assert (settled_off < 1.02 * moving_off).all()  # of 30 frames
-    assert (settled_off / moving_off).mean() < 0.95
-    # The covariance allows for motion at even odds, and for a map that is off by little.
-    variances = np.median([[np.diag(p.covariance)[:6] for p in case[:3]] for case in resting], 0)
-    variances[0] *= resting[0][0].inflation  # as it goes out
-    assert (variances[2] < variances[0]).all()
-    assert (variances[0] < 1.12 * variances[1]).all()
-    assert (variances[0] / variances[1]).min() < 0.97
 
 
 def test_at_rest_the_truth_is_covered(resting):
@@ -167,31 +126,6 @@ def test_a_vibrating_camera_stays_in_its_region(frames):
     assert (np.mean(np.array(squared) < chi2.ppf(0.95, 6), axis=0) >= 0.85).all()
 
 
-def test_slow_cameras_that_shake_are_not_taken_for_fast_ones():
-    """Typical speeds are weighed beside an in-frame turn, too: before a board, with the fastest
-    alone, slow cameras are off by several times as much.
-    """
-    sine, fast = np.vstack([np.zeros(3), SWING[1]]), replace(ASSUMED, may_rest=False)
-    errors, inside = [], []
-    for seed in range(16):
-        rng = np.random.default_rng(seed)
-        board = np.column_stack([rng.uniform(-0.6, 0.6, (70, 2)), np.zeros(70)])
-        tilted = Rotation.from_euler("xy", rng.uniform(-0.5, 0.5, 2)).as_matrix()
-        truth = np.concatenate(
-            [tilted.ravel(), [0.0, 0.0, 1.8], 3e-4 * rng.normal(size=6), np.zeros(6)]
-        )
-        observations = observe(truth, board, 0.5, rng, swing=wave(4.0, sine))
-        found, other = (
-            frame_posterior(observations, truth, PRIOR, 2.0, assumed) for assumed in (ASSUMED, fast)
-        )
-        assert np.any(found.shake)
-        errors.append([np.linalg.norm(step_between(x.state, truth)[:3]) for x in (found, other)])
-        inside.append(distance(found, truth, slice(0, 6)) < chi2.ppf(0.95, 6))
-    weighed, fastest = np.median(errors, axis=0)
-    assert weighed < 0.5 * fastest, (weighed, fastest)
-    assert np.mean(inside) >= 0.8
-
-
 def refused_of(observations, posterior):
     """Whether it is refused."""
     failure = refusal(observations, posterior, 0, min_inliers=12, threshold=2.0, rolling=True)
@@ -222,13 +156,6 @@ def test_vibration_is_followed_through_all_rows(cycles):
     assert found.noise == pytest.approx(0.2, rel=0.25)
 
 
-def test_wrong_matches_stay_outside_of_a_vibrating_frame():
-    observations, state = shaken(5, wrong=40, count=120)
-    found = frame_posterior(observations, state, PRIOR, 2.0, ASSUMED)
-    assert found.inliers[40:].mean() > 0.97
-    assert found.inliers[:40].sum() <= 3
-
-
 @pytest.mark.parametrize(
     ("count", "wrong", "published"),
     [
@@ -256,23 +183,6 @@ def test_few_points_of_a_vibrating_camera_are_refused_or_covered(count, wrong, p
     assert max(squared, default=0.0) < chi2.isf(5.7e-7, 12)  # five sigma
 
 
-@pytest.mark.bench
-def test_a_tracker_learns_in_a_second_what_hides_in_each_frame():
-    """A tenth of a degree at 100 Hz in a pixel of noise."""
-    learnt = []
-    for shakes in (False, True):
-        make = partial(vibration, degrees=0.1, hertz=100.0) if shakes else hand
-        seen = frames_of(Camera(), make, Rich(), 1, 4, length=25)
-        tracker = Tracker(Localizer(believed(seen.camera)))
-        for index in range(25):
-            assert tracker.localize(seen.middle_ns(index), *seen.seen(index, 1.0))
-        scales = tracker.prediction(seen.middle_ns(24) + 33_000_000).scales
-        learnt.append(scales)
-    calm, shaking = learnt
-    assert shaking.vibrations[1:].max() > shaking.vibrations[0] + 3.0
-    assert calm.vibrations[1:].max() < calm.vibrations[0] + 3.0
-
-
 @pytest.mark.parametrize("sure", [-10.0, 10.0])
 def test_however_sure_frames_are_what_is_clear_is_seen(sure):
     """Frames before that were all at rest, or all fast; calm, or shaken."""
@@ -284,12 +194,3 @@ def test_however_sure_frames_are_what_is_clear_is_seen(sure):
     found = frame_posterior(observations, truth, PRIOR, 2.0, knows)
     assert distance(found, truth, slice(0, 6)) < chi2.ppf(0.999, 6)
     assert distance(found, truth, slice(6, 12)) < chi2.ppf(0.999, 6)
-
-
-def test_a_motion_without_inliers_beside_a_bent_map_is_no_error():
-    """It was one where smooth errors are declared, and in small planes that are tracked."""
-    observations, truth = frame(3, 0.0, 0.5)
-    away = truth.copy()
-    away[11] = 40.0
-    found = frame_posterior(observations, away, PRIOR, 1e-3, replace(ASSUMED, map_deviation=0.01))
-    assert found.inliers.sum() < 12

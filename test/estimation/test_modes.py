@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.frames.conditions import named
-from benchmarks.frames.judged import judge
-from rs_localizer.core.state import PARAMETERS, step_between
+from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.correlated import Noise, nothing_shared, products_at
 from rs_localizer.estimation.mirror import leaning_less
 from rs_localizer.estimation.modes import (
@@ -115,37 +113,6 @@ def test_leans_are_integrated_as_on_a_fine_grid(tilt, noise):
 STATE = np.concatenate([np.eye(3).ravel(), [0.0, 0.0, 2.0], np.zeros(12)])
 
 
-def gaussians(seed=0, apart=1e-3):
-    rng = np.random.default_rng(seed)
-    states = np.array([apply_step(STATE, apart * rng.normal(size=PARAMETERS)) for _ in range(3)])
-    roots = 1e-3 * rng.normal(size=(3, PARAMETERS, PARAMETERS + 4))
-    return states, roots @ np.swapaxes(roots, 1, 2)
-
-
-def offset(state, other):
-    """By how much the camera turns, and the middle of the points (the origin) moves before it."""
-    turn, seen = step_between(state, other)[:3], state[9:12]
-    step = step_between(state, other)
-    step[3:6] = np.cross(seen, turn) - (other[9:12] - seen)
-    return step
-
-
-def test_mean_and_covariance_are_those_of_the_mixture():
-    states, covariances = gaussians()
-    weights = np.array([0.5, 0.3, 0.2])
-    mean, covariance, steps, *_ = averaged(states, covariances, 0, weights, weights)
-    expected = np.array([offset(states[0], state) for state in states])
-    np.testing.assert_allclose(steps, expected, atol=1e-15)
-    centre = weights @ expected
-    np.testing.assert_allclose(offset(states[0], mean), centre, atol=1e-15)
-    off = expected - centre
-    moments = np.einsum("k,ki,kj->ij", weights, off, off) + np.tensordot(weights, covariances, 1)
-    scale = np.sqrt(np.diag(moments))
-    np.testing.assert_allclose(
-        covariance / np.outer(scale, scale), moments / np.outer(scale, scale), atol=0.01
-    )
-
-
 def test_cameras_on_an_arc_about_the_points_are_as_far_away_as_each_of_them():
     """Their mean step would be nearer by 0.13 m, and its covariance deep."""
     states = np.array([apply_step(STATE, np.zeros(PARAMETERS)) for _ in range(2)])
@@ -196,12 +163,3 @@ def test_moments_of_a_mixture_are_those_of_cameras_on_the_arc():
     alone = along_arcs(both, CENTRE, np.ones(1), np.zeros((1, 18)), both[None])
     # One Gaussian of these moments is 15 % off along the line of sight.
     assert abs(alone[5, 5] / expected[5, 5] - 1.0) > 0.1
-
-
-@pytest.mark.bench
-def test_regions_before_a_small_tilted_plane_hold_under_motion():
-    """Along the ellipsoid's own axes they held in half of the frames."""
-    found = judge(named("planes/0.6m/tilt 30/10deg/1px"), 40, 2, {})
-    assert np.mean(found.localized) > 0.8
-    for moment in ("pose_s", "pose"):
-        assert np.mean(found.inside(moment)) >= 0.85

@@ -15,8 +15,6 @@ from rs_localizer.estimation.motion_window import (
     Gaussian,
     MotionWindow,
     Sample,
-    estimate_at,
-    gaussian_of,
     sample_of,
 )
 from rs_localizer.estimation.prior import Prior, motion_terms, with_motion
@@ -135,19 +133,6 @@ def test_it_is_least_squares_over_all_its_frames():
         assert found.time_ns == (0 if k == 0 else samples[k - 1].time_ns)
 
 
-def test_frames_that_leave_the_window_still_count():
-    rng = np.random.default_rng(1)
-    path, _ = simulated(HAND, 12, rng)
-    samples = samples_of(path, rng)
-    window = through(samples)
-    assert len(window) == LENGTH
-    means, covariances = dense(samples, np.repeat(window.deviations, (1, 1, 1, 3)))
-    scale = np.sqrt(np.diag(covariances[-1]))
-    # Scales have changed on the way.
-    off = (step_between(STILL, window.newest.state) - means[-1]) / scale
-    assert np.abs(off).max() < 0.5
-
-
 @pytest.mark.parametrize(
     ("before", "after", "frames", "low", "high"),
     # From a hand to a blow, and back; to a tripod, of which noise leaves no more to be told.
@@ -261,28 +246,3 @@ def test_points_tell_what_the_posterior_knows_beside_its_prior():
     np.testing.assert_allclose(
         sample.gradient / UNITS / scale, left / scale, atol=1e-2 * np.abs(left / scale).max()
     )
-
-
-def test_an_estimate_by_its_own_window_is_itself():
-    rng = np.random.default_rng(7)
-    root = 1e-3 * rng.normal(size=(18 + 84, 18 + 84))
-    fit = estimate(1e-2 * rng.normal(size=18), root @ root.T, 1e-3 * rng.normal(size=(28, 3)))
-    same = estimate_at(fit, gaussian_of(fit, 0))
-    np.testing.assert_allclose(same.rotation, fit.rotation, atol=1e-9)
-    np.testing.assert_allclose(same.shake, fit.shake, atol=1e-9)
-    np.testing.assert_allclose(same.joint_covariance, fit.joint_covariance, atol=1e-10)
-
-
-def test_shaking_goes_along_with_the_motion_that_it_is_tied_to():
-    """Conditioning on an exactly known motion beside the shaking."""
-    rng = np.random.default_rng(8)
-    root = 1e-3 * rng.normal(size=(18 + 84, 18 + 84))
-    fit = estimate(np.zeros(18), root @ root.T, np.zeros((28, 3)))
-    own = gaussian_of(fit, 0)
-    exact = own._replace(state=apply_step(own.state, 1e-4 * rng.normal(size=18)),
-                         covariance=1e-16 * np.eye(18))  # fmt: skip
-    by = estimate_at(fit, exact)
-    again = gaussian_of(by, 0)
-    np.testing.assert_allclose(again.state, exact.state, atol=1e-8)
-    assert np.abs(again.covariance).max() < 1e-8
-    assert np.abs(by.shake).max() > 1e-6

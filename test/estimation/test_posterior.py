@@ -36,24 +36,6 @@ def observe(scene, speed, noise, count, seed, outliers=0):
     return scene.observe(camera, points, measured), scene.state_of(motion)
 
 
-def test_inliers_are_those_within_the_noise_even_beyond_the_threshold(scene):
-    observations, truth = observe(scene, 0.1, 1.0, 200, 0, outliers=40)
-    posterior = maximum_a_posteriori(observations, truth, PRIOR, 2.0)
-    # Two pixels would keep 86 % of the true inliers at this noise.
-    assert posterior.inliers[40:].mean() > 0.98
-    assert posterior.inliers[:40].sum() <= 1
-    assert posterior.noise == pytest.approx(1.0, rel=0.1)
-
-
-def test_the_cost_is_that_of_the_inliers(scene):
-    """Also of a start that is so far off that the fit began with few of them."""
-    observations, start = observe(scene, 0.1, 0.5, 200, 0)
-    start[9:12] += [0.02, -0.01, 0.03]
-    nothing = motion_terms((0.0, 0.0), (0.0, 0.0))
-    posterior = maximum_a_posteriori(observations, start, nothing, 1.0)
-    assert posterior.cost == pytest.approx(posterior.squared_errors[posterior.inliers].sum())
-
-
 def information(seed=0, points=1.0):
     factor = np.random.default_rng(seed).normal(size=(18, 40))
     return points * factor @ factor.T

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +10,7 @@ from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import (
     Prior,
     add_prior,
-    held_terms,
     motion_terms,
-    pivot_of,
     state_in,
     terms_at,
     with_measurements,
@@ -106,36 +104,6 @@ def test_a_motion_prior_costs_the_mahalanobis_distance_about_its_pivot(size):
     assert cost == pytest.approx(step @ np.linalg.solve(spread, step), rel=1e-6)
 
 
-def test_the_pivot_is_what_an_image_sees_and_the_camera_where_its_place_is_measured():
-    turn, seen, place = np.diag([0.2, 0.1, 0.05]), np.diag([0.01, 0.01, 0.05]), [0.3, -0.2, 3.0]
-    hat = np.cross(place, np.eye(3)).T  # place x turn
-    spread = np.zeros((18, 18))
-    by = np.block([[np.eye(3), np.zeros((3, 3))], [hat, -np.eye(3)]])
-    spread[:6, :6] = by @ np.diag(np.r_[np.diag(turn), np.diag(seen)] ** 2) @ by.T
-    np.testing.assert_allclose(pivot_of(spread), place, rtol=1e-6)
-    np.testing.assert_allclose(pivot_of(np.eye(18)), 0.0, atol=1e-12)
-    assert not np.any(pivot_of(np.diag(np.full(18, np.inf))))
-
-
-def test_infinite_variances_leave_parameters_free():
-    spread = np.diag(np.concatenate([np.full(6, np.inf), np.full(6, 0.01)]))
-    terms = with_motion(NOTHING, Prior(motion=motion(), covariance=spread), CENTRE)
-    _, information, _ = evaluate(terms, state_in(motion(5), CENTRE))
-    np.testing.assert_allclose(information, np.diag([0.0] * 6 + [100.0] * 6 + [0.0] * 6))
-
-
-def test_motion_terms_are_precisions_and_none_for_zero():
-    state = state_in(motion(), CENTRE)
-    _, information, slope = evaluate(motion_terms((0.2, 0.0), (0.0, 0.05)), state)
-    np.testing.assert_allclose(
-        information, np.diag([0.0] * 6 + [25.0] * 3 + [0.0] * 6 + [400.0] * 3)
-    )
-    np.testing.assert_allclose(slope[6:9], 25.0 * state[12:15])
-    np.testing.assert_allclose(slope[15:18], 400.0 * state[21:24])
-    assert evaluate(NOTHING, state)[0] == 0.0
-    assert evaluate(held_terms(), state)[0] > 1e15
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -163,36 +131,6 @@ def test_a_motion_of_which_nothing_is_known_adds_and_replaces_nothing(size):
         terms, state = with_motion(own, prior, CENTRE), state_in(motion(5), CENTRE)
         for found, expected in zip(evaluate(terms, state), evaluate(own, state), strict=True):
             np.testing.assert_array_equal(found, expected)
-
-
-def test_a_motion_may_be_given_in_lists():
-    names = (field.name for field in fields(Motion))
-    listed = Motion(**{name: getattr(motion(), name).tolist() for name in names})
-    np.testing.assert_array_equal(state_in(listed, CENTRE), state_in(motion(), CENTRE))
-
-
-@pytest.mark.parametrize("name", PRIORS)
-def test_a_search_has_the_first_twelve_of_all_parameters(name):
-    """With the accelerations held where they are, at the same cost."""
-    state = apply_step(state_in(motion(), CENTRE), 0.2 * np.random.default_rng(2).normal(size=18))
-    cost, information, slope = evaluate(PRIORS[name], state, 2.0)
-    searched = evaluate(PRIORS[name], state, 2.0, size=12)
-    assert searched[0] == cost
-    np.testing.assert_array_equal(searched[1], information[:12, :12])
-    np.testing.assert_array_equal(searched[2], slope[:12])
-
-
-def test_a_prior_of_the_accelerations_replaces_that_of_the_configuration():
-    own = motion_terms((0.2, 0.1), (0.05, 0.03))
-    state = state_in(motion(), CENTRE)
-    for size, stays in ((12, True), (18, False)):
-        prior = Prior(motion=motion(), covariance=covariance(size=size))
-        both = evaluate(with_motion(own, prior, CENTRE), state)[1]
-        added = evaluate(with_motion(NOTHING, prior, CENTRE), state)[1]
-        left = np.diag(both - added)
-        np.testing.assert_allclose(left[6:12], np.repeat([25.0, 100.0], 3), rtol=1e-9)
-        assert np.allclose(left[12:], np.repeat([400.0, 1e4 / 9], 3) if stays else 0.0)
-    assert evaluate(own, state)[1][17, 17] > 0.0  # the terms themselves are left alone
 
 
 def test_a_slower_motion_is_a_narrower_prior_and_rest_the_narrowest():

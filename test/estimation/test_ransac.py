@@ -13,16 +13,13 @@ from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import motion_terms
 from rs_localizer.estimation.ransac import (
     NOTHING,
-    Candidate,
     Draws,
     Hypotheses,
     Pools,
     best_models,
     draw,
     generator,
-    optimize,
     pools_of,
-    prefix_sizes,
     search,
     state_of_model,
 )
@@ -94,21 +91,6 @@ def test_it_finds_the_inliers_and_stops_when_it_is_sure(problem):
     assert found.samples == sum(map(len, solver.samples))
 
 
-def test_it_gives_up_after_the_most_samples(problem):
-    observations, model, outliers = problem(0.5)
-    solver = Solver(model, outliers, always_wrong=True)
-    found = run(observations, solver, ALL, max_samples=120)
-    assert found.samples == 120
-    assert [len(block) for block in solver.samples] == [50, 50, 20]
-
-
-def test_a_better_start_is_kept(problem, scene):
-    observations, model, outliers = problem(0.3)
-    start = Candidate(np.arange(24.0), 1e-6)
-    found = run(observations, Solver(model, outliers), ALL, start=start)
-    assert found.state is start.state
-
-
 def test_good_pools_stop_the_search_early_and_all_are_drawn_from(problem):
     observations, model, outliers = problem(0.7)
     solver = Solver(model, outliers)
@@ -134,37 +116,6 @@ def test_pools_are_of_each_camera_that_has_enough_points():
     some = pools_of(camera, tau, 3, 6, near, np.zeros(0, np.int64), False)
     assert some.points.tolist() == list(range(0, 20, 2))
     assert len(pools_of(camera, tau, 3, 30, near, ranking, True).ends) == 0
-
-
-def test_without_pools_there_is_nothing(problem):
-    observations, model, outliers = problem(0.0)
-    nothing = pools_of(observations.camera, observations.tau, 1, 6, outliers, EVERYTHING, False)
-    found = run(observations, Solver(model, outliers), nothing)
-    assert not found.found
-    assert found.samples == 0
-
-
-def test_scores_put_good_samples_first(problem):
-    observations, model, outliers = problem(0.7)
-    ranked = pools_from(np.argsort(outliers, kind="stable"), ranked=True)
-    solver = Solver(model, outliers)
-    run(observations, solver, ranked, max_samples=1000)
-    assert not outliers[solver.samples[0]].any()
-
-
-def test_it_goes_on_from_where_another_search_stopped(problem):
-    """The samples of the first count: towards the most, and towards being sure."""
-    observations, model, outliers = problem(0.5)
-    pools = pools_from(EVERYTHING, EVERYTHING)
-    first = run(observations, Solver(model, outliers, always_wrong=True), pools, max_samples=200)
-    solver = Solver(model, outliers)
-    later = run(observations, solver, pools, max_samples=250, start=first)
-    assert later.samples == 250
-    assert sum(map(len, solver.samples)) == 50
-    # Of 293 samples that it takes to be sure 280 were drawn before, and a block has 50.
-    sure = run(observations, Solver(model, outliers), pools)
-    before = Candidate(sure.state, sure.cost, 280)
-    assert run(observations, solver, pools, start=before).samples == 330
 
 
 def samples_of(pool, count, size, tau=None, seed=0, prefixes=None):
@@ -203,24 +154,6 @@ def test_samples_spread_over_the_rows_where_they_can():
     assert (samples_of(np.arange(10), 5, 6, np.zeros(10)) >= 0).all()
 
 
-def prefixes(total, first, count, size=6):
-    sizes = np.empty(count, np.int64)
-    prefix_sizes(total, first, size, sizes)
-    return sizes
-
-
-def test_ranked_pools_begin_with_the_best_and_end_with_all():
-    sizes = prefixes(200, 0, 1000)
-    assert sizes[0] < 40
-    assert prefixes(200, 200_000, 1) == 200
-    assert (np.diff(sizes) >= 0).all()
-    parts = [prefixes(200, k, 100) for k in range(0, 1000, 100)]
-    np.testing.assert_array_equal(sizes, np.concatenate(parts))
-    samples = samples_of(np.arange(200), 1000, 6, prefixes=sizes)
-    assert (samples.max(axis=1) < sizes).all()
-    assert (prefixes(6, 0, 10) == 6).all()
-
-
 def test_models_become_states_by_the_motion_model(scene):
     model = np.random.default_rng(0).normal(size=18)
     rotation, c, w, drift = model[:9].reshape(3, 3), model[9:12], model[12:15], model[15:18]
@@ -253,13 +186,3 @@ def test_the_best_models_are_those_of_a_full_sort(scene):
     np.testing.assert_allclose(costs, expected, rtol=1e-12)
     for state, cost in zip(states, costs, strict=True):
         assert truncated_cost(data, state, 8.0, np.inf) == cost
-
-
-def test_places_without_a_model_stay_infinite(scene):
-    camera, _, points, _, measured = scene.frame()
-    data = scene.pack(camera, points, measured)
-    nothing = np.full((1, 18, 3), np.nan)
-    states, costs = best_models(nothing, data, 8.0, 2, np.inf)
-    assert np.isinf(costs).all()
-    _, cost = optimize(states, costs, data, 16.0, 2.0, FREE, 1.0)
-    assert np.isinf(cost)

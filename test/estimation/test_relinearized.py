@@ -61,16 +61,3 @@ def test_derivatives_are_those_of_exact_points(turn):
     assert after < 0.1 * before
     np.testing.assert_array_equal(found.rays, measured.rays)
     np.testing.assert_array_equal(found.tau, measured.tau)
-
-
-def test_few_points_and_lost_ones_keep_their_derivatives():
-    points, pixels = seen(400)
-    usable = find_usable(EXPOSURE, points, pixels, [len(points)], None)
-    few = packed(
-        EXPOSURE, points[:100], find_usable(EXPOSURE, points[:100], pixels[:100], [100], None)
-    )
-    assert relinearized(EXPOSURE, few, np.zeros(24), None) is few
-    far = Motion(np.eye(3), np.array([5.0, 0.0, 0.0]), np.zeros(3), np.zeros(3))
-    observations = packed(EXPOSURE, points, usable)
-    found = relinearized(EXPOSURE, observations, state_in(far, usable.centre), None)
-    np.testing.assert_allclose(by_ray(found), by_ray(observations), rtol=1e-6)

@@ -8,32 +8,6 @@ import pytest
 from rs_localizer.estimation import residuals
 from rs_localizer.estimation.refine import apply_step
 
-DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
-
-
-@pytest.mark.parametrize("direction", DIRECTIONS)
-def test_the_error_is_measured_at_the_row_where_the_model_puts_the_point(scene, direction):
-    camera, motion, points, true, measured = scene.frame(
-        direction, speed=0.3, noise=0.3, acceleration=0.3
-    )
-    found = residuals.squared_errors(
-        scene.pack(camera, points, measured), len(points), scene.state_of(motion)
-    )
-    expected = np.linalg.norm(measured - true, axis=1)
-    # The naive error, with the pose of the measured row, is off by up to a third here.
-    np.testing.assert_allclose(np.sqrt(found), expected, rtol=0.02)
-
-
-def test_the_cost_of_a_still_camera_is_that_of_one_that_hardly_moves(scene):
-    camera, motion, points, _, measured = scene.frame(speed=0.05, noise=1.0)
-    still, creeping = scene.state_of(motion), scene.state_of(motion)
-    still[12:], creeping[12:] = 0.0, 1e-12
-    points[0] -= 10 * motion.rotation[2]  # behind the camera
-    data = scene.pack(camera, points, measured)
-    cost = residuals.truncated_cost(data, still, 50.0, np.inf)
-    assert 2500 < cost < 2500 * len(points)
-    assert cost == pytest.approx(residuals.truncated_cost(data, creeping, 50.0, np.inf), rel=1e-9)
-
 
 @pytest.mark.parametrize("softness", [0.0, 1.0])
 def test_robust_cost_and_its_slope_belong_together(scene, softness):

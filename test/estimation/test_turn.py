@@ -5,15 +5,13 @@
 import numpy as np
 import pytest
 from scipy.special import logsumexp
-from scipy.stats import chi2
 
 from rs_localizer.core.scales import FACTORS, SPECTRA, VIBRATIONS
-from rs_localizer.core.shake import CYCLES, shake_at
-from rs_localizer.core.state import step_between
+from rs_localizer.core.shake import CYCLES
 from rs_localizer.estimation.correlated import nothing_shared
 from rs_localizer.estimation.prior import add_prior
 from rs_localizer.estimation.residuals import linearized
-from rs_localizer.estimation.turn import fit_turn, hidden_turn
+from rs_localizer.estimation.turn import hidden_turn
 
 from .frames import PRIOR, frame
 
@@ -80,37 +78,3 @@ def test_hidden_vibration_is_integrated_as_over_dense_matrices():
         found[:12, :12] / np.outer(deviations, deviations),
         expected[:12, :12] / np.outer(deviations, deviations), atol=0.05,
     )  # fmt: skip
-
-
-def shaken(seed, noise, degrees=0.3, cycles=1.3, count=80):
-    rng = np.random.default_rng(1000 + seed)
-    axis, phase = rng.normal(size=3), rng.uniform(0.0, 2.0 * np.pi)
-    swing = np.radians(degrees) * axis / np.linalg.norm(axis)
-    angle = 2.0 * np.pi * cycles
-
-    def turn(tau):  # no turn and no rate in the middle, as the states have them
-        wave = np.sin(angle * tau + phase) - np.sin(phase) - angle * tau * np.cos(phase)
-        return np.outer(wave, swing)
-
-    return frame(seed, 0.03, noise, count=count, swing=turn)
-
-
-@pytest.mark.parametrize("noise", [0.1, 0.5])
-def test_a_camera_that_shakes_is_followed_and_says_how_well(noise):
-    inside, errors, plain = [], [], []
-    for seed in range(8):
-        observations, truth = shaken(seed, noise)
-        fit = fit_turn(
-            observations.packed, observations.count, truth, PRIOR, 2.0, 16.0, 2.0, NONE,
-            np.zeros((80, 0)), np.log(0.03), np.log(0.03), 1.0, 590.0,
-        )  # fmt: skip
-        assert fit.finite
-        assert fit.gain > (5.0 if noise < 0.2 else -1.0)
-        error = step_between(fit.state, truth)[:6]
-        inside.append(error @ np.linalg.solve(fit.covariance[:6, :6], error) < chi2.ppf(0.99, 6))
-        errors.append(np.linalg.norm(error[:3]))
-        swing = shake_at(observations.tau, fit.turns)[:, :3]
-        plain.append(np.abs(swing).max())
-    assert np.mean(inside) >= 0.8
-    assert np.median(errors) < np.radians(0.03 if noise < 0.2 else 0.1)
-    assert np.median(plain) > np.radians(0.2)

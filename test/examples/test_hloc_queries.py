@@ -184,22 +184,3 @@ def test_moving_queries_lose_half_of_the_error(tmp_path):
         assert np.all(np.abs(off) < 5.0 * np.array(motion["twist_deviations"]))
         assert np.all(np.abs(off) < np.repeat([0.15, 0.6], 3))
     assert np.all(np.median(ours, axis=0) < 0.5 * np.median(theirs, axis=0))
-
-
-def test_older_files_and_bad_ones(tmp_path):
-    truth = motions(2)
-    new, old = make(tmp_path / "new", truth), make(tmp_path / "old", truth, old=True)
-    localize(new)
-    localize(old)
-    assert new.results.read_text() == old.results.read_text()
-    for change, text in ((9999, "other features or model"), (None, "no matches of query/cam0/0")):
-        with h5py.File(new.folder / "m.h5", "a") as file:
-            if change is None:
-                del file["query-cam0-0.jpg/db-0.jpg"]
-            else:
-                file["query-cam0-0.jpg/db-0.jpg/matches0"][3] = change
-        with pytest.raises(ValueError, match=text):
-            localize(new)
-    (new.folder / "queries.txt").write_text("query/cam0/0.jpg FOV 640 480 500 320 240 1")
-    with pytest.raises(ValueError, match="must be one of SIMPLE_PINHOLE"):
-        localize(new)

@@ -8,11 +8,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
-from scipy.stats import chi2
 
 pytest.importorskip("pyarrow", exc_type=ImportError)
 
@@ -134,47 +132,6 @@ def test_transforms_and_a_view(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     example("to_rerun").main(flight.table, str(tmp_path / "seen.rrd"))
     assert (tmp_path / "seen.rrd").read_bytes().startswith(b"RRF")
-
-
-def test_the_ellipsoid_holds_95_percent():
-    pytest.importorskip("rerun")
-    rng = np.random.default_rng(0)
-    root = rng.normal(size=(3, 3))
-    half_sizes, quaternion = example("to_rerun").ellipsoid(root @ root.T)
-    axes = Rotation.from_quat(quaternion).as_matrix()
-    samples = rng.multivariate_normal(np.zeros(3), root @ root.T, 20_000)
-    inside = np.sum((samples @ axes / half_sizes) ** 2, axis=1) <= 1.0
-    assert np.mean(inside) == pytest.approx(0.95, abs=0.01)
-    assert np.prod(half_sizes) == pytest.approx(
-        abs(np.linalg.det(root)) * chi2.ppf(0.95, 3) ** 1.5, rel=1e-4
-    )
-
-
-@pytest.mark.parametrize(
-    ("model", "D"),
-    [
-        ("plumb_bob", [0.1, -0.05, 0.001, 0.002, 0.03]),
-        ("rational_polynomial", [0.1, -0.05, 0.001, 0.002, 0.03, 0.02, 0.01, -0.01]),
-        ("equidistant", [0.02, -0.01, 0.003, 0.001]),
-    ],
-)
-def test_the_lens_is_that_of_opencv(model, D):
-    K = np.array([[500.0, 0.0, 321.5], [0.0, 510.0, 238.5], [0.0, 0.0, 1.0]])
-    points = np.random.default_rng(0).uniform([-0.8, -0.6, 2.0], [0.8, 0.6, 4.0], (30, 3))
-    parts = [*example("read_table").coefficients({"distortion_model": model, "D": D}).values()]
-    if len(parts) == 1:
-        pixels, _ = cv2.fisheye.projectPoints(
-            points[None], np.zeros(3), np.zeros(3), K, np.array(parts[0])
-        )
-    else:
-        radial, tangential, thin = parts
-        lens = np.array([*radial[:2], *tangential, *radial[2:], *thin])
-        pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, lens)
-    seen = Camera(640, 480, K, D, model).project(points)
-    np.testing.assert_allclose(pixels.reshape(-1, 2), seen, atol=1e-9)
-    tilted = {"distortion_model": "rational_polynomial", "D": [*[0.0] * 12, 0.1, 0.0]}
-    with pytest.raises(ValueError, match="no lens rational_polynomial of 14 coefficients"):
-        example("read_table").coefficients(tilted)
 
 
 def test_images_as_of_a_global_shutter():

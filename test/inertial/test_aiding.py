@@ -67,38 +67,3 @@ def test_upside_down_is_dropped_with_its_angle(held):
     assert status.alone is Alone.TURNED
     assert abs(np.degrees(status.extrinsic_angle) - 180.0) < 3.0
     assert all(result for _, result in found)
-
-
-def test_noise_is_dropped(held):
-    rng = np.random.default_rng(0)
-
-    def noise(samples, frame):
-        return ImuSamples(samples.times_ns, rng.normal(size=(len(samples), 3)))
-
-    found = statuses(held, noise)
-    assert found[-1][0].alone is Alone.DISAGREES
-    assert all(result for _, result in found)
-
-
-@pytest.mark.bench
-def test_interruptions_lose_nothing(held):
-    rng = np.random.default_rng(1)
-
-    def interrupted(samples, frame):
-        kind = rng.integers(4)
-        if kind == 0:
-            return None
-        if kind == 1:  # late
-            return ImuSamples(samples.times_ns[:-30], samples.angular_velocity[:-30])
-        if kind == 2:  # began a moment ago
-            return ImuSamples(samples.times_ns[-30:], samples.angular_velocity[-30:])
-        return samples
-
-    found = statuses(held, interrupted)
-    truths = held.frames.middle.position
-    assert all(result for _, result in found)
-    far = [np.linalg.norm(result.position - truths[k]) for k, (_, result) in enumerate(found)]
-    assert max(far) < 0.03
-    assert {status.alone for status, _ in found} == {
-        Alone.NONE, Alone.NO_SAMPLES, Alone.NOT_COVERED
-    }  # fmt: skip

@@ -51,14 +51,6 @@ def test_an_image_that_says_nothing_changes_nothing():
     np.testing.assert_allclose(gyroscope.errors.covariance, before.covariance)
 
 
-def test_an_offset_that_is_given_stays():
-    gyroscope = GyroscopeFilter(InertialSettings(1e-4, 1e-4, False))
-    gyroscope.hear_delay(1e-4, 1e-12)
-    assert gyroscope.errors.time_offset == 0.0
-    gyroscope.walk(10.0)
-    assert gyroscope.errors.covariance[3, 3] < 2e-8
-
-
 @pytest.mark.parametrize("smaller", [1e-9, 1e-4, 0.5, 1.0])
 def test_a_smaller_covariance_of_the_motion_leaves_all_definite(smaller):
     rng = np.random.default_rng(3)

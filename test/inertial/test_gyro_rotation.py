@@ -3,7 +3,6 @@
 """The turn within a frame: against SciPy's splines and its integration of the kinematics."""
 
 import numpy as np
-import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
@@ -52,12 +51,6 @@ def test_a_parabola_leaves_nothing():
     assert turn.roughness < 1e-6
     late = late_at(0.3, turn.tau, turn.rates, turn.parabola)
     np.testing.assert_allclose(late, np.zeros((2, 3)), atol=1e-5)
-
-
-@pytest.mark.parametrize("tau", [np.zeros(1), np.array([0.0, 0.0]), np.array([1.0, 0.0])])
-def test_times_must_increase(tau):
-    with pytest.raises(ValueError, match="increasing"):
-        GyroRotation.of(tau, np.zeros((len(tau), 3)))
 
 
 def test_compensated_bearings_are_those_of_the_middle_row():

@@ -61,18 +61,6 @@ def test_velocities_are_the_derivatives_of_the_poses(camera):
     assert np.all(found.without_gyro().angular_velocity == found.angular_velocity - turn.rate)
 
 
-def test_a_bias_is_what_the_points_are_left_with(camera):
-    shaken = Shaken(vibration=0.0)
-    points, pixels = shaken.frame(camera)
-    bias = np.radians([1.0, -2.0, 0.5])
-    known = errors()
-    loose = GyroscopeErrors(known.bias, 0.0, np.diag([1.0, 1.0, 1.0, 1e-10]), 1e-5)
-    within = turn_within(shaken.samples(bias=bias), MIDDLE_NS, READOUT_TIME, loose)
-    found = Localizer(camera).localize(points, pixels, turn=within.known)
-    left = found.without_gyro().angular_velocity / READOUT_TIME
-    np.testing.assert_allclose(left, -bias, atol=np.radians(0.05))
-
-
 def test_derivatives_by_bias_and_offset():
     samples = Shaken(vibration=0.02).samples(rate=397.0)  # none at the ends
     start, step = errors(), 1e-5
@@ -92,13 +80,6 @@ def test_derivatives_by_bias_and_offset():
         np.testing.assert_allclose(
             within.by_parameters[:3, k], by, atol=2e-3 + 0.02 * abs(by).max()
         )
-
-
-def test_what_the_samples_do_not_cover_is_not_known():
-    samples = Shaken().samples(reach=0.02)
-    assert turn_within(samples, MIDDLE_NS, READOUT_TIME, errors()) is not None
-    assert turn_within(samples, MIDDLE_NS, 0.05, errors()) is None
-    assert turn_between(samples, MIDDLE_NS - 33_000_000, MIDDLE_NS, errors()) is None
 
 
 def test_without_samples_everything_is_as_without_a_gyroscope(camera):

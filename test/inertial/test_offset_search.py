@@ -64,14 +64,6 @@ def test_a_camera_at_rest_says_nothing():
     assert status.time_offset_deviation > 5e-3
 
 
-def test_a_hand_alone_is_left_to_the_filter():
-    recorded = record(Camera(), hand, Rich(), (1, 8), 5)
-    tracker = tracker_of(recorded)
-    going, _ = followed(tracker, recorded, 8)
-    assert all(going)
-    assert tracker._aid._search._seen == 0
-
-
 @pytest.mark.parametrize("shaking", [((0.2, 60.0),), pytest.param((), marks=pytest.mark.bench)])
 def test_a_step_of_the_stamps_is_found(shaking):
     """Another clock from one sample on, by 20 ms: more than a period of the vibration."""

@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A small rendered room, mapped from a few images and used."""
 
-import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +17,9 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.tools.mapping import MappingError
-from rs_localizer.tools.mapping.anchors import Anchors
-from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map, check_fit
-from rs_localizer.tools.mapping.colmap import SPARSE, Effort
+from rs_localizer.tools.mapping.build import Built
+from rs_localizer.tools.mapping.colmap import SPARSE
 from rs_localizer.tools.mapping.gauge import through
-from rs_localizer.tools.mapping.report import written
 from rs_localizer.tools.mapping.views import View
 from rs_localizer.tools.simulation.settings import ImageSettings
 
@@ -139,25 +135,6 @@ def test_other_images_are_localized(room, views, built):
     assert np.median(theirs.positions) > 2.0 * np.median(ours.positions)
 
 
-@pytest.mark.bench
-def test_without_calibration_lens_and_shutter_are_found(views, folder):
-    """Nor a readout time, a direction or a scale; the images are enough for all but the last."""
-    alone = folder / "alone"
-    alone.mkdir()
-    work = Workshop(alone, Effort(), lambda *_: nullcontext(lambda count: None))
-    built = build_map(Given(views, None, Anchors()), work)
-    assert len(built.posed) == len(views)
-    assert built.shutter.visible
-    assert built.camera.scan_direction == "top_to_bottom"
-    apart = abs(built.camera.readout_time - 0.03)
-    assert apart < max(4.0 * built.refined.readout_time_deviation, 1e-3)
-    assert built.camera.K[0, 0] == pytest.approx(260.0, rel=0.02)
-    assert built.shutter.noise < 0.7 * built.shutter.global_noise
-    assert not built.placement.scaled
-    assert "top_to_bottom (estimated" in written(built, len(views), views)
-    shutil.rmtree(alone)
-
-
 def test_the_model_of_colmap_becomes_that_of_a_global_shutter(
     room, views, built, folder, tmp_path, capsys
 ):
@@ -173,14 +150,3 @@ def test_the_model_of_colmap_becomes_that_of_a_global_shutter(
     )
     before, after = (float(line.split()[k]) for k in (5, 9))
     assert after < 0.5 * before
-
-
-def test_a_map_that_its_images_do_not_fit_is_refused_with_the_lens_that_may_be_why():
-    check_fit(0.81, 207.0)
-    with pytest.raises(
-        MappingError, match=r"64 % of the keypoints .* focal length of 207 px"
-    ) as of:
-        check_fit(0.64, 207.0)
-    assert "--calibration" in str(of.value)
-    with pytest.raises(MappingError, match=r"the readout time and the calibration$"):
-        check_fit(0.64, None)

@@ -2,16 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors that are alike from image to image, and how much less they say."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from scenes import camera, ring, spot
 
-from rs_localizer.markers.families import family
 from rs_localizer.tools.adjust.cluster_robust import pull_at_landmarks
-from rs_localizer.tools.mapping.survey import Survey, survey
-from rs_localizer.tools.mapping.unknown_markers import every_marker
 
 RATE, LANDMARKS, SECONDS = 30, 60, 10
 
@@ -45,24 +39,3 @@ def test_what_errors_pull_at_landmarks_is_their_long_run_variance(share):
         np.concatenate([own, left[..., None]], axis=2), landmarks, times, np.zeros(LANDMARKS)
     )
     assert pull.measured / pull.expected == pytest.approx((1.0 + share) / (1.0 - share), rel=0.2)
-
-
-def surveyed(share: float) -> Survey:
-    """Five markers of 0.15 m, 5 s, 0.1 px."""
-    rng = np.random.default_rng(1)
-    poses, stamps = ring(rng, 5, 0.15), np.arange(0.0, 5.0, 1.0 / 30.0)
-    exact = spot(np.random.default_rng(2), poses, 0.15, stamps, 0.0)
-    errors = 0.1 * alike(rng, (len(stamps), 5, 4, 2), share)
-    seen = [
-        replace(one, quads=one.quads + of[one.markers])
-        for one, of in zip(exact, errors, strict=True)
-    ]
-    return survey(camera(), seen, every_marker([family("4x4_50")], 0.15, {}))
-
-
-def test_a_survey_knows_less_when_errors_are_alike():
-    independent, much = surveyed(0.0), surveyed(0.8)
-    assert 1.0 < independent.fit.inflation < 2.2
-    assert much.fit.inflation > 2.5 * independent.fit.inflation
-    ratio = much.deviations_of_shape / independent.deviations_of_shape
-    assert np.all(ratio > 1.3)

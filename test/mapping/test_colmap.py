@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.core.camera import Camera, Roi
+from rs_localizer.core.camera import Camera
 from rs_localizer.io.calibration import colmap_camera, colmap_parameters
 from rs_localizer.tools.mapping import MappingError, colmap
 from rs_localizer.tools.mapping.colmap import Effort, build_structure, image_name, pairs_of
@@ -49,17 +49,6 @@ def test_the_lens_is_the_same_for_colmap(model, D):
     back = colmap_camera(f"1 {known['model']} 320 240 {line}", None)
     points = np.random.default_rng(0).uniform([-0.5, -0.4, 1.0], [0.5, 0.4, 1.5], (50, 3))
     np.testing.assert_allclose(back.project(points), camera.project(points), atol=1e-9)
-
-
-def test_the_lens_of_a_part_of_the_sensor():
-    part = Camera(
-        640, 480, np.diag([2.0, 2.0, 1.0]) @ K, binning=(2, 2), roi=Roi(100, 50, 400, 300)
-    )
-    fx, fy, cx, cy = colmap_parameters(part)["params"][:4]
-    point = np.array([[0.1, -0.05, 1.0]])
-    np.testing.assert_allclose(
-        part.project(point)[0], [fx * 0.1 + cx - 0.5, fy * -0.05 + cy - 0.5], atol=1e-9
-    )
 
 
 def build(images: Path, folder: Path, count: int) -> colmap.Structure:

@@ -118,19 +118,3 @@ def test_the_model_is_that_of_a_global_shutter(scene, model, shutter, row, tau, 
         errors.append(camera(0.0).project(away) + 0.5 - image.pixels)
     errors = np.concatenate(errors)
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(NOISE, rel=0.1)
-
-
-def test_what_cannot_be_used_is_named(model, tmp_path, capsys):
-    out = tmp_path / "out"
-    for words, code, text in (
-        ((), 2, "are not times (such as frame_0000.png): give --rate"),
-        (("--rate", "30", "--shutter", "global"), 2, "of a global shutter needs no refinement"),
-        (("--rate", "30", "--map", "map.npz"), 2, "--colmap goes without --map"),
-        (("--rate", "30", "-p", "readout_time:=0.015"), 1, "15.0 ms was given"),
-    ):
-        assert main(["map", "refine", "--colmap", str(model), str(out), *words]) == code
-        assert text in capsys.readouterr().err
-        assert not out.exists()
-    assert main(["map", "refine", "--out", str(out)]) == 2
-    assert main(["map", "refine", "--colmap", str(tmp_path), str(out)]) == 1
-    assert f"{tmp_path} is no model of COLMAP" in capsys.readouterr().err

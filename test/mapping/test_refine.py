@@ -58,22 +58,6 @@ def small_problem() -> tuple[Problem, State]:
     return prepared.problem(seen, state, free), state
 
 
-def test_step_and_covariances_are_those_of_the_dense_system():
-    problem, state = small_problem()
-    matrix, slope = normal_of(problem.groups, problem.terms(state, 5.0))
-    inverse, factored = np.linalg.inv(matrix), Factored(problem.system(state, 5.0))
-    expected = -np.linalg.solve(matrix, slope)
-    found = factored.step()
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
-    of_landmarks, shared = factored.block_covariances()
-    motion, kept = problem.groups.motion, problem.groups.kept
-    for k, covariance in enumerate(of_landmarks):
-        at = slice(kept + 3 * k, kept + 3 * k + 3)
-        np.testing.assert_allclose(covariance, inverse[at, at], rtol=1e-5, atol=1e-12)
-    at = slice(motion, kept)
-    np.testing.assert_allclose(shared, inverse[at, at], rtol=1e-5, atol=1e-12)
-
-
 def test_modes_are_the_errors_of_the_motion_that_move_landmarks_most():
     """By dense algebra: whitened, and the largest of landmarks in their own deviations."""
     problem, state = small_problem()
@@ -85,17 +69,6 @@ def test_modes_are_the_errors_of_the_motion_that_move_landmarks_most():
     moves = np.linalg.solve(own, crossed.T @ modes)
     expected = eigh(of_motion, reduced, eigvals_only=True)[:-13:-1] - 1.0
     np.testing.assert_allclose(np.einsum("ik,ij,jk->k", moves, own, moves), expected, rtol=0.02)
-
-
-def test_the_slope_is_the_derivative_of_the_cost():
-    rng = np.random.default_rng(2)
-    problem, state = small_problem()
-    slope = normal_of(problem.groups, problem.terms(state, 5.0))[1]
-    direction = rng.normal(size=len(slope)) * 1e-6
-    costs = [problem.system(problem.moved(state, s * direction), 5.0).cost for s in (-1.0, 1.0)]
-    # Half the cost; noise moves with the flow, whose own derivative is left out.
-    assert 0.25 * (costs[1] - costs[0]) == pytest.approx(slope @ direction, rel=0.02)
-    assert costs[0] > 0.0
 
 
 @pytest.fixture(scope="module")
@@ -162,17 +135,6 @@ def test_landmarks_of_known_place_hold_frame_and_size(video):
     assert 0.3 < np.mean(squared) / 3.0 < 3.0
 
 
-def test_images_that_stand_alone():
-    scene = walk(np.random.default_rng(5), np.arange(0.0, 8.0, 0.5), points=100, off=0.1)
-    found = refine(camera(), scene.seen, scene.start)
-    assert len(found.spline.layout.starts) == 16
-    before = np.linalg.norm(scene.start.points - scene.points, axis=1)[found.refined]
-    assert np.median(errors(found, scene)) < 0.5 * np.median(before)
-    assert found.after < 0.35
-    with pytest.raises(ValueError, match="needs 20 images in a row"):
-        refine(camera(), scene.seen, scene.start, MapFreedom(readout_time=True))
-
-
 def shifted(seen: MapObservations, by: int) -> MapObservations:
     """The second half of the images sees other landmarks."""
     late = seen.images >= len(seen.stamps_ns) // 2
@@ -203,19 +165,6 @@ def test_what_is_no_map_is_refused(video):
         refine(camera(), video.seen, video.start, MapFreedom(deviations=one))
     with pytest.raises(ValueError, match="stamps must rise"):
         replace(video.seen, stamps_ns=video.seen.stamps_ns[::-1])
-
-
-def test_landmarks_that_are_known_worse_than_before_stay(video, right):
-    """Seen from one side only, they would be anywhere along it."""
-    found = right
-    seen = np.unique(video.seen.landmarks)
-    moved = np.linalg.norm(found.points - video.start.points, axis=1)
-    assert not np.all(found.refined[seen])
-    assert np.all(moved[~found.refined] == 0.0)
-    assert np.all(np.isnan(found.covariances[~found.refined]))
-    # None is worse off than the worst of those that were given.
-    before = np.linalg.norm(video.start.points - video.points, axis=1)
-    assert errors(found, video).max() < 1.5 * before.max()
 
 
 def test_cameras_that_never_see_the_same_refine_one_map():

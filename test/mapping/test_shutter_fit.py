@@ -10,8 +10,8 @@ from scenes import READOUT, camera, walk
 
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.tools.mapping.observations import MapFreedom
-from rs_localizer.tools.mapping.refine import RefinedMap, refine
-from rs_localizer.tools.mapping.shutter_fit import fit_shutter, likely_axes
+from rs_localizer.tools.mapping.refine import RefinedMap
+from rs_localizer.tools.mapping.shutter_fit import fit_shutter
 from rs_localizer.tools.readout_belief import ShutterFit
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
@@ -41,13 +41,6 @@ def test_a_global_shutter_is_left_alone():
     assert refined.readout_time == 0.0
 
 
-def test_a_motion_is_cut_where_a_camera_turns_over():
-    scene = walk(np.random.default_rng(1), VIDEO, points=100, count=40, line=0.4)
-    refined = refine(camera(), scene.seen, scene.start)
-    assert refined.fit_share > 0.95
-    assert refined.deviation == pytest.approx(0.3, rel=0.1)
-
-
 def test_images_that_no_smooth_motion_joins_have_poses_of_their_own():
     """As those of a time lapse, whose stamps are nearer than its images were, some by much."""
     scene = walk(np.random.default_rng(1), np.arange(0.0, 12.0, 1.0), readout=0.0)
@@ -60,9 +53,3 @@ def test_images_that_no_smooth_motion_joins_have_poses_of_their_own():
     assert refined.apart
     assert refined.fit_share > 0.95
     assert refined.deviation == pytest.approx(0.3, rel=0.15)
-
-
-def test_the_rows_of_sensors_lie_along_the_longer_side():
-    assert likely_axes((640, 480), None) == BOTH[::-1]
-    assert likely_axes((450, 800), None) == BOTH
-    assert likely_axes((450, 800), "bottom_to_top") == [ScanDirection.BOTTOM_TO_TOP]

@@ -89,18 +89,6 @@ def test_what_does_not_hang_together_is_named(spotted):
     assert [[marker.id for marker in part] for part in found.apart] == [[3, 4]]
 
 
-def test_images_of_one_marker_do_not_hide_the_noise(spotted, poses):
-    """All but every tenth image show one marker: two numbers more than a pose."""
-    few = []
-    for k, one in enumerate(spotted):
-        count = len(one.markers) if k % 10 == 0 else 1
-        few.append(replace(one, markers=one.markers[:count], quads=one.quads[:count]))
-    found = survey(camera(), few, MARKERS)
-    assert found.fit.deviation >= 0.05
-    assert np.mean(found.fit.inliers) > 0.95
-    check(found, poses, 0.1)
-
-
 def test_a_wrong_readout_time_is_named(spotted, right):
     assert not right.cameras[0].readout_check.differs
     wrong = survey(camera(0.7 * READOUT), spotted, MARKERS).cameras[0].readout_check

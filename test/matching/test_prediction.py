@@ -84,31 +84,3 @@ def test_a_prediction_tells_apart_what_looks_the_same(points, mutual):
     assert len(found) > 150
     assert np.mean(found.landmarks == shown[found.keypoints]) > 0.95
     assert len(set(found.landmarks.tolist())) == len(found)
-
-
-@pytest.mark.parametrize(("seen", "whole"), [(40_000, True), (400, False)])
-def test_where_too_many_are_in_view_nothing_is_spent_on_the_prediction(seen, whole, monkeypatch):
-    """The search of all landmarks is as fast as without one; a sample of them decides."""
-    rng = np.random.default_rng(0)
-    looked_at: list[int] = []
-    pixels, depth = rng.uniform(0.0, [639.0, 479.0], (40_000, 2)), rng.uniform(2.0, 6.0, 40_000)
-    rays = np.column_stack([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones(40_000)])
-    points = depth[:, None] * rays
-    points[rng.permutation(40_000)[seen:]] *= -1.0  # behind the camera
-    descriptors = rng.integers(0, 256, (40_000, 32), dtype=np.uint8)
-    shown = np.flatnonzero(points[:, 2] > 0.0)[:100]
-    keypoints = Keypoints(0, pixels[shown], None, descriptors[shown], None, 0)
-    still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    prior = Prior(motion=still, covariance=1e-6 * np.eye(18))
-    looking = find_view
-
-    def watched(camera: Camera, prior: Prior, points: Any, gate: float) -> Any:
-        looked_at.append(len(points))
-        return looking(camera, prior, points, gate)
-
-    monkeypatch.setattr("rs_localizer.matching.find_view", watched)
-    matcher = Matcher(Map(points, None, descriptors, "map"))
-    matches = matcher.match(keypoints, Matching(), Camera(640, 480, K), prior)
-    np.testing.assert_array_equal(matches.landmarks, shown[matches.keypoints])
-    assert len(matches.keypoints) == 100
-    assert looked_at == ([1000] if whole else [1000, 40_000])

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,31 +93,6 @@ def test_frames_are_forgotten_with_their_window(
         given += len(part.frames)
         ahead.append(asked - given)
     assert max(ahead) < 30 * (0.5 + 0.2)  # the margin's
-
-
-def test_a_window_without_poses_is_not_determined(
-    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    localizer, frames, stamps = recorded
-    in_windows(monkeypatch, 2.0)
-    start = min(stamps)
-    lost = [s for s in stamps if 1.2 * SECOND < s - start < 5.0 * SECOND]
-    known = [frame for frame in frames if frame.input_stamp_ns not in lost]
-    parts = list(smooth_frames(localizer, known, stamps, None))
-    assert sum(part.undetermined for part in parts) > len(lost) - 5  # next to known ones
-    assert len({f.stamp_ns for part in parts for f in part.frames}) >= len(known) - 10
-    few = [replace(frame) for frame in frames[:3]]
-    with pytest.raises(ValueError, match="3 frames have a pose, none of them 5 in a row"):
-        list(smooth_frames(localizer, few, stamps, None))
-
-
-def test_a_clock_that_jumps_costs_no_memory(
-    recorded: Recorded,
-) -> None:
-    localizer, frames, stamps = recorded
-    early = [1, *stamps]  # half a century before
-    parts = list(smooth_frames(localizer, frames, early, 100.0))
-    assert sum(len(part.frames) for part in parts) > 500
 
 
 def test_a_vibrating_camera_is_smoothed_beside_what_its_gyroscope_knows(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from scipy.spatial.transform import Rotation
 
 pytest.importorskip(  # of today, which NumPy 1.26 cannot import
     "pyarrow", reason="needs pyarrow (rs_localizer[table])", exc_type=ImportError
@@ -102,22 +101,6 @@ def test_what_is_there_is_not_replaced(flights: list[Path], tmp_path: Path, caps
     assert notes.read_text() == "mine"
 
 
-def test_smoothed_rows_are_those_of_the_smoothed_motion(
-    flights: list[Path], tmp_path: Path
-) -> None:
-    file = tmp_path / "frames.parquet"
-    words = [str(flights[0]), *SHUTTER, "--out", str(tmp_path / "out"), "--smooth"]
-    assert main(["replay", *words, "--parquet", str(file)]) == 0
-    poses, rows = read_tum(tmp_path / "out" / "poses.txt"), read_parquet(file).to_pylist()
-    stamps = [row["stamp_ns"] for row in rows]
-    assert stamps == sorted(set(stamps))  # one whose pose its neighbours tell is not refused, too
-    found = [row for row in rows if row["state"] == "localized"]
-    assert [[row["x"], row["y"], row["z"]] for row in found] == poses.positions.tolist()
-    turns = [[row[f"q{k}"] for k in "xyzw"] for row in found]
-    apart = Rotation.from_quat(turns).inv() * Rotation.from_quat(poses.quaternions)
-    assert apart.magnitude().max() < 1e-14  # of text, normalized anew
-
-
 _ALONE = """
 import pickle, sys
 import rs_localizer as rsl
@@ -139,10 +122,3 @@ def test_the_same_bytes_from_one_process_and_from_dask(flights: list[Path], tmp_
     assert one.read_bytes().startswith(b"PAR1")
     assert read_parquet(one).num_rows > 3 * 5
     assert two.read_bytes() == one.read_bytes()
-
-
-def test_wrong_settings_are_named(flights: list[Path]) -> None:
-    with pytest.raises(ValueError, match="'readout_tine' is not a setting; did you mean 'readout_"):
-        rsl.localize_recording(flights[1], settings={"readout_tine": 0.03})
-    with pytest.raises(ValueError, match=r"no_map\.npz"):
-        rsl.localize_recording(flights[1], "no_map.npz")

@@ -330,13 +330,6 @@ def test_a_missing_transform_refuses_the_frame_only(localize):
         assert np.allclose(frame.pose.position, expected[:3, 3], atol=1e-12)
 
 
-def test_odometry_that_is_missing_costs_no_pose(localize, robot):
-    frame, config = localize(robot, publish_tf="map_to_odom")
-    assert frame
-    with pytest.raises(TransformError, match="frame 'odom' does not exist; there are base_link"):
-        broadcast(frame, config, robot)
-
-
 @pytest.mark.parametrize("pose_time", list(PoseTime))
 def test_a_stamp_of_zero(localize, robot, pose_time):
     # The mounting is the latest, the pose goes out, and TF, which needs a time, gets nothing.

@@ -23,11 +23,9 @@ from rs_localizer.io.calibration import lens_parameters
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.recording import make_camera_info
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.settings import build
 from rs_localizer.tools.simulation.frames import simulate_frames
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.settings import FrameSettings
@@ -228,50 +226,6 @@ def test_a_new_camera_counts_from_the_next_frame_on(cloud, make_camera_info, moc
     assert localized(frames.localize(again(cloud))).body_frame == "right_eye"
 
 
-def test_new_settings_count_from_the_next_frame_on(cloud, make_camera_info, mock):
-    frames = FrameLocalizer(NodeConfig())
-    frames.calibrate(read_camera_info(make_camera_info(width=320)))
-    assert localized(frames.localize(again(cloud))).twist is None
-    frames.config = NodeConfig(readout_time=READOUT_TIME, inlier_threshold=5.0)
-    assert mock.made[-1].camera.width == 320
-    assert mock.made[-1].config.inlier_threshold == 5.0
-    assert localized(frames.localize(again(cloud))).twist is not None
-    with pytest.raises(ValueError, match="nine are too many"):
-        frames.config = NodeConfig(solver="r9p")
-    assert frames.config.inlier_threshold == 5.0
-    assert localized(frames.localize(again(cloud))).twist is not None
-
-
-def test_a_jump_of_time_and_another_map_start_afresh(mock, cloud, make_camera_info):
-    notices: list[tuple[str, str]] = []
-    frames = FrameLocalizer(
-        NodeConfig(readout_time=READOUT_TIME), lambda *words: notices.append(words)
-    )
-    frames.calibrate(read_camera_info(make_camera_info()))
-
-    def tracked(second: int, hundredths: int, frame: str = "map") -> bool:
-        """Whether the previous frame helped."""
-        cloud.header.stamp.sec, cloud.header.stamp.nanosec = second, hundredths * 10_000_000
-        cloud.header.frame_id = frame
-        localized(frames.localize(cloud))
-        return mock.made[-1].priors[-1] is not None
-
-    assert [tracked(5, 0), tracked(5, 3), tracked(5, 6)] == [False, True, True]
-    assert notices == []
-    # A recording that starts over.
-    assert [tracked(1, 0), tracked(1, 3)] == [False, True]
-    text = "the stamp 1.000 s lies 4.060 s before the last one; the previous frames are forgotten"
-    assert notices == [("time_went_back", text)]
-    # Another map at the next instant.
-    assert [tracked(1, 6, "cellar"), tracked(1, 9, "cellar")] == [False, True]
-    forgotten = "the previous frames are forgotten"
-    text = f"the points are in frame 'cellar', the last ones were in 'map'; {forgotten}"
-    assert notices[1:] == [("map_changed", text)]
-    frames.reset()  # who asks for it is not told
-    assert not tracked(1, 0, "map")
-    assert len(notices) == 2
-
-
 def simulated(direction: str, **settings: Any) -> list[tuple[Any, Any]]:
     """Messages and truth of frames of a fast camera, without noise."""
     camera = Camera(
@@ -316,34 +270,6 @@ def test_signs_and_frames_against_the_true_motion(make_camera_info, direction, p
         assert frame.twist is not None
         assert np.allclose(frame.twist.linear, linear, atol=1e-6)
         assert np.allclose(frame.twist.angular, angular, atol=1e-6)
-
-
-def test_no_more_than_max_points_are_used_and_that_is_said_once():
-    camera = Camera(640, 480, np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]]))
-    rng = np.random.default_rng(0)
-    points = rng.uniform((-1.0, -0.7, 2.0), (1.0, 0.7, 4.0), (3000, 3))
-    notices: list[str] = []
-    frames = FrameLocalizer(NodeConfig(max_points=500), lambda name, text: notices.append(text))
-    frames.calibrate(read_camera_info(make_camera_info(camera, 0)))
-    for stamp_ns in (1, 2):
-        result = frames.localize(cloud_of(stamp_ns, points, camera.project(points)))
-        assert isinstance(result, Localized)
-        assert len(result.estimate.inliers) == 500
-    assert notices == ["3000 points have come; max_points of them, 500, are used"]
-
-
-def test_what_one_camera_does_not_read_leaves_its_track():
-    frames = FrameLocalizer(NodeConfig(readout_time=0.03))
-    assert not frames.change(build({"readout_time": 0.03, "rig.window": 0.03}))
-    assert frames.change(build({"readout_time": 0.03, "min_inliers": 20}))
-
-
-def test_what_is_said_of_an_imu_that_is_not_used_leaves_the_track():
-    frames = FrameLocalizer(NodeConfig(readout_time=0.03))
-    noisy = {"readout_time": 0.03, "imu.gyroscope_noise": 1e-3}
-    assert frames.change(build({"readout_time": 0.03, "imu.use": "none"}))
-    assert not frames.change(build(noisy | {"imu.use": "none"}))
-    assert frames.change(build(noisy))
 
 
 def test_the_lens_of_a_camera_file_takes_the_place_of_camera_info(tmp_path, make_camera_info):

@@ -201,14 +201,6 @@ def test_the_camera_goes_on_alone(flight, fault):
     assert (flown.state.unused is not None) == lasts
 
 
-def test_readings_that_come_after_their_frames_are_late(flight):
-    flown, alone = fly(flight, most=30, late=0.1), fly(flight, config=WITHOUT, most=30)
-    assert flown.state.mostly.reason == ImuReason.LATE
-    assert "older than the last row" in flown.state.mostly.detail
-    for a, b in zip(flown.frames, alone.frames, strict=True):
-        assert np.array_equal(a.pose.position, b.pose.position)
-
-
 def test_a_wrong_mounting_is_noticed_and_told_with_its_angle(flight):
     upside_down = copy.deepcopy(flight.mounting)
     rotation = upside_down.transforms[0].transform.rotation
@@ -228,16 +220,6 @@ def test_gravity_is_compared_with_the_map(flight, down, degrees):
     config = NodeConfig(readout_time=READOUT_TIME, imu=imu, gravity_in_map=down)
     flown = fly(flight, config=config)
     assert math.degrees(flown.state.gravity) == pytest.approx(degrees, abs=5.0)
-
-
-def test_frames_that_stand_alone_use_it_too(flight):
-    config = NodeConfig(readout_time=READOUT_TIME, tracking=False)
-    both = fly(flight, config=config, most=45)
-    alone = fly(flight, lambda message, time: (), config, most=45)
-    both.assert_none_is_lost_or_wrong(45)
-    assert both.state.share > 0.9
-    assert not any(frame.estimate.tracked for frame in both.frames)
-    assert np.median(both.errors()[0]) < 0.75 * np.median(alone.errors()[0])
 
 
 def test_without_a_readout_time_or_for_a_global_shutter_it_is_not_used_and_that_is_told(flight):
@@ -311,10 +293,3 @@ def test_a_head_that_turns_the_camera_turns_its_rates():
     expected = true.apply([0.1, 0.2, -0.3]) + turn
     np.testing.assert_allclose(found.angular_velocity, expected, atol=1e-6)
     np.testing.assert_allclose(found.specific_force, true.apply([0.0, 0.0, 9.8]), atol=1e-5)
-
-
-def test_a_mounting_that_is_not_known_yet_is_none():
-    old = {NOW - ms * MS: Rotation.identity() for ms in (40, 20)}
-    rates = np.zeros((len(TIMES), 3))
-    with pytest.raises(TransformError, match="is known from"):
-        in_camera_axes(readings(rates), TIMES, tree(old, False), FRAMES, EXPOSURE, 0)

@@ -7,7 +7,7 @@ import pytest
 
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.io.clouds import Correspondences
-from rs_localizer.pipeline.frames import lens_is_off, oddities
+from rs_localizer.pipeline.frames import oddities
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, K)
@@ -28,11 +28,6 @@ def cloud(
 def test_nothing_is_odd():
     assert oddities(cloud(), CAMERA, "camera") == {}
     assert oddities(cloud(pixel=(640.2, 480.1)), CAMERA, "camera") == {}  # a tracker's slack
-
-
-def test_the_cameras_own_frame():
-    (text,) = oddities(cloud(frame="camera"), CAMERA, "camera").values()
-    assert "header.frame_id of the cloud (or map) must name the frame of x, y, z" in text
 
 
 @pytest.mark.parametrize(
@@ -58,9 +53,3 @@ def test_pixels_of_another_resolution():
     part = Camera(640, 480, K, binning=(2, 2), roi=Roi(100, 60, 400, 300))
     found = oddities(cloud(pixel=(300.0, 100.0)), part, "camera")
     assert "2 of 2 pixels lie outside the 200 x 150" in found["pixels_outside"]
-
-
-def test_a_lens_that_is_off_is_said_in_pixels():
-    text = lens_is_off(1.23)
-    assert "recalibrate the lens" in text
-    assert "1.2 px rms" in text

@@ -3,25 +3,21 @@
 """The list of inputs, and what is derived from it."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 import rs_localizer
 from rs_localizer.config import NodeConfig
-from rs_localizer.core.reasons import ImuReason, Reason
+from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagError
-from rs_localizer.io.clouds import Correspondences, EmptyCloudError
 from rs_localizer.io.topics import GIVEN_POSES
 from rs_localizer.offline.replay import NO_FRAMES, find_topics
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.inputs import INPUTS, Input, Role
-from rs_localizer.pipeline.refusal import IMU_REASONS, REASONS, Refusal, explained
+from rs_localizer.pipeline.inputs import INPUTS, Role
+from rs_localizer.pipeline.refusal import REASONS, Refusal
 
 ROOT = Path(__file__).parents[2]
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -39,11 +35,6 @@ def test_the_page_of_the_node_has_every_input_with_its_type():
     assert {name for name, _ in rows} == set(types)
     for name, kind in rows:
         assert kind.startswith(types[name].replace("/msg/", "/"))
-
-
-def test_launch_files_read_the_list_without_the_kernels():
-    code = "import rs_localizer.pipeline.inputs, sys; sys.exit('numba' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("name", INPUTS)
@@ -92,24 +83,6 @@ def test_what_is_not_there_or_not_clear_is_said():
         find_topics(bag(camera_info=INFO, a=CLOUD, b=CLOUD))
 
 
-def test_a_reader_of_correspondences_is_all_that_frames_of_another_kind_need():
-    def read(message: Any) -> Correspondences:
-        if not message:
-            raise EmptyCloudError("no point")
-        points = np.zeros((1, 3))
-        return Correspondences(0, "map", points, points[:, :2], None, 0, np.zeros(1, "<f8"))
-
-    item = Input(
-        "others", CLOUD, "of a test", Role.FRAMES, refused=Reason.BAD_CLOUD, read=read,
-        use=lambda localizer, cloud: localizer.localize_cloud(cloud),
-    )  # fmt: skip
-    frames = FrameLocalizer(NodeConfig())
-    empty, early = item.take(frames, ""), item.take(frames, "a message")
-    assert isinstance(empty, Refusal)
-    assert isinstance(early, Refusal)
-    assert (empty.reason, early.reason) == (Reason.EMPTY_CLOUD, Reason.NO_CAMERA_INFO)
-
-
 PACKAGE = Path(rs_localizer.__file__).parent
 
 
@@ -118,11 +91,3 @@ def test_every_reason_is_explained_and_given_somewhere():
     others = (path for path in PACKAGE.rglob("*.py") if path.name != "reasons.py")
     given = {name for path in others for name in re.findall(r"\bReason\.(\w+)", path.read_text())}
     assert {reason.name for reason in Reason} == given
-
-
-def test_every_reason_to_go_without_the_imu_has_its_sentence():
-    assert set(IMU_REASONS) == set(ImuReason)
-    assert not set(IMU_REASONS) & set(REASONS)
-    assert "which message belongs to which row" in explained(ImuReason.NO_READOUT_TIME)
-    assert "look from an angle" in explained("degenerate")
-    assert explained("unheard_of") == ""

@@ -9,17 +9,15 @@ import pytest
 
 import rs_localizer.pipeline.landmarks
 from benchmarks.simulation.keypoints import keypoint_rows, random_descriptors
-from rs_localizer.config import Matching, NodeConfig
+from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud, read_map
-from rs_localizer.io.maps.landmarks import Map, MapError, map_rows
-from rs_localizer.io.messages import MessageError
+from rs_localizer.io.maps.landmarks import Map, map_rows
 from rs_localizer.io.outputs import Localized
 from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.landmarks import read_landmarks
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.scene import room
@@ -103,67 +101,6 @@ def test_the_true_pose(frames, make_camera_info, names, tracking):
         assert result.estimate.tracked == (tracking and frame is not frames[0])
 
 
-def test_a_map_file_that_is_not_there_is_named(tmp_path):
-    said = r"map_file: .*nowhere\.npz cannot be read: No such file or directory"
-    with pytest.raises(MapError, match=said):
-        read_landmarks(str(tmp_path / "nowhere.npz"), "map")
-
-
-def test_a_map_that_is_missing_and_comes_late(frames, make_camera_info):
-    notices = Notices()
-    node = localizer(make_camera_info, notices)
-    assert node.missing == ()
-    reason, detail = refused(node.localize_keypoints(keypoints(frames[0], "id")))
-    assert (reason, detail) == (
-        "no_map", "no usable map has come yet, on map_points or as map_file"
-    )  # fmt: skip
-    assert node.missing == ("map_points",)
-    assert node.map is None
-    node.use_map(read_map(map_cloud(LANDMARKS)))
-    assert node.missing == ()
-    assert node.map is not None
-    assert len(node.map) == 4000
-    localized(node.localize_keypoints(keypoints(frames[1], "id")), frames[1])
-    assert notices == []
-
-
-def test_a_map_that_is_replaced(frames, make_camera_info):
-    notices = Notices()
-    node = localizer(make_camera_info, notices)
-    node.use_map(read_map(map_cloud(LANDMARKS)))
-    localized(node.localize_keypoints(keypoints(frames[0], "id")), frames[0])
-    # The same again says nothing and keeps the track.
-    node.use_map(read_map(map_cloud(LANDMARKS)))
-    assert localized(
-        node.localize_keypoints(keypoints(frames[1], "id")), frames[1]
-    ).estimate.tracked
-    assert notices == []
-    # A part of it in the same frame: the track goes on.
-    half = Map(POINTS[::2], IDS[::2], None, "map")
-    node.use_map(read_map(map_cloud(half)))
-    assert localized(
-        node.localize_keypoints(keypoints(frames[2], "id")), frames[2]
-    ).estimate.tracked
-    text = "a map of 2000 landmarks in frame 'map' replaces the one of 4000 in frame 'map'"
-    assert notices == [("map_replaced", text)]
-    # Another frame: everything starts afresh.
-    node.use_map(read_map(map_cloud(Map(POINTS, IDS, None, "cellar"))))
-    found = localized(node.localize_keypoints(keypoints(frames[3], "id")), frames[3])
-    assert found.map_frame == "cellar"
-    assert not found.estimate.tracked
-    assert [name for name, _ in notices] == ["map_replaced", "map_replaced", "map_changed"]
-    # One that cannot be used changes nothing.
-    bad = map_cloud(LANDMARKS)
-    bad.width = 10**6
-    with pytest.raises(MessageError, match="truncated"):
-        node.use_map(read_map(bad))
-    assert (
-        localized(node.localize_keypoints(keypoints(frames[4], "id")), frames[4]).map_frame
-        == "cellar"
-    )
-    assert len(notices) == 3
-
-
 def test_keypoints_that_give_no_pose(frames, make_camera_info):
     node = localizer(make_camera_info)
     node.use_map(read_map(map_cloud(LANDMARKS)))
@@ -220,21 +157,6 @@ def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
         assert result, result
         assert len(result.inliers) > 40
     assert asked == [True, False, True]
-
-
-def test_settings_of_matching(frames, make_camera_info):
-    notices = Notices()
-    node = localizer(
-        make_camera_info, notices, matching=Matching(max_keypoints=50, by="descriptor")
-    )
-    node.use_map(read_map(map_cloud(LANDMARKS)))
-    result = localized(node.localize_keypoints(keypoints(frames[0], "id", "descriptor")), frames[0])
-    assert len(result.estimate.inliers) <= 50
-    text = "70 keypoints have come, matching.max_keypoints of them, 50, are matched"
-    assert notices == [("too_many_keypoints", text)]
-    assert refused(node.localize_keypoints(keypoints(frames[1], "id")))[0] == "bad_keypoints"
-    node.config = NodeConfig(readout_time=READOUT_TIME)
-    localized(node.localize_keypoints(keypoints(frames[2], "id")), frames[2])
 
 
 def test_coordinates_far_from_the_origin_keep_their_digits(frames, make_camera_info):

@@ -42,18 +42,6 @@ def test_in_the_plane_the_body_has_its_x_and_y_and_heading():
     assert whole.rotation == pytest.approx(tilted.rotation)
 
 
-def test_it_is_held_for_ever_or_as_long_as_is_wanted():
-    correction = MapToOdom()
-    assert correction.held(SECOND, 0.0) is None
-    assert correction.holding(SECOND, place(0, 0, 0)) is None
-    assert correction.take(found(SECOND, place(1, 0, 0)), place(0, 0, 0), two_d=False) == ""
-    for hold, seconds, there in ((0.0, 1e4, True), (2.0, 1.9, True), (2.0, 2.1, False)):
-        held = correction.held(SECOND + round(seconds * SECOND), hold)
-        assert (held is not None) == there
-    correction.forget()
-    assert correction.held(SECOND, 0.0) is None
-
-
 def test_in_the_plane_it_is_as_sure_as_of_x_and_y_and_heading():
     frame = found(SECOND, place(1, 0, 0))
     frame.pose.covariance[...] = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])

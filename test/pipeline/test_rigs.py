@@ -4,19 +4,14 @@
 
 import re
 from collections import Counter
-from operator import attrgetter
 
 import numpy as np
 import pytest
 
-from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
-from rs_localizer.io.bags import BagError, open_bag
-from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.bags import open_bag
 from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import prepare, replay
-from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.rig_watch import RigWatch
 from rs_localizer.settings import build, load_params_file
 
 from .opposed_pair import PARTS, hand, record, rich, wall
@@ -71,17 +66,6 @@ def test_an_opposed_pair_before_a_wall_knows_pose_and_velocity(opposed, pose_tim
     assert np.degrees(medians[3]) < 12.0
     assert np.mean(np.abs(off) < 1.96 * deviations) > 0.85
     assert {frame.body_frame for frame in frames} == {"rig"}
-
-
-def test_inliers_name_their_camera(opposed):
-    path, _ = opposed
-    frame = localize(path)[0][3]
-    places = dict(zip(*np.unique(frame.inliers["camera"], return_counts=True), strict=True))
-    assert places == {place: share.inliers for place, share in enumerate(frame.cameras)}
-    assert [share.name for share in frame.cameras] == ["left", "right"]
-    for place, share in enumerate(frame.cameras):
-        own = frame.inliers["residual"][frame.inliers["camera"] == place]
-        assert share.residual == pytest.approx(np.sqrt(np.mean(own**2)), rel=1e-5)
 
 
 def test_a_camera_that_stops_and_starts_again_is_named_and_poses_go_on(tmp_path):
@@ -157,68 +141,3 @@ def test_a_clock_that_is_off_is_named(tmp_path, jump):
     assert re.match(r"the clock of right is -[34]\.\d+ \+- ", first)
     again = [text.endswith("both are estimated again") for text in others]
     assert again[:1] == [True] * (jump > 0.0)
-
-
-def test_one_camera_gives_the_same_bytes_by_name(tmp_path):
-    """As a rig of one, and without ``cameras``: poses, twists, covariances and inliers."""
-    path = tmp_path / "bag"
-    record(path, 0.5, names=("left",), max_orientation_deviation=1.0)
-    named, refused, _ = localize(path)
-    values = {"readout_time": 0.03, "min_inliers": 20, "max_orientation_deviation": 1.0}
-    alone = FrameLocalizer(build(values | {"base_frame": "rig"}))
-    plain = []
-    with open_bag(path) as bag:
-        settings = build(load_params_file(path / "parameters.yaml"))
-        alone.transforms = prepare(bag, settings)[1].transforms
-        for topic, _, message in bag.messages(("/left/camera_info", "/left/correspondences")):
-            if topic == "/left/camera_info":
-                alone.calibrate(read_camera_info(message))
-            else:
-                plain.append(alone.localize(message))
-    assert len(plain) == len(named) + len(refused) >= 14
-    plain = [frame for frame in plain if frame]
-    assert len(plain) == len(named) > 0
-    for one, other in zip(plain, named, strict=True):
-        assert one.stamp_ns == other.stamp_ns
-        for value in (
-            "pose.position", "pose.rotation", "pose.covariance", "twist.linear", "twist.angular",
-            "twist.covariance",
-        ):  # fmt: skip
-            a, b = (attrgetter(value)(it) for it in (one, other))
-            assert a.tobytes() == b.tobytes(), value
-        for field in one.inliers.dtype.names:
-            np.testing.assert_array_equal(one.inliers[field], other.inliers[field])
-
-
-def test_what_is_missing_is_said(tmp_path, opposed):
-    settings = build({"cameras": ["left", "rear"], "readout_time": 0.03})
-    said = "has no topic rear/camera_info; it has /left/camera_info"
-    with open_bag(opposed[0]) as bag, pytest.raises(BagError, match=said):
-        prepare(bag, settings)
-    record(tmp_path / "bag", seconds=0.2, names=("left",))
-    frames, refused, _ = localize(tmp_path / "bag", max_orientation_deviation=1.0)
-    assert {len(frame.cameras) for frame in frames} <= {1}
-    assert len(frames) + len(refused) >= 5
-
-
-def test_cameras_do_not_go_with_what_is_of_one():
-    with pytest.raises(ValueError, match=r"left.readout_time must be above 0"):
-        build({"cameras": ["left", "right"], "right.readout_time": 0.03})
-    with pytest.raises(ValueError, match="estimate_readout_time is for one camera"):
-        build({"cameras": ["left"], "readout_time": 0.03, "estimate_readout_time": True})
-    with pytest.raises(ValueError, match=r"rear\.readout_time: no such camera; cameras names left"):
-        build({"cameras": ["left"], "readout_time": 0.03, "rear.readout_time": 0.02})
-    assert not NodeConfig().of_cameras
-
-
-def test_a_fault_of_the_reference_ends_when_all_agree_again():
-    config = build({"cameras": ["left", "right", "rear"], "readout_time": 0.03})
-    watch = RigWatch(config, lambda *_: None)
-    for position in (0.1, 0.0):  # m, of both beside the first one
-        for name, fit in watch._fits.items():
-            fit.count, fit.covariance = 30, np.eye(7) * 1e-6
-            fit.mean = np.r_[position, np.zeros(6)]
-            watch._conclude(name, fit)
-        if position:
-            assert "of left relative to the others" in watch.faults["extrinsics"]
-    assert not watch.faults

@@ -21,7 +21,6 @@ from rs_localizer.io.detections import APRILTAG_TYPE, ISAAC_TYPE, read_detection
 from rs_localizer.io.images import read_any_image
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -138,31 +137,6 @@ def written(walls: Path, path: Path, messages: list[Any]) -> Path:
             stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
             writer.write("/detections", message, stamp_ns)
     return path
-
-
-def test_poses_are_those_of_our_own_detector_within_their_covariances(
-    walls: Path, tmp_path: Path
-) -> None:
-    marker_map = walls / "marker_map.yaml"
-    assert main(["detect", str(walls), "--map", str(marker_map), "--out", str(tmp_path / "o")]) == 0
-    shutter = ["-p", f"readout_time:={READOUT}"]
-    assert main(["replay", str(tmp_path / "o"), *shutter, "--out", str(tmp_path / "own")]) == 0
-    path = written(walls, tmp_path / "tags", of_apriltag(walls))
-    words = [*shutter, "-p", f"marker_map:={marker_map}"]
-    assert main(["replay", str(path), *words, "--out", str(tmp_path / "theirs")]) == 0
-    own, theirs = (read_tum(tmp_path / name / "poses.txt") for name in ("own", "theirs"))
-    common, a, b = np.intersect1d(own.stamps_ns, theirs.stamps_ns, return_indices=True)
-    assert len(common) == len(images(walls))
-    apart = own.positions[a] - theirs.positions[b]
-    deviations = []
-    for name in ("own", "theirs"):
-        with open_bag(tmp_path / name / "result") as bag:
-            said = bag.messages(["/rs_localizer/pose_with_covariance"])
-            blocks = [m.pose.covariance.reshape(6, 6)[:3, :3] for _, _, m in said]
-            deviations.append(np.array(blocks))
-    both = deviations[0] + deviations[1]
-    distances = np.einsum("ni,nij,nj->n", apart, np.linalg.inv(both), apart)
-    assert np.median(distances) < 7.8  # 95 % of chi-squared with 3 degrees of freedom
 
 
 @cache

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from catkin_pkg.package import parse_package
 
 ROOT = Path(__file__).parents[2]
 COMMAND = "import sys; from rs_localizer.__main__ import run; sys.exit(run())"
@@ -80,13 +79,3 @@ def test_nodes_do_not_wait_for_packages_of_commands(tmp_path):
     code = "import rs_localizer.ros.node.managed, rs_localizer.ros.detector.markers"
     done = run(code, without(tmp_path, *NOT_FOR_NODES))
     assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_package_xml_has_no_key_that_rosdep_gives_to_pip():
-    # Ubuntu 24.04 refuses pip beside apt, and rosdep stops before the keys that follow.
-    package = parse_package(str(ROOT / "package.xml"))
-    package.evaluate_conditions({"ROS_DISTRO": "jazzy"})
-    items = [*package.exec_depends, *package.test_depends]
-    names = [item.name for item in items if item.evaluated_condition]
-    assert [name for name in names if name.endswith("-pip") or "numba" in name] == []
-    assert {"python3-scipy", "python3-numpy", "python3-opencv", "python3-yaml"} <= set(names)

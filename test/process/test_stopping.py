@@ -6,12 +6,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections import namedtuple
 
 import pytest
-
-from benchmarks.signals import campaign
-from rs_localizer.process.stopping import _is_fragile
 
 # What is interrupted in the middle of code that Numba calls, or in a finalizer.
 PROGRAM = """
@@ -29,13 +25,6 @@ with StopSignals():
     except KeyboardInterrupt:
         print("interrupted")
 """
-
-
-@pytest.mark.bench
-def test_random_signals():
-    ended = list(campaign(10, seed=1, commands=("replay", "detect", "markers")))
-    assert [one for one in ended if one.fault] == []
-    assert any(one.code > 128 for one in ended)
 
 
 def test_a_process_that_is_being_started_is_not_lost():
@@ -99,28 +88,6 @@ with StopRequest() as stop:
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
     )
     assert said.stdout == f"{heard}\n"
-
-
-def test_an_alarm_as_the_clean_up_ends_raises_nothing():
-    body = "os.kill(os.getpid(), 15)"
-    late = """signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])
-        time.sleep(0.6)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGALRM])"""
-    program = PROGRAM.format(folder="", number=15, body=body) + f"        {late}\n"
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
-
-
-def test_named_tuples_are_not_interrupted_halfway():
-    """Numba has them made, and returns a result beside the exception."""
-    pair, calls = namedtuple("pair", ["one"]), []
-    sys.setprofile(lambda frame, *_: calls.append((frame.f_code.co_name, _is_fragile(frame))))
-    pair(1)
-    sys.setprofile(None)
-    assert calls[0] == ("<lambda>", True)
-    assert calls[-1] == (sys._getframe().f_code.co_name, False)
 
 
 LATER = "import threading; threading.Timer(0.2, os.kill, (os.getpid(), 15)).start(); import numba"

@@ -230,16 +230,6 @@ def test_what_cannot_be_started_fails_before_anything_is(describe, file, given, 
         describe(file, **(MAP.get(file, {}) | given))
 
 
-@pytest.mark.parametrize("file", LOCALIZING)
-def test_a_node_that_ends_ends_the_others(describe, file):
-    given = MAP.get(file, {})
-    if file in DETECTORS:
-        given = {**given, "camera": "usb_cam"}
-    nodes = [piece for piece in describe(file, **given) if piece.kind == "Node"]
-    assert len(nodes) == (4 if file in DETECTORS else 2)
-    assert all("on_exit" in piece.options for piece in nodes if piece.options["package"] != "rviz2")
-
-
 def test_each_camera_of_a_rig_has_a_detector_in_its_namespace(describe):
     found = describe("rig.launch.py", cameras="[front, rear]", marker_map=WALL, namespace="robot")
     detectors = [

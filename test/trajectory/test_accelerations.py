@@ -4,17 +4,12 @@
 
 import numpy as np
 import projector
-from dense import normal_of
 from scipy.linalg import toeplitz
 from scipy.spatial.transform import Rotation
-from test_fit import guess, make_camera, observe
 
-from rs_localizer.tools.adjust.fit import fit
 from rs_localizer.tools.adjust.motion import acceleration_rows
-from rs_localizer.tools.adjust.problem import Problem, View
 from rs_localizer.tools.adjust.spline import Layout, Spline
-from rs_localizer.tools.adjust.variables import Freedom, start_state
-from rs_localizer.tools.smoothing import told
+from rs_localizer.tools.adjust.variables import Freedom
 
 SPACING, ANGULAR, LINEAR, FADING = 0.04, 3.0, 2.0, 0.1
 
@@ -49,24 +44,3 @@ def test_the_prior_is_that_of_accelerations_that_fade():
         rows = acceleration_rows(spline, freedom.accelerations(SPACING))
         np.testing.assert_allclose(rows.cost, by_hand(spline, fading), rtol=1e-9)
         np.testing.assert_allclose(rows.cost, np.sum(rows.errors**2), rtol=1e-12)
-
-
-def test_the_keypoints_tell_as_many_numbers_as_the_trace_says():
-    rng = np.random.default_rng(1)
-    motion, camera = projector.Motion.random(rng), make_camera()
-    frames = projector.record(rng, motion, projector.room(rng, 60), readout=0.03, seconds=0.6)
-    seen = observe(camera, frames)
-    start = start_state(camera, seen, guess(rng, motion, frames), 0.03)
-    freedom = Freedom(False, angular_acceleration=8.0, linear_acceleration=4.0, fading=FADING)
-    found = fit(camera, seen, start, freedom, 0.5)
-    problem = Problem([View(camera, seen, freedom)], found.state)
-    expected = freedom.accelerations(found.state.spline.layout.spacing)
-    prior, _ = normal_of(problem.groups, [acceleration_rows(found.state.spline, expected)])
-    whole, _ = normal_of(problem.groups, problem.terms(found.state, found.deviation))
-    share = np.linalg.solve(whole, prior)
-    parts = np.tile(np.repeat([0, 1], 3), len(found.state.spline.positions))
-    count = 3 * (len(found.state.spline.positions) - 2)
-    # The prior has no terms between turns and places: the trace falls apart into theirs.
-    assert np.all(prior[np.ix_(parts == 0, parts == 1)] == 0.0)
-    expected = [count - np.trace(share[np.ix_(parts == k, parts == k)]) for k in (0, 1)]
-    np.testing.assert_allclose(told(found).numbers, expected, rtol=1e-4)

@@ -14,8 +14,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import Observed
 from rs_localizer.tools.calibration import Calibration, calibrate
-from rs_localizer.tools.first_lens import covered, first_lens
-from rs_localizer.tools.readout_belief import discrepancy, examine
+from rs_localizer.tools.first_lens import first_lens
+from rs_localizer.tools.readout_belief import examine
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 
@@ -70,30 +70,6 @@ def test_the_reversed_direction_is_found_and_images_without_the_board_are_not_mi
     assert found.images == len(images) - 3
 
 
-def test_corners_that_are_held_and_regions_that_are_empty_are_named(board):
-    """A board whose shape is free is worth no word, one with too many corners is."""
-    assert board.held == 0
-    flat, stranger = projector.board(), np.ones((1, 3))
-    shape = verdict.moved(board, np.concatenate([stranger, flat[::-1]]))
-    np.testing.assert_array_equal(shape[:1], stranger)
-    np.testing.assert_allclose(shape[1:], flat[::-1], atol=2e-3)
-    assert np.all(np.any(shape[1:] != flat[::-1], axis=1))
-    found, seen = board, board.posed.observations
-    large = replace(seen, landmarks=np.zeros((500, 3)), points=np.zeros(15_000, dtype=np.int64))
-    held = replace(
-        found,
-        posed=replace(found.posed, observations=large),
-        fit=replace(found.fit, freedom=replace(found.fit.freedom, landmarks=0.0)),
-    )
-    assert held.held == 500
-    assert any("map's 500 points" in remark for remark in verdict.remarks(held))
-    above = seen.subset(seen.pixels[:, 1] < projector.HEIGHT / 2)
-    part = replace(found, posed=replace(found.posed, observations=above))
-    share, *regions = verdict.uncovered(part)
-    assert {"bottom left", "bottom", "bottom right"} <= set(regions)
-    assert any(f"never showed the map: {share}" in remark for remark in verdict.remarks(part))
-
-
 def test_a_global_shutter_is_one():
     found = calibrate(CAMERA, list(recording(0.0)))
     assert found.global_shutter
@@ -137,30 +113,6 @@ def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree():
     assert not any("times less likely" in remark for remark in verdict.remarks(found))
 
 
-def test_what_nothing_can_contradict_or_no_camera_has_is_refused(board):
-    found = board
-    # A part that does not determine it as well as the whole must is no witness.
-    vague = tuple(replace(block, deviation=0.06 / 30.0) for block in found.blocks[1:])
-    short = replace(found, blocks=(found.blocks[0], *vague))
-    assert f"1 of {len(found.blocks)} parts" in verdict.refusal(short)
-    assert "longer than the interval" in verdict.refusal(replace(found, readout_time=0.04))
-    fit = found.fit
-    off = replace(fit.camera, K=fit.camera.K + np.outer([1.0, 0.0, 0.0], [0.0, 0.0, 5e3]))
-    assert "outside the image" in verdict.refusal(replace(found, fit=replace(fit, camera=off)))
-    assert "off their stamps" in verdict.refusal(replace(found, jitter=1.1e-3))
-    # No rolling shutter takes a millisecond; a camera that stamps its images is to be believed.
-    fast = replace(found, readout_time=1e-3, deviation=1e-4)
-    assert verdict.refusal(fast) == ""
-    assert "no rolling shutter is that fast" in verdict.refusal(replace(fast, own_stamps=False))
-
-
-def test_a_whole_that_lies_beside_all_of_its_parts_is_known_less_well():
-    parts, deviations = np.array([1.0, 1.2, 1.1]), np.full(3, 0.1)
-    assert discrepancy(1.15, parts, deviations) == 0.0  # within the noise of their mean
-    assert discrepancy(2.1, parts, deviations) == pytest.approx(np.sqrt(1.0 - 0.01 / 3.0))
-    assert discrepancy(2.1, parts[:0], deviations[:0]) == 0.0
-
-
 @pytest.mark.parametrize(
     ("model", "deep"), [("equidistant", False), ("equidistant", True), ("plumb_bob", False)]
 )
@@ -190,31 +142,6 @@ def test_the_distortion_model_is_that_of_the_lens(model, deep):
     np.testing.assert_allclose(found.distort(corner)[0], camera.distort(corner)[0], atol=1.0)
 
 
-def test_a_fisheye_that_moves_fast_is_found_where_a_plain_lens_leaves_out_its_rim(monkeypatch):
-    """A first lens, from images that move, is a plain one that fits the middle of the image."""
-    K, k = np.array([[200.0, 0.0, 320.0], [0.0, 200.0, 240.0], [0.0, 0.0, 1.0]]), (-0.012, 0.002)
-
-    def project(motion, t, points):
-        rotations, centres = motion.pose(t)
-        local = np.einsum("nji,nj->ni", rotations, points - centres)
-        angle = np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])
-        radius = angle * (1.0 + k[0] * angle**2 + k[1] * angle**4)
-        unit = local[:, :2] / np.hypot(local[:, 0], local[:, 1])[:, None]
-        return 200.0 * radius[:, None] * unit + K[:2, 2]
-
-    monkeypatch.setattr(projector, "project", project)
-    rng = np.random.default_rng(3)
-    motion, board = projector.Motion.random(rng, 0.2, 0.04), projector.board(8, 6, 0.08, 0.0)
-    board = board - board.mean(axis=0) + [0.0, 0.0, 0.22]
-    frames = projector.record(rng, motion, board, readout=0.02, seconds=1.5, noise=0.1)
-    images = [Observed(round(1e9 * f.stamp), f.points, f.pixels) for f in frames]
-    plain = Camera(projector.WIDTH, projector.HEIGHT, K, D=np.array([-0.33, 0.15, 0, 0, -0.04]))
-    found = calibrate(plain, images, intrinsics=True)
-    assert found.fit.camera.distortion_model == "equidistant"
-    assert found.fit.camera.D[:2] == pytest.approx(k, abs=1e-3)
-    assert abs(found.readout_time - 0.02) < 4.0 * found.deviation
-
-
 def test_stamps_of_an_even_camera_with_missing_images():
     times = np.delete(np.arange(100) / 30.0, [10, 11, 50])
     found = examine(times)
@@ -223,11 +150,3 @@ def test_stamps_of_an_even_camera_with_missing_images():
     assert not found.irregular
     rng = np.random.default_rng(0)
     assert examine(times + 7e-4 * rng.normal(size=len(times))).irregular
-
-
-def test_what_images_cover_together():
-    left = np.array([[0.0, 0.0], [319.0, 0.0], [319.0, 479.0], [0.0, 479.0]])
-    assert covered((640, 480), [np.zeros((0, 2))]) == 0.0
-    assert covered((640, 480), [left]) == pytest.approx(0.5, abs=0.02)
-    right = left + np.array([320.0, 0.0])
-    assert covered((640, 480), [left, right]) == 1.0

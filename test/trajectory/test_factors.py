@@ -17,7 +17,7 @@ from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
 from rs_localizer.tools.adjust.priors import Floating, lens_term, mount_term
 from rs_localizer.tools.adjust.problem import Problem, View
 from rs_localizer.tools.adjust.spline import Layout, Spline
-from rs_localizer.tools.adjust.system import Factored, Quadratic, System
+from rs_localizer.tools.adjust.system import Factored, System
 from rs_localizer.tools.adjust.variables import (
     Accelerations,
     Extrinsics,
@@ -150,14 +150,3 @@ def test_steps_and_covariances_are_those_of_the_dense_system(of, length):
     for first, found in zip(firsts, factored.local_covariances(firsts), strict=True):
         own = inverse[6 * first : 6 * first + 24, 6 * first : 6 * first + 24]
         np.testing.assert_allclose(found, own, atol=1e-5 * np.abs(own).max())
-
-
-def test_damping_multiplies_the_diagonal():
-    problem, state = small()
-    terms = problem.terms(state, 1.0)
-    matrix, slope = normal_of(problem.groups, terms)
-    matrix[np.diag_indices(len(matrix))] *= 1.5
-    expected = -np.linalg.solve(matrix, slope)
-    found = Factored(problem.system(state, 1.0), 0.5).step()
-    np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max() + 1e-12)
-    assert any(isinstance(term, Quadratic) for term in terms)

@@ -3,7 +3,7 @@
 """The readout time from neighbouring frames: value, deviation, alarms; on an own projector."""
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 import projector
@@ -11,7 +11,6 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.shutter import Motion, numbers_of, project_rolling
 from rs_localizer.core.types import Estimate
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.readout_estimate import (
@@ -20,7 +19,6 @@ from rs_localizer.pipeline.readout_estimate import (
     ReadoutEstimate,
     View,
     equation,
-    view,
 )
 from rs_localizer.tracking import Tracker
 
@@ -94,25 +92,6 @@ def test_no_alarm_at_rest_nor_at_slow_motion(turn):
     assert not any(measured and measured.contradicts(READOUT) for measured in said)
 
 
-def test_time_that_goes_back_starts_afresh():
-    frames, estimate = recording(seconds=0.5), ReadoutEstimate()
-    result = Localizer(CAMERA).localize(frames[0].points, frames[0].pixels)
-    for k, of in enumerate(triples(READOUT, 1.0)):
-        estimate.take(of, 1.0 / 30.0)
-        if k == 5:
-            assert estimate.measured is not None
-    for time_ns in (10**9, 10**9 - 1):
-        estimate.add(time_ns, CAMERA, result, frames[0].points, frames[0].pixels)
-    assert estimate.measured is None
-
-
-def test_contradiction_needs_both_many_deviations_and_a_real_difference():
-    assert not MeasuredReadout(0.030, 1e-3, 100, 100.0).contradicts(0.033)
-    assert not MeasuredReadout(0.030, 1e-6, 100, 100.0).contradicts(0.031)
-    assert MeasuredReadout(0.030, 5e-4, 100, 100.0).contradicts(0.033)
-    assert MeasuredReadout(-0.030, 5e-4, 100, 100.0).contradicts(0.030)
-
-
 NOISE = 1e-3
 
 
@@ -147,22 +126,6 @@ def test_at_rest_nothing_is_known():
     assert found is None or abs(found.odds(0.0, READOUT)) < 0.1
 
 
-def test_a_camera_that_shakes_within_its_frames_is_seen():
-    assert measured(triples(0.0, speed=3.0, shaking=10.0 * NOISE)).misfit > 1.5
-
-
-def test_a_jump_says_nothing():
-    of = triples(READOUT, speed=1.0)
-    jumped = of[10]._replace(x=of[10].x + 100.0)
-    assert measured([*of[:10], jumped]) == measured(of[:10])
-
-
-def test_a_covariance_that_is_none_is_left_out():
-    of = triples(READOUT, speed=1.0)
-    singular = of[10]._replace(yy=np.zeros((6, 6)))
-    assert measured([*of[:10], singular]).odds(READOUT, 0.0) > 2.0
-
-
 def covariance(rng: np.random.Generator, size: int) -> np.ndarray:
     root = rng.normal(size=(size, 2 * size))
     scale = 10.0 ** rng.uniform(-2.0, 0.0, size)
@@ -193,43 +156,3 @@ def test_the_equation_of_three_views_holds_for_a_steady_turn():
         expected += lift @ each.covariance @ lift.T
     found = np.block([[of.xx, of.yx.T], [of.yx, of.yy]])
     np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
-def test_an_image_alone_finds_its_motion_and_says_how_well(direction):
-    """Many noisy images of one motion: the steps scatter as their covariance says."""
-    rng = np.random.default_rng(2)
-    camera = Camera(
-        projector.WIDTH, projector.HEIGHT, projector.K, projector.D, scan_direction=direction
-    )
-    true = Motion(so3.exp(0.1 * rng.normal(size=3)), rng.normal(0.0, 0.1, 3),
-                  rng.normal(0.0, 0.05, 3), rng.normal(0.0, 0.02, 3))  # fmt: skip
-    points = np.column_stack([rng.uniform(-1.0, 1.0, (80, 2)), rng.uniform(2.0, 4.0, 80)])
-    exact, _ = project_rolling(camera, true.at_rows, points)
-    shown = camera.inside(exact)
-    points, exact = points[shown], exact[shown]
-    seen = partial(
-        Estimate, *numbers_of(true)[:4], inliers=np.ones(len(points), bool),
-        residuals=np.zeros(len(points)), joint_covariance=np.eye(18), global_shutter_inliers=0,
-        iterations=0,
-    )()  # fmt: skip
-    distances = []
-    for _ in range(60):
-        noisy = exact + rng.normal(0.0, 0.3, exact.shape)
-        distances.append(
-            step(seen, alone := view(camera, seen, points, noisy))
-            @ np.linalg.solve(alone.covariance, step(seen, alone))
-        )
-    # Chi-squared of 12 degrees of freedom, but that the noise is an estimate.
-    assert np.mean(distances) == pytest.approx(12.0, rel=0.2)
-    assert np.abs(step(seen, view(camera, seen, points, exact))).max() < 1e-9
-    few = replace(seen, inliers=np.arange(len(points)) < 12)
-    assert view(camera, few, points, exact) is None
-
-
-def step(before: Estimate, found: View) -> np.ndarray:
-    """From an estimate to what the image alone says (12,)."""
-    turn = so3.log(np.ascontiguousarray(before.rotation @ found.rotation))
-    moved = before.rotation @ (found.position - before.position)
-    return np.r_[turn, moved, found.motion[:3] - before.angular_velocity,
-                 found.motion[3:] - before.linear_velocity]  # fmt: skip

@@ -89,9 +89,3 @@ def test_motions_that_are_not_one_are_refused():
         calibrate_rig({"front": front, "rear": rear})
     with pytest.raises(ValueError, match="several cameras, not 1"):
         calibrate_rig({"front": front})
-
-
-def test_what_is_not_determined_is_named():
-    rear = pair()["rear"]
-    vague = replace(rear, deviations=np.r_[rear.deviations[:6], 0.003])
-    assert vague.undetermined == "clock +- 3 ms (limit 1.5)"

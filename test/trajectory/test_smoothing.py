@@ -84,26 +84,6 @@ def test_smoothed_motion_is_better_than_tracked_and_its_covariance_holds(turn):
         assert 2.0 < squared.mean() < 8.0
 
 
-def test_hard_accelerations_are_not_smoothed_away():
-    rng = np.random.default_rng(13)
-    rate = np.full((6, 1), 2.0 * np.pi * 3.0)  # Hz
-    amplitudes = np.array([[100.0], [0.0], [0.0], [20.0], [0.0], [0.0]]) / rate**2
-    phases = np.array([[0.0], [0.0], [0.0], [1.0], [0.0], [0.0]])
-    motion = projector.Motion(amplitudes, rate, phases)
-    recorded = projector.record(rng, motion, projector.room(rng, 2000), readout=READOUT,
-                                seconds=2.0, noise=1.0, outliers=0.2)  # fmt: skip
-    frames = track(recorded)
-    found = run(frames)
-    times = np.linspace(0.2, 1.8, 200)
-    states = found.fit.state.spline.states(times - 1e-9 * found.start_ns)
-    before, after = motion.twist(times - 1e-3), motion.twist(times + 1e-3)
-    angular, linear = ((b - a) / 2e-3 for a, b in zip(before, after, strict=True))
-    for seen, true, most in ((states.angular_acceleration, angular, 100.0),
-                             (states.linear_acceleration, linear, 20.0)):  # fmt: skip
-        assert np.abs(true).max() > 0.95 * most
-        assert np.sum(seen * true) / np.sum(true * true) == pytest.approx(1.0, abs=0.03)
-
-
 def test_frames_that_shake_faster_than_the_motion_are_said_to():
     """60 Hz, which a gyroscope knows: a spline averages it away and would be sure of it."""
     rng = np.random.default_rng(14)

@@ -76,12 +76,3 @@ def test_a_constant_turn_and_a_straight_line_are_kept():
     np.testing.assert_allclose(states.positions, t[:, None] * velocity, atol=1e-12)
     np.testing.assert_allclose(states.angular, np.tile(rate, (7, 1)), atol=1e-12)
     np.testing.assert_allclose(states.angular_acceleration, 0.0, atol=1e-9)
-
-
-def test_stretches_do_not_share_controls():
-    layout = Layout.over(np.array([[0.0, 1.0], [2.0, 2.11]]), 0.05)
-    first, u = layout.locate(np.array([-1.0, 0.0, 0.999, 1.2, 1.9, 2.05, 5.0]))
-    assert np.all(first[:4] + 4 <= layout.firsts[1])
-    assert np.all(first[4:] >= layout.firsts[1])
-    assert np.all((u >= 0.0) & (u <= 1.0))
-    assert layout.inside(np.array([0.5, 1.5, 2.1])).tolist() == [True, False, True]

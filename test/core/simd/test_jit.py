@@ -127,47 +127,6 @@ def test_a_full_disk_is_a_warning(load, cache, recwarn):
     assert files(cache, ".nbc") == []
 
 
-def test_a_kernel_is_compiled_with_one_that_comes_from_the_cache(load, cache):
-    load()(1.5)
-    double = load()
-    assert double(1.5) == 3.0
-    assert hits(double) == 1
-    quadruple = sys.modules["doubling"].quadruple
-    assert quadruple(1.5) == 6.0
-    assert hits(quadruple) == 0
-    # The callee has been inlined, as it is where both are compiled.
-    (code,) = quadruple.inspect_llvm().values()
-    assert "8doubling6double" not in "".join(line for line in code.splitlines() if " call " in line)
-
-
-def test_a_large_kernel_is_called_where_it_is(load, cache, monkeypatch):
-    monkeypatch.setattr(jit, "_LARGE", 0)
-
-    def quadruple() -> Any:
-        load()
-        return sys.modules["doubling"].quadruple
-
-    load()(1.5)
-    one = quadruple()  # with one that comes from the cache
-    assert one(1.5) == 6.0
-    assert hits(sys.modules["doubling"].double) == 1
-    (code,) = one.inspect_llvm().values()
-    assert "8doubling6double" in "".join(line for line in code.splitlines() if " call " in line)
-    again = quadruple()
-    assert again(1.5) == 6.0
-    assert hits(again) == hits(sys.modules["doubling"].double) == 1
-    # What it would call is no longer there.
-    for file in files(cache, ".nb?"):
-        if ".double-" in file.name:
-            file.unlink()
-    anew = quadruple()
-    assert anew(1.5) == 6.0  # and nothing is said: no file was damaged
-    assert hits(anew) == 0
-    last = quadruple()
-    assert last(1.5) == 6.0
-    assert hits(last) == 1
-
-
 @pytest.mark.parametrize("shared", ["cache", "rs_localizer", "digest", "kernels"])
 def test_a_cache_that_others_can_write_is_not_used(load, monkeypatch, shared):
     """Numba unpickles what is there: whoever writes it runs code in this process."""
@@ -239,13 +198,3 @@ def test_every_folder_with_kernels_counts():
         if "import kernel" in path.read_text() or "import inlined" in path.read_text()
     }
     assert using == set(jit.PARTS)
-
-
-def test_a_digest_covers_the_parts_up_to_its_own(tmp_path):
-    for part in jit.PARTS:
-        (tmp_path / part / "inside").mkdir(parents=True)
-        (tmp_path / part / "inside" / "file.py").write_text("")
-    before = {part: jit.digest(part, tmp_path) for part in jit.PARTS}
-    (tmp_path / "matching" / "inside" / "file.py").write_text("changed")
-    changed = {part for part in jit.PARTS if jit.digest(part, tmp_path) != before[part]}
-    assert changed == {"matching", "markers", "tools"}

@@ -49,14 +49,6 @@ def test_arithmetic_is_that_of_numpy():
     np.testing.assert_allclose(result, expected, rtol=1e-14)
 
 
-def test_structural_zeros_and_ones_are_free_and_right():
-    (x,) = given = values(1)
-    result = run(
-        traced(lambda v: [0.0 * v[0], 1.0 * v[0], v[0] + 0.0, v[0] - 0.0, 0.0 - v[0]], 1), given, 5
-    )
-    np.testing.assert_array_equal(result, [0 * x, x, x, x, -x])
-
-
 def test_selection_is_lane_by_lane_and_false_for_nan():
     given = values(2)
     given[0, 0] = np.nan

@@ -3,13 +3,10 @@
 """The marker detector as its users meet it: its own process, real DDS, images of all kinds."""
 
 import signal
-import subprocess
-import sys
 from typing import Any
 
 import cv2
 import numpy as np
-import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
@@ -121,22 +118,3 @@ def test_images_become_correspondences(start_node, peer, tmp_path):
     assert talk.listeners(0)
     assert node.stop(signal.SIGTERM) == 0
     assert "Traceback" not in node.log
-
-
-# Modules, packages not counted.
-MOST = {"markers": 50, "features": 41}
-
-
-@pytest.mark.parametrize("kind", MOST)
-def test_the_detectors_do_not_import_the_estimator(kind):
-    code = (
-        f"import sys, rs_localizer.ros.detector.{kind}\n"
-        "print(*(n for n, m in sys.modules.items() if n.startswith('rs_localizer.')"
-        " and not hasattr(m, '__path__')))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    names = done.stdout.split()
-    parts = {name.split(".")[1] for name in names}
-    assert parts.isdisjoint({"estimation", "localizer", "tracking", "matching"})
-    assert kind == "markers" or "markers" not in parts
-    assert len(names) < MOST[kind]

@@ -87,13 +87,3 @@ def test_a_node_that_dies_is_told_with_its_last_words(tmp_path):
         live.LiveNode(settings, tmp_path / "log", 0) as node,
     ):
         node.wait(lambda line: None)
-
-
-def test_a_node_that_falls_silent_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(live, "_SILENCE", 0.5)
-    monkeypatch.setattr(live, "_NODE", "import time; time.sleep(60)")
-    with (
-        pytest.raises(live.LiveError, match=r"(?s)has said nothing for 1 s; .*\n  nothing$"),
-        live.LiveNode({}, tmp_path / "log", 0) as node,
-    ):
-        node.wait(lambda line: None)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The diagnosis of a node: what a user reads first when there are no poses."""
 
-import math
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -11,18 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rs_localizer.core.reasons import ImuReason
-from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.io.outputs import CameraShare
-from rs_localizer.pipeline.imu import ImuState, Unused
-from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.localizer.health import (
     Condition,
     diagnose,
-    imu_oddity,
-    imu_values,
-    of_interest,
     tell,
 )
 from rs_localizer.ros.node.health import Level
@@ -124,17 +116,6 @@ def test_numbers_of_a_working_node(world):
     assert values["Frames answered"] == "100"
 
 
-def test_numbers_of_a_rig_and_of_the_readout_time_that_the_motion_shows(world):
-    world.statistics.answered(frame(rig=True), world.now)
-    values = world.diagnose().values
-    assert values["Inliers of front"] == "2 of 3 (67%)"
-    assert values["Residual RMS of front (px)"] == "3.500"
-    assert values["Inliers of rear"] == "1 of 1 (100%)"
-    assert "Readout time seen (ms)" not in values
-    seen = replace(GOOD, readout=MeasuredReadout(-0.02004, 1.2e-4, 100, 100.0))
-    assert world.diagnose(seen).values["Readout time seen (ms)"] == "-20.04 +- 0.12"
-
-
 def test_lost_after_some_frames_and_found_by_one(world):
     world.pass_frames(10, rate=50.0)
     world.refuse(4)
@@ -217,66 +198,3 @@ def test_what_is_missing_comes_first(world, change, level, state, message):
     health = world.diagnose(replace(GOOD, **change))
     assert (health.level, health.values["State"]) == (level, state)
     assert health.message.startswith(message)
-
-
-def test_what_is_missing_came_and_cannot_be_used(world):
-    for _ in range(3):
-        world.refusals.add("bad_camera_info", "the camera is not calibrated: K[0] is 0")
-    health = world.diagnose(replace(GOOD, missing=("camera_info",)))
-    assert health.message == (
-        "waiting for camera_info; 3 cannot be used: see bad_camera_info in the log"
-    )
-
-
-def test_topics_that_nothing_waits_for_are_left_out():
-    nobody = replace(COMES, seconds=9.0, heard=False, cause="it has no publisher")
-    deaf = replace(nobody, cause="the QoS of /x does not fit", mismatch=True)
-    kinds = ("correspondences", "keypoints")
-
-    def names(missing: tuple[str, ...] = (), **silence: Silence) -> set[str]:
-        return set(of_interest(silence, missing))
-
-    assert names(correspondences=nobody, keypoints=nobody) == set(kinds)
-    assert names(correspondences=COMES, keypoints=nobody) == {"correspondences"}
-    assert names(correspondences=COMES, keypoints=deaf) == set(kinds)
-    assert names(keypoints=COMES, map_points=nobody) == {"keypoints"}
-    assert names(("map_points",), keypoints=COMES, map_points=nobody) == {"keypoints", "map_points"}
-
-
-STATUS = InertialStatus(
-    Alone.NONE, np.radians([0.5, -0.25, 1.0]), math.radians(0.01), 0.0049, 0.0002
-)
-USED = ImuState(200, 190, 0.97, None, None, {"imu_gap": 10}, 400.04, -0.0051, STATUS)
-LATE = Unused(ImuReason.LATE, "the last reading is 97.5 ms older than the last row")
-UNUSED = ImuState(200, 0, 0.0, LATE, LATE, {"imu_late": 200}, math.nan, math.nan, None)
-
-
-def test_an_imu_in_use_or_not():
-    assert imu_values(USED) == {
-        "IMU": "used",
-        "IMU used (share of the last frames)": "97%",
-        "IMU rate (Hz)": "400.0",
-        "IMU bias (deg/s, camera axes)": "0.500 -0.250 1.000 +- 0.010",
-        "IMU time offset (ms)": "-5.10 +- 0.20",
-        "IMU not used: imu_gap": "10",
-    }
-    assert imu_oddity(USED) == {}
-    assert imu_values(UNUSED) == {
-        "IMU": f"not used: {LATE}",
-        "IMU used (share of the last frames)": "0%",
-        "IMU not used: imu_late": "200",
-    }
-    said = imu_oddity(UNUSED)["imu"]
-    assert "or use another clock: the last reading is 97.5 ms older than the last row" in said
-    assert "a larger imu.wait" in said  # what to do
-    # The most frequent reason is said, and not the last one.
-    slow = replace(UNUSED, mostly=Unused(ImuReason.TOO_SLOW, "a reading comes every 20.0 ms"))
-    assert imu_values(slow)["IMU"] == f"not used: {slow.mostly}"
-    assert "every 20.0 ms" in imu_oddity(slow)["imu"]
-
-
-def test_gravity_that_contradicts_the_map_is_a_warning():
-    assert imu_oddity(replace(USED, gravity=math.radians(2.0))) == {}
-    state = replace(USED, gravity=math.radians(88.0))
-    assert "88 degrees off gravity_in_map" in imu_oddity(state)["imu.gravity"]
-    assert imu_values(state)["IMU gravity off gravity_in_map (deg)"] == "88.0"

@@ -6,19 +6,10 @@ import os
 import re
 import signal
 import time
-from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import GetState
 from rcl_interfaces.srv import GetParameters
-from rclpy.context import Context
-
-from rs_localizer.io.outputs import TYPES
-from rs_localizer.io.topics import CAMERA_MARKER, INTEGRITY
-from rs_localizer.ros.localizer.node import LocalizerNode
-from rs_localizer.ros.node import managed
-from rs_localizer.ros.node.inputs import Inputs
 
 # A module that tells that it is being imported, and takes its time.
 SLOW = "import pathlib, time; pathlib.Path(__file__).with_suffix('.seen').touch(); time.sleep(60)"
@@ -55,27 +46,6 @@ def test_an_end_that_the_middleware_holds_up_is_cut_short(start_node):
     assert time.monotonic() - begin < 15.0
     assert "did not end within 4 s" in node.log
     assert "in run" in node.log
-
-
-def test_publishers_are_active_before_a_frame_can_come(monkeypatch):
-    active: list[bool] = []
-
-    class Early(Inputs):
-        def __init__(self, node: LocalizerNode, *arguments: Any) -> None:
-            active.extend(it.is_activated for it in node.publishers if hasattr(it, "is_activated"))
-            super().__init__(node, *arguments)
-
-    monkeypatch.setattr(managed, "Inputs", Early)
-    context = Context()
-    rclpy.init(context=context)
-    node = LocalizerNode(context=context)
-    try:
-        node.trigger_configure()
-        node.trigger_activate()
-    finally:
-        node.destroy_node()
-        rclpy.shutdown(context=context)
-    assert active == [True] * len([*TYPES, INTEGRITY, CAMERA_MARKER])
 
 
 def test_what_it_says_at_start_and_an_end_by_signals(start_node, tmp_path):

@@ -4,7 +4,6 @@
 
 import contextlib
 import sys
-import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -134,26 +133,6 @@ def test_map_to_odom(made, robot, peer):
     base = heard(robot, peer, "map", "base_link", 7 * second)
     assert base.transform.translation.x == pytest.approx(10.0)
     assert base.transform.rotation.w == pytest.approx(1.0)
-
-
-def test_odometry_that_does_not_come(made, robot, peer):
-    node = made(publish_tf="map_to_odom", transform_tolerance=0.1)
-    for stamp in (5, 6):
-        robot.send("odom", "base_link", 1.0, stamp * 10**9)
-    known(node, peer, "odom", "base_link", 6 * 10**9)
-    node.publish(frame(7 * 10**9), node.config)
-    assert not node.notes
-    time.sleep(0.15)
-    node.publish(frame(8 * 10**9), node.config)
-    assert len(node.notes) == 1
-    assert "extrapolation into the future" in node.notes[0][1]
-    # What still waits when the node is deactivated is not sent any more.
-    node.broadcaster.forget()
-    robot.send("odom", "base_link", 1.0, 9 * 10**9)
-    known(node, peer, "odom", "base_link", 9 * 10**9)
-    peer.spin_until(lambda: False, 0.1)
-    with pytest.raises(Exception, match="does not exist"):
-        robot.buffer.lookup_transform("map", "base_link", Time())
 
 
 def test_the_correction_never_stops(made, robot, peer):

@@ -85,14 +85,6 @@ def test_another_state_is_told_afresh(bench):
     assert bench.lines == ["no_pose: because lost", "no_pose: because waiting for"]
 
 
-@pytest.mark.parametrize(("level", "state"), [(Level.OK, "tracking"), (Level.OK, "inactive")])
-def test_what_is_meant_so_is_not_logged(bench, level, state):
-    bench.health = Health(level, state, "as it should be", {})
-    for _ in range(20):
-        bench.tick()
-    assert bench.lines == []
-
-
 RATES = (10.0, 30.0, 60.0)
 
 
@@ -120,13 +112,6 @@ def test_a_steady_camera_misses_nothing(rate, jitter):
         assert missing(stamps(rate, 150, jitter, np.random.default_rng(seed))) == 0
 
 
-def test_no_rate_no_verdict():
-    rng = np.random.default_rng(0)
-    triggered = np.cumsum(rng.exponential(1e8, 200)).astype(np.int64)  # whenever something moves
-    assert missing(triggered) == 0
-    assert missing([]) == missing([5]) == missing([0, 10, 30, 40]) == 0
-
-
 class Log:
     """Refusals with a clock that stands still, and the lines that they gave."""
 
@@ -140,23 +125,6 @@ class Log:
 @pytest.fixture
 def log() -> Log:
     return Log()
-
-
-def test_one_line_for_each_reason_and_period(log):
-    log.add("dark", "no light")
-    log.add("dark", "no light")
-    log.add("late", "too late")
-    assert log.lines == ["dark: no light", "late: too late"]
-    log.now += 4.9
-    log.add("dark", "no light")
-    assert len(log.lines) == 2
-    log.now += 0.2
-    log.add("dark", "no light")
-    assert log.lines[2:] == ["dark: no light (2 more since the last report)"]
-    log.now += 5.1
-    log.add("dark", "no light")
-    assert log.lines[3:] == ["dark: no light"]
-    assert log.refusals.counts == {"dark": 5, "late": 1}
 
 
 def test_details_that_differ_in_numbers_are_one(log):

@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A topic is heard as well as its publishers send it, whoever comes first."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from rs_localizer.ros.node import inputs as inputs_module
 from rs_localizer.ros.node.inputs import LATCHED as LATCHED_DATA
@@ -35,25 +34,6 @@ WHOLE = QoSProfile(depth=1, reliability=RELIABLE, durability=LATCHED)
 )
 def test_the_best_that_all_offer(wished, offers, expected):
     assert best(wished, offers) == expected
-
-
-@pytest.mark.parametrize(
-    ("kind", "quality", "large"),
-    [(Image, BEST_EFFORT, True), (Image, RELIABLE, False), (CameraInfo, BEST_EFFORT, False)],
-)
-def test_why_large_messages_are_lost_is_said(kind, quality, large):
-    profile = QoSProfile(depth=1, reliability=quality)
-    name = f"sensor_msgs/msg/{kind.__name__}"
-    camera = SimpleNamespace(
-        topic_type=name, node_namespace="/", node_name="camera", qos_profile=profile
-    )
-    node: Any = SimpleNamespace(
-        _node=SimpleNamespace(get_publishers_info_by_topic=lambda topic: [camera])
-    )
-    topic: Any = SimpleNamespace(msg_type=kind, topic_name="/image", qos_profile=profile)
-    cause, mismatch = Inputs._cause(node, topic)
-    assert cause.startswith("it has 1 publisher, but no message comes")
-    assert ("above half a megabyte are lost" in cause, mismatch) == (large, False)
 
 
 def test_a_topic_follows_its_publishers(peer):

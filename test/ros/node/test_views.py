@@ -8,27 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from visualization_msgs.msg import Marker
 
-from rs_localizer.ros.node.views import camera_marker, map_marker
+from rs_localizer.ros.node.views import camera_marker
 
 
 def numbers(points: Any) -> Any:
     return np.array([[p.x, p.y, p.z] for p in points])
-
-
-def test_a_map_is_its_points_or_the_outlines_of_its_markers():
-    points = np.random.default_rng(0).normal(size=(30_000, 3))
-    marker = map_marker("hall", points)
-    assert (marker.type, marker.header.frame_id) == (Marker.POINTS, "hall")
-    assert len(marker.points) == 20_000
-    square = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]], float)
-    marker = map_marker("hall", square)
-    assert marker.type == Marker.LINE_LIST
-    lines = numbers(marker.points).reshape(-1, 2, 3)
-    assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) == pytest.approx([1.0] * 4)
-    assert marker.color.a == 1.0
-    assert marker.scale.x > 0.0
 
 
 @pytest.mark.parametrize(

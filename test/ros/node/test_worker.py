@@ -105,18 +105,6 @@ def test_the_newest_frame_wins_and_what_it_replaced_is_counted(fake):
     assert summary.total == {"received": 4, "answered": 2, "replaced": 2}
 
 
-def test_topics_do_not_replace_each_other(fake):
-    fake.send("one")
-    fake.wait(fake.started)
-    fake.send("two")
-    fake.send("other", topic="others")
-    fake.send("three")  # in the place of two
-    fake.go_on.release(3)
-    for _ in range(3):
-        fake.wait(fake.done)
-    assert fake.published == ["one old", "three old", "other old"]
-
-
 def test_updates_come_before_the_next_frame_and_never_within_one(fake):
     order: list[str] = []
 
@@ -138,23 +126,6 @@ def test_updates_come_before_the_next_frame_and_never_within_one(fake):
     fake.wait(fake.done)
     assert fake.published == ["one old", "two newest"]
     assert order == ["camera", "newest"]
-
-
-def test_errors_and_refusals_are_told_and_it_goes_on(fake):
-    def fail(frames: Any) -> None:
-        raise ValueError("no such setting")
-
-    fake.go_on.release(3)
-    for frame in ("bug", "dark", "light"):
-        fake.send(frame)
-        fake.wait(fake.done)
-    fake.worker.update("settings", fail)
-    fake.wait(fake.done)
-    assert fake.published == ["light old"]
-    assert fake.refusals.counts == {"internal_error": 1, "dark": 1}
-    summary = fake.statistics.summary()
-    assert summary.total["refused"] == 2
-    assert fake.errors[0].startswith("ValueError('no such setting') in fail, ")
 
 
 def test_nothing_is_published_after_a_pause(fake):
@@ -198,19 +169,6 @@ def test_a_mounting_that_does_not_come_is_a_refusal(fake):
     assert fake.published == []
 
 
-def test_a_frame_that_waits_for_its_mounting_is_dropped_by_a_pause(fake):
-    fake.go_on.release(1)
-    fake.send("late")
-    fake.wait(fake.started)
-    deadline = time.monotonic() + PATIENCE
-    fake.worker.pause()
-    fake.mounted = {"late"}
-    while not fake.statistics.summary().total["dropped"]:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    assert fake.published == []
-
-
 def test_a_frame_waits_for_what_it_needs_but_not_for_long(fake):
     fake.go_on.release(3)
     fake.awaited = {"one"}
@@ -226,13 +184,3 @@ def test_a_frame_waits_for_what_it_needs_but_not_for_long(fake):
     fake.send("three", patience=0.05)
     fake.wait(fake.done)
     assert fake.published == ["one old", "two old", "three old"]
-
-
-def test_the_end_waits_for_the_last_frame_but_not_for_ever(fake):
-    fake.send("one")
-    fake.wait(fake.started)
-    fake.worker.close()
-    assert not wait_for_workers(0.05)
-    fake.go_on.release()
-    assert wait_for_workers(PATIENCE)
-    assert fake.published == []
