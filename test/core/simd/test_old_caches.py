@@ -44,10 +44,3 @@ def test_what_nobody_used_for_a_month_is_removed(cache):
     assert not old.exists()
     assert all(path.is_dir() for path in staying)
     assert (cache / "3333333333333333").is_file()
-
-
-def test_use_keeps_a_folder(cache):
-    used = folder(cache, "1" * 16, 31)
-    assert jit._is_ours(used / "rs_localizer.core.so3")
-    compiler._remove_old(cache)
-    assert used.is_dir()

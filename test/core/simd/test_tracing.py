@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 import rs_localizer
-from rs_localizer.core.simd.algebra import cross, least_squares, nearest_rotation
+from rs_localizer.core.simd.algebra import least_squares
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.simd.tracing import LANES, select, sqrt, traced, traced_sums
-from rs_localizer.core.so3 import hat
+from rs_localizer.core.simd.tracing import LANES, traced, traced_sums
 
 
 def run(function, values, outputs):
@@ -31,40 +29,6 @@ def run(function, values, outputs):
 
 def values(count, seed=0):
     return np.random.default_rng(seed).normal(size=(count, LANES))
-
-
-def test_arithmetic_is_that_of_numpy():
-    x, y = given = values(2)
-    result = run(
-        traced(
-            lambda v: [v[0] + v[1], 2.0 - v[0], v[0] * v[1], v[0] / v[1], 1.0 / v[0], -v[0],
-                       abs(v[0]), sqrt(v[0] * v[0] + 1.0), 3.0 * v[0] - 1.0],
-            2,
-        ),
-        given, 9,
-    )  # fmt: skip
-    expected = [
-        x + y, 2 - x, x * y, x / y, 1 / x, -x, abs(x), np.sqrt(x * x + 1), 3 * x - 1,
-    ]  # fmt: skip
-    np.testing.assert_allclose(result, expected, rtol=1e-14)
-
-
-def test_selection_is_lane_by_lane_and_false_for_nan():
-    given = values(2)
-    given[0, 0] = np.nan
-    result = run(
-        traced(
-            lambda v: [
-                select(v[0] > 0.0, v[1], -1.0),
-                select((v[0] > 0.0) & (v[1] < 0.0), 1.0, v[0]),
-            ],
-            2,
-        ),
-        given, 2,
-    )  # fmt: skip
-    x, y = given
-    np.testing.assert_array_equal(result[0], np.where(x > 0, y, -1))
-    np.testing.assert_array_equal(result[1], np.where((x > 0) & (y < 0), 1, x))
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(3, 3), (6, 4), (8, 8), (12, 5)])
@@ -89,25 +53,6 @@ def test_a_singular_lane_is_not_finite_and_leaves_the_others_alone():
     size = np.abs(solution).max(axis=0)
     assert not size[2] < 1e12
     assert (np.delete(size, 2) < 1e3).all()
-
-
-def test_cross_and_nearest_rotation():
-    given = values(6)
-    result = run(
-        traced(
-            lambda v: cross(v[0:3], v[3:6]) + [x for r in nearest_rotation(v[0:3]) for x in r],
-            6,
-        ),
-        given, 12,
-    )  # fmt: skip
-    for lane in range(LANES):
-        a, b = given[:3, lane], given[3:, lane]
-        np.testing.assert_allclose(result[:3, lane], np.cross(a, b), atol=1e-14)
-        u, _, vt = np.linalg.svd(np.eye(3) + hat(a))
-        np.testing.assert_allclose(result[3:, lane].reshape(3, 3), u @ vt, atol=1e-13)
-        assert Rotation.from_matrix(u @ vt).magnitude() == pytest.approx(
-            np.arctan(np.linalg.norm(a))
-        )
 
 
 def test_sums_go_over_all_lanes_of_all_blocks():

@@ -77,14 +77,6 @@ def test_lines_of_a_lasting_state(bench, level, state, name):
     assert set(bench.lines) == {f"{name}: something is wrong"}
 
 
-def test_another_state_is_told_afresh(bench):
-    for state in (State.LOST, State.WAITING):
-        bench.health = Health(Level.ERROR, state, f"because {state}", {})
-        for _ in range(7):
-            bench.tick()
-    assert bench.lines == ["no_pose: because lost", "no_pose: because waiting for"]
-
-
 RATES = (10.0, 30.0, 60.0)
 
 
