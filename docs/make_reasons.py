@@ -9,6 +9,7 @@ What follows there is written by hand, and kept.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -21,19 +22,15 @@ _REASONS_INTRODUCTION = """\
 ## Why a frame has no pose
 
 The same in the library (`Failure.reason`), in `replay`, in the log and in `/diagnostics`.
-*Settings*:
+What to look at is in italics; *settings*:
 {settings}
 
-| reason | means | look at |
-|---|---|---|
 """
 _IMU_INTRODUCTION = """
 ## Why the IMU is not used for an image
 
 The camera continues alone, and the image still has its pose: [imu.md](imu.md).
 
-| reason | means | look at |
-|---|---|---|
 """
 _BY_HAND = "\n<!-- From here on written by hand"
 
@@ -48,10 +45,11 @@ def reasons_page() -> str:
 
 
 def _rows(reasons: Mapping[str, Meaning]) -> str:
-    return "".join(
-        f"| `{name}` | {means} | {look.replace(SETTINGS, '*settings*')} |\n"
+    said = (
+        f"* `{name}`: {means}; *{look.replace(SETTINGS, 'settings')}*"
         for name, (means, look) in reasons.items()
     )
+    return "".join(f"{textwrap.fill(line, 100, subsequent_indent='  ')}\n" for line in said)
 
 
 if __name__ == "__main__":
