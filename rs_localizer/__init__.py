@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from rs_localizer.io.rigs import (
         RigParts,
         read_camchain,
-        read_rig_config,
         write_camchain,
     )
     from rs_localizer.localizer import Localizer
@@ -53,7 +52,6 @@ __all__ = [
     "localize_recording",
     "read_calibration",
     "read_camchain",
-    "read_rig_config",
     "rectify",
     "solve_minimal",
     "write_camchain",
@@ -74,7 +72,7 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
         "core.units": ("CameraState", "camera_state"),
         "estimation.prior": ("Prior",),
         "io.calibration": ("read_calibration",),
-        "io.rigs": ("RigParts", "read_camchain", "read_rig_config", "write_camchain"),
+        "io.rigs": ("RigParts", "read_camchain", "write_camchain"),
         "localizer": ("Localizer",),
         "offline.table": ("localize_recording",),
         "solvers.minimal": ("solve_minimal",),

@@ -98,20 +98,14 @@ def read_calibration(path: Path | str) -> Camera:
     if (match := _CHOICE.fullmatch(str(path))) is not None and not path.exists():
         path, chosen = Path(match[1]), match[2]
     with calibration_faults(path, "YAML, JSON or XML", "not a usable calibration"):
-        text = path.read_text(encoding="utf-8-sig")
-        camera = _camera(text, chosen)
-    if camera is None:
-        raise CalibrationError(
-            f"{path} is not a calibration: expected a {CALIBRATION_KINDS}; {_fields_in_words(text)}"
-        )
-    x, y = camera.K[:2, 2]
-    if not (0.0 < x < camera.width and 0.0 < y < camera.height):
-        raise CalibrationError(
-            f"{path} is not a usable calibration: its principal point ({x:g}, {y:g}) lies outside "
-            f"its image of {camera.width}x{camera.height}: are width and height exchanged, or of "
-            "another resolution?"
-        )
-    return camera
+        camera = _camera(path.read_text(encoding="utf-8-sig"), chosen)
+        x, y = camera.K[:2, 2]
+        if not (0.0 < x < camera.width and 0.0 < y < camera.height):
+            raise ValueError(
+                f"its principal point ({x:g}, {y:g}) lies outside its image of {camera.width}x"
+                f"{camera.height}: are width and height exchanged, or of another resolution?"
+            )
+        return camera
 
 
 @contextlib.contextmanager
@@ -127,13 +121,12 @@ def calibration_faults(path: Path, kind: str, unusable: str) -> Iterator[None]:
             raise CalibrationError(f"{path} is {unusable}: {fault}") from error
 
 
-def _camera(text: str, chosen: str | None) -> Camera | None:
+def _camera(text: str, chosen: str | None) -> Camera:
     lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
     if _LINE.match(next(lines, "")) is not None:
         return colmap_camera(text, chosen)
     tree = _load_tree(text)
-    if not isinstance(tree, dict):
-        return None
+    tree = tree if isinstance(tree, dict) else {}
     tree = next(iter(_at(tree, _BESIDE_PARAMETERS)), tree)
     cameras = {name: item for name, item in tree.items() if _is_kalibr(item)}
     if cameras:
@@ -142,8 +135,11 @@ def _camera(text: str, chosen: str | None) -> Camera | None:
         raise ValueError(f"it has no camera {chosen!r} to choose")
     if _is_kalibr(tree):
         return kalibr_camera(tree)
-    found = (_of_program(_nested(tree), program) for program in _PROGRAMS)
-    return next((camera for camera in found if camera is not None), None)
+    for program in _PROGRAMS:
+        if (camera := _of_program(_nested(tree), program)) is not None:
+            return camera
+    found = ", ".join(sorted(map(str, tree))[:8]) or "nothing"
+    raise ValueError(f"expected a {CALIBRATION_KINDS}; found {found}")
 
 
 T = TypeVar("T")
@@ -151,14 +147,14 @@ T = TypeVar("T")
 
 def _choose(cameras: Mapping[str, T], name: str | None) -> T:
     """The only camera of a file, or the one that is named."""
-    if name is None and len(cameras) == 1:
-        return next(iter(cameras.values()))
     if not cameras:
         raise ValueError("it has no camera")
+    if name is None and len(cameras) == 1:
+        (name,) = cameras
     if name is None or name not in cameras:
-        names = ", ".join(cameras)
         raise ValueError(
-            f"it has the cameras {names}: choose one with #{next(iter(cameras))} behind the file"
+            f"it has the cameras {', '.join(cameras)}: choose one with #{next(iter(cameras))} "
+            "behind the file"
         )
     return cameras[name]
 
@@ -197,13 +193,6 @@ def _xml_value(item: ElementTree.Element) -> Any:
     except ValueError:
         values = words
     return values[0] if len(values) == 1 and item.tag != "data" else values
-
-
-def _fields_in_words(text: str) -> str:
-    with contextlib.suppress(YamlError):
-        if isinstance(tree := _load_tree(text), dict):
-            return f"found {', '.join(sorted(map(str, tree))[:8]) or 'nothing'}"
-    return "found neither"
 
 
 def _at(tree: dict[str, Any], paths: tuple[str, ...]) -> Iterator[Any]:
@@ -279,18 +268,14 @@ def _matrix(item: Any) -> Array:
 
 def _size(item: Any) -> tuple[int, int] | None:
     """Width and height of a pair or a mapping; None: it says neither."""
-    if isinstance(item, dict) and not _numbers(item):
-        sides: list[Any] = [
-            next((item[n] for n in names if n in item), None) for names in (_WIDTH, _HEIGHT)
-        ]
-        if sides == [None, None]:
-            return None
-        if None in sides:
-            raise KeyError((_WIDTH, _HEIGHT)[sides.index(None)][0])
-    else:
-        sides = _values(item).tolist()
-    width, height = sides
-    return int(width), int(height)
+    if _numbers(item):
+        width, height = _values(item).tolist()
+        return int(width), int(height)
+    sides: list[Any]
+    sides = [next((item[n] for n in names if n in item), None) for names in (_WIDTH, _HEIGHT)]
+    if None in sides and sides != [None, None]:
+        raise KeyError((_WIDTH, _HEIGHT)[sides.index(None)][0])
+    return None if None in sides else (int(sides[0]), int(sides[1]))
 
 
 def _distortion(item: Any, model: str) -> Array | None:
@@ -409,11 +394,10 @@ def kalibr_camera(tree: dict[str, Any]) -> Camera:
         raise ValueError(f"distortion_model must be one of {known}; found {name!r}")
     # Coefficients of eucm and ds stand before the focal lengths.
     *front, fx, fy, cx, cy = map(float, tree["intrinsics"])
-    behind = [] if name == "none" else tree["distortion_coeffs"]
-    width, height = tree["resolution"]
+    D = np.array([*front, *([] if name == "none" else tree["distortion_coeffs"])], np.float64)
     lens = _KALIBR_LENSES[name] if kind == "pinhole" else kind
-    D = np.array([*front, *behind], np.float64)
-    return Camera(int(width), int(height), pinhole_matrix(fx, fy, cx, cy), D, lens)
+    width, height = map(int, tree["resolution"])
+    return Camera(width, height, pinhole_matrix(fx, fy, cx, cy), D, lens)
 
 
 def kalibr_fields(camera: Camera) -> dict[str, Any]:

@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 _START = (
-    "import resource, runpy, sys; memory, seconds = map(int, sys.argv[1:3]); "
-    "resource.setrlimit(resource.RLIMIT_DATA, (memory, memory)); "
-    "resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds)); "
-    "resource.setrlimit(resource.RLIMIT_CORE, (0, 0)); "
+    "import resource as r, runpy, sys; memory, seconds = map(int, sys.argv[1:3]); "
+    "limits = {r.RLIMIT_DATA: memory, r.RLIMIT_CPU: seconds, r.RLIMIT_CORE: 0}; "
+    "[r.setrlimit(kind, (most, most)) for kind, most in limits.items()]; "
     "sys.argv = sys.argv[3:]; runpy.run_path(sys.argv[0], run_name='__main__')"
 )
 # Of a machine whose cores are busy: s for each second of work.
@@ -53,26 +52,23 @@ def run_limited(
     with TemporaryDirectory(prefix="rs_localizer-") as folder:
         given, out = Path(folder) / "task.json", Path(folder) / "out.npz"
         given.write_text(json.dumps(task), encoding="utf-8")
-        command = [sys.executable, "-c", _START, str(memory), str(seconds)]
+        words = map(str, (memory, seconds, script, given, out))
         try:
             done = subprocess.run(
-                [*command, str(script), str(given), str(out)], env=environment, check=False,
+                [sys.executable, "-c", _START, *words], env=environment, check=False,
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
                 timeout=_WAITING * seconds,
             )  # fmt: skip
         except subprocess.TimeoutExpired:
             raise LimitedError(f"it takes longer than {seconds} s") from None
-        if done.returncode or not out.is_file():
-            raise LimitedError(_death(done, memory, seconds))
-        with np.load(out) as arrays:  # never unpickled
-            return dict(arrays)
-
-
-def _death(done: "subprocess.CompletedProcess[bytes]", memory: int, seconds: int) -> str:
+        if done.returncode == 0 and out.is_file():
+            with np.load(out) as arrays:  # never unpickled
+                return dict(arrays)
     if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
-        return f"it takes longer than {seconds} s"
+        raise LimitedError(f"it takes longer than {seconds} s")
     lines = done.stderr.decode("utf-8", "replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "no word")
+    last = last[:_LONGEST_WORDS]
     if "MemoryError" in last or "alloc" in last or done.returncode == -signal.SIGABRT:
-        return f"it needs more than {memory / 1e6:.0f} MB, or is damaged: {last[:_LONGEST_WORDS]}"
-    return last[:_LONGEST_WORDS]
+        raise LimitedError(f"it needs more than {memory / 1e6:.0f} MB, or is damaged: {last}")
+    raise LimitedError(last)

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How cameras are mounted to each other, in Kalibr's camchain and COLMAP's ``rig_config.json``.
+"""How cameras are mounted to each other, in Kalibr's camchain.
 
 A camchain has a mapping for each camera, in their order. Its names are Kalibr's, ``cam0``, or any
 other; besides what Kalibr writes, each may have ``readout_time`` (s) and ``scan_direction``.
@@ -14,10 +14,10 @@ other; besides what Kalibr writes, each may have ``readout_time`` (s) and ``scan
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -32,7 +32,7 @@ from rs_localizer.io.calibration import (
     kalibr_camera,
     kalibr_fields,
 )
-from rs_localizer.io.transforms import Transform, TransformError, from_numbers, make_transform
+from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.io.yaml_text import load_yaml
 
 RIG_FRAME = "rig"
@@ -40,8 +40,6 @@ _CHAIN, _IMU, _SHIFT = "T_cn_cnm1", "T_cam_imu", "timeshift_cam_imu"
 _SHUTTER = ("readout_time", "scan_direction")
 # Entries of R R^T - I beyond this are no rounding of a file's digits.
 _ORTHONORMAL = 1e-3
-
-T = TypeVar("T")
 
 
 class RigParts(NamedTuple):
@@ -58,7 +56,8 @@ def read_camchain(path: Path | str) -> RigParts:
     Raises:
         CalibrationError: for anything else, saying what was found.
     """
-    return _load(Path(path), _camchain)
+    with calibration_faults(path := Path(path), "YAML or JSON", "no usable rig"):
+        return _camchain(load_yaml(path.read_text(encoding="utf-8")))
 
 
 def write_camchain(path: Path, parts: RigParts) -> None:
@@ -86,22 +85,6 @@ def write_camchain(path: Path, parts: RigParts) -> None:
             }
         tree[name], before = fields, name
     path.write_text(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None), "utf-8")
-
-
-def read_rig_config(path: Path | str) -> dict[str, tuple[Array, Array]]:
-    """Rotation (3,3) and translation (3,) camera_from_rig by name, of COLMAP's ``rig_config.json``.
-
-    The name is the last folder of ``image_prefix``; the rig's axes are those of ``ref_sensor``.
-
-    Raises:
-        CalibrationError: for anything else, or several rigs.
-    """
-    return _load(Path(path), _rig_config)
-
-
-def _load(path: Path, reader: Callable[[Any], T]) -> T:
-    with calibration_faults(path, "YAML or JSON", "no usable rig"):
-        return reader(load_yaml(path.read_text(encoding="utf-8")))
 
 
 def _camchain(tree: Any) -> RigParts:
@@ -149,34 +132,6 @@ def _rigid(name: str, values: Any) -> Array:
     if off > _ORTHONORMAL or np.linalg.det(rotation) < 0.0 or np.any(matrix[3] != (0, 0, 0, 1)):
         raise ValueError(f"{name} is no rigid transform: {matrix.tolist()}")
     return matrix
-
-
-def _rig_config(tree: Any) -> dict[str, tuple[Array, Array]]:
-    if not isinstance(tree, list) or len(tree) != 1:
-        count = f"{len(tree)} rigs" if isinstance(tree, list) else f"{type(tree).__name__}"
-        raise ValueError(f"expected a list of one rig with cameras, found {count}")
-    poses = dict(_sensors(tree[0]["cameras"]))
-    if len(poses) != len(tree[0]["cameras"]):
-        raise ValueError("two cameras have the same last folder of image_prefix")
-    return poses
-
-
-def _sensors(cameras: Any) -> Iterator[tuple[str, tuple[Array, Array]]]:
-    references = [bool(item.get("ref_sensor")) for item in cameras]
-    if sum(references) != 1:
-        raise ValueError(f"one camera must be the ref_sensor, found {sum(references)}")
-    for item, reference in zip(cameras, references, strict=True):
-        name = str(item["image_prefix"]).strip("/").split("/")[-1]
-        if reference:
-            yield name, (np.eye(3), np.zeros(3))
-            continue
-        w, x, y, z = map(float, item["cam_from_rig_rotation"])
-        tx, ty, tz = map(float, item["cam_from_rig_translation"])
-        try:
-            pose = from_numbers((tx, ty, tz), (x, y, z, w))
-        except TransformError as error:
-            raise ValueError(f"{name}: {error}") from error
-        yield name, (pose.rotation, pose.translation)
 
 
 def optical_frame(name: str) -> str:

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigs in files of other programs: signs and order by hand, and what is written comes back."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,6 @@ from rs_localizer.io.calibration import CalibrationError, read_calibration
 from rs_localizer.io.rigs import (
     RigParts,
     read_camchain,
-    read_rig_config,
     write_camchain,
 )
 
@@ -129,37 +126,18 @@ def test_a_written_camchain_comes_back(tmp_path):
         )
 
 
-def test_rig_config_of_colmap(tmp_path):
-    # COLMAP's quaternions begin with w: a quarter about y, as in its documentation.
-    half = 0.7071067811865476
-    second = {
-        "image_prefix": "rig1/camera2/",
-        "cam_from_rig_rotation": [half, 0.0, half, 0.0],
-        "cam_from_rig_translation": [0.1, 0.2, 0.3],
-    }
-    tree = [{"cameras": [{"image_prefix": "rig1/camera1/", "ref_sensor": True}, second]}]
-    (tmp_path / "rig_config.json").write_text(json.dumps(tree))
-    poses = read_rig_config(tmp_path / "rig_config.json")
-    np.testing.assert_array_equal(poses["camera1"][0], np.eye(3))
-    rotation, translation = poses["camera2"]
-    # By a quarter about y, z becomes x.
-    np.testing.assert_allclose(rotation @ [0, 0, 1], [1, 0, 0], atol=1e-12)
-    np.testing.assert_array_equal(translation, [0.1, 0.2, 0.3])
-
-
 @pytest.mark.parametrize(
-    ("text", "reader", "expected"),
+    ("text", "expected"),
     [
-        (CHAIN.replace("T_cn_cnm1", "T"), read_camchain, "no usable rig: cam1 has no 'T_cn_cnm1'"),
-        (CHAIN.replace("[0.0, 1.0, 0.0, 0.0]", "[0.0, -1.0, 0.0, 0.0]"), read_camchain,
+        (CHAIN.replace("T_cn_cnm1", "T"), "no usable rig: cam1 has no 'T_cn_cnm1'"),
+        (CHAIN.replace("[0.0, 1.0, 0.0, 0.0]", "[0.0, -1.0, 0.0, 0.0]"),
          "cam1: T_cn_cnm1 is no rigid transform"),
-        (CHAIN.replace("camera_model: ds", "camera_model: omni"), read_camchain,
+        (CHAIN.replace("camera_model: ds", "camera_model: omni"),
          "cam1: camera_model must be pinhole, eucm or ds, found 'omni'"),
-        ("[1, 2]", read_camchain, "a camchain has a mapping for each camera"),
-        ('[{"cameras": [{"image_prefix": "a/"}]}]', read_rig_config, "the ref_sensor, found 0"),
+        ("[1, 2]", "a camchain has a mapping for each camera"),
     ],
 )  # fmt: skip
-def test_faults_are_named(tmp_path, text, reader, expected):
+def test_faults_are_named(tmp_path, text, expected):
     (tmp_path / "rig").write_text(text)
     with pytest.raises(CalibrationError, match=expected):
-        reader(tmp_path / "rig")
+        read_camchain(tmp_path / "rig")

@@ -138,7 +138,7 @@ def test_one_of_several_cameras(tmp_path):
     ("text", "expected"),
     [
         ("a: [", r"camera.yaml is not a YAML, JSON or XML file"),
-        ("width: 3\nname: x", r"is not a calibration: .* found name, width"),
+        ("width: 3\nname: x", r"not a usable calibration: .* found name, width"),
         (ROS.replace("image_width", "breite"), r"not a usable calibration: no 'image_width'"),
         (ROS.replace("rational_polynomial", "fov"), r"distortion_model must be .* got 'fov'"),
         (VINS.replace("PINHOLE", "MEI").replace("fx", "gamma1"), "or JSON with K, D, width and"),
