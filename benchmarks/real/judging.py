@@ -41,8 +41,6 @@ _INSIDE, _MEDIAN = 12.592, 2.366
 _INSIDE_3 = 7.815  # likewise with three degrees of freedom
 # Printed boards: by this part of the way from its middle a corner is off (0.2 mm in 10 cm).
 _PAPER = 0.002
-# Images in one block of the bootstrap: neighbours show nearly the same.
-_BLOCK, _RESAMPLES = 10, 1000
 
 
 def judged(clip: Clip, lens: Camera, shutter: Shutter, config: NodeConfig) -> dict[str, float]:
@@ -100,8 +98,7 @@ def localized(name: str, camera: Camera, images: Sequence[Observed], config: Nod
 
 def _jitter(clip: Clip, poses: Poses, others: Poses) -> dict[str, float]:
     """Second differences of a method over those of another, on the images that both localize."""
-    turns: list[tuple[float, float]] = []
-    moves: list[tuple[float, float]] = []
+    pairs = []
     stamps = np.array([image.stamp_ns for image in clip.images]) * 1e-9
     for k in range(1, len(poses) - 1):
         triples = [[one for one in of[k - 1 : k + 2] if one] for of in (poses, others)]
@@ -109,19 +106,11 @@ def _jitter(clip: Clip, poses: Poses, others: Poses) -> dict[str, float]:
             stamps[k + 1] - stamps[k - 1] > 3.0 * clip.interval
         ):
             continue
-        first, second = (_second_difference(triple) for triple in triples)
-        turns.append((first[0], second[0]))
-        moves.append((first[1], second[1]))
-    found = {}
-    for name, pairs in (("turn", turns), ("move", moves)):
-        values = np.array(pairs or [(math.nan, math.nan)])
-        drawn = [values[chosen] for chosen in _resampled(np.arange(len(values)))]
-        for part in (50, 95):
-            own, other = np.percentile(values, part, axis=0)
-            found[f"{name}{part}"] = float(own / other)
-            ratios = np.divide(*np.array([np.percentile(v, part, axis=0) for v in drawn]).T)
-            low, high = np.percentile(ratios, [2.5, 97.5])
-            found |= {f"{name}{part}_low": float(low), f"{name}{part}_high": float(high)}
+        pairs.append([_second_difference(triple) for triple in triples])
+    found: dict[str, float] = {}
+    for part in (50, 95):
+        own, other = np.percentile(pairs or np.full((1, 2, 2), np.nan), part, axis=0)
+        found |= {f"turn{part}": float(own[0] / other[0]), f"move{part}": float(own[1] / other[1])}
     return found
 
 
@@ -184,9 +173,8 @@ def _halves(camera: Camera, images: Sequence[Observed], config: NodeConfig) -> d
     row["random_turn_claimed"] = halves.get("turn_claimed", math.nan)
     errors = {name: _errors(by, fits[name], parts[1]) for name, by in cameras.items()}
     for name in ("single", "tracked", "reversed"):
-        low, middle, high = _ratio(errors[name], errors[PEER])
-        row |= {f"{name}_held": middle, f"{name}_held_low": low, f"{name}_held_high": high}
-    row["tracked_over_single"] = _ratio(errors["tracked"], errors["single"])[1]
+        row[f"{name}_held"] = _ratio(errors[name], errors[PEER])
+    row["tracked_over_single"] = _ratio(errors["tracked"], errors["single"])
     row["held_px"] = float(np.sqrt(np.nanmean(errors[PEER])))
     return row
 
@@ -233,11 +221,11 @@ def _shutter_gain(clip: Clip) -> dict[str, float]:
         counts = np.bincount(unseen.frames, minlength=len(parts[1]))
         sums = np.bincount(unseen.frames, squared, len(parts[1]))
         errors.append(np.where(counts > 0, sums / np.maximum(counts, 1), np.nan))
-    row = {"found_ms": 1e3 * found.readout_time}
-    for name, own in (("motion", errors[0]), ("backward", errors[2])):
-        low, middle, high = _ratio(own, errors[1])
-        row |= {f"{name}_held": middle, f"{name}_held_low": low, f"{name}_held_high": high}
-    return row
+    return {
+        "found_ms": 1e3 * found.readout_time,
+        "motion_held": _ratio(errors[0], errors[1]),
+        "backward_held": _ratio(errors[2], errors[1]),
+    }
 
 
 def _agreement(ones: Poses, others: Poses, *, shared: bool) -> dict[str, float]:
@@ -300,19 +288,9 @@ def _errors(camera: Camera, poses: Poses, held_out: Sequence[Observed]) -> Array
     return errors
 
 
-def _ratio(errors: Array, others: Array) -> tuple[float, float, float]:
-    """Of the root mean squares on common images: 2.5 %, value, 97.5 %, by a bootstrap of blocks."""
-    common = np.flatnonzero(np.isfinite(errors) & np.isfinite(others))
-    if len(common) == 0:
-        return math.nan, math.nan, math.nan
-    own, other = errors[common], others[common]
-    drawn = [np.sqrt(errors[k].sum() / others[k].sum()) for k in _resampled(common)]
-    low, high = np.percentile(drawn, [2.5, 97.5])
-    return float(low), float(np.sqrt(own.sum() / other.sum())), float(high)
-
-
-def _resampled(frames: IntArray) -> list[IntArray]:
-    """Frames of a bootstrap: blocks of them, drawn with replacement."""
-    blocks = np.array_split(frames, max(len(frames) // _BLOCK, 1))
-    picks = np.random.default_rng(0).integers(len(blocks), size=(_RESAMPLES, len(blocks)))
-    return [np.concatenate([blocks[k] for k in pick]) for pick in picks]
+def _ratio(errors: Array, others: Array) -> float:
+    """Of the root mean squares on common images."""
+    common = np.isfinite(errors) & np.isfinite(others)
+    if not common.any():
+        return math.nan
+    return float(np.sqrt(errors[common].sum() / others[common].sum()))

@@ -1,0 +1,358 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How good refined maps and surveyed markers are, on simulated rooms whose truth is known:
+
+python -m benchmarks.mapping bend regions surveys coverage
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks.independent import cameras
+from benchmarks.independent.rotations import Array, exponential
+from rs_localizer.cli.options import integer
+from rs_localizer.core.camera import Camera
+from rs_localizer.markers.families import family
+from rs_localizer.tools.adjust.problem import LIMIT
+from rs_localizer.tools.mapping.gauge import through
+from rs_localizer.tools.mapping.observations import MapObservations, Start
+from rs_localizer.tools.mapping.refine import MapFreedom, refine
+from rs_localizer.tools.mapping.survey import Survey, survey
+from rs_localizer.tools.mapping.unknown_markers import Spotted, every_marker
+
+_HALF = 2.5  # m, of the room
+_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+_STEEPEST = 0.35  # cosine of the angle at which markers are still seen
+_LEAST_SIDE = 12.0  # px
+_NOISE, _MARKER_NOISE, _OFF = 0.3, 0.1, 0.02  # px, px, m
+_READOUT = 0.03
+_UNIT = 1.7  # m
+_FAMILY = "4x4_50"
+_START_NS = 10**12
+
+Pose = tuple[Array, Array]
+"""map_from_marker (3,3), (3,)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walk:
+    """A hand-held camera that goes round in the middle of the room and looks outward."""
+
+    phases: Array  # (12,)
+    turning: float  # rad/s
+    wide: float = 1.2  # m
+
+    def poses(self, times: Array) -> tuple[Array, Array]:
+        """map_from_camera (n,3,3), (n,3) at times (n,), s; y of the map points down."""
+        t, p = np.asarray(times, float), self.phases
+        place = np.column_stack([
+            self.wide * np.cos(0.4 * t + p[0]) + 0.03 * np.sin(5.0 * t + p[1]),
+            0.2 * np.sin(0.6 * t + p[2]) + 0.02 * np.sin(7.0 * t + p[3]),
+            self.wide * np.sin(0.5 * t + p[4]) + 0.03 * np.sin(6.0 * t + p[5]),
+        ])  # fmt: skip
+        about = np.zeros((3, len(t), 3))
+        about[0, :, 1] = self.turning * t + 0.06 * np.sin(5.0 * t + p[6])
+        about[1, :, 0] = 0.25 * np.sin(0.7 * t + p[7]) + 0.05 * np.sin(8.0 * t + p[8])
+        about[2, :, 2] = 0.1 * np.sin(0.9 * t + p[9]) + 0.04 * np.sin(6.0 * t + p[10])
+        turn = exponential(about[0]) @ exponential(about[1]) @ exponential(about[2])
+        return turn, place
+
+
+def _walk(rng: np.random.Generator, turning: float, wide: float = 1.2) -> Walk:
+    return Walk(rng.uniform(0.0, 2.0 * np.pi, 12), turning, wide)
+
+
+def _believed(camera: cameras.Camera, readout_time: float) -> Camera:
+    return Camera(
+        width=camera.width, height=camera.height, K=camera.matrix, D=np.array(camera.distortion),
+        readout_time=readout_time, scan_direction=camera.scan,
+    )  # fmt: skip
+
+
+def _walls(rng: np.random.Generator, count: int) -> Array:
+    """Points (count,3) on the six sides of the room."""
+    points = rng.uniform(-_HALF, _HALF, (count, 3))
+    points[np.arange(count), rng.integers(0, 3, count)] = _HALF * rng.choice([-1.0, 1.0], count)
+    return points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Film:
+    """Images of a walk."""
+
+    camera: cameras.Camera
+    walk: Walk
+    stamps: Array  # (g,) s, of the first rows
+
+    def see(self, points: Array, rng: np.random.Generator, most: int) -> MapObservations:
+        """Keypoints of points (p,3), so many of an image at most."""
+        images, landmarks, pixels = [], [], []
+        for g, shown in enumerate(self._shown(points)):
+            found = rng.permutation(np.flatnonzero(np.isfinite(shown[:, 0])))[:most]
+            images.append(np.full(len(found), g))
+            landmarks.append(found)
+            pixels.append(shown[found] + rng.normal(0.0, _NOISE, (len(found), 2)))
+        return MapObservations(
+            _START_NS + np.round(1e9 * self.stamps).astype(np.int64),
+            np.concatenate(images),
+            np.concatenate(landmarks),
+            np.concatenate(pixels),
+        )
+
+    def near(self, points: Array, rng: np.random.Generator) -> Start:
+        """A first guess that is off the truth."""
+        rotations, places = self.walk.poses(self.stamps + 0.5 * self.camera.readout_time)
+        return Start(
+            points + rng.normal(0.0, _OFF, points.shape),
+            rotations @ exponential(rng.normal(0.0, 0.25 * _OFF, (len(rotations), 3))),
+            places + rng.normal(0.0, _OFF, places.shape),
+        )
+
+    def spot(self, poses: list[Pose], size: float, rng: np.random.Generator) -> list[Spotted]:
+        """The markers that images show whole, large and not too slanted."""
+        corners = np.concatenate([size * _SQUARE @ turn.T + place for turn, place in poses])
+        normals = np.array([turn[:, 2] for turn, _ in poses])
+        middles = np.array([place for _, place in poses])
+        spotted = []
+        for stamp, pixels in zip(self.stamps.tolist(), self._shown(corners), strict=True):
+            quads = pixels.reshape(-1, 4, 2)
+            toward = self.walk.poses(np.array([stamp]))[1][0] - middles
+            slant = np.einsum("ni,ni->n", toward, normals) / np.linalg.norm(toward, axis=1)
+            side = np.linalg.norm(np.roll(quads, 1, axis=1) - quads, axis=2).min(axis=1)
+            with np.errstate(invalid="ignore"):
+                seen = np.flatnonzero((slant > _STEEPEST) & (side > _LEAST_SIDE))
+            found = quads[seen] + rng.normal(0.0, _MARKER_NOISE, (len(seen), 4, 2))
+            spotted.append(Spotted(_START_NS + round(1e9 * stamp), seen, found))
+        return spotted
+
+    def _shown(self, points: Array) -> Iterator[Array]:
+        """Pixels (p,2) of points in each image; NaN for those that it does not show."""
+        size = np.array([self.camera.width, self.camera.height]) - 1.0
+        for stamp in self.stamps.tolist():
+            rotation, place = self.walk.poses(np.array([stamp]))
+            local = (points - place) @ rotation[0]
+            # What lies far outside is folded back by the lens's polynomial.
+            ahead = np.flatnonzero(np.abs(local[:, :2]).max(axis=1) < local[:, 2])
+
+            def local_at(delay: Array, stamp: float = stamp, those: Array = points[ahead]) -> Array:
+                rotations, places = self.walk.poses(stamp + delay)
+                return np.asarray(np.einsum("nji,nj->ni", rotations, those - places))
+
+            pixels = self.camera.project_rolling(local_at, (len(ahead),))
+            with np.errstate(invalid="ignore"):
+                inside = np.all((pixels > 1.0) & (pixels < size - 1.0), axis=1)
+            shown = np.full((len(points), 2), np.nan)
+            shown[ahead[inside]] = pixels[inside]
+            yield shown
+
+
+def _room(rng: np.random.Generator, turning: float) -> tuple[Array, MapObservations, Start]:
+    """Landmarks of a room, what 180 images show of them, and a first guess."""
+    walk, points = _walk(rng, turning), _walls(rng, 1500)
+    film = Film(cameras.Camera(), walk, np.arange(0.0, 12.0, 1.0 / 15.0))
+    return points, film.see(points, rng, 80), film.near(points, rng)
+
+
+def bend(seed: int) -> Iterator[str]:
+    """Errors of one map: as given, and adjusted with each shutter."""
+    points, seen, start = _room(np.random.default_rng(seed), 0.6)
+
+    def errors(own: Array) -> str:
+        """Of landmarks, but for the whole's place and size."""
+        off = through(own[of], points[of])(own[of]) - points[of]
+        return "{:8.2f} {:8.2f}".format(
+            *1e3 * np.percentile(np.linalg.norm(off, axis=1), [50.0, 95.0])
+        )
+
+    yield "shutter of the adjustment    landmarks  median    95 % (mm)  noise (px)  readout (ms)"
+    for name, readout, free, offset in (
+        ("global", 0.0, False, 0.5 * _READOUT),
+        ("rolling, given", _READOUT, False, 0.0),
+        ("rolling, found from 20 ms", 0.02, True, 0.0),
+    ):
+        camera, freedom = _believed(cameras.Camera(), readout), MapFreedom(readout_time=free)
+        found = refine(camera, seen, start, freedom, stamp_offset=offset)
+        of = found.refined & (found.sights >= 6)
+        if not readout:
+            yield f"{'as given':28} {np.count_nonzero(of):9} {errors(start.points)}"
+        spread = "" if not free else f" +- {1e3 * found.readout_time_deviation:.3f}"
+        yield (
+            f"{name:28} {np.count_nonzero(of):9} {errors(found.points)} "
+            f"{found.after:10.3f}  {1e3 * found.readout_time:.3f}{spread}"
+        )
+
+
+def regions(seed: int, walks: int = 8) -> Iterator[str]:
+    """Landmarks of walks, in units of their own, by the deviations that are told of them."""
+    every = []
+    for k in range(walks):
+        points, seen, start = _room(np.random.default_rng([seed, k]), 0.5)
+        start = replace(start, points=start.points / _UNIT, positions=start.positions / _UNIT)
+        found = refine(_believed(cameras.Camera(), _READOUT), seen, start)
+        own, true = found.points[found.refined], points[found.refined]
+        variances = np.einsum("nii->ni", found.covariances[found.refined])
+        every.append(np.abs(own - through(true, own)(true)) / np.sqrt(variances))
+        yield f"walk {k}: inside 68, 95, 99.7 %: {_inside(every[-1:])}"
+    yield f"coordinates of landmarks inside 68, 95, 99.7 %: {_inside(every)}"
+
+
+def _inside(normalised: Sequence[Array]) -> str:
+    every = np.abs(np.concatenate([np.ravel(one) for one in normalised]))
+    return " ".join(f"{100.0 * np.mean(every < k):5.1f}" for k in (1.0, 1.96, 3.0))
+
+
+def ring(rng: np.random.Generator, count: int) -> list[Pose]:
+    """Markers all around the room, hung by hand."""
+    poses = []
+    for k in range(count):
+        angle = 2.0 * np.pi * (k + rng.uniform(-0.2, 0.2)) / count
+        outward = np.array([np.sin(angle), 0.0, np.cos(angle)])
+        place = 2.2 * outward + [0.0, rng.uniform(-0.4, 0.4), 0.0]
+        up = np.array([0.0, -1.0, 0.0])
+        turn = np.column_stack([np.cross(up, -outward), up, -outward])
+        poses.append((turn @ exponential(rng.normal(0.0, 0.15, (1, 3)))[0], place))
+    return poses
+
+
+def grid(columns: int, rows: int, pitch: float) -> list[Pose]:
+    """A printed wall before the camera's place at rest."""
+    x, y = np.arange(columns) - 0.5 * (columns - 1), np.arange(rows) - 0.5 * (rows - 1)
+    facing = np.diag([1.0, -1.0, -1.0])
+    return [(facing, np.array([pitch * u, pitch * v, 1.0])) for v in y for u in x]
+
+
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    name: str
+    walls: bool = False
+    seconds: float = 30.0
+    rate: float = 30.0  # Hz
+
+
+_SCENES = (
+    _Scene("printed wall 3x2 of 0.06 m, VGA", walls=True),
+    _Scene("12 of 0.15 m around a room, VGA"),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Errors:
+    """Of all markers of one survey: in the frame of the first one, and of the shape."""
+
+    off: tuple[Array, Array]  # (m,6) m and rad
+    normalised: tuple[Array, Array]  # (m,6) each coordinate by its own deviation
+    squared: float  # mean squared error by the own covariance
+    squared_by_bound: float
+
+
+def surveys(seed: int, trials: int = 3) -> Iterator[str]:
+    """Errors of the markers and what they are told to be, where corners have white noise."""
+    yield (
+        f"{'scene':36} first marker: mm, deg   shape: mm, deg   inside 68, 95, 99.7 %: frame; "
+        "shape   by own covariance, by the bound"
+    )
+    for scene in _SCENES:
+        found = [_survey(scene, [seed, trial]) for trial in range(trials)]
+        cells = []
+        for k in range(2):
+            off = np.concatenate([one.off[k] for one in found])
+            place, turn = (np.median(np.linalg.norm(x, axis=1)) for x in np.split(off, 2, axis=1))
+            cells.append(f"{1e3 * place:8.2f} {np.degrees(turn):7.3f}")
+        inside = "; ".join(_inside([one.normalised[k] for one in found]) for k in range(2))
+        own = np.sqrt(np.mean([one.squared for one in found]))
+        bound = np.sqrt(np.mean([one.squared_by_bound for one in found]))
+        yield f"{scene.name:36} {cells[0]}    {cells[1]}    {inside}   {own:.2f} {bound:.2f}"
+
+
+def coverage(seed: int, trials: int = 40) -> Iterator[str]:
+    """How many of the truths lie inside the regions of many rooms, the readout time given and found
+    by turns.
+    """
+    scene = _Scene("12 of 0.15 m around a room", seconds=12.0, rate=15.0)
+    found: list[_Errors] = []
+    yield "rooms  coordinates inside 68, 95, 99.7 %: frame    shape    by own deviations, each room"
+    for trial in range(trials):
+        found.append(_survey(scene, [seed, 1000 + trial], known=trial % 2 == 0))
+        inside = "    ".join(_inside([one.normalised[k] for one in found]) for k in range(2))
+        squared = np.array([error.squared for error in found])
+        every, last = np.sqrt(np.mean(squared)), np.sqrt(squared[-1])
+        yield f"{len(found):5}  {inside}    {every:.2f} ({last:.2f})"
+
+
+def _survey(scene: _Scene, seeds: list[int], known: bool = True) -> _Errors:
+    rng = np.random.default_rng(seeds)
+    walk = _walk(rng, 0.0, 0.15) if scene.walls else _walk(rng, 0.6, 0.5)
+    poses = grid(3, 2, 0.08) if scene.walls else ring(rng, 12)
+    size = 0.06 if scene.walls else 0.15
+    true_camera = cameras.Camera()
+    film = Film(true_camera, walk, np.arange(0.0, scene.seconds, 1.0 / scene.rate))
+    camera = _believed(true_camera, true_camera.readout_time if known else 0.0)
+    found = survey(camera, film.spot(poses, size, rng), every_marker([family(_FAMILY)], size, {}))
+    turn, origin = poses[found.markers[0].id]
+    true = [(turn.T @ poses[m.id][0], turn.T @ (poses[m.id][1] - origin)) for m in found.markers]
+    off = _off(found, true, np.eye(3), np.zeros(3))
+    squares = np.concatenate([size * _SQUARE @ axes.T + place for axes, place in true])
+    ours = np.concatenate([marker.corners for marker in found.markers])
+    back = Rotation.align_vectors(squares - squares.mean(axis=0), ours - ours.mean(axis=0))[0]
+    over = back.as_matrix()
+    shape = _off(found, true, over, squares.mean(axis=0) - over @ ours.mean(axis=0))
+    own = off[1:].ravel()
+    squared = float(own @ np.linalg.solve(found.covariance[6:, 6:], own)) / len(own)
+    return _Errors(
+        (off[1:], shape),
+        (off[1:] / found.deviations[1:], shape / found.deviations_of_shape),
+        squared,
+        squared * _by_bound(found),
+    )
+
+
+def _by_bound(found: Survey) -> float:
+    """The survey's covariance by that of the bound: the inverse of the normal matrix at the true
+    noise, all weights one.
+    """
+    fit = found.fit
+    squared, limit = fit.squared_errors[fit.inliers], (LIMIT * fit.deviation) ** 2
+    weight = float(np.mean((1.0 - squared / limit) ** 2))
+    return fit.inflation * fit.deviation**2 / (weight * _MARKER_NOISE**2)
+
+
+def _off(found: Survey, true: list[Pose], turn: Array, shift: Array) -> Array:
+    """Errors (m,6) of places and turns after a motion of the whole."""
+    return np.array([
+        np.concatenate([
+            turn @ marker.pose.position + shift - place,
+            Rotation.from_matrix(turn @ marker.pose.rotation @ axes.T).as_rotvec(),
+        ])
+        for marker, (axes, place) in zip(found.markers, true, strict=True)
+    ])  # fmt: skip
+
+
+_PARTS: dict[str, Callable[[int], Iterator[str]]] = {
+    "bend": bend, "regions": regions, "surveys": surveys, "coverage": coverage
+}  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.mapping",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("names", nargs="+", metavar="PART", choices=_PARTS, help=", ".join(_PARTS))
+    parser.add_argument("--seed", type=integer(0), default=0, metavar="N")
+    options = parser.parse_args()
+    for name in options.names:
+        for text in _PARTS[name](options.seed):
+            print(text, flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
