@@ -2,11 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Points that are left out: mismatches, or witnesses against the motion."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import rs_localizer as rsl
-from benchmarks.gross import frame
+from benchmarks.gross import deviations, frame
 
 
 def results(scene, fault, count=6):
@@ -32,6 +35,28 @@ def test_right_calibrations_lose_no_frame(scene):
 def test_what_has_two_poses_has_none(scene, fault):
     found = [result for result in results(scene, fault) if result]
     assert found == []
+
+
+@pytest.mark.parametrize(
+    ("scene", "off", "length"),
+    [
+        ("volume", 1.25, "0.8"),
+        ("volume", 0.9, "1.1"),
+        ("volume", 1.1, "0.92"),
+        ("corner", 0.8, "1.[23]"),
+    ],
+)
+def test_the_focal_length_that_would_fit_is_named(scene, off, length):
+    """Two thirds of the points fit a motion, the others lie some pixels beyond it."""
+    random, details = np.random.default_rng(4), []
+    for _ in range(100):
+        camera, points, pixels, rotation = frame(scene, "right", random)
+        told = replace(camera, K=camera.K * [[off, 1.0, 1.0], [1.0, off, 1.0], [1.0, 1.0, 1.0]])
+        result = rsl.Localizer(told).localize(points, pixels)
+        assert not result or deviations(result, rotation) < 5.0
+        details.append("" if result else result.detail)
+    named = re.compile(rf"more with a focal length of {length}\d* times K's: is K of another image")
+    assert any(named.search(detail) for detail in details)
 
 
 def test_a_moved_corner_is_a_notice():
