@@ -144,8 +144,6 @@ def tell_telemetry(
         used = build(shutter_values(args)).readout_time if used is None else used
         if abs(used / telemetry.readout_time - 1.0) > _SAME:
             said[-1] += f" (not used: {1e3 * used:.2f} ms was {how})"
-    if telemetry.exposure is not None:
-        said.append(f"exposure {1e3 * telemetry.exposure:.2f} ms (median)")
     if telemetry.lens:
         said.append(telemetry.lens)
         if (profile := telemetry.profile) is not None:

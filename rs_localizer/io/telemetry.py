@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gyroscope, accelerometer, exposure, readout time and lens inside videos, by telemetry-parser.
+"""Gyroscope, accelerometer, readout time and lens inside videos, by telemetry-parser.
 
 GoPro, DJI, Insta360, Sony, Canon and others write them; the library (extra ``video``) knows their
 formats and turns all to one orientation. Its axes in those of the camera are gyroflow's
@@ -46,7 +46,6 @@ _STABILIZED, _STABILIZER = "0x45495345", "0x45495341"  # GoPro: EISE, whether, a
 _OFF = ("", "N", "N/A", "OFF")
 _MEI = "insta360"
 _ANGLES = 200  # of a lens, to fit another model to: more change nothing
-_FIELD, _DIAGONAL = "0x56464f56", "0x5a464f56"  # GoPro: VFOV, its letter, and ZFOV, degrees
 
 
 class TelemetryError(ValueError):
@@ -62,9 +61,8 @@ class Telemetry:
     rates: Array  # (n,3) rad/s, optical axes of the camera
     forces: Array  # (n,3) m/s^2, specific force in these axes; NaN where it is not measured
     readout_time: float | None  # s
-    exposure: float | None  # s, median
     stabilizer: str = ""  # what has changed the images; empty: nothing that is known
-    lens: str = ""  # its setting
+    lens: str = ""  # what its profile says
     profile: Camera | None = None  # its lens, where the maker's profile is of a model of ours
 
     @property
@@ -75,10 +73,9 @@ class Telemetry:
 
 def has_telemetry(path: Path) -> bool:
     """Whether a file looks as if it had any, without reading it."""
-    size = path.stat().st_size
     with path.open("rb") as file:
         looked_at = file.read(_LOOKED_AT)
-        file.seek(max(0, size - _LOOKED_AT))
+        file.seek(max(0, path.stat().st_size - _LOOKED_AT))
         looked_at += file.read(_LOOKED_AT) + _tracks(file)
     return any(mark in looked_at for mark in _MARKS)
 
@@ -135,16 +132,14 @@ def interpreted(found: dict[str, Any]) -> Telemetry | None:
     stabilizer = str(values.get(_STABILIZER, "")).strip()
     if values.get(_STABILIZED) == "N" or stabilizer.upper() in _OFF:
         stabilizer = "electronic stabilization" if values.get(_STABILIZED) == "Y" else ""
-    exposures = found["exposures"][found["exposures"] > 0.0]
     return Telemetry(
         said["name"],
         times,
         rates,
         _spread(found["accelerometer"][:, 1:], times) @ CAMERA_FROM_SENSOR.T,
         1e-3 * readout if 0.0 < readout < _LONGEST_READOUT else None,
-        float(np.median(exposures)) if len(exposures) else None,
         stabilizer,
-        _lens(values, profile),
+        _lens(profile),
         _profile(profile),
     )
 
@@ -187,21 +182,14 @@ def _number(value: Any) -> float:
         return np.nan
 
 
-def _lens(values: dict[str, Any], profile: dict[str, Any]) -> str:
-    """A profile, or the setting of a GoPro's lens: each needs a calibration of its own."""
+def _lens(profile: dict[str, Any]) -> str:
+    """What a lens profile says; each needs a calibration of its own."""
     fisheye = profile.get("fisheye_params")
-    if isinstance(fisheye, dict) and "camera_matrix" in fisheye:
-        model = profile.get("distortion_model") or "opencv_fisheye"
-        fx = _number(next(iter(np.ravel(np.array(fisheye["camera_matrix"], object))), None))
-        return (
-            f"lens profile by {profile.get('calibrated_by') or 'its maker'} ({model}, {fx:.0f} px)"
-        )
-    if values.get(_FIELD) is None:
+    if not isinstance(fisheye, dict) or "camera_matrix" not in fisheye:
         return ""
-    degrees = _number(values.get(_DIAGONAL))
-    return f"field of view {values[_FIELD]}" + (
-        "" if np.isnan(degrees) else f" ({degrees:.0f} deg)"
-    )
+    model = profile.get("distortion_model") or "opencv_fisheye"
+    fx = _number(next(iter(np.ravel(np.array(fisheye["camera_matrix"], object))), None))
+    return f"lens profile by {profile.get('calibrated_by') or 'its maker'} ({model}, {fx:.0f} px)"
 
 
 def _profile(profile: dict[str, Any]) -> Camera | None:
@@ -209,12 +197,10 @@ def _profile(profile: dict[str, Any]) -> Camera | None:
     try:
         if profile.get("distortion_model") == _MEI:
             size, lens = profile["calib_dimension"], profile["fisheye_params"]
-            K, D = (
-                np.array(lens["camera_matrix"], float),
-                np.array(lens["distortion_coeffs"], float),
-            )
-            K, D = _equidistant(K, D, 0.5 * min(size["w"], size["h"]))
-            lens = {"camera_matrix": K.tolist(), "distortion_coeffs": D.tolist()}
+            names = ("camera_matrix", "distortion_coeffs")
+            K, D = (np.array(lens[name], float) for name in names)
+            fitted = _equidistant(K, D, 0.5 * min(size["w"], size["h"]))
+            lens = {name: part.tolist() for name, part in zip(names, fitted, strict=True)}
             profile = profile | {"fisheye_params": lens, "distortion_model": "opencv_fisheye"}
         return gyroflow_camera(profile)
     except (KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError):
@@ -227,12 +213,7 @@ def _equidistant(K: Array, D: Array, radius: float) -> tuple[Array, Array]:
     Mei and Rives, "Single view point omnidirectional camera calibration from planar grids" (ICRA
     2007): a bearing on the unit sphere, seen from ``xi`` behind its centre, then a polynomial. The
     two differ by some hundredths of a pixel; what decentres (p1, p2) is left out, a pixel at the
-    rim where they are 1e-4.
-
-    Args:
-        K: (3,3) camera matrix.
-        D: k1, k2, k3, p1, p2, xi.
-        radius: of the circle, px.
+    rim where they are 1e-4. ``D``: k1, k2, k3, p1, p2, xi; ``radius`` of the circle, px.
     """
     k1, k2, k3, _, _, xi = D
     angles = np.linspace(0.0, np.pi, _ANGLES, endpoint=False)[1:]

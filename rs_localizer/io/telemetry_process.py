@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-_EXPOSURE, _TURNS, _LENS = "Exposure", "Quaternion", "Lens"
+_TURNS, _LENS = "Quaternion", "Lens"
 
 
 def extract(parser: Any) -> dict[str, Any]:
@@ -21,28 +21,24 @@ def extract(parser: Any) -> dict[str, Any]:
 
     Returns:
         ``gyroscope`` and ``accelerometer`` (n,4) ms and three numbers, ``turns`` (k,5) ms and
-        x y z w, ``exposures`` (m,) s, and ``said``, JSON of the camera's ``name``, of ``values`` by
-        their names and of the lens ``profile``.
+        x y z w, and ``said``, JSON of the camera's ``name``, of ``values`` by their names and of
+        the lens ``profile``.
     """
     samples, tags = parser.normalized_imu(), parser.telemetry(False)
     groups = [group for group in tags if isinstance(group, dict)]
-    found: dict[str, Any] = {
-        "gyroscope": _readings(samples, "gyro"), "accelerometer": _readings(samples, "accl"),
-        "turns": np.zeros((0, 5)), "exposures": np.zeros(0),
-    }  # fmt: skip
     rows = [row for group in groups for row in _data(group, _TURNS, list)]
-    if rows:
-        found["turns"] = np.array(
-            [[row["t"], *(row["v"][axis] for axis in "xyzw")] for row in rows]
-        )
-    exposures = [np.ravel(_data(group, _EXPOSURE, list)).tolist() for group in groups]
-    found["exposures"] = np.array([x for some in exposures for x in some if isinstance(x, float)])
+    turns = [[row["t"], *(row["v"][axis] for axis in "xyzw")] for row in rows]
     said = {
         "name": " ".join(dict.fromkeys(f"{parser.camera} {parser.model or ''}".split())),
         "values": _values(groups),
         "profile": next((lens for group in groups if (lens := _data(group, _LENS, dict))), {}),
     }
-    return found | {"said": json.dumps(said, default=str)}
+    return {
+        "gyroscope": _readings(samples, "gyro"),
+        "accelerometer": _readings(samples, "accl"),
+        "turns": np.array(turns, float).reshape(-1, 5),
+        "said": json.dumps(said, default=str),
+    }
 
 
 def _data(group: dict[str, Any], name: str, kind: type) -> Any:
