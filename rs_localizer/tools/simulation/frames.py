@@ -63,15 +63,11 @@ def frame_stamps(motion: TrueMotion, camera: Camera, rate: float) -> list[int]:
     The camera runs on through the gaps of a recorded motion, but what it saw there is unknown:
     these frames are left out.
     """
-    intervals = motion.intervals_ns
-    readout_ns = round(camera.readout_time * 1e9)
+    intervals, readout_ns = motion.intervals_ns, round(camera.readout_time * 1e9)
     start, end = intervals[0][0], intervals[-1][1]
     stamps = [start + round(k * 1e9 / rate) for k in range(int((end - start) * 1e-9 * rate) + 1)]
-    return [
-        stamp
-        for stamp in stamps
-        if any(first <= stamp and stamp + readout_ns <= last for first, last in intervals)
-    ]
+    seen = [(first, last - readout_ns) for first, last in intervals]
+    return [stamp for stamp in stamps if any(first <= stamp <= last for first, last in seen)]
 
 
 def middle_stamp(camera: Camera, stamp_ns: int) -> int:
@@ -113,38 +109,23 @@ def simulate_frames(
     if stamps_ns is None:
         stamps_ns = frame_stamps(motion, camera, settings.rate)
     for index, stamp_ns in enumerate(stamps_ns):
-        rng = np.random.default_rng([seed, index])
-        yield _frame(camera, motion, map_points, settings, stamp_ns, rng)
-
-
-def _frame(
-    camera: Camera,
-    motion: TrueMotion,
-    map_points: Array,
-    settings: FrameSettings,
-    stamp_ns: int,
-    rng: np.random.Generator,
-) -> SimulatedFrame:
-    middle_ns = middle_stamp(camera, stamp_ns)
-    now = np.zeros(1)
-    middle_row = motion.state(middle_ns, now)
-    ids, pixels = _visible(camera, motion, middle_ns, map_points, settings, rng)
-    inliers = np.ones(len(ids), dtype=bool)
-    inliers[: round(settings.outliers * len(ids))] = False
-    inliers = rng.permutation(inliers)
-    pixels = pixels + rng.normal(0.0, settings.noise, size=pixels.shape)
-    uniform = rng.uniform(-0.5, np.array(camera.size) - 0.5, size=pixels.shape)
-    return SimulatedFrame(
-        stamp_ns=stamp_ns,
-        middle_ns=middle_ns,
-        ids=ids,
-        points=map_points[ids],
-        pixels=np.where(inliers[:, None], pixels, uniform),
-        inliers=inliers,
-        first_row=motion.state(stamp_ns, now),
-        middle_row=middle_row,
-        readout_time=camera.readout_time,
-    )
+        rng, now = np.random.default_rng([seed, index]), np.zeros(1)
+        middle_ns = middle_stamp(camera, stamp_ns)
+        ids, pixels = _visible(camera, motion, middle_ns, map_points, settings, rng)
+        inliers = rng.permutation(np.arange(len(ids)) >= round(settings.outliers * len(ids)))
+        pixels = pixels + rng.normal(0.0, settings.noise, size=pixels.shape)
+        uniform = rng.uniform(-0.5, np.array(camera.size) - 0.5, size=pixels.shape)
+        yield SimulatedFrame(
+            stamp_ns=stamp_ns,
+            middle_ns=middle_ns,
+            ids=ids,
+            points=map_points[ids],
+            pixels=np.where(inliers[:, None], pixels, uniform),
+            inliers=inliers,
+            first_row=motion.state(stamp_ns, now),
+            middle_row=motion.state(middle_ns, now),
+            readout_time=camera.readout_time,
+        )
 
 
 def _visible(

@@ -31,10 +31,9 @@ from rs_localizer.tools.simulation.walls import TexturedPlane
 def pyramids(planes: Sequence[TexturedPlane]) -> tuple[Image, NDArray[np.int64]]:
     """The pictures of several planes with all their reductions, for the kernel.
 
-    Returns:
-        texels (n,) and levels (planes, levels, 3): ``levels[p, l]`` is where level ``l`` of picture
-        ``p`` begins, its width and height; each level averages two by two texels of the one before.
-        Pictures with fewer levels repeat their last.
+    Returns texels (n,) and levels (planes, levels, 3): ``levels[p, l]`` is where level ``l`` of
+    picture ``p`` begins, its width and height; each level averages two by two texels of the one
+    before. Pictures with fewer levels repeat their last.
     """
     reduced = [_reductions(plane.texture) for plane in planes]
     depth = max(len(images) for images in reduced)
@@ -222,19 +221,12 @@ class Renderer:
         state = motion.state(middle_ns, times.ravel())
         homographies = np.stack(
             [plane.homographies(state.rotations, state.positions) for plane in self.planes], axis=1
-        )
-        shape = (*times.shape, len(self.planes), 3, 3)
+        ).reshape((*times.shape, len(self.planes), 3, 3))
         lines = np.empty(self._rays.shape[:2], np.float32)
         render_lines(
-            self._rays,
-            homographies.reshape(shape).astype(np.float32),
-            self._texels,
-            self._levels,
-            np.float32(_BACKGROUND),
-            0,
-            len(lines),
-            lines,
-        )
+            self._rays, homographies.astype(np.float32), self._texels, self._levels,
+            np.float32(_BACKGROUND), 0, len(lines), lines,
+        )  # fmt: skip
         image: NDArray[np.float32] = lines.T if self._sideways else lines
         if self.settings.noise > 0.0:
             rng = np.random.default_rng(list(seed))
@@ -296,11 +288,9 @@ def rendered_frames(
     stamps_ns: Sequence[int],
     seed: int = 0,
 ) -> Iterator[RenderedFrame]:
-    """The frames of a camera along a motion.
+    """The frames of a camera along a motion, whose first rows are exposed at ``stamps_ns``.
 
-    Args:
-        stamps_ns: exposure of the first row of each frame, see ``simulation.frame_stamps``.
-        seed: each image has its own noise, from this and its place in the list.
+    Each image has its own noise, from ``seed`` and its place in the list.
     """
     now = np.zeros(1)
 

@@ -62,19 +62,15 @@ def sampled_states(motion: TrueMotion, spacing: float = 0.1) -> TrueState:
 class ConstantVelocity:
     """A camera that turns at a constant body rate while its centre moves on a straight line.
 
-    Args:
-        angular_velocity: (3,) rad/s in camera axes.
-        linear_velocity: (3,) m/s, along the camera's axes at the start.
-        duration: s.
-        rotation, position: map_from_camera at the start; default: looking along the map's x axis
-            with z up, from the origin.
-        start_ns: time of the start.
+    At the start it looks along the map's x axis with z up, from the origin, unless it is said.
     """
 
-    angular_velocity: Array
-    linear_velocity: Array
-    duration: float
-    rotation: Array = field(default_factory=lambda: BODY_FROM_CAMERA["forward_left_up"])
+    angular_velocity: Array  # (3,) rad/s in camera axes
+    linear_velocity: Array  # (3,) m/s, along the camera's axes at the start
+    duration: float  # s
+    rotation: Array = field(  # map_from_camera at the start
+        default_factory=lambda: BODY_FROM_CAMERA["forward_left_up"]
+    )
     position: Array = field(default_factory=lambda: np.zeros(3))
     start_ns: int = 0
 
