@@ -12,8 +12,6 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.rigs import RigParts, write_camchain
-from rs_localizer.io.transforms import TransformTree
-from rs_localizer.settings import build, load_params_file
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 K = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 240.0], [0.0, 0.0, 1.0]])
@@ -77,23 +75,3 @@ def test_pixels_are_those_of_the_row_by_the_cameras_own_clock(recording):
     apart = np.array(stamps["rear"][:pairs]) - stamps["front"][:pairs] - 250_000_000
     assert np.abs(apart).min() > 1e5
     assert np.ptp(apart) > 1e3
-
-
-def test_the_recording_says_how_the_rig_is_mounted_and_set(recording):
-    out, _ = recording
-    tree = TransformTree()
-    with open_bag(out) as bag:
-        for _, _, message in bag.messages(("/tf_static",)):
-            tree.add(message, static=True)
-        (info, *_) = [m for _, _, m in bag.messages(("/rear/camera_info",))]
-    assert info.header.frame_id == "rear_optical_frame"
-    mounted = tree.lookup(info.header.frame_id, "rig", None)
-    np.testing.assert_allclose(mounted.rotation, TURN, atol=1e-12)
-    np.testing.assert_allclose(mounted.translation, PLACE, atol=1e-12)
-    config = build(load_params_file(out / "parameters.yaml"))
-    assert config.cameras == ("front", "rear")
-    assert config.base_frame == "rig"
-    rear = config.of_cameras["rear"]
-    assert (rear.readout_time, rear.scan_direction, rear.stamp_offset) == (
-        0.02, "bottom_to_top", -0.25,
-    )  # fmt: skip
