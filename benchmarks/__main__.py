@@ -62,7 +62,6 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   mapping                          refined maps and surveyed markers
   fuzzing                          wrong input for everything that reads
   load, load.changes               live nodes under load, and set anew
-  signals                          commands that are stopped at random moments
   simulation                       bags as of simulate, of more sensors
   start                            memory and time of a start of the node
 """

@@ -8,7 +8,7 @@ sequences a person who walks through, or a marker that is misread. A frame count
 pose lies outside the region of 99.9 %, or more than a tenth of what it shows has changed in the
 map. Views in which all has moved together are left out: nothing in them tells.
 
-    python -m benchmarks.integrity --out out/integrity          # weights as they are
+    python -m benchmarks.integrity                               # weights as they are
     python -m benchmarks.integrity --fit                         # prints new ones
 """
 
@@ -16,8 +16,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -199,17 +198,15 @@ def fit(rows: list[Row]) -> None:
     print("TEMPER, GOES_WRONG, RECOVERS", best[1:], "CALIBRATION", np.round(platt, 3).tolist())
 
 
-def report(rows: list[Row], out: Path | None) -> None:
-    """Reliability, ROC and detection, as text and pictures."""
+def report(rows: list[Row]) -> None:
+    """Reliability, ROC and detection, as text."""
     said, wrong = recursive(rows), np.array([row.wrong for row in rows])
     share = weights_of(wrong)
     print(f"{len(rows)} frames, {wrong.sum()} wrong, weighted to {BASE:.0%}")
-    table = []
     for low, high in itertools.pairwise(BINS):
         here = (said >= low) & (said < high)
         if here.any():
             pair = [np.average(each[here], weights=share[here]) for each in (said, wrong)]
-            table.append(pair)
             print(f"  {low:5.3f} to {high:5.3f}: {here.sum():5} frames, said {pair[0]:.4f}, "
                   f"found {pair[1]:.4f}")  # fmt: skip
     order = np.argsort(-said)
@@ -220,8 +217,6 @@ def report(rows: list[Row], out: Path | None) -> None:
         print(f"above {limit}: {sum(right)} of {len(right)} frames in right maps")
         for kind in dict.fromkeys(KINDS[3:]):
             print(f"  {kind}: {_detected(rows, said, kind, limit)}")
-    if out is not None:
-        _draw(out, table, hits, alarms)
 
 
 def _detected(rows: list[Row], said: Array, kind: str, limit: float) -> str:
@@ -237,37 +232,18 @@ def _detected(rows: list[Row], said: Array, kind: str, limit: float) -> str:
     return f"{len(first)} of {count} sequences found{middle}"
 
 
-def _draw(out: Path, table: list[Any], hits: Array, alarms: Array) -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    out.mkdir(parents=True, exist_ok=True)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4))
-    said, found = np.array(table).T
-    left.loglog(said, np.maximum(found, 1e-4), "o-")
-    left.loglog([1e-3, 1], [1e-3, 1], "k:")
-    left.set(xlabel="said", ylabel="found", title="Reliability")
-    right.plot(alarms, hits)
-    right.set(xlabel="right frames above", ylabel="wrong frames above", title="ROC")
-    figure.tight_layout()
-    figure.savefig(out / "integrity.png")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sequences", type=int, default=240)
     parser.add_argument("--first", type=int, default=480, help="below 480 are those of the fit")
     parser.add_argument("--fit", action="store_true", help="print new weights, of the first ones")
-    parser.add_argument("--out", type=Path, help="folder of the picture")
     chosen = parser.parse_args()
     first = 0 if chosen.fit else chosen.first
     numbers = range(first, first + chosen.sequences)
     rows = [row for number in tqdm(numbers, disable=None) for row in sequence(number)]
     if chosen.fit:
         fit(rows)
-    report(rows, chosen.out)
+    report(rows)
 
 
 if __name__ == "__main__":

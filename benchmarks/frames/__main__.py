@@ -63,7 +63,6 @@ def _parser() -> argparse.ArgumentParser:
     against = commands.add_parser("compare", help="two tables, condition by condition")
     against.add_argument("before", type=Path, metavar="BEFORE.csv")
     against.add_argument("after", type=Path, metavar="AFTER.csv")
-    against.add_argument("--plot", type=Path, metavar="FILE.png")
     against.add_argument("--all", action="store_true", help="also conditions that hardly differ")
     against.set_defaults(command=compare)
     timed = commands.add_parser("times", help="CPU time beside PoseLib's, and calls of a frame")

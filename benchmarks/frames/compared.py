@@ -64,8 +64,6 @@ def compare(options: argparse.Namespace) -> int:
         if notable or options.all:
             sys.stdout.write(f"{name:{width}}  {_line(figures, options.all)}\n")
     _write_totals(before, after, changes)
-    if options.plot is not None:
-        _draw(changes, options.plot)
     return int(any(change.sign < 0 for each in changes.values() for change in each.values()))
 
 
@@ -146,13 +144,9 @@ def _error(before: Array, after: Array, recording: Array) -> Change:
     """The ratio of the medians, by resampling recordings."""
     groups = [np.flatnonzero(recording == one) for one in np.unique(recording)]
     rng = np.random.default_rng(0)
-    if len(groups) == len(recording):
-        picks = rng.integers(len(before), size=(_RESAMPLES, len(before)))
-        medians = [np.median(one[picks], axis=1) for one in (before, after)]
-    else:
-        drawn = (rng.integers(len(groups), size=len(groups)) for _ in range(_RESAMPLES))
-        some = [np.concatenate([groups[k] for k in pick]) for pick in drawn]
-        medians = [np.array([np.median(one[k]) for k in some]) for one in (before, after)]
+    drawn = (rng.integers(len(groups), size=len(groups)) for _ in range(_RESAMPLES))
+    some = [np.concatenate([groups[k] for k in pick]) for pick in drawn]
+    medians = [np.array([np.median(one[k]) for k in some]) for one in (before, after)]
     tiny = np.finfo(float).tiny
     ratios = (medians[1] + tiny) / (medians[0] + tiny)
     low, high = np.quantile(ratios, [0.5 * _CHANCE, 1.0 - 0.5 * _CHANCE])
@@ -211,15 +205,8 @@ def totals(judged: Mapping[str, Judged]) -> dict[str, dict[str, float]]:
 
 def totals_line(label: str, row: Mapping[str, float] | None) -> str:
     """One line of the table; without a row: the names of the columns."""
-    names = (
-        "localized",
-        *_SHARES[1:-1],
-        ">5s",
-        *_ERRORS,
-        *(f"s_{name}" for name in _SHARP),
-        "ms",
-        "ms_95",
-    )
+    sharp = (f"s_{name}" for name in _SHARP)
+    names = ("localized", *_SHARES[1:-1], ">5s", *_ERRORS, *sharp, "ms", "ms_95")
     cells = (f"{name if row is None else f'{row[name]:.3g}':>10}" for name in names)
     return f"{label:12}{''.join(cells)}"
 
@@ -281,45 +268,3 @@ def _write_totals(
             sys.stdout.write(f"{totals_line(label, table[bench])}\n")
         together = changes_together(before, after, {name: changes[name] for name in names})
         sys.stdout.write(f"{'':15}  {_line(together, False) or 'nothing certain'}\n")
-
-
-def _draw(changes: Mapping[str, Mapping[str, Change]], file: Path) -> None:
-    """Before across, after upwards; what is certainly different has an edge."""
-    from matplotlib.figure import Figure
-
-    names = ("localized", "pose@s", "pose@m", "twist@m", "deg@s", "deg", "deg/s", "ms")
-    benches = list(dict.fromkeys(name.split("/")[0] for name in changes))
-    picture = Figure(figsize=(16.0, 8.5), layout="constrained")
-    for axes, name in zip(picture.subplots(2, 4).flat, names, strict=True):
-        for index, bench in enumerate(benches):
-            those = [
-                each[name]
-                for key, each in changes.items()
-                if key.split("/")[0] == bench and name in each
-            ]
-            axes.scatter(
-                [one.before for one in those], [one.after for one in those], 22,
-                color=_colour(index, len(benches)), label=bench, linewidths=1.2,
-                edgecolors=[("none", "#0a7d22", "#c01515")[one.sign] for one in those],
-            )  # fmt: skip
-        if name not in _SHARES:
-            axes.set_xscale("log")
-            axes.set_yscale("log")
-        low, high = axes.get_xlim()
-        axes.plot([low, high], [low, high], color="0.6", linewidth=0.8, zorder=0)
-        axes.set_title(name, fontsize=10)
-        axes.set_xlabel("before")
-        axes.set_ylabel("after")
-    handles, labels = picture.axes[0].get_legend_handles_labels()
-    picture.legend(handles, labels, loc="outside lower center", ncols=10, fontsize=8)
-    picture.suptitle(
-        "Conditions before and after; certainly better: green, worse: red", fontsize=11
-    )
-    picture.savefig(file, dpi=110)
-
-
-def _colour(index: int, count: int) -> tuple[float, ...]:
-    from matplotlib import colormaps
-
-    colour: tuple[float, ...] = colormaps["tab20"](index / max(count, 1))
-    return colour

@@ -14,13 +14,12 @@ import sys
 import numpy as np
 
 from benchmarks.load.frames import simulated
-from benchmarks.load.measuring import Result, fastest, steady
+from benchmarks.load.measuring import Result, steady
 from rs_localizer.cli.options import integer, number
 
 _MOST_REPLACED = 0.001  # share of the frames
 _MOST_P50, _MOST_P99 = 4.0, 12.0  # ms
 _MOST_GROWTH = 5.0  # MB after the first minute
-_LEAST_RATE = 250.0  # Hz
 _ROUND = 8.0  # s of different frames where there is an IMU
 
 
@@ -34,18 +33,11 @@ def main() -> int:
     parser.add_argument(
         "--imu", type=number(100.0), default=0.0, metavar="HZ", help="of an IMU beside each camera"
     )
-    parser.add_argument(
-        "--max-rate", action="store_true", help="instead: how fast frames are answered at most"
-    )
     args = parser.parse_args()
     # Frames and readings start over together.
     different = round(_ROUND * args.rate) if args.imu else 500
     frames = simulated(args.points, args.outliers, args.rate, different, args.imu)
     print(f"{args.points} points, {args.outliers:.0%} outliers", flush=True)
-    if args.max_rate:
-        rate = fastest(frames, 60.0 * args.minutes)
-        print(f"sustained maximum {rate:.0f} Hz (at least {_LEAST_RATE:.0f})")
-        return 0 if rate >= _LEAST_RATE else 1
     results = steady(frames, args.cameras, round(60.0 * args.minutes * args.rate))
     print(f"{args.cameras} camera(s) at {args.rate:g} Hz for {args.minutes:g} min")
     met = [_report(index, result) for index, result in enumerate(results)]

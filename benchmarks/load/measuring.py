@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,17 +31,12 @@ from rs_localizer.io import topics
 from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.settings import NODE_NAME
 
-NODE_PROGRAM = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
-"""The node as its executable runs it, which may not be on the path."""
+_NODE = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
 
 # The first start on a machine compiles all kernels.
 _START_TIMEOUT = 300.0
 # Frames that are still on their way when the last one has been sent, in s.
 _REST_TIME = 1.5
-# Closed loop: frames that are under way at any time. With one, the node would wait for us.
-_UNDER_WAY = 2
-_LOST_AFTER = 0.5  # s
-_SHUTTER = ("-p", f"readout_time:={READOUT_TIME}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,11 +105,8 @@ class Ear:
 
 
 @contextlib.contextmanager
-def running(count: int, *settings: str) -> Iterator[tuple[Node, list[tuple[str, int]]]]:
+def running(count: int) -> Iterator[tuple[Node, list[tuple[str, int]]]]:
     """That many live nodes: our own node, and their namespaces and process ids.
-
-    Args:
-        settings: arguments for ROS; none: the readout time of the simulated camera.
 
     Raises:
         ChildProcessError: when a node ends at its start, with its log.
@@ -128,9 +120,7 @@ def running(count: int, *settings: str) -> Iterator[tuple[Node, list[tuple[str, 
             nodes = []
             for index in range(count):
                 namespace = f"/load_{os.getpid()}/camera{index}"
-                log = Path(directory) / f"node{index}.log"
-                processes.append(_start_node(namespace, log, settings or _SHUTTER))
-                _wait_until_active(processes[-1], log)
+                processes.append(_started(namespace, Path(directory) / f"node{index}.log"))
                 nodes.append((namespace, processes[-1].pid))
             yield peer, nodes
         finally:
@@ -139,6 +129,19 @@ def running(count: int, *settings: str) -> Iterator[tuple[Node, list[tuple[str, 
             for process in processes:
                 process.wait()
             rclpy.try_shutdown()
+
+
+def _started(namespace: str, log: Path) -> subprocess.Popen[bytes]:
+    words = ("--ros-args", "-r", f"__ns:={namespace}", "-p", f"readout_time:={READOUT_TIME}")
+    with log.open("wb") as file:
+        process = subprocess.Popen([sys.executable, "-c", _NODE, *words], stdout=file, stderr=file)
+    deadline = time.monotonic() + _START_TIMEOUT
+    while "active with solver" not in log.read_text():
+        if process.poll() is not None or time.monotonic() > deadline:
+            process.kill()
+            raise ChildProcessError(f"the node did not start:\n{log.read_text()}")
+        time.sleep(0.1)
+    return process
 
 
 def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
@@ -161,7 +164,7 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
             time.sleep(1.0)
             if sents[0][0] > 0.0:
                 memory.append([_memory(pid) for _, pid in nodes])
-                used.append([time.monotonic(), *(cpu_time(pid) for _, pid in nodes)])
+                used.append([time.monotonic(), *(_cpu_time(pid) for _, pid in nodes)])
         spent = np.subtract(used[-1], used[0])
         time.sleep(_REST_TIME)
         for ear in ears:
@@ -183,49 +186,6 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
         ]
 
 
-def fastest(frames: Frames, seconds: float) -> float:
-    """Hz at which one node answers frames that are sent as soon as it has answered."""
-    with running(1) as (peer, [(namespace, _)]):
-        ear = Ear(peer, namespace, frames, 1_000_000)
-        camera = Camera(peer, namespace, frames)
-        camera.wait()
-        sent, first, start = 0, 0, 0.0
-        last = time.monotonic()
-        before = 0
-        while True:
-            now = time.monotonic()
-            if ear.answered > before:
-                before, last = ear.answered, now
-            if now - last > _LOST_AFTER:  # refused or lost: go on without them
-                sent, last = ear.answered, now
-            while sent - ear.answered < _UNDER_WAY:
-                camera.send(sent)
-                sent += 1
-            time.sleep(0.0002)
-            # The first frames are on the way while both sides still discover each other.
-            if not start and ear.answered > frames.rate:
-                start, first = now, ear.answered
-            if start and now - start > seconds:
-                ear.close()
-                return (ear.answered - first) / (now - start)
-
-
-def _start_node(namespace: str, log: Path, settings: Sequence[str]) -> subprocess.Popen[bytes]:
-    arguments = ("--ros-args", "-r", f"__ns:={namespace}", *settings)
-    with log.open("wb") as file:
-        return subprocess.Popen(
-            [sys.executable, "-c", NODE_PROGRAM, *arguments], stdout=file, stderr=file
-        )
-
-
-def _wait_until_active(process: subprocess.Popen[bytes], log: Path) -> None:
-    deadline = time.monotonic() + _START_TIMEOUT
-    while "active with solver" not in log.read_text():
-        if process.poll() is not None or time.monotonic() > deadline:
-            raise ChildProcessError(f"the node did not start:\n{log.read_text()}")
-        time.sleep(0.1)
-
-
 def _memory(pid: int) -> float:
     """Resident set of a process in MB."""
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
@@ -234,7 +194,7 @@ def _memory(pid: int) -> float:
     return float("nan")
 
 
-def cpu_time(pid: int) -> float:
+def _cpu_time(pid: int) -> float:
     """Seconds of all cores that a process has used."""
     values = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK")
