@@ -50,7 +50,6 @@ setup(
             "ros-jazzy-rmw-fastrtps-cpp",
         ],
         "colcon": ["colcon-common-extensions", "ros-jazzy-ament-package"],
-        "completion": ["argcomplete"],
         "docs": ["sphinx", "myst-parser", "sphinxcontrib-mermaid"],
         "evo": ["evo"],
         "examples": ["h5py", "pyarrow", "pycolmap", "rerun-sdk"],

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``python -m rs_localizer`` and the executable: takes signals in hand, then imports the rest."""
 
-# PYTHON_ARGCOMPLETE_OK
 from __future__ import annotations
 
 import os
@@ -38,10 +37,9 @@ def run() -> int:
             with importing(_PROGRAM):
                 from rs_localizer import cli
 
-                cli.WORKING = not ("_ARGCOMPLETE" in os.environ or _asks_for_help(sys.argv))
-                from rs_localizer.cli.main import complete, main
+                cli.WORKING = not _asks_for_help(sys.argv)
+                from rs_localizer.cli.main import main
 
-                complete()
             code = main(importing=importing)
         except KeyboardInterrupt:  # before a command runs
             sys.stderr.write(f"{_PROGRAM}: interrupted\n")

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
 import shutil
 import sys
 import threading
@@ -18,7 +17,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from rs_localizer.cli.options import UsageError, add_options
+from rs_localizer.cli.options import UsageError
 from rs_localizer.io.atomic_files import atomic_files, check_writable
 
 # Bars are shown by one process. tqdm's own lock for several is a semaphore, of which Python 3.14
@@ -44,28 +43,6 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     for name, text in COMMON:
         short = (name[1:3],) if name != "--json" else ()
         group.add_argument(*short, name, action="store_true", help=text, dest=f"common{name}")
-
-
-class LateParser(argparse.ArgumentParser):
-    """Parser of a command, whose module is imported when its turn comes."""
-
-    _module = ""
-
-    def come_from(self, module: str) -> None:
-        """Name the module."""
-        self._module = module
-        # argcomplete asks for no parsing before it looks at the arguments.
-        if self.prog.split()[-1] in os.environ.get("COMP_LINE", "").split():
-            self._add_arguments()
-
-    def _add_arguments(self) -> None:
-        name, self._module = self._module, ""
-        if name:
-            add_options(self, importlib.import_module(name).Options)
-
-    def parse_known_args(self, *args: Any, **kwargs: Any) -> Any:
-        self._add_arguments()
-        return super().parse_known_args(*args, **kwargs)
 
 
 def replaced(args: Any, mark: str, place: Path | None = None) -> Callable[[Path], None] | None:

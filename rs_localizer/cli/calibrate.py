@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,17 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from rs_localizer.cli import WORKING, image_input, refuse_existing, with_values, write_all
+from rs_localizer.cli.image_input import ImageOptions, given_lens
 from rs_localizer.cli.marker_map import TargetOptions, find_map
 from rs_localizer.cli.options import (
-    CAMERA_FLAGS,
-    Inputs,
-    Settings,
     UsageError,
     argument,
     option,
 )
 from rs_localizer.cli.rig_input import cameras_of, mounting_lines, numbers
 from rs_localizer.cli.settings_args import given_settings, given_topics, remapped
+from rs_localizer.io.image_clock import DEFAULT_START_NS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
 
 if WORKING:
@@ -38,7 +36,6 @@ if WORKING:
     from rs_localizer.io.calibration import (
         kalibr_fields,
         lens_parameters,
-        read_calibration,
         write_calibration,
     )
     from rs_localizer.io.camera_info import read_camera_info
@@ -73,7 +70,6 @@ if WORKING:
     from rs_localizer.tools.adjust.observe import Observed, in_order
     from rs_localizer.tools.calibration import Calibration, calibrate
     from rs_localizer.tools.first_lens import covered, first_lens
-    from rs_localizer.tools.imu import MountFound
     from rs_localizer.tools.rig import Mounted, Recording, calibrate_rig
 
 # A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
@@ -84,72 +80,44 @@ _GIVEN = "TF, or the axes of a video,"
 _LEAST_SCALE = 0.005
 
 
-def time_offset(found: MountFound, config: NodeConfig) -> float:
-    """``imu.time_offset`` (s): the camera's time is its stamp plus ``stamp_offset``."""
-    return found.time_offset + config.stamp_offset
-
-
-def imu_lines(found: Calibration, imu: ImuRecording | None, config: NodeConfig) -> list[str]:
+def _tell_imu(found: Calibration, imu: ImuRecording, config: NodeConfig) -> None:
     """Rows of the table, and sentences on what is odd."""
-    if imu is None:
-        return []
-    mount = found.mount
-    if mount is None:
-        return [f"imu: {found.no_mount}"]
-    offset = (
-        f"{1e3 * time_offset(mount, config):+.3f} +- {1e3 * mount.time_offset_deviation:.3f} ms"
-    )
-    turn = Rotation.from_matrix(mount.mount.camera_from_imu).as_quat(canonical=True)
-    turn_deviations = np.degrees(mount.rotation_deviations)
-    bias, bias_deviations = np.degrees([mount.mount.bias, mount.bias_deviations])
-    rows = [
-        ("imu.time_offset", offset, mount.time_offset_determined),
+    one = found.mount
+    if one is None:
+        print(f"imu: {found.no_mount}")
+        return
+    offset, spread = 1e3 * (one.time_offset + config.stamp_offset), 1e3 * one.time_offset_deviation
+    turn = numbers(Rotation.from_matrix(one.mount.camera_from_imu).as_quat(canonical=True), 5)
+    error = numbers(np.degrees(one.rotation_deviations), 3)
+    bias, errors = (numbers(np.degrees(each), 3) for each in (one.mount.bias, one.bias_deviations))
+    for name, text, known in (
+        ("imu.time_offset", f"{offset:+.3f} +- {spread:.3f} ms", one.time_offset_determined),
         (
-            "rotation camera <- imu",
-            f"{numbers(turn, 5)} (x y z w) +- {numbers(turn_deviations, 3)} deg",
-            mount.rotation_determined,
+            "rotation camera <- imu", f"{turn} (x y z w) +- {error} deg",
+            one.rotation_determined,
         ),
-        (
-            "gyroscope bias",
-            f"{numbers(bias, 3)} +- {numbers(bias_deviations, 3)} deg/s",
-            mount.bias_determined,
-        ),
-        ("gyroscope noise", f"{np.degrees(mount.noise):.3f} deg/s, {mount.samples} samples", True),
-    ]
-    said = [
-        f"{name:26} {text if known else f'not observable: {text}'}" for name, text, known in rows
-    ]
-    return said + _remarks(mount, imu)
-
-
-def _remarks(found: MountFound, imu: ImuRecording) -> list[str]:
-    said = []
-    if found.inflation > 1.0:
-        said.append(
+        ("gyroscope bias", f"{bias} +- {errors} deg/s", one.bias_determined),
+        ("gyroscope noise", f"{np.degrees(one.noise):.3f} deg/s, {one.samples} samples", True),
+    ):  # fmt: skip
+        print(f"{name:26} {text if known else f'not observable: {text}'}")
+    if one.inflation > 1.0:
+        print(
             f"imu: parts of the recording have different offsets: the deviation is "
-            f"{found.inflation:.1f} times that of the noise alone"
+            f"{one.inflation:.1f} times that of the noise alone"
         )
     if imu.camera_from_imu is None:
-        said.append("imu: TF has no transform from it to the camera; its rotation is not checked")
-    elif found.rotation_determined:
-        off = np.degrees(found.mount.turned_from(imu.camera_from_imu))
-        error = float(np.degrees(np.linalg.norm(found.rotation_deviations)))
-        if off > max(_MOST_TURN, _SIGMAS * error):
-            said.append(f"imu: {_GIVEN} has another rotation, {off:.1f} deg off: is it right?")
+        print("imu: TF has no transform from it to the camera; its rotation is not checked")
+    elif one.rotation_determined:
+        off = np.degrees(one.mount.turned_from(imu.camera_from_imu))
+        chance = _SIGMAS * float(np.degrees(np.linalg.norm(one.rotation_deviations)))
+        if off > max(_MOST_TURN, chance):
+            print(f"imu: {_GIVEN} has another rotation, {off:.1f} deg off: is it right?")
         else:
-            said.append(f"imu: {_GIVEN} agrees with the rotation to {off:.2f} deg")
-    scales, errors = found.mount.shape[:3], found.shape_deviations[:3]
-    if np.any(np.abs(scales) > np.maximum(_LEAST_SCALE, _SIGMAS * errors)):
+            print(f"imu: {_GIVEN} agrees with the rotation to {off:.2f} deg")
+    scales = one.mount.shape[:3]
+    if np.any(np.abs(scales) > np.maximum(_LEAST_SCALE, _SIGMAS * one.shape_deviations[:3])):
         percent = " ".join(f"{100.0 * scale:+.1f}" for scale in scales)
-        said.append(f"imu: the gyroscope's scales are {percent} % off (allowed for)")
-    return said
-
-
-def imu_parameters(found: Calibration, config: NodeConfig) -> str:
-    """Lines of the parameters file; none where the offset is not known."""
-    if found.mount is None or not found.mount.time_offset_determined:
-        return ""
-    return f"    imu.time_offset: {time_offset(found.mount, config)!r}\n"
+        print(f"imu: the gyroscope's scales are {percent} % off (allowed for)")
 
 
 # Beside FILE.yaml, as FILE_...
@@ -158,7 +126,7 @@ _TRANSFORMS, _CAMCHAIN = "transforms.launch.xml", "camchain.yaml"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(TargetOptions, Settings, Inputs):
+class Options(TargetOptions, ImageOptions):
     recordings: list[Path] = argument(
         "a bag of correspondences or keypoints; or, with --map or --board, images: a video, a "
         "folder, a bag; several with --rig", "RECORDING",
@@ -170,17 +138,11 @@ class Options(TargetOptions, Settings, Inputs):
         "files, or as their topics begin; --camera is a camchain, or FILE of all as "
         "FILE#NAME", default=False,
     )  # fmt: skip
-    calibration: Path | None = option(
-        "lens; without one it is found, too", "FILE", flag=CAMERA_FLAGS
-    )
     intrinsics: bool = option("find the lens as well", default=False)
     imu: bool = option(
         "find how the IMU of a bag or of a video goes with the camera: offset of its stamps, "
         "rotation, bias", default=False,
     )  # fmt: skip
-    rate: float | None = option(
-        "images per second of a video or of files", "HZ", limits=(0.0, math.inf), above=True
-    )
     out: Path | None = option(
         "what is known of the camera, lens and shutter: --camera of the other commands, params "
         "file and camera_file of the node", "FILE.yaml",
@@ -203,18 +165,16 @@ class _Source:
 
 
 def run(options: Options) -> Figures | None:
+    if options.out is not None and options.out.suffix not in (".yaml", ".yml"):
+        raise UsageError(f"--out must end in .yaml, got {options.out}")
     topic = remapped(options).get(IMU, "") if options.imu else None
-    args = with_values(options, imu=topic)
+    args = with_values(options, imu=topic, recording=options.recordings[0])
     if args.rig:
         _calibrate_rig(args)
         return None
     if len(args.recordings) > 1:
         raise UsageError("several recordings are those of a --rig")
-    return calibrate_one(with_values(args, recording=args.recordings[0]))
-
-
-def _finds_lens(args: Any, recording: Path) -> bool:
-    return args.intrinsics or (args.calibration is None and not is_bag(recording))
+    return calibrate_one(args)
 
 
 def calibrate_one(args: Any) -> Figures:
@@ -223,7 +183,7 @@ def calibrate_one(args: Any) -> Figures:
         refuse_existing(args, *([_MAP] if args.map or args.board else []))
     if args.camera_info is not None:
         refuse_existing(with_values(args, out=args.camera_info))
-    config = _config(args)
+    config = given_settings(args)
     source = _read(args, config)
     intrinsics = args.intrinsics or source.new_lens
     camera = replace(source.camera, scan_direction=config.scan_direction)
@@ -269,19 +229,13 @@ def _calibrated(args: Any, source: _Source, camera: Camera, config: NodeConfig) 
     )
     if intrinsics:
         _tell_lens(found)
-    for line in imu_lines(found, source.imu, config):
-        print(line)
+    if source.imu is not None:
+        _tell_imu(found, source.imu, config)
     if args.plot is not None:
         from rs_localizer.tools.calibration_plots import save_plots
 
         save_plots(camera, found, args.plot)
     return found
-
-
-def _config(args: Any) -> NodeConfig:
-    if args.out is not None and args.out.suffix not in (".yaml", ".yml"):
-        raise UsageError(f"--out must end in .yaml, got {args.out}")
-    return given_settings(args)
 
 
 def _read(args: Any, config: NodeConfig) -> _Source:
@@ -290,8 +244,7 @@ def _read(args: Any, config: NodeConfig) -> _Source:
         raise ValueError(f"{path} does not exist")
     if not is_bag(path):
         imu = _imu_of_video(args, path)
-        camera = None if args.calibration is None else read_calibration(args.calibration)
-        source = image_input.of_files(args, path, camera)
+        source = image_input.of_files(args, path, given_lens(args))
         found = _detected(args, source.shots)
         image_input.tell_times(source.clock)
         return replace(found, own_stamps=path.is_dir() and args.rate is None, imu=imu)
@@ -303,8 +256,8 @@ def _read(args: Any, config: NodeConfig) -> _Source:
             imu = read_imu_recording(bag, args.imu or None, frame)
         if IMAGE not in topics and has_frames(bag):
             return replace(_correspondences(args, bag, config), imu=imu)
-        given = None if args.calibration is None else read_calibration(args.calibration)
-        return replace(_detected(args, image_input.of_bag(bag, given, args).shots), imu=imu)
+        shots = image_input.of_bag(bag, given_lens(args), args).shots
+        return replace(_detected(args, shots), imu=imu)
 
 
 def _imu_of_video(args: Any, path: Path) -> ImuRecording | None:
@@ -316,7 +269,8 @@ def _imu_of_video(args: Any, path: Path) -> ImuRecording | None:
             "-r imu:=TOPIC is for bags, and --imu for videos with a gyroscope of their own clock "
             "(without --rate): this one has none that is known"
         )
-    return image_input.video_imu(telemetry)
+    stamps = DEFAULT_START_NS + np.round(1e9 * telemetry.times).astype(np.int64)
+    return ImuRecording(stamps, telemetry.rates, np.eye(3))
 
 
 def _correspondences(args: Any, bag: BagReader, config: NodeConfig) -> _Source:
@@ -325,9 +279,7 @@ def _correspondences(args: Any, bag: BagReader, config: NodeConfig) -> _Source:
     topics = find_topics(bag, given_topics(args)).without(IMU)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     recorded = read_recording(bag, topics, config.matching, landmarks)
-    camera = recorded.calibration.camera(0.0, config.scan_direction)
-    if args.calibration is not None:
-        camera = read_calibration(args.calibration)
+    camera = given_lens(args) or recorded.calibration.camera(0.0, config.scan_direction)
     images = [Observed(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in recorded.clouds]
     return _Source(images, camera)
 
@@ -365,19 +317,17 @@ def _detected(args: Any, shots: Iterator[Shot | Carried]) -> _Source:
 
 
 def _tell(found: Calibration, rate: float | None) -> None:
-    direction = verdict.scan_direction(found)
-    rows = [
+    for name, text in (
         ("readout time", f"{1e3 * verdict.readout_time(found):.3f} ms"),
         ("standard deviation", f"{1e3 * found.deviation:.3f} ms"),
         ("of it by noise alone", f"{1e3 * found.formal_deviation:.3f} ms"),
-        ("scan_direction", str(direction)),
+        ("scan_direction", str(verdict.scan_direction(found))),
         ("interval between images", f"{1e3 * found.stamps.interval:.3f} ms"),
         ("images with a pose", f"{len(found.posed.times)} of {found.images}"),
         ("noise of the keypoints", f"{found.fit.deviation:.3f} px"),
         ("keypoints that fit", f"{np.mean(found.fit.inliers):.1%}"),
         ("spacing of the knots", f"{1e3 * found.fit.state.spline.layout.spacing:.1f} ms"),
-    ]
-    for name, text in rows:
+    ):
         print(f"{name:26} {text}")
     along = 1e3 * verdict.sense(found)
     for block in found.blocks:
@@ -398,11 +348,10 @@ def _tell(found: Calibration, rate: float | None) -> None:
 def _tell_lens(found: Calibration) -> None:
     state = found.fit.state
     deviations = np.sqrt(np.diag(found.fit.border_covariance)[1 : 1 + len(state.lens)])
-    names = ("fx", "fy", "cx", "cy")
+    names = ["fx", "fy", "cx", "cy", *(f"D[{k}]" for k in range(len(state.lens) - 4))]
     print(f"{'lens':26} {found.fit.camera.distortion_model}")
-    for k, value in enumerate(state.lens):
-        name = names[k] if k < len(names) else f"D[{k - len(names)}]"
-        print(f"{name:26} {value:.5g} +- {found.inflation * deviations[k]:.2g}")
+    for name, value, deviation in zip(names, state.lens, deviations, strict=True):
+        print(f"{name:26} {value:.5g} +- {found.inflation * deviation:.2g}")
     errors = found.lens
     print(
         f"{'what it is off by':26} centre {errors.principal_point:.2g} px, focal length "
@@ -433,8 +382,11 @@ def _write(
         if refused
         else f"    readout_time: {verdict.readout_time(found)!r}\n"
         f"    readout_time_deviation: {found.deviation!r}\n"
-        f"    scan_direction: {verdict.scan_direction(found)}\n" + imu_parameters(found, config)
+        f"    scan_direction: {verdict.scan_direction(found)}\n"
     )
+    mount = found.mount
+    if mount is not None and mount.time_offset_determined and not refused:
+        text += f"    imu.time_offset: {mount.time_offset + config.stamp_offset!r}\n"
     writers: dict[Path, Callable[[Path], object]] = {}
     # Those of a lens that was given hold on.
     errors = found.lens if intrinsics else config.calibration
@@ -483,18 +435,19 @@ def _calibrate_rig(args: Any) -> None:
         raise UsageError("--imu is for one camera: leave it out with --rig")
     # Cameras by name need a readout time; what it is does not matter where it is estimated.
     args.assignments = ["readout_time:=0.03", *args.assignments]
-    config, recordings, maps = _config(args), dict[str, Recording](), list[MarkerMap]()
+    config, recordings, maps = given_settings(args), dict[str, Recording](), list[MarkerMap]()
     cameras = cameras_of(args, config)
     if args.out is not None:
-        found = cameras if _finds_lens(args, args.recordings[0]) else ()
-        refuse_existing(args, _TRANSFORMS, _CAMCHAIN, *(f"{name}_{_LENS}" for name in found))
+        new = args.calibration is None and not is_bag(args.recordings[0])
+        lenses = [f"{name}_{_LENS}" for name in cameras if args.intrinsics or new]
+        refuse_existing(args, _TRANSFORMS, _CAMCHAIN, *lenses)
     intrinsics = args.intrinsics
     for name, own in cameras.items():
         print(f"{name}:")
         axis = config.of_cameras.get(name, config).scan_direction
         of_camera = replace(config, scan_direction=axis)
         plots = None if args.plot is None else args.plot / name
-        of_args = with_values(own.args, plots=plots)
+        of_args = with_values(own.args, plot=plots)
         source = _read(of_args, of_camera)
         intrinsics |= source.new_lens
         maps += [] if source.map is None else [source.map]
@@ -519,7 +472,14 @@ def _calibrate_rig(args: Any) -> None:
     refusals = {name: text for name, one in rig.items() if (text := one.undetermined)}
     if args.out is not None and not refusals:
         frames = {name: own.frame for name, own in cameras.items()}
-        values = _of_maps(config, maps) | (_of_lenses(recordings) if intrinsics else {})
+        declared = max(
+            config.map_deviation, *(each.settings.get("map_deviation", 0.0) for each in maps), 0.0
+        )
+        values = {"map_deviation": declared} if declared else {}
+        if intrinsics:  # which all cameras share: those of the worst
+            errors = np.max([each.calibration.lens for each in recordings.values()], axis=0)
+            pairs = zip(LensErrors._fields, errors.tolist(), strict=True)
+            values |= {f"calibration.{name}": value for name, value in pairs}
         _write_rig(args.out, _parts(rig, recordings, config), frames, values, comments, intrinsics)
         print(f"next: {_next_of_rig(args)}")
     if refusals:
@@ -563,18 +523,6 @@ def _parts(
     base = config.of_cameras.get(next(iter(rig)), config).stamp_offset
     offsets = {name: base + own.offset for name, own in mounts.items()}
     return RigParts(cameras, poses, offsets)
-
-
-def _of_lenses(recordings: Mapping[str, Recording]) -> dict[str, float]:
-    """Parameters that all cameras share: the errors of the worst."""
-    errors = np.max([each.calibration.lens for each in recordings.values()], axis=0)
-    pairs = zip(LensErrors._fields, errors.tolist(), strict=True)
-    return {f"calibration.{name}": value for name, value in pairs}
-
-
-def _of_maps(config: NodeConfig, maps: Sequence[MarkerMap]) -> dict[str, float]:
-    declared = [config.map_deviation, *(each.settings.get("map_deviation", 0.0) for each in maps)]
-    return {"map_deviation": max(declared)} if max(declared) else {}
 
 
 def _write_rig(

@@ -7,29 +7,29 @@ from __future__ import annotations
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple
 
 from rs_localizer.cli import WORKING, replaced, with_values
 from rs_localizer.cli.image_input import (
     ImageOptions,
     opened,
+    replay_command,
     shutter_values,
     tell_left_out,
-    tell_next,
     tell_telemetry,
-    time_faults,
-    write_shutter,
+    tell_times,
 )
 from rs_localizer.cli.marker_map import TargetOptions, find_map
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.cli.rig_input import cameras_of
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
 from rs_localizer.io.bags import BagWriter, is_bag
-from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock
-from rs_localizer.settings import build, settings
+from rs_localizer.io.image_clock import DEFAULT_START_NS
+from rs_localizer.io.recording import PARAMETERS
+from rs_localizer.settings import build, settings, write_parameters
 
 if WORKING:
     import numpy as np
@@ -47,10 +47,6 @@ if WORKING:
 
     Shots = Iterable[Shot | Carried]
 
-Seen = TypeVar("Seen")
-
-# Options of markers and boards.
-_OF_MARKERS = ("map", "board", "pattern", "square")
 _LEAST_KEYPOINTS = settings(FeatureConfig)["max_keypoints"].minimum or 1.0
 
 
@@ -73,74 +69,33 @@ class Options(TargetOptions, ImageOptions):
     with_images: bool = option("copy compressed images, too", default=False, flag="--images")
 
 
-def run(args: Options) -> Figures | None:
-    if args.features is None and args.max_keypoints is not None:
-        raise UsageError("--max-keypoints goes with --features")
-    if args.features is None and args.map is None and args.board is None:
-        raise UsageError("give --map, --board or --features")
-    if args.features is None:
-        figures = detect_one(args)
-        tell_next(args)
-        return figures
-    detect_features(args)
-    tell_next(args, " --map MAP")
-    return None
+def run(args: Options) -> Figures:
+    figures = detect(args)
+    if not {"readout_time", "cameras"} & set(shutter_values(args)):
+        print(
+            "the readout time is not known: poses come without twists; calibrate measures it, and "
+            "-p readout_time:=SECONDS gives it to the next command"
+        )
+    known, more = (args.out / PARAMETERS).exists(), " --map MAP" if args.features else ""
+    print(f"next: {replay_command(args.out, known=known)}{more}")
+    return figures
 
 
-def detect_one(args: Options) -> Figures:
+def detect(args: Options) -> Figures:
     """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
-    marker_map = find_map(args)
-    config = DetectorConfig()
-
-    def look(
-        shots: Shots, bag: BagWriter, options: offline.Options, bar: Any
-    ) -> tuple[Recorded, Counter[str]]:
-        notices: Counter[str] = Counter()
-        detector = FrameDetector(config, lambda _, text: notices.update([text]), marker_map)
-        detector.warm_up()
-        recorded = record(
-            shots, detector, bag, options, done=bar.update,
-            tell=lambda text: bar.write(f"note: {text}", file=sys.stderr),
-        )  # fmt: skip
-        return recorded, notices
-
-    every = []
-    for name, (recorded, notices), clock in _look(args, look, marker_map.settings):
-        _tell(_place(args, name), recorded, notices)
-        for fault in (*recorded.faults, *time_faults(args, clock, recorded.period, name)):
-            print(f"warning: {fault}")
-        every.append(recorded)
-    tell_telemetry(args)
-    return {
-        "images": sum(one.images for one in every),
-        "with_corners": sum(one.with_corners for one in every),
-        "corners": min(one.corners for one in every),
-        "residual_of_a_still_pose_px": max(one.residual for one in every),
-        "warnings": "; ".join(fault for one in every for fault in one.faults),
-    }
-
-
-def _look(
-    args: Options,
-    look: Callable[[Shots, BagWriter, offline.Options, Any], Seen],
-    of_map: Mapping[str, float] | None = None,
-) -> list[tuple[str, Seen, ImageClock | None]]:
-    """Record what ``look`` finds in the images of each camera of a rig, or of one without a name.
-
-    Where the lenses of one video are goes into the bag.
-    """
-    settings, seen = build(shutter_values(args)), []
+    of_map, look = _of_markers(args) if args.features is None else _of_features(args)
+    settings, every, warnings = build(shutter_values(args)), list[Figures](), list[str]()
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
         with BagWriter(out) as bag:
-            cameras = {"": args}
+            cameras: dict[str, Any] = {"": args}
             if settings.of_cameras:
                 rig = cameras_of(with_values(args, recordings=[args.images]), settings)
                 cameras = {name: own.args for name, own in rig.items()}
                 if args.calibration is not None and not is_bag(args.images):
-                    bag.write(
-                        TF_STATIC, make_mounts(read_camchain(args.calibration)), DEFAULT_START_NS
-                    )
+                    mounts = make_mounts(read_camchain(args.calibration))
+                    bag.write(TF_STATIC, mounts, DEFAULT_START_NS)
             for name, own in cameras.items():
+                of = settings.of_cameras.get(name, settings)
                 with (
                     opened(own, args.images) as source,
                     tqdm(total=source.total, unit="image", desc="detect", disable=None) as bar,
@@ -148,55 +103,92 @@ def _look(
                     shots: Shots = source.shots
                     if name not in ("", settings.cameras[0]):  # what goes along is of the first
                         shots = (shot for shot in shots if not isinstance(shot, Carried))
-                    direction = settings.of_cameras.get(name, settings).scan_direction
-                    options = offline.Options(args.with_images, direction, name)
-                    seen.append((name, look(shots, bag, options, bar), source.clock))
-        write_shutter(args, out, of_map)
-    return seen
-
-
-def _place(args: Options, name: str) -> str:
-    return f"{args.out}, {name}" if name else str(args.out)
-
-
-def _tell(what: str, recorded: Recorded, notices: Counter[str]) -> None:
-    fit = ""
-    if np.isfinite(recorded.residual):
-        fit = f", within {recorded.residual:.3f} px rms of a global-shutter pose (median)"
-    print(
-        f"{what}: {recorded.with_corners} of {recorded.images} images, "
-        f"{recorded.corners:.0f} corners each (median){fit}"
-    )
-    if recorded.with_corners < recorded.images:
-        print(f"{recorded.images - recorded.with_corners} images show no part of the map")
-    tell_left_out(recorded.refused, recorded.carried)
-    for text, count in notices.most_common(3):
-        print(f"note ({count} images): {text}")
-
-
-def detect_features(args: Options) -> None:
-    """Find the keypoints of all images."""
-    for name in _OF_MARKERS:
-        if getattr(args, name) is not None:
-            raise UsageError(f"--{name.replace('_', '-')} is for markers; give it or --features")
-    kind = args.features or ""
-    config = FeatureConfig(features=kind)
-    if args.max_keypoints is not None:
-        config = FeatureConfig(features=kind, max_keypoints=args.max_keypoints)
-    extractor = FrameExtractor(config)
-
-    def look(shots: Shots, bag: BagWriter, options: offline.Options, bar: Any) -> Extraction:
-        return record_features(shots, extractor, bag, options, bar.update)
-
-    for name, extraction, clock in _look(args, look):
-        with_any = len(extraction.counts)
-        print(
-            f"{_place(args, name)}: {with_any} of {extraction.images} images, "
-            f"{np.median(extraction.counts):.0f} keypoints ({args.features}) each (median)"
-        )
-        if bare := len(extraction.stamps_ns) - with_any:
-            print(f"{bare} images have no keypoint")
-        tell_left_out(extraction.refused, extraction.carried)
-        for fault in time_faults(args, clock, extraction.period, name):
-            print(f"warning: {fault}")
+                    options = offline.Options(args.with_images, of.scan_direction, name)
+                    seen = look(shots, bag, options, bar)
+                print(f"{f'{args.out}, {name}' if name else args.out}: {seen.said}")
+                tell_left_out(seen.found.refused, seen.found.carried)
+                for fault in seen.faults:
+                    print(f"warning: {fault}")
+                tell_times(source.clock, of.readout_time, seen.found.period)
+                warnings += seen.faults
+                every.append(seen.figures)
+        if values := {**of_map, **shutter_values(args)}:
+            write_parameters(out / PARAMETERS, values)
     tell_telemetry(args)
+    merged = {key: _WORST[key](each[key] for each in every) for key in every[0]}
+    return {**merged, "warnings": "; ".join(warnings)}
+
+
+# Of several cameras.
+_WORST: dict[str, Any] = {
+    "images": sum, "with_corners": sum, "corners": min, "residual_of_a_still_pose_px": max,
+    "with_keypoints": sum, "keypoints": min,
+}  # fmt: skip
+
+
+class _Seen(NamedTuple):
+    """What the images of a camera show."""
+
+    found: Extraction | Recorded
+    said: str
+    figures: Figures
+    faults: Sequence[str] = ()
+
+
+Look = Callable[["Shots", BagWriter, "offline.Options", Any], _Seen]
+
+
+def _of_markers(args: Options) -> tuple[Mapping[str, float], Look]:
+    if args.max_keypoints is not None:
+        raise UsageError("--max-keypoints goes with --features")
+    if args.map is None and args.board is None:
+        raise UsageError("give --map, --board or --features")
+    marker_map, config = find_map(args), DetectorConfig()
+
+    def look(shots: Shots, bag: BagWriter, options: offline.Options, bar: Any) -> _Seen:
+        notices: Counter[str] = Counter()
+        detector = FrameDetector(config, lambda _, text: notices.update([text]), marker_map)
+        detector.warm_up()
+        found = record(
+            shots, detector, bag, options, done=bar.update,
+            tell=lambda text: bar.write(f"note: {text}", file=sys.stderr),
+        )  # fmt: skip
+        said = (
+            f"{found.with_corners} of {found.images} images, {found.corners:.0f} corners each "
+            "(median)"
+        )
+        if np.isfinite(found.residual):
+            said += f", within {found.residual:.3f} px rms of a global-shutter pose (median)"
+        said += "".join(f"\nnote ({n} images): {text}" for text, n in notices.most_common(3))
+        figures: Figures = {
+            "images": found.images,
+            "with_corners": found.with_corners,
+            "corners": found.corners,
+            "residual_of_a_still_pose_px": found.residual,
+        }
+        return _Seen(found, said, figures, found.faults)
+
+    return marker_map.settings, look
+
+
+def _of_features(args: Options) -> tuple[Mapping[str, float], Look]:
+    for name in ("map", "board", "pattern", "square"):
+        if getattr(args, name) is not None:
+            raise UsageError(f"--{name} is for markers; give it or --features")
+    most = args.max_keypoints or FeatureConfig().max_keypoints
+    extractor = FrameExtractor(FeatureConfig(features=args.features or "", max_keypoints=most))
+
+    def look(shots: Shots, bag: BagWriter, options: offline.Options, bar: Any) -> _Seen:
+        found = record_features(shots, extractor, bag, options, bar.update)
+        figures: Figures = {
+            "images": found.images,
+            "with_keypoints": len(found.counts),
+            "keypoints": float(np.median(found.counts)),
+        }
+        said = (
+            f"{len(found.counts)} of {found.images} images, {np.median(found.counts):.0f} "
+            f"keypoints ({args.features}) each (median)"
+        )
+        return _Seen(found, said, figures)
+
+    return {}, look

@@ -17,17 +17,14 @@ from rs_localizer.cli import WORKING, with_values
 from rs_localizer.cli.options import CAMERA_FLAGS, Inputs, Settings, UsageError, option
 from rs_localizer.cli.settings_args import given_values, remapped
 from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
-from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
+from rs_localizer.io.image_clock import ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE
-from rs_localizer.settings import build, camera_values, write_parameters
+from rs_localizer.settings import build, camera_values
 
 if WORKING:
-    import numpy as np
-
     from rs_localizer.core.camera import Camera
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
-    from rs_localizer.io.imu import ImuRecording
     from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_telemetry
     from rs_localizer.io.video import count_lenses, has_times
     from rs_localizer.offline.image_sources import (
@@ -64,9 +61,14 @@ class ImageOptions(Settings, Inputs):
     )  # fmt: skip
 
 
+def given_lens(args: Any) -> Camera | None:
+    """The camera of ``--camera``, if there is one."""
+    return None if args.calibration is None else read_calibration(args.calibration)
+
+
 def shutter_values(args: Any) -> dict[str, Any]:
     """The settings that were given, or that stand beside the images of a bag, by dotted name."""
-    beside, calibration = args.images / PARAMETERS, getattr(args, "calibration", None)
+    beside, calibration = args.images / PARAMETERS, args.calibration
     given = args.params is not None or (calibration is not None and camera_values(calibration))
     if not given and is_bag(args.images) and beside.exists():
         return given_values(with_values(args, params=beside))
@@ -86,14 +88,12 @@ def telemetry_of(path: Path) -> Telemetry | None:
     Raises:
         ValueError: for telemetry that cannot be read.
     """
-    telemetry = _telemetry(path)
+    telemetry = read_telemetry(path) if _has_telemetry(path) and _can_read() else None
     return None if telemetry is None or telemetry.stabilizer else telemetry
 
 
-def _telemetry(path: Path) -> Telemetry | None:
-    if not path.is_file() or is_bag(path):
-        return None
-    return read_telemetry(path) if has_telemetry(path) and _can_read() else None
+def _has_telemetry(path: Path) -> bool:
+    return path.is_file() and not is_bag(path) and has_telemetry(path)
 
 
 def _can_read() -> bool:
@@ -101,16 +101,9 @@ def _can_read() -> bool:
     return all(importlib.util.find_spec(name) is not None for name in ("telemetry_parser", "av"))
 
 
-def video_imu(telemetry: Telemetry) -> ImuRecording:
-    """The readings of a video."""
-    stamps = DEFAULT_START_NS + np.round(1e9 * telemetry.times).astype(np.int64)
-    return ImuRecording(stamps, telemetry.rates, np.eye(3))
-
-
 def tell_telemetry(
-    args: Any, used: float | None = None, measured: Camera | None = None,
-    lens: bool = True,
-) -> None:  # fmt: skip
+    args: Any, used: float | None = None, measured: Camera | None = None, lens: bool = True
+) -> None:
     """Say what a video knows of its camera, and what is not used of it.
 
     Args:
@@ -119,16 +112,19 @@ def tell_telemetry(
         measured: the camera, if it was measured.
         lens: whether a lens profile takes the place of a calibration.
     """
-    path = args.images
-    is_rig = measured is None and bool(build(shutter_values(args)).of_cameras)
+    path, settings = args.images, None if measured else build(shutter_values(args))
+    is_rig = settings is not None and bool(settings.of_cameras)
     if path.suffix == ".insv" and importlib.util.find_spec("av") is not None:
         names = LENSES[: count_lenses(path)]
         if len(names) > 1 and measured is None and not is_rig:
             print(f"note: of {', '.join(names)} the first one is used; calibrate --rig takes all")
-    telemetry = _telemetry(path)
+    if not _has_telemetry(path):
+        return
+    if not _can_read():
+        print("note: the video has a gyroscope; to use it: pip install 'rs_localizer[video]'")
+        return
+    telemetry = read_telemetry(path)
     if telemetry is None:
-        if not _can_read() and path.is_file() and not is_bag(path) and has_telemetry(path):
-            print("note: the video has a gyroscope; to use it: pip install 'rs_localizer[video]'")
         return
     if telemetry.stabilizer:
         print(
@@ -140,29 +136,21 @@ def tell_telemetry(
     said = [f"gyroscope at {telemetry.rate:.0f} Hz" + (" (not used of a rig)" if is_rig else "")]
     if telemetry.readout_time is not None:
         said.append(f"readout time {1e3 * telemetry.readout_time:.2f} ms")
-        how = "given" if used is None else "measured"
-        used = build(shutter_values(args)).readout_time if used is None else used
-        if abs(used / telemetry.readout_time - 1.0) > _SAME:
-            said[-1] += f" (not used: {1e3 * used:.2f} ms was {how})"
+        how, ours = ("measured", used) if settings is None else ("given", settings.readout_time)
+        if ours is not None and abs(ours / telemetry.readout_time - 1.0) > _SAME:
+            said[-1] += f" (not used: {1e3 * ours:.2f} ms was {how})"
+    profile = telemetry.profile
     if telemetry.lens:
         said.append(telemetry.lens)
-        if (profile := telemetry.profile) is not None:
-            used_one = lens and args.calibration is None
-            said[-1] += ", used" if used_one else ", not used"
-            if measured is not None:
-                focal = measured.K[0, 0] * profile.width / measured.width
-                if abs(focal / profile.K[0, 0] - 1.0) > _SAME:
-                    said[-1] += (
-                        f" (its focal length is {profile.K[0, 0]:.0f} px, {focal:.0f} px was "
-                        "measured: of another mode?)"
-                    )
+    if telemetry.lens and profile is not None:
+        said[-1] += ", used" if lens and args.calibration is None else ", not used"
+        focal = measured.K[0, 0] * profile.width / measured.width if measured else profile.K[0, 0]
+        if abs(focal / profile.K[0, 0] - 1.0) > _SAME:
+            said[-1] += (
+                f" (its focal length is {profile.K[0, 0]:.0f} px, {focal:.0f} px was measured: of "
+                "another mode?)"
+            )
     print(f"{telemetry.camera}: {', '.join(said)}")
-
-
-def write_shutter(args: Any, out: Path, of_map: Mapping[str, float] | None = None) -> None:
-    """What is known of the shutter and of the map, into the directory of a recording."""
-    if values := {**(of_map or {}), **shutter_values(args)}:
-        write_parameters(out / PARAMETERS, values)
 
 
 def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> None:
@@ -174,31 +162,18 @@ def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> Non
         print(f"kept for replay: {kept}")
 
 
-def time_faults(args: Any, clock: ImageClock | None, period: float, camera: str = "") -> list[str]:
-    """Say where the times are from; what speaks against them, and against the readout time.
+def tell_times(clock: ImageClock | None, readout_time: float = 0.0, period: float = 0.0) -> None:
+    """Say where the times of images are from that have been read, and what speaks against them.
 
     Args:
+        readout_time: s, as it was given.
         period: s from one image to the next.
-        camera: of a rig, whose images these are.
     """
-    faults, settings = [], build(shutter_values(args))
     if clock is not None:
         print(clock.description())
-        faults.append(clock.fault())
-    own = settings.of_cameras.get(camera, settings)
-    faults.append(readout_fault(own.readout_time, period))
-    return [fault for fault in faults if fault]
-
-
-def tell_next(args: Any, more: str = "") -> None:
-    """The command that makes poses of the recording, with further options."""
-    if not {"readout_time", "cameras"} & set(shutter_values(args)):
-        print(
-            "the readout time is not known: poses come without twists; calibrate measures it, and "
-            "-p readout_time:=SECONDS gives it to the next command"
-        )
-    known = (args.out / PARAMETERS).exists()
-    print(f"next: {replay_command(args.out, known=known)}{more}")
+    for fault in (clock and clock.fault(), readout_fault(readout_time, period)):
+        if fault:
+            print(f"warning: {fault}")
 
 
 def replay_command(recording: Path, *, known: bool = True) -> str:
@@ -218,9 +193,7 @@ class Source:
 
 
 @contextlib.contextmanager
-def opened(
-    args: Any, path: Path, calibrated: bool = True,
-) -> Iterator[Source]:  # fmt: skip
+def opened(args: Any, path: Path, calibrated: bool = True) -> Iterator[Source]:
     """Images with the lens of ``args.calibration`` or, of a bag, its camera_info.
 
     Args:
@@ -231,37 +204,33 @@ def opened(
     Raises:
         UsageError: for options that do not go with it, or that are missing.
     """
-    if not is_bag(path):
-        if args.remaps:
-            raise UsageError("-r names topics of a bag")
-        if getattr(args, "lens", None) is not None:
-            if args.rate is not None:
-                raise UsageError("--rate is for one camera: leave it out with cameras")
-            if args.calibration is None:
-                raise UsageError(
-                    "cameras in one file: --camera FILE_camchain.yaml of calibrate --rig"
-                )
-            yield of_files(args, path, read_calibration(args.calibration))
-            return
+    camera = given_lens(args)
+    if is_bag(path):
+        if args.rate is not None:
+            raise UsageError("--rate is for videos and folders; a bag has its own times")
+        with open_bag(path) as bag:
+            if bag.fault is not None:
+                print(f"warning: {bag.fault}")
+            yield of_bag(bag, camera, args, calibrated)
+        return
+    if args.remaps:
+        raise UsageError("-r names topics of a bag")
+    telemetry = None
+    if getattr(args, "lens", None) is not None:
+        if args.rate is not None:
+            raise UsageError("--rate is for one camera: leave it out with cameras")
+        if camera is None:
+            raise UsageError("cameras in one file: --camera FILE_camchain.yaml of calibrate --rig")
+    else:
         telemetry = telemetry_of(path)
-        camera = None if args.calibration is None else read_calibration(args.calibration)
         if camera is None and calibrated:
             camera = None if telemetry is None else telemetry.profile
             if camera is None:
                 raise UsageError("a video or folder has no camera_info: give --camera")
-        source = of_files(args, path, camera)
-        if telemetry is not None and source.clock is not None:
-            moving = with_telemetry(source.shots, telemetry, source.clock)
-            source = replace(source, shots=moving)
-        yield source
-        return
-    if args.rate is not None:
-        raise UsageError("--rate is for videos and folders; a bag has its own times")
-    with open_bag(path) as bag:
-        if bag.fault is not None:
-            print(f"warning: {bag.fault}")
-        camera = None if args.calibration is None else read_calibration(args.calibration)
-        yield of_bag(bag, camera, args, calibrated)
+    source = of_files(args, path, camera)
+    if telemetry is not None and source.clock is not None:
+        source = replace(source, shots=with_telemetry(source.shots, telemetry, source.clock))
+    yield source
 
 
 def of_bag(bag: BagReader, camera: Camera | None, args: Any, calibrated: bool = True) -> Source:
@@ -280,27 +249,17 @@ def of_files(args: Any, path: Path, camera: Camera | None) -> Source:
     Raises:
         UsageError: when they have no times, and there is no ``args.rate``.
     """
-    rate, lens = args.rate, getattr(args, "lens", None)
+    lens, clock = getattr(args, "lens", None), ImageClock(args.rate)
     if lens is not None:  # their common zero is the first image of the first one
         clock = ImageClock()
         return Source(from_video(path, camera, clock, lens), None, clock)
-    if not path.is_dir():
-        if rate is None and not has_times(path):
-            raise UsageError("this video has no presentation times: give --rate; the readout time "
-                             "scales with it")  # fmt: skip
-        clock = ImageClock(rate)
-        return Source(from_video(path, camera, clock), None, clock)
-    files = image_files(path)
-    if rate is None and name_times(files) is None:
-        raise UsageError("the names of the files are not times: give --rate")
-    clock = ImageClock(rate)
-    return Source(from_files(files, camera, clock), len(files), clock)
-
-
-def tell_times(clock: ImageClock | None) -> None:
-    """Say where the times of images are from that have been read, and what speaks against them."""
-    if clock is None:
-        return
-    print(clock.description())
-    if fault := clock.fault():
-        print(f"warning: {fault}")
+    if path.is_dir():
+        files = image_files(path)
+        if args.rate is None and name_times(files) is None:
+            raise UsageError("the names of the files are not times: give --rate")
+        return Source(from_files(files, camera, clock), len(files), clock)
+    if args.rate is None and not has_times(path):
+        raise UsageError(
+            "this video has no presentation times: give --rate; the readout time scales with it"
+        )
+    return Source(from_video(path, camera, clock), None, clock)

@@ -8,7 +8,6 @@ when who reads the output goes away (``| head``).
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import difflib
 import importlib
@@ -20,12 +19,11 @@ import sys
 import traceback
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import rs_localizer
-from rs_localizer.cli import COMMON, LateParser, add_common
+from rs_localizer.cli import COMMON, add_common
 from rs_localizer.cli.options import Parser, UsageError, add_options, read
 from rs_localizer.io.atomic_files import remove_unfinished
 from rs_localizer.process.missing import explain
@@ -39,8 +37,7 @@ _STEERING = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(NamedTuple):
     """A command: what it does, and a line that a user can try.
 
     Its module, imported only when it is chosen, offers the dataclass ``Options`` and
@@ -53,78 +50,69 @@ class Command:
 
 
 COMMANDS = {
-    "demo": Command(
-        "rs_localizer.cli.demo",
-        "play the bundled recordings through the real node; ends with a table and pictures",
-        "rs_localizer demo --out out",
-    ),
-    "replay": Command(
-        "rs_localizer.cli.replay",
-        "a recording in; poses and twists out, as text files and as a bag",
-        "rs_localizer replay flight -p readout_time:=0.03 --out flight_poses",
-    ),
-    "simulate": Command(
-        "rs_localizer.cli.simulate",
-        "write a recording with ground truth: a scene, a motion, a rolling-shutter camera",
-        "rs_localizer simulate flight --trajectory poses.txt --duration 30 --noise 1",
-    ),
-    "markers make": Command(
-        "rs_localizer.cli.markers",
-        "prints of markers or a board, true to scale, with their map",
-        "rs_localizer markers make wall --family apriltag_36h11 --page a4",
-    ),
-    "detect": Command(
-        "rs_localizer.cli.detect",
-        "find markers or a board in a video, a bag or a folder of images; writes a recording",
-        "rs_localizer detect video.mp4 --map wall.yaml --camera camera.yaml --out seen",
-    ),
-    "calibrate": Command(
-        "rs_localizer.cli.calibrate",
-        "readout time, scan direction and lens of a camera that moves in a recording; or of a rig",
-        "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --out camera.yaml",
-    ),
-    "readout": Command(
-        "rs_localizer.cli.readout",
-        "published readout times of a camera: median, spread, sources",
-        "rs_localizer readout imx219 1920x1080",
-    ),
-    "evaluate": Command(
-        "rs_localizer.cli.evaluate",
-        "errors of estimated poses and twists against the truth, as tables and plots",
-        "rs_localizer evaluate flight_poses flight",
-    ),
-    "map build": Command(
-        "rs_localizer.cli.map.build",
-        "a map of landmarks from images: structure by COLMAP, refined with the rolling shutter",
-        "rs_localizer map build walk.mp4 --camera camera.yaml --out room",
-    ),
-    "map survey": Command(
-        "rs_localizer.cli.map.survey",
-        "find the poses of all markers that a recording shows; sizes are taken as given",
-        "rs_localizer map survey wall.mp4 --family apriltag_36h11 --size 0.15 --camera "
-        "camera.yaml --out wall.yaml",
-    ),
-    "map refine": Command(
-        "rs_localizer.cli.map.refine",
-        "adjust a map with the rolling shutter that saw it, or a model of COLMAP",
-        "rs_localizer map refine seen --map room.npz --out refined.npz",
-    ),
-    "map align": Command(
-        "rs_localizer.cli.map.align",
-        "write a map to another file; in metres, z up, with an origin, where these are given",
-        "rs_localizer map align room.npz level.npz --up 0 -1 0 --origin 7",
-    ),
-    "map info": Command(
-        "rs_localizer.cli.map.info",
-        "describe a map of landmarks or of markers, and name sizes in other units",
-        "rs_localizer map info wall.yaml",
-    ),
-    "warm": Command(
-        "rs_localizer.cli.warm",
-        "compile all kernels now, for images and installers; the first start is then as any other",
-        "rs_localizer warm",
-    ),
-}
+    name: Command(
+        f"rs_localizer.cli.{name.replace(' ', '.').removesuffix('.make')}",
+        summary,
+        f"rs_localizer {name} {words}".rstrip(),
+    )
+    for name, summary, words in (
+        (
+            "demo", "play the bundled recordings through the real node; a table and pictures",
+            "--out out",
+        ),
+        (
+            "replay", "a recording in; poses and twists out, as text files and as a bag",
+            "flight -p readout_time:=0.03 --out flight_poses",
+        ),
+        (
+            "simulate",
+            "write a recording with ground truth: a scene, a motion, a rolling-shutter camera",
+            "flight --trajectory poses.txt --duration 30 --noise 1",
+        ),
+        (
+            "markers make", "prints of markers or a board, true to scale, with their map",
+            "wall --family apriltag_36h11 --page a4",
+        ),
+        (
+            "detect",
+            "find markers or a board in a video, a bag or a folder of images; writes a recording",
+            "video.mp4 --map wall.yaml --camera camera.yaml --out seen",
+        ),
+        (
+            "calibrate",
+            "readout time, scan direction and lens of a camera that moves in a recording, or a rig",
+            "video.mp4 --board 9x6 --square 0.025 --out camera.yaml",
+        ),
+        (
+            "readout", "published readout times of a camera: median, spread, sources",
+            "imx219 1920x1080",
+        ),
+        (
+            "evaluate", "errors of estimated poses and twists against the truth",
+            "flight_poses flight",
+        ),
+        (
+            "map build",
+            "a map of landmarks from images: structure by COLMAP, refined with the rolling shutter",
+            "walk.mp4 --camera camera.yaml --out room",
+        ),
+        (
+            "map survey", "find the poses of all markers that a recording shows, by their sizes",
+            "wall.mp4 --family apriltag_36h11 --size 0.15 --camera camera.yaml --out wall.yaml",
+        ),
+        (
+            "map refine", "adjust a map with the rolling shutter that saw it, or COLMAP's model",
+            "seen --map room.npz --out refined.npz",
+        ),
+        (
+            "map align",
+            "write a map to another file; in metres, z up, with an origin, where these are given",
+            "room.npz level.npz --up 0 -1 0 --origin 7",
+        ),
+        ("map info", "describe a map, and name sizes in other units", "wall.yaml"),
+        ("warm", "compile all kernels now; the first start is then as any other", ""),
+    )
+}  # fmt: skip
 
 
 def main(
@@ -181,12 +169,6 @@ def parse(name: str, module: ModuleType, words: Sequence[str]) -> Any:
     Raises:
         UsageError: for words that it does not understand.
     """
-    parser = parser_of(name, module)
-    return read(module.Options, parser.parse_args(list(words)))
-
-
-def parser_of(name: str, module: ModuleType) -> Parser:
-    """The parser of a command, by its dataclass of options."""
     summary = COMMANDS[name].summary
     parser = Parser(
         prog=f"rs_localizer {name}",
@@ -195,7 +177,7 @@ def parser_of(name: str, module: ModuleType) -> Parser:
     )
     add_options(parser, module.Options)
     add_common(parser)
-    return parser
+    return read(module.Options, parser.parse_args(list(words)))
 
 
 def _chosen(words: Sequence[str]) -> tuple[str, Sequence[str]]:
@@ -241,12 +223,13 @@ def _listed(names: Iterable[str]) -> str:
 def _said(name: str, error: Exception) -> int | None:
     """Say what went wrong; the exit code, None for a fault in the program."""
     match error:
-        case BrokenPipeError():
-            return _unheard()
-        case UsageError():
-            return _fail(name, str(error), 2)
+        case BrokenPipeError():  # nobody reads any more
+            with contextlib.suppress(OSError, ValueError):
+                # What is left in the buffer would be written at the end, and fail again.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return _SIGPIPE
         case ValueError() | OSError():
-            return _fail(name, str(error), 1)
+            return _fail(name, str(error), 2 if isinstance(error, UsageError) else 1)
         case ImportError():  # of what only some of its work needs
             return _fail(name, explain(error), 1)
         case MemoryError():
@@ -302,33 +285,7 @@ def _as_json(value: Any) -> Any:
     return value if isinstance(value, (bool, int, type(None))) else str(value)
 
 
-def complete() -> None:
-    """Answer a shell that asks how to complete a line, if one does (argcomplete)."""
-    if "_ARGCOMPLETE" not in os.environ:
-        return
-    import argcomplete
-
-    parser = argparse.ArgumentParser(prog="rs_localizer", allow_abbrev=False)
-    commands = {"": parser.add_subparsers(parser_class=LateParser)}
-    for name, command in COMMANDS.items():
-        group, _, last = name.rpartition(" ")
-        if group not in commands:
-            commands[group] = commands[""].add_parser(group).add_subparsers(parser_class=LateParser)
-        own = commands[group].add_parser(last, help=command.summary)
-        own.come_from(command.module)
-        add_common(own)
-    argcomplete.autocomplete(parser)
-
-
 def _fail(name: str, text: str, code: int) -> int:
     shown = " ".join(text.split()).translate(_STEERING)
     print(f"{' '.join(['rs_localizer', *name.split()])}: {shown}", file=sys.stderr)
     return code
-
-
-def _unheard() -> int:
-    """Nobody reads the output any more; to say so would be heard by nobody either."""
-    with contextlib.suppress(OSError, ValueError):
-        # What is left in the buffer would be written at the end of the process, and fail again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return _SIGPIPE

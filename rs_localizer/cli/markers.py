@@ -46,10 +46,6 @@ class Options(Overwrite):
         f"side of a marker (default: {_SIZE}) or of a board's squares ({_SQUARE})", "M",
         limits=(0.0, math.inf), above=True,
     )  # fmt: skip
-    gap: float | None = option(
-        "between the markers of a grid (default: a third of their size)", "M",
-        limits=(0.0, math.inf),
-    )  # fmt: skip
     first_id: int = option("id of the first marker", "N", 0, limits=(0, math.inf))
     page: str = option("of paper", default="a4", choices=sorted(PAGES))
     standing: bool = option(
@@ -93,11 +89,8 @@ def _map(options: Options) -> MarkerMap:
     counts = read_counts(getattr(options, what) or _GRID, f"--{what}")
     if what == "grid":
         size = options.size or _SIZE
-        gap = _GAP * size if options.gap is None else options.gap
         first = options.first_id
-        return MarkerMap(wall(options.family, counts, size, gap, first_id=first, pose=pose))
-    if options.gap is not None:
-        raise UsageError("--gap is for a grid")
+        return MarkerMap(wall(options.family, counts, size, _GAP * size, first_id=first, pose=pose))
     square = options.size or _SQUARE
     if what == "chessboard":
         return MarkerMap(boards=(Chessboard(*counts, square, pose=pose),))

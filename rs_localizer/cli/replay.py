@@ -183,7 +183,7 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
         matches = Path(place) / "matches"
         of_images = _detection(options, recording, matches)
         by_markers = of_images.features is None
-        (detect.detect_one if by_markers else detect.detect_features)(of_images)
+        detect.detect(of_images)
         # What was given is in the file beside the matches now, with what the video says.
         own = matches / PARAMETERS
         alone = replace(
@@ -345,7 +345,8 @@ def _replay(
                 if options.smooth:
                     smoothed.add(frame.input_stamp_ns)
     if tally.smoothed is not None:
-        tally.write_bridged(out)
+        text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in tally.bridged)
+        (out / BRIDGED).write_text(text, encoding="utf-8")
     if tally.table is not None:
         for answer in refused:
             if answer.stamp_ns not in smoothed:

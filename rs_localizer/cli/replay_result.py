@@ -171,7 +171,7 @@ class Tally:
     seconds: float = 0.0
     moving: bool = False  # whether there are twists
     smoothed: Counter[str] | None = None  # what became of the moments of one that was smoothed
-    bridged: array[int] = field(default_factory=lambda: array("q"))  # ns
+    bridged: array[int] = field(default_factory=lambda: array("q"))  # ns, without an image
     imu: ImuState | None = None
     readout: tuple[float, float] | None = None  # s, as the motion shows it, and its deviation
     _stamps_ns: array[int] = field(default_factory=lambda: array("q"))  # of the images
@@ -196,11 +196,6 @@ class Tally:
         self.bridged.extend(part.bridged.tolist())
         return part.frames
 
-    def write_bridged(self, out: Path) -> None:
-        """Write the stamps of poses without an image of their own, in s, one a line."""
-        text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in self.bridged)
-        (out / BRIDGED).write_text(text, encoding="utf-8")
-
     def refuse(self, refusal: Refusal) -> None:
         """Count a message without one."""
         self.refused[refusal.reason] += 1
@@ -219,12 +214,9 @@ class Tally:
     @property
     def period(self) -> float:
         """Seconds from frame to frame, median; NaN for less than two."""
-        stamps = np.unique(np.array(self._stamps_ns, np.int64))
-        if len(stamps) < 2:
-            return np.nan
-        steps = np.diff(stamps) * 1e-9
+        steps = np.diff(np.unique(np.array(self._stamps_ns, np.int64))) * 1e-9
         # Between those with a pose others may have been refused.
-        return float(np.median(steps / np.round(steps / steps.min())))
+        return float(np.median(steps / np.round(steps / steps.min()))) if len(steps) else np.nan
 
 
 def figures(tally: Tally) -> Figures:
@@ -248,67 +240,55 @@ def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:
 
     ``timed``: whether to say how fast, which is never the same twice.
     """
-    rows = [("frames", str(tally.total)), ("localized", str(tally.localized))]
-    rows += [(f"  refused: {reason}", str(n)) for reason, n in tally.refused.most_common()]
+    rows: list[tuple[str, object]] = [("frames", tally.total), ("localized", tally.localized)]
+    rows += [(f"  refused: {reason}", n) for reason, n in tally.refused.most_common()]
     for name, (count, _) in sorted(tally.notices.items(), key=lambda item: -item[1][0]):
-        kind = "restarted" if name in _RESTARTS else "noticed"
-        rows.append((f"{kind}: {name}", str(count)))
-    dropped = int(tally.column("dropped").sum())
+        rows.append((f"{'restarted' if name in _RESTARTS else 'noticed'}: {name}", count))
     for name, count in (
-        ("rows dropped (not finite)", dropped),
+        ("rows dropped (not finite)", int(tally.column("dropped").sum())),
         ("stamps repeated, not in the text files", tally.repeated),
         ("without a transform on /tf", tally.not_sent),
     ):
-        rows += [(name, str(count))] if count else []
-    rows += _quality(tally, config) + _inertial(tally.imu)
+        rows += [(name, count)] if count else []
+    if tally.localized:
+        rolling = find_solver(config.solver).rolling_shutter
+        still = [("  inliers with a global shutter", "global_shutter_inliers", ".0f")]
+        rows += [
+            (name, f"{np.median(tally.column(column)):{form}}")
+            for name, column, form in (
+                ("residual of the inliers (px rms, median)", "residual", ".3f"),
+                ("error of map and lens (px rms, median)", "model_error", ".3f"),
+                ("points of a frame (median)", "points", ".0f"),
+                (f"  inliers{' with a rolling shutter' * rolling}", "inliers", ".0f"),
+                *still * rolling,
+            )
+        ]
+        if rolling:
+            rows.append(("tracked from the frame before", f"{tally.column('tracked').mean():.1%}"))
+    if (imu := tally.imu) is not None:
+        rows.append(("localized with the IMU", f"{imu.used / imu.frames:.1%}"))
+        rows += [(f"  without: {reason}", count) for reason, count in imu.reasons.items()]
+        if imu.used and imu.status is not None and np.isfinite(imu.time_offset):
+            bias = np.linalg.norm(np.degrees(imu.status.bias))
+            rows.append(("  bias of the gyroscope (deg/s)", f"{bias:.2f}"))
+            rows.append(("  time offset of the IMU (ms)", f"{1e3 * imu.time_offset:.2f}"))
     if timed:
         rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
     if (smoothed := tally.smoothed) is not None:
         rows += [
-            ("samples of the smoothed motion", str(smoothed["samples"])),
-            (f"  bridged, listed in {BRIDGED}", str(len(tally.bridged))),
-            ("  left out, not determined", str(smoothed["undetermined"])),
-            ("  shaken faster than it follows, left as they were", str(smoothed["shaken"])),
+            ("samples of the smoothed motion", smoothed["samples"]),
+            (f"  bridged, listed in {BRIDGED}", len(tally.bridged)),
+            ("  left out, not determined", smoothed["undetermined"]),
+            ("  shaken faster than it follows, left as they were", smoothed["shaken"]),
         ]
     for name, text in rows:
-        print(f"{name:40} {text:>8}")
-    for reason in (*tally.refused, *(tally.imu.reasons if tally.imu else ())):
-        if text := explained(reason):
-            print(textwrap.fill(f"{reason}: {text}", _WIDTH, subsequent_indent="    "))
-    for name, (_, text) in tally.notices.items():
-        print(textwrap.fill(f"{name}: {text}", _WIDTH, subsequent_indent="    "))
-    fault = readout_fault(config.readout_time, tally.period)
-    if fault is not None:
+        print(f"{name:40} {text!s:>8}")
+    reasons = (*tally.refused, *(tally.imu.reasons if tally.imu else ()))
+    sentences = {reason: explained(reason) for reason in reasons}
+    for name, text in (
+        sentences | {name: text for name, (_, text) in tally.notices.items()}
+    ).items():
+        if text:
+            print(textwrap.fill(f"{name}: {text}", _WIDTH, subsequent_indent="    "))
+    if (fault := readout_fault(config.readout_time, tally.period)) is not None:
         print(f"warning: {fault}")
-
-
-def _inertial(imu: ImuState | None) -> list[tuple[str, str]]:
-    if imu is None:
-        return []
-    rows = [("localized with the IMU", f"{imu.used / imu.frames:.1%}")]
-    rows += [(f"  without: {reason}", str(count)) for reason, count in imu.reasons.items()]
-    if imu.used and imu.status is not None and np.isfinite(imu.time_offset):
-        bias, offset = np.degrees(imu.status.bias), 1e3 * imu.time_offset
-        rows += [
-            ("  bias of the gyroscope (deg/s)", f"{np.linalg.norm(bias):.2f}"),
-            ("  time offset of the IMU (ms)", f"{offset:.2f}"),
-        ]
-    return rows
-
-
-def _quality(tally: Tally, config: NodeConfig) -> list[tuple[str, str]]:
-    if not tally.localized:
-        return []
-    rows = [
-        (name, f"{np.median(tally.column(column)):{form}}")
-        for name, column, form in (
-            ("residual of the inliers (px rms, median)", "residual", ".3f"),
-            ("error of map and lens (px rms, median)", "model_error", ".3f"),
-            ("points of a frame (median)", "points", ".0f"),
-            ("  inliers with a rolling shutter", "inliers", ".0f"),
-            ("  inliers with a global shutter", "global_shutter_inliers", ".0f"),
-        )
-    ]
-    if not find_solver(config.solver).rolling_shutter:
-        return [*rows[:3], ("  inliers", rows[3][1])]
-    return [*rows, ("tracked from the frame before", f"{np.mean(tally.column('tracked')):.1%}")]

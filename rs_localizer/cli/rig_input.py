@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rs_localizer.cli import WORKING, with_values
-from rs_localizer.cli.options import UsageError, option
+from rs_localizer.cli.options import UsageError
 
 if WORKING:
     import numpy as np
@@ -125,17 +124,6 @@ class MapCamera:
     mounting: Mounting | None  # None: the axes are its own
 
 
-@dataclass(frozen=True, kw_only=True)
-class MountingOptions:
-    """several recordings: cameras on one body, named as their files."""
-
-    mounting: tuple[float, float, float] | None = option(
-        "standard deviations of a rig's extrinsics and clocks as they are given, which are "
-        "estimated as well (default: the largest with which calibrate --rig accepts them)",
-        "DEG M S", limits=(0.0, math.inf), above=True,
-    )  # fmt: skip
-
-
 def map_cameras(args: Any, config: NodeConfig) -> list[MapCamera]:
     """The cameras of ``args.recordings``; those of a rig in the axes of the first.
 
@@ -167,15 +155,12 @@ def map_cameras(args: Any, config: NodeConfig) -> list[MapCamera]:
     if lacking := [name for name in sources if not shutters[name].readout_time > 0.0]:
         raise UsageError(f"no readout_time of {', '.join(lacking)}: calibrate --rig finds it")
     first = given[next(iter(sources))].inverse()
-    deviations = DETERMINED  # rad, m, s
-    if args.mounting is not None:
-        deviations = tuple(np.multiply(args.mounting, [np.radians(1.0), 1.0, 1.0]))
     cameras = list[MapCamera]()
     for name, own in sources.items():
         pose, mounting = given[name] @ first, None
         if cameras:
             extrinsics = Extrinsics(pose.rotation, -pose.rotation.T @ pose.translation, 0.0)
-            mounting = Mounting(extrinsics, np.repeat(deviations, [3, 3, 1]))
+            mounting = Mounting(extrinsics, np.repeat(DETERMINED, [3, 3, 1]))
         shutter = {each.name: getattr(shutters[name], each.name) for each in fields(CameraSettings)}
         cameras.append(MapCamera(name, own.args, replace(config, **shutter), mounting))
     return cameras

@@ -16,9 +16,6 @@ if WORKING:
     from rs_localizer.config import NodeConfig
     from rs_localizer.settings import build, camera_values, load_params_file, parse_assignment
 
-# Rows by name, as row times.
-_ROWS = {"first": -0.5, "middle": 0.0, "last": 0.5}
-
 
 def given_values(
     args: Any,
@@ -69,25 +66,6 @@ def _check(values: dict[str, Any], check: Callable[[NodeConfig], object] | None)
     config = build(values)
     if check is not None:
         check(config)
-
-
-def row_time(text: str) -> float:
-    """A row by its name or by its time.
-
-    Raises:
-        UsageError: for anything else.
-    """
-    if text in _ROWS:
-        return _ROWS[text]
-    try:
-        tau = float(text)
-    except ValueError:
-        tau = float("nan")
-    if not -0.5 <= tau <= 0.5:
-        raise UsageError(
-            f"--row: must be {', '.join(_ROWS)}, or a row time from -0.5 to 0.5; got {text!r}"
-        )
-    return tau
 
 
 def remapped(options: Any) -> dict[str, str]:

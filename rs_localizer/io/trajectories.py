@@ -253,8 +253,8 @@ def read_motions(
     if path.is_file() and not is_bag(path):
         return Motions(read_tum(path), None)
     with open_bag(path) as bag:
-        pose_topic = _topic(bag, _POSE, pose_topic, "--pose-topic", required=True)
-        twist_topic = _topic(bag, _TWIST, twist_topic, "--twist-topic", required=False)
+        pose_topic = _topic(bag, _POSE, pose_topic, "-r pose:=", required=True)
+        twist_topic = _topic(bag, _TWIST, twist_topic, "-r twist:=", required=False)
         messages = _by_stamp(bag, pose_topic)
         poses = Trajectory(
             np.array(list(messages), np.int64),

@@ -60,7 +60,6 @@ class Unsaid:
 
     family: Family | None = None  # None: as the file says, or the usual one
     size: float | None = None  # m
-    part: str = ""  # name of the bundle to take
 
 
 def is_marker_file(path: Path) -> bool:
@@ -204,13 +203,13 @@ def _bundle(file: _Entry, name: str, unsaid: Unsaid) -> Iterator[Marker]:
     }
     if not bundles:
         raise ValueError("it has no tag_bundles: standalone tags have no place")
-    chosen = unsaid.part or next(iter(bundles))
-    if chosen not in bundles or (len(bundles) > 1 and not unsaid.part):
+    if len(bundles) > 1:
         raise ValueError(
-            f"it has {len(bundles)} bundles, each in a frame of its own: choose one of "
-            f"{', '.join(bundles)} with --part"
+            f"it has {len(bundles)} bundles, each in a frame of its own ({', '.join(bundles)}): "
+            "leave one in the file"
         )
-    for tag in bundles[chosen].entries("layout", "tag"):
+    (chosen,) = bundles.values()
+    for tag in chosen.entries("layout", "tag"):
         number, size = tag.identify("id"), float(tag.take("size", _NUMBER))
         place, turn = tag.numbers("xyz"), tag.numbers(("qx", "qy", "qz"))
         turn.append(float(tag.take("qw", _NUMBER, 1.0)))

@@ -190,26 +190,6 @@ def test_what_a_command_prints_as_json(result, told, command, capsys):
         assert json.loads(capsys.readouterr().out) == {"command": "replay", **told}
 
 
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("rs_localizer rep", {"replay"}),
-        ("rs_localizer evaluate --pl", {"--plot"}),
-        ("rs_localizer simulate out --scan-direction l", {"left_to_right"}),
-        ("rs_localizer map build --mar", {"--markers"}),
-    ],
-)
-def test_shells_complete(tmp_path, line, expected):
-    pytest.importorskip("argcomplete")
-    asked = {
-        "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": " ", "COMP_LINE": line,
-        "COMP_POINT": str(len(line)), "_ARGCOMPLETE_SUPPRESS_SPACE": "1", "COMP_TYPE": "9",
-        "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "answer"),
-    }  # fmt: skip
-    assert run(**asked).returncode == 0
-    assert {word.strip() for word in (tmp_path / "answer").read_text().split()} == expected
-
-
 # A module that tells that it is being imported, and takes its time.
 SLOW = "import pathlib, time; pathlib.Path(__file__).with_suffix('.seen').touch(); time.sleep(60)"
 

@@ -4,49 +4,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
-from rs_localizer.cli import WORKING
-from rs_localizer.cli.options import option
-
-if WORKING:
+if TYPE_CHECKING:
     from rs_localizer.tools.readout_belief import ReadoutCheck
 
-print_step = partial(print, "adjusted:", flush=True)
-"""What an adjustment calls after each of its steps."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class ReadoutOptions:
-    """the readout time."""
-
-    keep_readout_time: bool = option(
-        "write the map even where the images show another readout time than was given",
-        default=False,
-    )
-
-
-def check_readout(
-    options: Any, readout: ReadoutCheck | None, instead: str, camera: str = ""
-) -> None:
+def check_readout(readout: ReadoutCheck | None, camera: str = "") -> None:
     """Refuse a map that is made with the wrong readout time.
 
     It is bent by many times what its deviations say, and fits its images nearly as well.
 
     Args:
-        instead: what else the user can do.
         camera: of a rig, whose readout time it is.
 
     Raises:
-        ValueError: unless the user wants it all the same.
+        ValueError: with the readout time that the images show.
     """
-    if readout is None or not readout.differs:
-        return
-    fault = f"{camera}: {readout.message}" if camera else readout.message
-    if not options.keep_readout_time:
-        raise ValueError(
-            f"{fault}; {instead}, and with --keep-readout-time it is written all the same"
-        )
-    print(f"warning: {fault}")
+    if readout is not None and readout.differs:
+        whose = f"{camera}: " if camera else ""
+        instead = "calibrate --rig finds it" if camera else "-p readout_time:=0.0 estimates it"
+        raise ValueError(f"{whose}{readout.message}; {instead}")

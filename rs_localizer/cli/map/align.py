@@ -5,20 +5,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
-import numpy as np
-
-from rs_localizer.cli import WORKING
-from rs_localizer.cli.map import either
-from rs_localizer.cli.options import UsageError, option
-from rs_localizer.core.arrays import Array
+from rs_localizer.cli import WORKING, refuse_existing, write_all
+from rs_localizer.cli.map import info
+from rs_localizer.cli.options import UsageError, argument, option
+from rs_localizer.io.maps.files import SUFFIX, write_npz
+from rs_localizer.markers.map_files import FORMATS, OWN, SUFFIXES, write_any
 
 if WORKING:
+    import numpy as np
     from scipy.spatial.transform import Rotation
 
-    from rs_localizer.io.maps.landmarks import Map
+    from rs_localizer.core.arrays import Array
+    from rs_localizer.io.maps.landmarks import Map, make_map
     from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.markers.poses import Pose
     from rs_localizer.markers.prints import Marker
@@ -27,81 +28,95 @@ if WORKING:
 _LEAST_FLOOR = 3  # points make a plane
 # A floor whose points lie within this part of their extent of a line has no direction.
 _LINE = 1e-3
-_UP = np.array([0.0, 0.0, 1.0])
-
-Place = Callable[[int], Array]
-"""Where (3,) the landmark or marker of an id is, m."""
+_OUTPUTS = (SUFFIX, *SUFFIXES)
 
 
-@dataclass(frozen=True, slots=True)
-class Wishes:
-    """What is to hold of the map; None: as it is."""
-
-    scale: float | None = None  # factor
-    distance: tuple[int, int, float] | None = None  # between two ids, m
-    up: Array | None = None  # (3,) along the map's axes as they are
-    floor: tuple[int, ...] = ()  # ids in a level plane, below the rest
-    upright: int | None = None  # marker whose y axis points up
-    origin: int | None = None  # id
-    origin_at: Array | None = None  # (3,) m, in the map as it is
-
-
-def place_of(any_map: Map | MarkerMap) -> Place:
-    """Where the landmarks, or the middles of the markers, of a map are."""
-    if isinstance(any_map, MarkerMap):
-        places = {marker.id: marker.pose.position for marker in any_map.markers}
-    elif any_map.ids is None:
-        places = {}
-    else:
-        places = dict(zip(any_map.ids.tolist(), any_map.points, strict=True))
-
-    def place(number: int) -> Array:
-        if number not in places:
-            what = "marker" if isinstance(any_map, MarkerMap) else "landmark"
-            raise ValueError(f"the map has no {what} {number}")
-        return np.asarray(places[number])
-
-    return place
+@dataclass(frozen=True, kw_only=True)
+class Options(info.Options):
+    out: Path = argument(f"ends in {', '.join(_OUTPUTS)}", "OUT")
+    to: str | None = option(
+        "of markers (default: .json is of wpilib, .yaml our own)", choices=list(FORMATS)
+    )
+    overwrite: bool = option("replace OUT", default=False)
+    scale: float | None = option("factor", "FACTOR", limits=(0.0, math.inf), above=True)
+    distance: tuple[float, float, float] | None = option(
+        "instead: two ids (of landmarks, or of markers, whose middles count), and how far apart "
+        "they are", "ID ID M",
+    )  # fmt: skip
+    up: tuple[float, float, float] | None = option("z of the new map, in the map as it is", "X Y Z")
+    floor: list[int] = option(
+        "instead: three ids or more in a level plane at the bottom of the map", "ID ...", list
+    )
+    origin: int | None = option("id at the origin", "ID")
 
 
-def alignment(any_map: Map | MarkerMap, wishes: Wishes) -> Similarity:
+def run(options: Options) -> info.Figures:
+    suffix = options.out.suffix
+    usual = "wpilib" if suffix == ".json" else OWN
+    if suffix not in _OUTPUTS:
+        raise UsageError(f"OUT must end in {' or '.join(_OUTPUTS)}, got {options.out}")
+    if options.to and (suffix == SUFFIX or (options.to == "wpilib") != (usual == "wpilib")):
+        raise UsageError(f"{options.to} is written to {'.json' if suffix != '.json' else '.yaml'}")
+    for one, other in (("scale", "distance"), ("up", "floor")):
+        if getattr(options, one) and getattr(options, other):
+            raise UsageError(f"give one of --{one}, --{other}")
+    refuse_existing(options)
+    any_map, kind = info.read(options)
+    if isinstance(any_map, Map) and suffix != SUFFIX:
+        raise UsageError(f"{options.file} holds landmarks, which go to {SUFFIX}")
+    wishes = (options.scale, options.distance, options.up, options.floor, options.origin)
+    if any(wish not in (None, []) for wish in wishes):
+        by = alignment(any_map, options)
+        turn = np.degrees(Rotation.from_matrix(by.rotation).magnitude())
+        shift = ", ".join(f"{value:.4f}" for value in by.translation)
+        print(f"scaled by {by.scale:.6g}, turned by {turn:.3f} deg, shifted by ({shift}) m")
+        any_map = moved(any_map, by)
+    figures = info.describe(options.file, any_map, kind)
+
+    def write(part: Path) -> None:
+        if isinstance(any_map, Map):
+            write_npz(part, any_map)
+        elif suffix != SUFFIX:
+            write_any(part, any_map, options.to or usual)
+        else:  # corners, with ids of ``detect``: rows of its points
+            ids = np.arange(len(any_map.points))
+            write_npz(part, make_map(any_map.points, ids, None, any_map.map_frame))
+
+    write_all({options.out: write})
+    return {**figures, "written_to": str(options.out)}
+
+
+def alignment(any_map: Map | MarkerMap, wishes: Options) -> Similarity:
     """What brings a map to where it is wanted.
 
     Raises:
         ValueError: for ids that the map does not have, or points that tell no direction or size.
     """
-    place = place_of(any_map)
-    turn = upright(-_up(any_map, wishes, place))
-    scale = wishes.scale or 1.0
+    if isinstance(any_map, MarkerMap):
+        what, places = "marker", {one.id: one.pose.position for one in any_map.markers}
+    else:
+        ids = [] if any_map.ids is None else any_map.ids.tolist()
+        what, places = "landmark", dict(zip(ids, any_map.points, strict=False))
+
+    def place(number: float) -> Array:
+        if number not in places:
+            raise ValueError(f"the map has no {what} {number:g}")
+        return np.asarray(places[int(number)])
+
+    up = np.array(wishes.up or (0.0, 0.0, 1.0))
+    if not np.linalg.norm(up) > 0.0:
+        raise ValueError("the direction of up must not be 0 0 0")
+    if wishes.floor:
+        up = _normal(np.array([place(number) for number in wishes.floor]), any_map.points)
+    turn, scale = upright(-up), wishes.scale or 1.0
     if wishes.distance is not None:
         one, other, wanted = wishes.distance
         apart = float(np.linalg.norm(place(one) - place(other)))
-        if not apart > 0.0:
-            raise ValueError(f"{one} and {other} are at one place: they give no scale")
+        if not min(apart, wanted) > 0.0:
+            raise ValueError(f"--distance: {one:g} and {other:g} are {apart:g} m apart, no scale")
         scale = wanted / apart
-    origin = np.zeros(3)
-    if wishes.origin is not None:
-        origin = place(wishes.origin)
-    elif wishes.origin_at is not None:
-        origin = wishes.origin_at
+    origin = np.zeros(3) if wishes.origin is None else place(wishes.origin)
     return Similarity(scale, turn, -scale * turn @ origin)
-
-
-def _up(any_map: Map | MarkerMap, wishes: Wishes, place: Place) -> Array:
-    """The direction (3,) that shall point up."""
-    if wishes.up is not None:
-        if not np.linalg.norm(wishes.up) > 0.0:
-            raise ValueError("the direction of up must not be 0 0 0")
-        return wishes.up
-    if wishes.upright is not None:
-        if not isinstance(any_map, MarkerMap):
-            raise ValueError("only markers stand upright; landmarks have no axes")
-        place(wishes.upright)
-        marker = next(marker for marker in any_map.markers if marker.id == wishes.upright)
-        return np.asarray(marker.pose.rotation[:, 1])
-    if wishes.floor:
-        return _normal(np.array([place(number) for number in wishes.floor]), any_map.points)
-    return _UP
 
 
 def _normal(floor: Array, points: Array) -> Array:
@@ -116,113 +131,33 @@ def _normal(floor: Array, points: Array) -> Array:
     return np.asarray(normal if (points.mean(axis=0) - middle) @ normal >= 0.0 else -normal)
 
 
-def moved(landmarks: Map, by: Similarity) -> Map:
-    """A map of landmarks after a similarity."""
-    covariances = landmarks.covariances
-    if covariances is not None:
-        covariances = by.covariances(covariances)
-    modes = landmarks.error_modes
-    if modes is not None:
-        modes = np.asarray(by.scale * by.rotation @ modes, np.float32)
-    return replace(
-        landmarks, points=by(landmarks.points), covariances=covariances, error_modes=modes
-    )
-
-
-def moved_markers(marker_map: MarkerMap, by: Similarity) -> MarkerMap:
-    """A marker map after a similarity, which changes the markers' sizes with the scale.
+def moved(any_map: Map | MarkerMap, by: Similarity) -> Map | MarkerMap:
+    """A map after a similarity, which changes the markers' sizes with the scale.
 
     Raises:
         ValueError: when boards would change their size.
     """
-    if marker_map.boards and by.scale != 1.0:
+    if isinstance(any_map, Map):
+        covariances, modes = any_map.covariances, any_map.error_modes
+        return replace(
+            any_map,
+            points=by(any_map.points),
+            covariances=None if covariances is None else by.covariances(covariances),
+            error_modes=None
+            if modes is None
+            else np.asarray(by.scale * by.rotation @ modes, np.float32),
+        )
+    if any_map.boards and by.scale != 1.0:
         raise ValueError("a map with boards cannot be scaled: their squares have a size")
-    boards = tuple(
-        replace(
-            board, pose=Pose(by(board.pose.position[None])[0], by.rotation @ board.pose.rotation)
-        )
-        for board in marker_map.boards
-    )
-    return MarkerMap(
-        tuple(_moved(marker, by) for marker in marker_map.markers), boards, marker_map.map_frame
-    )
-
-
-def _moved(marker: Marker, by: Similarity) -> Marker:
-    deviations = marker.deviations
-    if deviations is not None:
-        # Correlations are not kept: as if there were none.
-        place, turn = (
-            np.sqrt(by.rotation**2 @ part**2) for part in (deviations[:3], deviations[3:])
-        )
-        deviations = np.concatenate([by.scale * place, turn])
-    return Marker(marker.family, marker.id, by(marker.corners), deviations)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Options(either.OtherFileOptions):
-    scale: float | None = option("factor", "FACTOR", limits=(0.0, math.inf), above=True)
-    distance: tuple[str, str, str] | None = option(
-        "instead: two ids (of landmarks, or of markers, whose middles count), and how far apart "
-        "they are", "ID ID M",
-    )  # fmt: skip
-    up: tuple[float, float, float] | None = option("z of the new map, in the map as it is", "X Y Z")
-    floor: list[int] = option(
-        "instead: three ids or more in a level plane at the bottom of the map", "ID ...", list
-    )
-    upright: int | None = option("instead: an upright marker: its y axis is up", "ID")
-    origin: int | None = option("id at the origin", "ID")
-    origin_at: tuple[float, float, float] | None = option("instead: in the map as it is", "X Y Z")
-
-
-def run(options: Options) -> either.Figures:
-    either.check_output(options)
-    wishes = _wishes(options)
-    any_map, kind = either.read(options)
-    result = any_map if wishes is None else _aligned(any_map, wishes)
-    figures = either.describe(options.file, result, kind)
-    either.write(options, result)
-    return {**figures, "written_to": str(options.out)}
-
-
-def _aligned(any_map: Map | MarkerMap, wishes: Wishes) -> Map | MarkerMap:
-    """The map as it is wanted; says what that changes."""
-    by = alignment(any_map, wishes)
-    result = moved_markers(any_map, by) if isinstance(any_map, MarkerMap) else moved(any_map, by)
-    turn = np.degrees(Rotation.from_matrix(by.rotation).magnitude())
-    shift = ", ".join(f"{value:.4f}" for value in by.translation)
-    print(f"scaled by {by.scale:.6g}, turned by {turn:.3f} deg, shifted by ({shift}) m")
-    if isinstance(any_map, MarkerMap) and by.scale != 1.0:
-        print("the sizes of the markers are scaled as well")
-    return result
-
-
-def _wishes(options: Options) -> Wishes | None:
-    """What is to hold of the map; None: it is only to be written to another file."""
-    names = ("scale", "distance", "up", "floor", "upright", "origin", "origin_at")
-    if not any(getattr(options, name) not in (None, []) for name in names):
-        return None
-    for group in (("scale", "distance"), ("up", "floor", "upright"), ("origin", "origin_at")):
-        given = [name for name in group if getattr(options, name) not in (None, [])]
-        if len(given) > 1:
-            raise UsageError(f"give one of {', '.join('--' + n.replace('_', '-') for n in given)}")
-    distance = None
-    if options.distance is not None:
-        one, other, apart = options.distance
-        try:
-            distance = int(one), int(other), float(apart)
-        except ValueError:
-            raise UsageError(
-                f"--distance takes two ids and metres, got {options.distance}"
-            ) from None
-        if not 0.0 < distance[2] < np.inf:
-            raise UsageError(f"--distance: {apart} is not a length")
-    return Wishes(
-        options.scale, distance, _vector(options.up), tuple(options.floor), options.upright,
-        options.origin,
-        _vector(options.origin_at),
-    )  # fmt: skip
-
-
-def _vector(values: tuple[float, float, float] | None) -> Array | None:
-    return None if values is None else np.array(values)
+    boards = [
+        replace(one, pose=Pose(by(one.pose.position[None])[0], by.rotation @ one.pose.rotation))
+        for one in any_map.boards
+    ]
+    markers = []
+    for one in any_map.markers:
+        deviations = one.deviations
+        if deviations is not None:  # correlations are not kept: as if there were none
+            parts = np.sqrt(deviations.reshape(2, 3) ** 2 @ by.rotation.T**2)
+            deviations = (parts * [[by.scale], [1.0]]).ravel()
+        markers.append(Marker(one.family, one.id, by(one.corners), deviations))
+    return MarkerMap(tuple(markers), tuple(boards), any_map.map_frame)

@@ -20,7 +20,7 @@ from rs_localizer.cli.image_input import (
     shutter_values,
     tell_left_out,
     tell_telemetry,
-    time_faults,
+    tell_times,
 )
 from rs_localizer.cli.options import UsageError, argument, number, option
 from rs_localizer.config import FeatureConfig
@@ -120,8 +120,7 @@ def look_at_images(args: Any, looker: Looker) -> Looked:
         raise ValueError(f"{args.images} has no image that can be read; {why}")
     tell_left_out(refused, {})
     period = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else np.nan
-    for fault in time_faults(args, source.clock, period):
-        print(f"warning: {fault}")
+    tell_times(source.clock, build(shutter_values(args)).readout_time, period)
     sights = []
     for name, seconds, u, v in args.point:
         if seconds not in named:
@@ -152,13 +151,6 @@ class Options(ImageOptions):
         "of a video that are used, at most", "N", _IMAGES_PER_SECOND, limits=(0.0, math.inf),
         above=True,
     )  # fmt: skip
-    max_keypoints: int = option(
-        "of an image", "N", FeatureConfig().max_keypoints, limits=(50, math.inf)
-    )
-    threads: int = option(
-        "of COLMAP; with more than one, the last digits vary", "N", 1, limits=(1, math.inf)
-    )
-    seed: int = option("of COLMAP", "N", 0, limits=(0, math.inf))
 
 
 def run(options: Options) -> None:
@@ -176,7 +168,9 @@ def run(options: Options) -> None:
     with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
         with TemporaryDirectory(dir=out) as images:
-            looked = look_at_images(args, Looker(args.max_keypoints, Path(images), markers))
+            looked = look_at_images(
+                args, Looker(FeatureConfig().max_keypoints, Path(images), markers)
+            )
             anchors = Anchors(markers, looked.points, tuple(args.distance))
             inputs = Given(
                 looked.views, looked.camera, anchors, shutter.readout_time,
@@ -184,14 +178,9 @@ def run(options: Options) -> None:
             )  # fmt: skip
             folder = out / COLMAP
             folder.mkdir()
-            built = build_map(inputs, Workshop(folder, _effort(args), stage))
+            built = build_map(inputs, Workshop(folder, Effort(), stage))
         _write(out, built, looked)
     _tell(args, built, looked)
-
-
-def _effort(args: Any) -> Effort:
-    features = max(args.max_keypoints, Effort().features)
-    return Effort(args.threads, args.seed, features)
 
 
 def _check_points(args: Any) -> None:

@@ -4,24 +4,93 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from rs_localizer.cli import WORKING
-from rs_localizer.cli.map import either
+from rs_localizer.cli.options import UsageError, argument, option
+from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.recording import MAP_FRAME
+from rs_localizer.markers.map_files import FORMATS, USUAL_FAMILY, Unsaid, is_marker_file, read_any
 
 if WORKING:
+    import numpy as np
+
+    from rs_localizer.io.maps.landmarks import Map
+    from rs_localizer.markers.families import family
     from rs_localizer.markers.map_check import other_units
     from rs_localizer.markers.maps import MarkerMap
 
+Figures = dict[str, Any]
+"""What is printed, and by ``--json``: identifiers, with their units."""
+
 
 @dataclass(frozen=True, kw_only=True)
-class Options(either.MapFileOptions):
-    pass
+class Options:
+    """markers: what files of other programs omit."""
+
+    file: Path = argument(
+        "landmarks: a .npz file or a folder of COLMAP; markers: a .yaml or .json file of "
+        f"{', '.join(FORMATS)}", "FILE",
+    )  # fmt: skip
+    family: str | None = option(f"(default: that of the file, or {USUAL_FAMILY.name})", "NAME")
+    size: float | None = option("of all markers", "M", limits=(0.0, math.inf), above=True)
 
 
-def run(options: Options) -> either.Figures:
-    any_map, kind = either.read(options)
-    table = either.describe(options.file, any_map, kind)
+def run(options: Options) -> Figures:
+    any_map, kind = read(options)
+    figures = describe(options.file, any_map, kind)
     if isinstance(any_map, MarkerMap) and (faults := list(other_units(any_map))):
         raise ValueError(f"{options.file}: {'; '.join(faults)}")
-    return table
+    return figures
+
+
+def read(options: Options) -> tuple[Map | MarkerMap, str]:
+    """The map that the options name, and the name of its format."""
+    if not is_marker_file(options.file):
+        # Frames are the localizer's business: files of landmarks do not name one.
+        return read_map_file(options.file, MAP_FRAME), "landmarks"
+    try:
+        kind = None if options.family is None else family(options.family)
+    except ValueError as error:
+        raise UsageError(f"--family: {error}") from error
+    return read_any(options.file, Unsaid(kind, options.size))
+
+
+def describe(file: Path, any_map: Map | MarkerMap, kind: str) -> Figures:
+    """Print what a map holds, and return it."""
+    figures: Figures = {"format": kind}
+    if isinstance(any_map, MarkerMap):
+        figures |= {"map_frame": any_map.map_frame, "markers": len(any_map.markers)}
+        for name in sorted({marker.family.name for marker in any_map.markers}):
+            ids = sorted(marker.id for marker in any_map.markers if marker.family.name == name)
+            figures |= {f"ids_{name}": ids}
+        figures["sizes_m"] = sorted({round(marker.size, 6) for marker in any_map.markers})
+        figures["boards"] = [board.name for board in any_map.boards]
+        known = [one.deviations for one in any_map.markers if one.deviations is not None]
+        deviations = np.linalg.norm(np.array(known).reshape(-1, 6)[:, :3], axis=1)
+    else:
+        figures |= {"landmarks": len(any_map), "left_out_not_finite": any_map.dropped}
+        if any_map.ids is not None:
+            figures |= {"first_id": int(any_map.ids.min()), "last_id": int(any_map.ids.max())}
+        if any_map.descriptors is not None:
+            figures["descriptor_length"] = any_map.descriptors.shape[1]
+            figures["descriptor_type"] = str(any_map.descriptors.dtype)
+        if any_map.error_modes is not None:
+            shared = np.sqrt(np.sum(any_map.error_modes**2, axis=(1, 2)))
+            figures["shared_deviation_median_mm"] = 1e3 * float(np.median(shared))
+        covariances = np.zeros((0, 3, 3)) if any_map.covariances is None else any_map.covariances
+        deviations = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        deviations = deviations[np.isfinite(deviations)]
+    figures["deviations"] = len(deviations)
+    if len(deviations):
+        figures["deviation_median_mm"] = 1e3 * float(np.median(deviations))
+    for name, values in zip("xyz", any_map.points.T, strict=True):
+        for what, of in (("min", np.min), ("median", np.median), ("max", np.max)):
+            figures[f"{name}_{what}_m"] = float(of(values))
+    print(file)
+    for name, value in figures.items():
+        print(f"  {name:28} {f'{value:.3f}' if isinstance(value, float) else value}")
+    return figures

@@ -5,22 +5,17 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, refuse_existing, write_all
-from rs_localizer.cli.map import ReadoutOptions, check_readout, colmap, print_step
-from rs_localizer.cli.map.colmap import ColmapOptions
+from rs_localizer.cli import WORKING, refuse_existing, replaced, write_all
+from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import CAMERA_FLAGS, Inputs, Settings, UsageError, argument, option
-from rs_localizer.cli.rig_input import (
-    MapCamera,
-    MountingOptions,
-    map_cameras,
-    mounting_lines,
-)
-from rs_localizer.cli.settings_args import given_settings, given_topics
+from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
+from rs_localizer.cli.settings_args import given_settings, given_topics, given_values
 from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
 from rs_localizer.io.topics import IMU
 
@@ -29,47 +24,53 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer.core.arrays import Array
+    from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.bags import open_bag
     from rs_localizer.io.calibration import read_calibration, write_calibration
     from rs_localizer.io.clouds import Correspondences
-    from rs_localizer.io.maps.landmarks import Map
+    from rs_localizer.io.maps.colmap import read_model, write_model
+    from rs_localizer.io.maps.landmarks import Map, MapError
+    from rs_localizer.offline.image_sources import name_times
     from rs_localizer.offline.recordings import read_recording
     from rs_localizer.offline.replay import find_topics
+    from rs_localizer.settings import build
+    from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, Shutter, undo_shutter
     from rs_localizer.tools.mapping.observations import RecordedMap, RigCamera, from_recordings
     from rs_localizer.tools.mapping.refine import MapFreedom, RefinedMap, refine_rig
 
-_GIVEN, _ESTIMATED, _GLOBAL = "given", "estimated", "global"
-_HOLD = 0.001
+_HOLD = 0.001  # m, deviation of landmarks of known place
+_step = partial(print, "adjusted:", flush=True)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ReadoutOptions, MountingOptions, ColmapOptions, Settings, Inputs):
+class Options(Settings, Inputs):
     recordings: list[Path] = argument("a bag of correspondences or keypoints", "RECORDING", list)
     map: Path | None = option("the map (default: the points of the recording)", "MAP")
     out: Path | None = option(f"ends in {SUFFIX}", "OUT")
     overwrite: bool = option("replace OUT", default=False)
-    shutter: str | None = option(
-        "the readout time: as set, to be found, or none (default: as set, found if it is 0)",
-        choices=(_GIVEN, _ESTIMATED, _GLOBAL),
-    )
     intrinsics: bool = option("adjust the lens as well", default=False)
     hold: list[int] = option(
         "landmarks of known place, three or more: they hold frame and size of the map (default: "
         "the map as a whole stays where it is, with the size that it has)", "ID ...", list,
     )  # fmt: skip
-    hold_deviation: float = option(
-        "how well these are known", "M", _HOLD, limits=(0.0, math.inf), above=True
-    )
     calibration: Path | None = option(
         "instead of camera_info; of a rig, a camchain as calibrate --rig writes it",
         "FILE",
         flag=CAMERA_FLAGS,
     )
+    colmap: tuple[Path, Path] | None = option(
+        "instead of RECORDING: folder of a sparse model of COLMAP, text or binary, of one camera, "
+        "and one to create, for programs that know a global shutter only", "IN OUT",
+    )  # fmt: skip
+    rate: float | None = option(
+        "with --colmap: images per second of the numbers in the images' names, which else are "
+        "times in ns", "HZ", limits=(0.0, math.inf), above=True,
+    )  # fmt: skip
 
 
 def run(args: Options) -> None:
     if args.colmap is not None:
-        colmap.run(args)
+        _undo_shutter(args, *args.colmap)
         return
     if not args.recordings or args.out is None:
         raise UsageError("give RECORDING and --out OUT, or --colmap IN OUT")
@@ -80,34 +81,34 @@ def run(args: Options) -> None:
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     cameras = map_cameras(args, config)
     known = all(of.config.readout_time > 0.0 for of in cameras)
-    shutter = args.shutter or (_GIVEN if known else _ESTIMATED)
-    if shutter == _GIVEN and not known:
-        raise UsageError("--shutter given needs -p readout_time:=S or --params")
-    rig, clouds = zip(*(_recorded(of, landmarks, shutter) for of in cameras), strict=True)
+    rig, clouds = zip(*(_recorded(of, landmarks) for of in cameras), strict=True)
     with tqdm(total=sum(map(len, clouds)), unit="image", desc="localize", disable=None) as bar:
         localized = from_recordings([one.camera for one in rig], clouds, landmarks, bar.update)
     deviations = _deviations(args, localized.landmarks, config.map_deviation)
-    freedom = MapFreedom(shutter == _ESTIMATED, args.intrinsics, deviations)
-    refined = refine_rig(rig, localized.seen, localized.start, freedom, done=print_step)
-    _tell(localized, refined, [of.name for of in cameras])
-    for of, result in zip(cameras, refined.cameras, strict=True):
-        check_readout(args, result.readout_check, "see --shutter estimated", of.name)
-    _write(args, localized.landmarks, refined, [of.name for of in cameras])
+    freedom = MapFreedom(not known, args.intrinsics, deviations)
+    refined = refine_rig(rig, localized.seen, localized.start, freedom, done=_step)
+    names = [of.name for of in cameras]
+    _tell(localized, refined, names)
+    for name, result in zip(names, refined.cameras, strict=True):
+        check_readout(result.readout_check, name)
+    _write(args, args.out, localized.landmarks, refined, names)
 
 
 def _recorded(
-    of: MapCamera, landmarks: Map | None, shutter: str
+    of: MapCamera, landmarks: Map | None
 ) -> tuple[RigCamera, tuple[Correspondences, ...]]:
     """A camera, and what it saw of the map."""
     config, args = of.config, of.args
     with open_bag(args.recording) as bag:
         topics = find_topics(bag, given_topics(args)).without(IMU)
         recorded = read_recording(bag, topics, config.matching, landmarks)
-    readout_time = 0.0 if shutter == _GLOBAL else config.readout_time
-    camera = recorded.calibration.camera(readout_time, config.scan_direction)
+    camera = recorded.calibration.camera(config.readout_time, config.scan_direction)
     if args.calibration is not None:
-        lens = read_calibration(args.calibration)
-        camera = replace(lens, readout_time=readout_time, scan_direction=config.scan_direction)
+        camera = replace(
+            read_calibration(args.calibration),
+            readout_time=config.readout_time,
+            scan_direction=config.scan_direction,
+        )
     return RigCamera(camera, config.stamp_offset, of.mounting), recorded.clouds
 
 
@@ -118,33 +119,31 @@ def _deviations(args: Options, landmarks: Map, map_deviation: float) -> Array | 
         return np.full(len(landmarks), every) if map_deviation > 0.0 else None
     if landmarks.ids is None:
         raise UsageError("--hold needs a map with ids")
-    unknown = sorted(set(args.hold) - set(landmarks.ids.tolist()))
-    if unknown:
+    if unknown := sorted(set(args.hold) - set(landmarks.ids.tolist())):
         raise UsageError(f"--hold: the map has no landmark {unknown[0]}")
-    return np.where(np.isin(landmarks.ids, args.hold), args.hold_deviation, every)
+    return np.where(np.isin(landmarks.ids, args.hold), _HOLD, every)
 
 
 def _tell(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> None:
     moved = np.linalg.norm(refined.points - localized.start.points, axis=1)[refined.refined]
     spread = np.sqrt(np.trace(refined.covariances[refined.refined], axis1=1, axis2=2))
-    rows = [
-        ("images with a pose", f"{len(localized.seen.stamps_ns)} of {localized.images}"),
-        ("landmarks refined", f"{np.count_nonzero(refined.refined)} of {len(refined.points)}"),
-        ("noise before", f"{refined.before:.3f} px"),
-        ("noise after", f"{refined.after:.3f} px"),
-        ("keypoints that fit", f"{np.mean(refined.inliers):.1%}"),
-    ]
+    rows = {
+        "images with a pose": f"{len(localized.seen.stamps_ns)} of {localized.images}",
+        "landmarks refined": f"{np.count_nonzero(refined.refined)} of {len(refined.points)}",
+        "noise before": f"{refined.before:.3f} px",
+        "noise after": f"{refined.after:.3f} px",
+        "keypoints that fit": f"{np.mean(refined.inliers):.1%}",
+    }
     if len(moved):
         far = f"{1e3 * np.median(moved):.1f} mm (median), {1e3 * moved.max():.1f} at most"
-        rows.append(("landmarks moved by", far))
-        rows.append(("deviation of a landmark", f"{1e3 * np.median(spread):.1f} mm (median)"))
+        rows["landmarks moved by"] = far
+        rows["deviation of a landmark"] = f"{1e3 * np.median(spread):.1f} mm (median)"
     for of, camera in zip(names, refined.cameras, strict=True):
         deviation = camera.readout_time_deviation
-        spread_text = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
+        text = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
         name = f"{of}: readout time" if of else "readout time"
-        rows.append((name, f"{1e3 * camera.readout_time:.3f}{spread_text} ms"))
-    for name, text in rows:
-        print(f"{name:26} {text}")
+        rows[name] = f"{1e3 * camera.readout_time:.3f}{text} ms"
+    _print(rows)
     for of, camera in zip(names, refined.cameras, strict=True):
         if camera.deviations.any():
             lines = mounting_lines(of, names[0], camera.extrinsics, camera.deviations)
@@ -154,22 +153,103 @@ def _tell(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> 
             print(f"{whose} is negative: the scan direction is the reverse of what was set")
 
 
-def _write(args: Options, landmarks: Map, result: RefinedMap, names: Sequence[str]) -> None:
+def _print(rows: dict[str, str]) -> None:
+    for name, text in rows.items():
+        print(f"{name:28} {text}")
+
+
+def _write(
+    args: Options, out: Path, landmarks: Map, result: RefinedMap, names: Sequence[str]
+) -> None:
     refined = replace(
         landmarks, points=result.points, covariances=result.covariances, error_modes=None
     )
-    assert args.out is not None
-    writers: dict[Path, Callable[[Path], object]] = {
-        args.out: lambda part: write_npz(part, refined)
-    }
+    writers: dict[Path, Callable[[Path], object]] = {out: lambda part: write_npz(part, refined)}
     for name, camera in zip(names, result.cameras, strict=True) if args.intrinsics else ():
-        of = f"{args.out.stem}_{name}" if name else args.out.stem
-        lens = args.out.with_name(f"{of}_camera_info.yaml")
+        lens = out.with_name(f"{out.stem}{f'_{name}' if name else ''}_camera_info.yaml")
         writers[lens] = partial(write_calibration, camera=camera.camera)
     write_all(writers)
-    unchanged = np.count_nonzero(~result.refined)
-    if unchanged:
+    if unchanged := np.count_nonzero(~result.refined):
         print(
             f"{unchanged} landmarks are unchanged: in fewer than two images, or from "
             "too few sides to be known better"
         )
+
+
+# A model of COLMAP, as of a global shutter.
+
+
+def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
+    for name in ("recordings", "out", "map", "hold"):
+        if getattr(args, name) not in (None, []):
+            raise UsageError(f"--colmap goes without {'--' * (name != 'recordings')}{name}")
+    try:
+        model = read_model(folder)
+    except MapError as error:
+        raise MapError(f"{folder}: {error}") from error
+    camera = model.camera if args.calibration is None else read_calibration(args.calibration)
+    stamps = image_stamps(list(model.images), args.rate)
+    values = given_values(args)
+    readout = build(values).readout_time or None
+    direction = str(build(values).scan_direction)
+    known = Shutter(
+        readout, direction if readout or "scan_direction" in values else None, args.intrinsics
+    )
+    earlier = replaced(replace(args, out=out), "images.txt")
+    with atomic_directory(out, earlier) as built:
+        result = undo_shutter(camera, model, model.images, stamps, known, _step)
+        check_readout(result.refined.readout_check)
+        built.mkdir()
+        write_model(built, result.camera, result.images, result.points)
+    _tell_model(result, len(model.images), len(model.points))
+    print(f"written: {out}")
+
+
+def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:
+    """When images were taken, ns, by their names: times in ns, or numbers at a rate.
+
+    Raises:
+        UsageError: for names that are neither.
+    """
+    if rate is None:
+        times = name_times([Path(name) for name in names])
+        if times is None:
+            raise UsageError(
+                f"the names of the images are not times (such as {names[0]}): give --rate, "
+                "the images per second of the numbers in them (1e9 for ns since a video's start)"
+            )
+        return {name: times[Path(name)] for name in names}
+    stamps = {}
+    for name in names:
+        numbers = re.findall(r"\d+", Path(name).stem)
+        if not numbers:
+            raise UsageError(f"the name {name} has no number for --rate")
+        stamps[name] = round(1e9 * int(numbers[-1]) / rate)
+    if len(set(stamps.values())) < len(stamps):
+        raise UsageError("images of the same number: --rate is for images of one video")
+    return stamps
+
+
+def _tell_model(result: GlobalShutterModel, images: int, points: int) -> None:
+    kept, shutter = sum(len(image.points) for image in result.images.values()), result.camera
+    _print({
+        "images with a pose": f"{len(result.images)} of {images}",
+        "points": f"{len(result.points.ids)} of {points}",
+        "keypoints that fit": f"{kept} of {result.keypoints}",
+        "error with a global shutter": (
+            f"{result.before:.3f} px rms before, {result.after:.3f} after"
+        ),
+        "noise of u and of v": f"{result.refined.deviation:.3f} px",
+        "readout time": f"{1e3 * shutter.readout_time:.3f} ms {shutter.scan_direction}",
+    })  # fmt: skip
+    fit = result.shutter
+    if fit is not None and not fit.visible:
+        print(
+            f"warning: the images show no rolling shutter ({1e3 * fit.readout_time:.1f} +- "
+            f"{1e3 * fit.deviation:.1f} ms fits best): the model is that of a global one"
+        )
+    elif fit is None and not shutter.readout_time:
+        why = "too few images follow each other"
+        if result.refined.apart:
+            why = "no smooth motion joins the images, each has a pose of its own: too little"
+        print(f"warning: {why} to show a rolling shutter: give it")

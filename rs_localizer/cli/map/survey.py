@@ -11,14 +11,9 @@ from pathlib import Path
 
 from rs_localizer.cli import WORKING, refuse_existing, write_all
 from rs_localizer.cli.image_input import ImageOptions, opened, tell_times
-from rs_localizer.cli.map import ReadoutOptions, check_readout
+from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import UsageError, argument, option
-from rs_localizer.cli.rig_input import (
-    MapCamera,
-    MountingOptions,
-    map_cameras,
-    mounting_lines,
-)
+from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
 from rs_localizer.cli.settings_args import given_settings
 from rs_localizer.markers.families import FAMILIES, Family, family
 
@@ -38,12 +33,14 @@ if WORKING:
     from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
 
 _LISTED = 12
-_SHAPE, _ORIGIN = "shape", "origin"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ReadoutOptions, MountingOptions, ImageOptions):
-    recordings: list[Path] = argument("a video, a folder of images, or a bag", "RECORDING")
+class Options(ImageOptions):
+    recordings: list[Path] = argument(
+        "a video, a folder of images, or a bag; several: of cameras on one body, named as their "
+        "files", "RECORDING",
+    )  # fmt: skip
     family: list[str] = option(
         f"of the markers; may be repeated: {', '.join(FAMILIES)}", "NAME", list, required=True
     )
@@ -54,11 +51,6 @@ class Options(ReadoutOptions, MountingOptions, ImageOptions):
     origin: int | None = option(
         "marker whose frame is that of the map (default: the lowest id of the largest connected "
         "group)", "ID",
-    )  # fmt: skip
-    deviations: str = option(
-        "covariances to write: of the markers relative to each other, or in the frame of the "
-        "origin, whose own are 0", default=_SHAPE,
-        choices=(_SHAPE, _ORIGIN),
     )  # fmt: skip
     out: Path = option("map to write", "WALL.yaml", required=True)
     overwrite: bool = option("replace WALL.yaml", default=False)
@@ -77,11 +69,10 @@ def run(args: Options) -> None:
     spotter, cameras = Spotter(markers), map_cameras(args, config)
     filmed = [_filmed(camera, spotter) for camera in cameras]
     found = survey_rig(filmed, markers, origin=origin)
-    every = found.deviations_of_shape if args.deviations == _SHAPE else found.deviations
+    every = found.deviations_of_shape
     _tell(found, every, cameras, filmed)
     for camera, result in zip(cameras, found.cameras, strict=True):
-        instead = "calibrate --rig finds it" if camera.name else "without one it is found"
-        check_readout(args, result.readout_check, instead, camera.name)
+        check_readout(result.readout_check, camera.name)
     pairs = zip(found.markers, every, strict=True)
     surveyed = tuple(replace(marker, deviations=deviations) for marker, deviations in pairs)
     marker_map = MarkerMap(surveyed)

@@ -45,7 +45,6 @@ class Shutter:
     readout_time: float | None = None  # s; None: estimated
     scan_direction: str | None = None  # None: unknown
     lens: bool = False  # whether the lens is adjusted
-    tau: float = 0.0  # row time of the global shutter: 0 the middle row, -0.5 first, 0.5 last
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +98,7 @@ def undo_shutter(
     fits: BoolArray = (errors < (LIMIT * refined.deviation) ** 2) & (in_camera[:, 2] > 0.0)
     fits &= (np.bincount(rows[fits], minlength=len(points)) > 1)[rows]
     at, rows, pixels = at[fits], rows[fits], pixels[fits]
-    states = refined.spline.states(refined.times + abs(refined.readout_time) * known.tau)
+    states = refined.spline.states(refined.times)
     turns = np.swapaxes(states.rotations, 1, 2)
     views = turns, -np.einsum("nij,nj->ni", turns, states.positions)
     place = np.searchsorted(used, at)
