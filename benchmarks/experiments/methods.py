@@ -9,17 +9,21 @@ the paper: the pose whose orientation is nearest to the truth, which no real met
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
-from benchmarks.experiments.kernels import best_solutions, refine_frames
 from benchmarks.experiments.trials import POINTS, Motions, Trials, angles, camera
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.rig import Mounts, Rig
+from rs_localizer.core.state import STATE_SIZE
+from rs_localizer.estimation.observations import Observations, weighted
 from rs_localizer.estimation.prior import assumptions
+from rs_localizer.estimation.ransac import best_models, optimize, state_of_model
+from rs_localizer.estimation.refine import EXPECTED_NOISE, refine
 from rs_localizer.solvers.minimal import solve_minimal
 from rs_localizer.solvers.table import find_solver
 
@@ -78,7 +82,7 @@ def estimate(
     models = _models(method, trials, trials.truth.rotation if initial is None else initial)
     threshold = LocalizerConfig().inlier_threshold * max(1.0, noise)
     if models.shape[1] > 1:
-        models = _best(models, trials, _SCORE_SCALE * threshold)[:, None]
+        return _best(models, trials, _SCORE_SCALE * threshold)
     if method.refined:
         return _refined(models[:, 0], trials, threshold)
     return _motions(models[:, 0])
@@ -98,7 +102,7 @@ def plausible_triplet(trials: Trials) -> Motions:
 
     What can be had without the truth.
     """
-    return _motions(_best(_triplet_models(trials), trials, _ALL_POINTS_SCALE))
+    return _best(_triplet_models(trials), trials, _ALL_POINTS_SCALE)
 
 
 def states(motions: Motions) -> Array:
@@ -140,24 +144,46 @@ def _motions(models: Array) -> Motions:
                    models[:, 15:18])  # fmt: skip
 
 
-def view_arguments(trials: Trials) -> tuple[Array, Array, Array, Array, Mounts]:
-    """What the kernels of many frames need to know of them."""
+def observed(trials: Trials, count: int = POINTS) -> Iterator[Observations]:
+    """The first so many points of each frame."""
     view = camera()
-    by_ray = view.pixel_jacobian(trials.rays[0])
-    return trials.points, trials.rays, trials.tau, by_ray, Mounts.one(view.row_time_gradient)
+    by_ray, mounts = view.pixel_jacobian(trials.rays[0]), Mounts.one(view.row_time_gradient)
+    for points, rays, tau in zip(trials.points, trials.rays, trials.tau, strict=True):
+        yield Observations.of(points[:count], rays[:count], tau[:count], by_ray[:count], mounts)
 
 
-def _best(models: Array, trials: Trials, scale: float) -> Array:
-    chosen: Array = best_solutions(models, *view_arguments(trials), scale)
-    return chosen
+def _best(models: Array, trials: Trials, scale: float) -> Motions:
+    """Of the solutions (h,k,18) of each frame the one with the least truncated error."""
+    found = np.full((len(models), STATE_SIZE), np.nan)
+    for i, frame in enumerate(observed(trials)):
+        kept, costs = best_models(models[i][:, :, None], frame.packed, scale, 1, np.inf)
+        if np.isfinite(costs[0]):
+            found[i] = kept[0]
+    return _of_states(found)
 
 
 def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
+    """Local optimisation and final refinement of the Localizer on all points."""
     prior, _ = assumptions(
         camera().readout_time, Rig.of(camera()), LocalizerConfig(), find_solver("r6p_vcwt")
     )
-    found = refine_frames(np.ascontiguousarray(models), *view_arguments(trials), threshold, prior)
-    w, velocity = -found[:, 12:15], found[:, 15:18]
-    translation = found[:, 9:12]
+    noise = EXPECTED_NOISE * threshold
+    found = np.full((len(models), STATE_SIZE), np.nan)
+    for i, frame in enumerate(observed(trials)):
+        if np.isnan(models[i, 0]):
+            continue
+        start = state_of_model(models[i])[None]
+        state, cost = optimize(
+            start, np.zeros(1), frame.packed, 8.0 * threshold, threshold, prior, noise
+        )
+        if np.isfinite(cost):
+            near = (frame.squared_errors(state) < 4.0 * threshold**2).astype(np.float64)
+            inliers = weighted(frame.packed, near)
+            found[i] = refine(inliers, state, 1e6, 0.0, prior, noise, 2, 10, 1e-6)[0]
+    return _of_states(found)
+
+
+def _of_states(found: Array) -> Motions:
+    w, translation = -found[:, 12:15], found[:, 9:12]
     return Motions(found[:, :9].reshape(-1, 3, 3), translation, w,
-                   np.cross(w, translation) - velocity)  # fmt: skip
+                   np.cross(w, translation) - found[:, 15:18])  # fmt: skip

@@ -11,12 +11,13 @@ from matplotlib.axes import Axes
 
 from benchmarks.experiments import charts
 from benchmarks.experiments import methods as m
-from benchmarks.experiments.kernels import frame_errors, informations
-from benchmarks.experiments.methods import Method, states, view_arguments
+from benchmarks.experiments.methods import Method, observed, states
 from benchmarks.experiments.results import Claim, Context, Result, Table, limited
 from benchmarks.experiments.sweeps import ORIENTATION, Curves, motion_errors, sweep
 from benchmarks.experiments.trials import POINTS, Setting, Trials, draw_trials
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
+from rs_localizer.estimation.residuals import normal_equations
 
 _NOISES = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
 _SPEED, _TRANSLATION = 20.0, 0.2  # deg and units per frame
@@ -34,7 +35,9 @@ def run(context: Context) -> Result:
     trials = draw_trials(context.trials, context.seed, Setting(_SPEED, _TRANSLATION, 1.0))
     bounds = {n: _median_bound(trials, n, context.seed) for n in (_SIX, POINTS)}
     six, fifty = (bound[0] for bound in bounds.values())
-    seen = frame_errors(states(m.estimate(m.VCWT_OURS, trials)), *view_arguments(trials))[:, _SIX:]
+    found = states(m.estimate(m.VCWT_OURS, trials))
+    squared = [x.squared_errors(state) for x, state in zip(observed(trials), found, strict=True)]
+    seen = np.sqrt(np.array(squared)[:, _SIX:])
     refined = motion_errors(m.estimate(m.REFINED, trials, noise=1.0), trials.truth)[:, ORIENTATION]
 
     def draw_bounds(axes: Axes, metric: int) -> None:
@@ -104,9 +107,13 @@ def _median_bound(trials: Trials, points: int, seed: int) -> Array:
     Errors are drawn from the normal distribution whose covariance is the inverse Fisher
     information of the first so many points at the true motion.
     """
-    world, rays, tau, by_ray, mounts = view_arguments(trials)
-    world, rays, tau = (np.ascontiguousarray(x[:, :points]) for x in (world, rays, tau))
-    information = informations(states(trials.truth), world, rays, tau, by_ray[:points], mounts)
+    information = np.empty((len(trials), PARAMETERS, PARAMETERS))
+    slope = np.empty(PARAMETERS)
+    for each, frame, state in zip(
+        information, observed(trials, points), states(trials.truth), strict=True
+    ):
+        normal_equations(frame.packed, state, 1e6, 0.0, 2, each, slope)
+    information = information[:, :MOTION_PARAMETERS, :MOTION_PARAMETERS]
     scale = 1.0 / np.sqrt(np.einsum("hii->hi", information))
     scaled = information * scale[:, :, None] * scale[:, None, :]
     values, vectors = np.linalg.eigh(scaled)

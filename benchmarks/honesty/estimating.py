@@ -11,16 +11,22 @@ import numpy as np
 
 from benchmarks.honesty.scores import Score, Scores, Truth, score_at
 from benchmarks.independent.cameras import Camera
-from benchmarks.independent.frames import Frames, MakeMotions, simulate
-from benchmarks.independent.motions import States
+from benchmarks.independent.frames import Frames, MakeMotions, first_row_times, simulate
+from benchmarks.independent.gyroscopes import Imu
+from benchmarks.independent.motions import Moving, States
 from benchmarks.independent.scenes import Scene
 from rs_localizer.core import camera as core
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 
 LENGTH = 8  # frames of a recording
 COUNTED = 5  # the last ones: the tracker has had three to settle
+
+_BIAS_WALK = 1e-4  # rad/s^2/sqrt(Hz)
+_BEFORE, _AFTER = 0.6, 0.03  # s of samples before the middle row and behind it
 
 _simulated = lru_cache(maxsize=4)(simulate)
 
@@ -103,3 +109,82 @@ def scored(frames: Frames, results: dict[int, Estimate | Failure], camera: core.
 def truth_of(states: States, frame: int) -> Truth:
     """One of many states."""
     return Truth(*(getattr(states, name)[frame] for name in Truth.__slots__))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """Frames, and the samples of the IMU beside each recording."""
+
+    frames: Frames
+    samples: tuple[ImuSamples, ...]
+    imu: Imu
+
+    def around(self, frame: int) -> ImuSamples:
+        """The samples that come with a frame."""
+        every = self.samples[int(self.frames.recording[frame])]
+        middle = self.frames.middle_ns(frame)
+        first, last = np.searchsorted(
+            every.times_ns, [middle - round(1e9 * _BEFORE), middle + round(1e9 * _AFTER)]
+        )
+        return ImuSamples(every.times_ns[first:last], every.angular_velocity[first:last])
+
+    @property
+    def settings(self) -> InertialSettings:
+        return InertialSettings(self.imu.noise, _BIAS_WALK, True)
+
+
+def record(
+    camera: Camera,
+    make_motions: MakeMotions,
+    scene: Scene,
+    size: tuple[int, int],
+    seed: int,
+    imu: Imu | None = None,
+) -> Recorded:
+    """Simulate recordings and their IMU: so many, and so many frames of each."""
+    recordings, length = size
+    imu = imu or Imu()
+    made: list[Moving] = []
+
+    def remembered(count: int, rng: np.random.Generator) -> Moving:
+        made.append(make_motions(count, rng))
+        return made[-1]
+
+    frames = simulate(camera, remembered, scene, recordings, length, seed)
+    first = first_row_times(camera, length)
+    begin = int(frames.stamp_ns[0]) - round(1e9 * first[0])  # time 0 of the motions
+    rng = np.random.default_rng(seed)
+    samples = []
+    for which in range(recordings):
+        stamps, rates, _ = imu.record(made[0], which, first[0] - 0.3, first[-1] + 0.3, rng)
+        samples.append(ImuSamples(stamps + begin, rates))
+    return Recorded(frames, tuple(samples), imu)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Followed:
+    """What a tracker made of recordings."""
+
+    scores: Scores  # at the middle row
+    time_offsets: list[float]  # s, at the end of each recording
+
+
+def follow(recorded: Recorded, noise: float, aided: bool, skipped: int) -> Followed:
+    """Track all recordings; the first frames of each are not counted."""
+    frames, camera = recorded.frames, believed(recorded.frames.camera)
+    tracker = Tracker(Localizer(camera), recorded.settings if aided else None)
+    scores: list[Score] = []
+    offsets: list[float] = []
+    for frame in range(len(frames)):
+        place, recording = int(frames.place[frame]), int(frames.recording[frame])
+        if place == 0:
+            tracker.reset()
+        points, pixels = frames.seen(frame, noise)
+        imu = recorded.around(frame) if aided else None
+        found = tracker.localize(frames.middle_ns(frame), points, pixels, imu=imu)
+        if place >= skipped:
+            truth = truth_of(frames.middle, frame)
+            scores.append(score_at(found, 0.0, camera.readout_time, truth, recording))
+        if place == frames.place.max() and tracker.inertial is not None:
+            offsets.append(tracker.inertial.time_offset)
+    return Followed(Scores(scores), offsets)

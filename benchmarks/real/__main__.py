@@ -19,11 +19,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.real import gyro, mocap, motion, solvers
-from benchmarks.real.calibrations import report
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
-from benchmarks.real.options import add_settings, settings_of
 from benchmarks.real.peers import PEERS
+from benchmarks.real.recordings import add_settings
+from rs_localizer.cli.settings_args import given_settings
 
 Row = Mapping[str, float]
 # What the text shows of the table, in parts.
@@ -75,19 +75,10 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--cache", type=Path, help="corners, calibrations (default: OUT/cache)")
     parser.add_argument("--images", type=int, default=300, help="most of each video")
     parser.add_argument("--only", nargs="*", default=[], help="names of videos without suffix")
-    parser.add_argument(
-        "--calibrations", action="store_true", help="calibrate's halves and thirds instead"
-    )
     add_settings(parser)
     args = parser.parse_args(argv)
     cache = args.cache or args.out / "cache"
-    config = settings_of(args)
-    if args.calibrations:
-        text = report(clips_of(args.folder, cache, args.images, args.only), cache)
-        args.out.mkdir(parents=True, exist_ok=True)
-        print(text)
-        (args.out / "calibrations.txt").write_text(text + "\n", encoding="utf-8")
-        return
+    config = given_settings(args)
     rows: dict[str, Row] = {}
     for clip in clips_of(args.folder, cache, args.images, args.only):
         shutter = shutter_of(clip, cache)

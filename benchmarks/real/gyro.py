@@ -20,13 +20,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 
 from benchmarks.real.gyroscopes import Gyroscope, aligned, read_board_video
-from benchmarks.real.options import add_settings, settings_of
 from benchmarks.real.peers import PEERS, GlobalPose, solve_pnp_ransac
-from benchmarks.real.recordings import Recording, read_bag
+from benchmarks.real.recordings import Recording, add_settings, read_bag
+from rs_localizer.cli.settings_args import given_settings
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
@@ -36,15 +36,11 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.markers.prints import Chessboard
 from rs_localizer.tracking import Tracker
 
-mpl.use("Agg")
-from matplotlib import pyplot as plt
-
 _INSIDE = 7.815  # 95 % quantile of chi-squared with three degrees of freedom
 _QUANTILE = 1.96  # of a normal number, both sides of 95 %
 _NEAR = 1.0  # px
 _FASTEST = 15  # images
 _NS = 1e-9
-_AXES = "xyz"
 _LAGS = (0, 1, 2)  # images that a tracked result waits for
 SINGLE, TRACKED = "single", "tracked"
 _LATER = f"{TRACKED}, 1 later"
@@ -198,36 +194,26 @@ def text(judged: Judged) -> str:
 
 def draw(judged: Judged, gyroscope: Gyroscope, readout_time: float, file: Path) -> None:
     """Turn rates of single images, with 95 % bars, and of tracked ones over the gyroscope's."""
-    start = judged.times[0]
-    shown_rates = {}
-    for name in (SINGLE, _LATER):
-        estimates = {k: x for k, x in judged.poses[name].items() if isinstance(x, Estimate)}
-        rates, covariances = rates_of(estimates, readout_time)
-        bars = _QUANTILE * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-        shown_rates[name] = judged.times[list(estimates)] - start, rates, bars
-    seconds, rates, bars = shown_rates[SINGLE]
-    later, tracked, _ = shown_rates[_LATER]
-    shown = (gyroscope.times > start) & (gyroscope.times < judged.times[-1])
-    figure, panels = plt.subplots(3, 1, figsize=(9, 6), sharex=True, layout="constrained")
+    start, times = judged.times[0], gyroscope.times
+    shown = (times > start) & (times < judged.times[-1])
+    figure = Figure(figsize=(9, 6), layout="constrained", dpi=100)
+    panels = figure.subplots(3, 1, sharex=True)
     for k, panel in enumerate(panels):
-        panel.plot(
-            gyroscope.times[shown] - start, np.rad2deg(gyroscope.rates[shown, k]),
-            color="#b04a00", linewidth=1.0, label="gyroscope (no estimator sees it)",
-        )  # fmt: skip
-        panel.errorbar(
-            seconds, np.rad2deg(rates[:, k]), np.rad2deg(bars[:, k]), fmt="o", color="#1f4e9c",
-            markersize=3, linewidth=0.7, label="one image each, with 95 %",
-        )  # fmt: skip
-        panel.plot(
-            later, np.rad2deg(tracked[:, k]), ".", color="#2a8c4a", markersize=4,
-            label="tracked, known one image later",
-        )  # fmt: skip
-        panel.set_ylabel(f"{_AXES[k]} (deg/s)")
-        panel.grid(alpha=0.3)
+        rates = np.rad2deg(gyroscope.rates[shown, k])
+        panel.plot(times[shown] - start, rates, label="gyroscope (no estimator sees it)")
+    for name, label in ((SINGLE, "one image each"), (_LATER, "tracked, one image later")):
+        found = {k: x for k, x in judged.poses[name].items() if isinstance(x, Estimate)}
+        rates, covariances = rates_of(found, readout_time)
+        bars = _QUANTILE * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+        for k, panel in enumerate(panels):
+            panel.errorbar(
+                judged.times[list(found)] - start, np.rad2deg(rates[:, k]), np.rad2deg(bars[:, k]),
+                fmt=".", linewidth=0.7, label=f"{label}, with 95 %",
+            )  # fmt: skip
+            panel.set_ylabel(f"{'xyz'[k]} (deg/s)")
     panels[0].legend(loc="upper right", fontsize="small", ncols=3)
     panels[-1].set_xlabel("time (s)")
-    figure.savefig(file, dpi=100)
-    plt.close(figure)
+    figure.savefig(file)
 
 
 def main(argv: Sequence[str]) -> None:
@@ -244,7 +230,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--out", type=Path, default=Path("real"), help="table and picture")
     add_settings(parser)
     args = parser.parse_args(argv)
-    config = settings_of(args)
+    config = given_settings(args)
     args.out.mkdir(parents=True, exist_ok=True)
     if args.gyroscope is None:
         columns, lines = (int(word) for word in args.board.split("x"))

@@ -1,9 +1,10 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings with correspondences, whoever made them, as the judges take them."""
+"""Recordings with correspondences, whoever made them, and settings, as the judges take them."""
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,3 +66,12 @@ def read_bag(path: Path, config: NodeConfig) -> Recording:
         for cloud in clouds
     ]
     return Recording(path.name, camera, frames)
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """``--params FILE``, ``-p NAME:=VALUE``, for ``given_settings``."""
+    parser.add_argument("--params", type=Path, metavar="FILE", help="settings: a ROS 2 params file")
+    parser.add_argument(
+        "-p", dest="assignments", action="append", default=[], metavar="NAME:=VALUE",
+        help="one setting; may be repeated",
+    )  # fmt: skip

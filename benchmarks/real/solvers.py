@@ -17,9 +17,9 @@ import numpy as np
 
 from benchmarks.experiments import methods as m
 from benchmarks.experiments.plain_ransac import Best, PlainRansac
-from benchmarks.real.options import add_settings, settings_of
 from benchmarks.real.peers import PEERS
-from benchmarks.real.recordings import Frame, Recording, read_bag
+from benchmarks.real.recordings import Frame, Recording, add_settings, read_bag
+from rs_localizer.cli.settings_args import given_settings
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
@@ -107,7 +107,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--out", type=Path, default=Path("real"), help="table")
     add_settings(parser)
     args = parser.parse_args(argv)
-    config = settings_of(args)
+    config = given_settings(args)
     recording = read_bag(args.recording, config)
     frames = recording.frames[:: args.every]
     before = minimal(recording, frames)

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.honesty.estimating import believed
-from benchmarks.honesty.recordings import follow, record
+from benchmarks.honesty.estimating import believed, follow, record
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, shaken_hand

@@ -8,8 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmarks.honesty.estimating import believed, truth_of
-from benchmarks.honesty.recordings import record
+from benchmarks.honesty.estimating import believed, record, truth_of
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, rest, shaken_hand
