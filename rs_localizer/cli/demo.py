@@ -24,7 +24,6 @@ if WORKING:
     from scipy.spatial.transform import Rotation
 
     from rs_localizer import data
-    from rs_localizer.cli.replay_result import Track
     from rs_localizer.core.camera import Camera
     from rs_localizer.core.shutter import Motion
     from rs_localizer.core.simd import compiler
@@ -40,6 +39,7 @@ if WORKING:
         make_correspondences,
     )
     from rs_localizer.io.trajectories import Motions, Trajectory, Twists, read_tum
+    from rs_localizer.offline.results import Track
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.settings import build, load_params_file
     from rs_localizer.tools import cube_clip, errors

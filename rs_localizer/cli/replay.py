@@ -4,15 +4,16 @@
 
 from __future__ import annotations
 
-import csv
-import fcntl
+import contextlib
 import functools
 import importlib.util
 import json
 import math
 import shlex
+import shutil
+import textwrap
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,26 +29,21 @@ from rs_localizer.cli.options import (
     argument,
     option,
 )
-from rs_localizer.cli.replay_result import (
-    BRIDGED,
-    POSES,
-    RESULT,
-    TWISTS,
-    Tally,
-    figures,
-    fresh,
-    print_summary,
-    write_frame,
-)
 from rs_localizer.cli.settings_args import given_settings, given_topics
-from rs_localizer.io.atomic_files import atomic_files, check_writable, write_errors
+from rs_localizer.io.atomic_files import (
+    atomic_directory,
+    check_writable,
+)
 from rs_localizer.io.bags import BagReader, BagWriter, is_bag, open_bag
+from rs_localizer.io.trajectories import POSES_FILE as POSES
+from rs_localizer.io.trajectories import TWISTS_FILE as TWISTS
 
 if WORKING:
     import numpy as np
     from tqdm import tqdm
 
     from rs_localizer.config import FeatureKind, ImuUse, NodeConfig
+    from rs_localizer.io.image_clock import readout_fault
     from rs_localizer.io.maps.files import read_map_file
     from rs_localizer.io.maps.landmarks import Map
     from rs_localizer.io.messages import stamp_ns
@@ -56,11 +52,15 @@ if WORKING:
     from rs_localizer.io.topics import IMU
     from rs_localizer.markers.map_files import is_marker_file
     from rs_localizer.offline.fleet import (
+        LOG,
+        MARKER,
+        SUMMARY,
         Figures,
         Outcome,
         Task,
+        do_all,
         finished,
-        perform_all,
+        refuse_others,
         tasks_of,
     )
     from rs_localizer.offline.image_sources import holds_images, image_topics
@@ -73,8 +73,11 @@ if WORKING:
         prepare,
         replay,
     )
+    from rs_localizer.offline.results import Tally, at_rate, figures, write_frame
     from rs_localizer.offline.table import FrameTable, read_parquet, schema, write_parquet
     from rs_localizer.pipeline.frames import FrameLocalizer
+    from rs_localizer.pipeline.refusal import explained
+    from rs_localizer.solvers.table import find_solver
 
 if TYPE_CHECKING:
     from pyarrow import Table  # an extra
@@ -82,8 +85,9 @@ if TYPE_CHECKING:
     from rs_localizer.cli import detect  # of images only
 
 _ORB_BYTES = 32  # of a descriptor; AKAZE's has 61
-# Of each of many recordings, and of all.
-TABLE, SUMMARY = "frames.parquet", "summary.csv"
+# Of each of many recordings.
+TABLE = "frames.parquet"
+RESULT, BRIDGED = "result", "bridged.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -336,7 +340,7 @@ def _replay(
                 (frame.input_stamp_ns, frame) for part in parts for frame in tally.smooth(part)
             )
         elif options.rate is not None:
-            frames = _at_rate(frames, localizer, options.rate)
+            frames = at_rate(frames, localizer, options.rate)
         for recorded_ns, frame in frames:
             tally.not_sent += not write_frame(writer, frame, localizer, recorded_ns)
             tally.track.add(frame)
@@ -362,23 +366,87 @@ def _replay(
     tally.repeated, tally.moving = tally.track.write(out, localizer.config.pose_time)
 
 
-def _at_rate(
-    frames: Iterable[tuple[int, Localized]], localizer: FrameLocalizer, rate: float
-) -> Iterator[tuple[int, Localized]]:
-    """The motion so many times a second until each frame; frames where it is not known."""
-    step_ns = max(round(1e9 / rate), 1)
-    last_ns: int | None = None
-    for recorded_ns, frame in frames:
-        now_ns = frame.input_stamp_ns
-        if not localizer.predicts:
-            yield recorded_ns, frame
-        elif last_ns is not None:
-            # A longer gap ends the track.
-            begin = max(last_ns, now_ns - 10**9) // step_ns + 1
-            for time_ns in range(begin * step_ns, now_ns + 1, step_ns):
-                if found := localizer.at(time_ns):
-                    yield time_ns, found
-        last_ns = now_ns
+# Notices of a frame that could not follow the one before.
+_RESTARTS = ("time_went_back", "map_changed")
+_WIDTH = 96
+
+
+@contextlib.contextmanager
+def fresh(out: Path, overwrite: bool) -> Iterator[Path]:
+    """Within ``with``, make a result, which then takes the place of ``out``."""
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        if not overwrite:
+            raise ValueError(f"{out} exists; choose another --out, or --overwrite")
+        if not (out / RESULT / "metadata.yaml").is_file():
+            raise ValueError(f"{out} is not a result of replay; --overwrite leaves it as it is")
+    with atomic_directory(out, _remove_results if overwrite else None) as built:
+        built.mkdir()
+        yield built
+
+
+def _remove_results(out: Path) -> None:
+    for name in (POSES, TWISTS, BRIDGED, MARKER, LOG):
+        (out / name).unlink(missing_ok=True)
+    shutil.rmtree(out / RESULT, ignore_errors=True)
+
+
+def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:
+    """Print it as a table, the reasons of refusals explained below.
+
+    ``timed``: whether to say how fast, which is never the same twice.
+    """
+    rows: list[tuple[str, object]] = [("frames", tally.total), ("localized", tally.localized)]
+    rows += [(f"  refused: {reason}", n) for reason, n in tally.refused.most_common()]
+    for name, (count, _) in sorted(tally.notices.items(), key=lambda item: -item[1][0]):
+        rows.append((f"{'restarted' if name in _RESTARTS else 'noticed'}: {name}", count))
+    for name, count in (
+        ("rows dropped (not finite)", int(tally.column("dropped").sum())),
+        ("stamps repeated, not in the text files", tally.repeated),
+        ("without a transform on /tf", tally.not_sent),
+    ):
+        rows += [(name, count)] if count else []
+    if tally.localized:
+        rolling = find_solver(config.solver).rolling_shutter
+        still = [("  inliers with a global shutter", "global_shutter_inliers", ".0f")]
+        rows += [
+            (name, f"{np.median(tally.column(column)):{form}}")
+            for name, column, form in (
+                ("residual of the inliers (px rms, median)", "residual", ".3f"),
+                ("error of map and lens (px rms, median)", "model_error", ".3f"),
+                ("points of a frame (median)", "points", ".0f"),
+                (f"  inliers{' with a rolling shutter' * rolling}", "inliers", ".0f"),
+                *still * rolling,
+            )
+        ]
+        if rolling:
+            rows.append(("tracked from the frame before", f"{tally.column('tracked').mean():.1%}"))
+    if (imu := tally.imu) is not None:
+        rows.append(("localized with the IMU", f"{imu.used / imu.frames:.1%}"))
+        rows += [(f"  without: {reason}", count) for reason, count in imu.reasons.items()]
+        if imu.used and imu.status is not None and np.isfinite(imu.time_offset):
+            bias = np.linalg.norm(np.degrees(imu.status.bias))
+            rows.append(("  bias of the gyroscope (deg/s)", f"{bias:.2f}"))
+            rows.append(("  time offset of the IMU (ms)", f"{1e3 * imu.time_offset:.2f}"))
+    if timed:
+        rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
+    if (smoothed := tally.smoothed) is not None:
+        rows += [
+            ("samples of the smoothed motion", smoothed["samples"]),
+            (f"  bridged, listed in {BRIDGED}", len(tally.bridged)),
+            ("  left out, not determined", smoothed["undetermined"]),
+            ("  shaken faster than it follows, left as they were", smoothed["shaken"]),
+        ]
+    for name, text in rows:
+        print(f"{name:40} {text!s:>8}")
+    reasons = (*tally.refused, *(tally.imu.reasons if tally.imu else ()))
+    sentences = {reason: explained(reason) for reason in reasons}
+    for name, text in (
+        sentences | {name: text for name, (_, text) in tally.notices.items()}
+    ).items():
+        if text:
+            print(textwrap.fill(f"{name}: {text}", _WIDTH, subsequent_indent="    "))
+    if (fault := readout_fault(config.readout_time, tally.period)) is not None:
+        print(f"warning: {fault}")
 
 
 def _tell(tally: Tally, config: NodeConfig, out: Path, timed: bool) -> None:
@@ -418,65 +486,23 @@ def _replay_all(options: Options) -> None:
     files = [file for file in (params, landmarks, lens) if file is not None]
     work = functools.partial(_replay_of_many, own)
     tasks = tasks_of(options.recordings, out.absolute(), work, repr(own), files)
-    for task in tasks:
-        if task.folder.exists() and finished(task) is None and not options.overwrite:
-            raise ValueError(
-                f"{task.folder} exists and is no result of this recording, settings and version; "
-                "choose another --out, or --overwrite"
-            )
-    with write_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-    with (out / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise ValueError(f"another command is writing into {out}; wait for its end") from None
-        outcomes = _share_out(tasks, options)
+    if not options.overwrite:
+        refuse_others(tasks)
+    before = sum(finished(task) is not None for task in tasks)
+    print(f"{before} of {len(tasks)} recordings have been done before")
+    with tqdm(total=len(tasks) - before, unit="recording", disable=None) as bar:
+
+        def heard(task: Task, outcome: Outcome) -> None:
+            bar.update()
+            bar.write(f"{task.folder.name}: {outcome.reason or 'done'}")
+
+        outcomes = do_all(tasks, out, options.scheduler, options.workers, heard)
+    print(f"written to {out / SUMMARY}")
     done = [task for task in tasks if outcomes[task.folder].figures is not None]
     if options.parquet is not None:
         _write_table([read_parquet(task.folder / TABLE) for task in done], options.parquet)
     if failed := len(tasks) - len(done):
         raise ValueError(f"{failed} of {len(tasks)} recordings failed; {out / SUMMARY} says why")
-
-
-def _share_out(tasks: list[Task], options: Options) -> dict[Path, Outcome]:
-    """What became of each, by its folder; the summary is written however it ends."""
-    outcomes = {
-        task.folder: Outcome(known, "") for task in tasks if (known := finished(task)) is not None
-    }
-    print(f"{len(outcomes)} of {len(tasks)} recordings have been done before")
-    waiting = [task for task in tasks if task.folder not in outcomes]
-    try:
-        with tqdm(total=len(waiting), unit="recording", disable=None) as bar:
-            made = perform_all(waiting, options.scheduler, options.workers) if waiting else ()
-            for task, outcome in made:
-                outcomes[task.folder] = outcome
-                bar.update()
-                bar.write(f"{task.folder.name}: {outcome.reason or 'done'}")
-    finally:
-        for task in tasks:  # what is done and has not been heard of, as after Ctrl-C
-            known = finished(task)
-            unheard = Outcome(known, "not done" if known is None else "")
-            outcomes.setdefault(task.folder, unheard)
-        _summarize(tasks, outcomes)
-    return outcomes
-
-
-def _summarize(tasks: list[Task], outcomes: dict[Path, Outcome]) -> None:
-    """Write the table; it says the same whoever did the work, in whatever order it was done."""
-    file = tasks[0].folder.with_name(SUMMARY)
-    known = [outcomes[task.folder] for task in tasks]
-    columns = list(dict.fromkeys(name for outcome in known for name in outcome.figures or ()))
-    with atomic_files(file) as (part,), part.open("w", encoding="utf-8", newline="") as text:
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(["recording", "folder", *columns, "reason"])
-        for task, outcome in zip(tasks, known, strict=True):
-            values = [(outcome.figures or {}).get(name, "") for name in columns]
-            cells = [f"{v:.6g}" if isinstance(v, float) else str(v) for v in values]
-            row = [str(task.recording), task.folder.name, *cells, outcome.reason]
-            # Text that a spreadsheet does not take for a formula.
-            writer.writerow([f"'{cell}" if cell[:1] in ("=", "+", "@") else cell for cell in row])
-    print(f"written to {file}")
 
 
 def _replay_of_many(options: Options, recording: Path, out: Path) -> Figures:

@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import contextlib
+import csv
+import fcntl
 import functools
 import hashlib
 import io
@@ -17,18 +19,20 @@ import socket
 import threading
 import uuid
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.io.atomic_files import write_errors
+from rs_localizer.io.atomic_files import atomic_files, write_errors
 
 Figures = dict[str, float | int | str]
 """What the summary says of a recording, by identifiers with their units."""
 
 MARKER, LOG = "fleet.json", "log.txt"
 """In each complete result: what it is of, written last; and what the command would have said."""
+SUMMARY = "summary.csv"
+"""A row of each recording."""
 
 _PACKAGE = Path(__file__).parents[1]
 # How often a recording may take its worker with it until it counts as failed.
@@ -208,6 +212,67 @@ def perform_all(
             except Exception as error:  # with its worker, or the scheduler: Dask says which
                 outcome = Outcome(None, f"lost: {' '.join(str(error).split())[:200]}")
             yield futures[future], outcome
+
+
+def refuse_others(tasks: Sequence[Task]) -> None:
+    """Raise ``ValueError`` for a folder that is there, and no result of its task."""
+    for task in tasks:
+        if task.folder.exists() and finished(task) is None:
+            raise ValueError(
+                f"{task.folder} exists and is no result of this recording, settings and version; "
+                "choose another --out, or --overwrite"
+            )
+
+
+def do_all(
+    tasks: Sequence[Task], out: Path, scheduler: str | None, workers: int | None,
+    heard: Callable[[Task, Outcome], object],
+) -> dict[Path, Outcome]:  # fmt: skip
+    """What became of each, by its folder; the summary in ``out`` is written however it ends.
+
+    Args:
+        heard: called as tasks end that had not been done before.
+
+    Raises:
+        ValueError: while another command is at it; as :func:`perform_all`.
+    """
+    with write_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    with (out / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ValueError(f"another command is writing into {out}; wait for its end") from None
+        outcomes = {
+            task.folder: Outcome(known) for task in tasks if (known := finished(task)) is not None
+        }
+        waiting = [task for task in tasks if task.folder not in outcomes]
+        try:
+            for task, outcome in perform_all(waiting, scheduler, workers) if waiting else ():
+                outcomes[task.folder] = outcome
+                heard(task, outcome)
+        finally:
+            for task in tasks:  # what is done and has not been heard of, as after Ctrl-C
+                known = finished(task)
+                unheard = Outcome(known, "not done" if known is None else "")
+                outcomes.setdefault(task.folder, unheard)
+            _summarize(tasks, outcomes, out / SUMMARY)
+    return outcomes
+
+
+def _summarize(tasks: Sequence[Task], outcomes: Mapping[Path, Outcome], file: Path) -> None:
+    """Write the table; it says the same whoever did the work, in whatever order it was done."""
+    known = [outcomes[task.folder] for task in tasks]
+    columns = list(dict.fromkeys(name for outcome in known for name in outcome.figures or ()))
+    with atomic_files(file) as (part,), part.open("w", encoding="utf-8", newline="") as text:
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(["recording", "folder", *columns, "reason"])
+        for task, outcome in zip(tasks, known, strict=True):
+            values = [(outcome.figures or {}).get(name, "") for name in columns]
+            cells = [f"{v:.6g}" if isinstance(v, float) else str(v) for v in values]
+            row = [str(task.recording), task.folder.name, *cells, outcome.reason]
+            # Text that a spreadsheet does not take for a formula.
+            writer.writerow([f"'{cell}" if cell[:1] in ("=", "+", "@") else cell for cell in row])
 
 
 def _clear(tasks: Sequence[Task]) -> None:

@@ -19,6 +19,7 @@ import pytest
 
 from rs_localizer.cli import replay
 from rs_localizer.cli.main import main
+from rs_localizer.offline import fleet
 from rs_localizer.offline.fleet import Outcome, Task, perform, perform_all, tasks_of
 
 pytest.importorskip("distributed", reason="needs Dask")
@@ -75,7 +76,7 @@ def test_two_workers_write_the_bytes_of_one_process(recordings, tmp_path, capsys
 def instead(monkeypatch: pytest.MonkeyPatch, work: Callable[[Task], Outcome] | None) -> None:
     """Work in this process, without the time that a worker's start takes; None: nobody works."""
     monkeypatch.setattr(
-        replay, "perform_all", lambda tasks, *_: ((task, work(task)) for task in tasks if work)
+        fleet, "perform_all", lambda tasks, *_: ((task, work(task)) for task in tasks if work)
     )
 
 

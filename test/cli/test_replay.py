@@ -14,10 +14,11 @@ from recorded import CAMERA, READOUT_TIME, SHUTTER, flight, write_ros1
 
 from rs_localizer.cli import replay as replay_command
 from rs_localizer.cli.main import main
-from rs_localizer.cli.replay_result import Tally, figures, print_summary
+from rs_localizer.cli.replay import print_summary
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES, Localized
 from rs_localizer.io.trajectories import read_motions, read_tum, read_twists
+from rs_localizer.offline.results import Tally, figures
 from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.tools.simulation.recording import write_simulated
 from rs_localizer.tools.simulation.scene import room

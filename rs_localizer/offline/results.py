@@ -1,51 +1,46 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What replay makes of a recording: poses, twists, a bag, and a summary.
+"""What comes of a recording: poses, twists, messages, and what a summary says.
 
 Frames are written as they come; of each, some numbers stay (250 bytes).
 """
 
 from __future__ import annotations
 
-import contextlib
-import shutil
-import textwrap
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
-from rs_localizer.cli import WORKING
+from rs_localizer.config import PoseTime
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.outputs import Localized, messages
+from rs_localizer.io.topics import TF
+from rs_localizer.io.trajectories import (
+    POSES_FILE,
+    TWISTS_FILE,
+    Motions,
+    Trajectory,
+    Twists,
+    write_tum,
+    write_twists,
+)
+from rs_localizer.io.transforms import TransformError, make_transform
+from rs_localizer.offline.fleet import Figures
+from rs_localizer.offline.replay import TF_TYPE
+from rs_localizer.offline.table import FrameTable
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.imu import ImuState
+from rs_localizer.pipeline.published import broadcast
+from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.settings import NODE_NAME
 
-if WORKING:
-    from rs_localizer.config import NodeConfig, PoseTime
-    from rs_localizer.core import so3
-    from rs_localizer.core.arrays import Array
-    from rs_localizer.io.atomic_files import atomic_directory
-    from rs_localizer.io.bags import BagWriter
-    from rs_localizer.io.image_clock import readout_fault
-    from rs_localizer.io.outputs import Localized, messages
-    from rs_localizer.io.topics import TF
-    from rs_localizer.io.trajectories import Motions, Trajectory, Twists, write_tum, write_twists
-    from rs_localizer.io.transforms import TransformError, make_transform
-    from rs_localizer.offline.fleet import LOG, MARKER, Figures
-    from rs_localizer.offline.replay import TF_TYPE
-    from rs_localizer.offline.table import FrameTable
-    from rs_localizer.pipeline.frames import FrameLocalizer
-    from rs_localizer.pipeline.imu import ImuState
-    from rs_localizer.pipeline.published import broadcast
-    from rs_localizer.pipeline.refusal import Refusal, explained
-    from rs_localizer.settings import NODE_NAME
-    from rs_localizer.solvers.table import find_solver
-
-if TYPE_CHECKING:  # of --smooth
-    from rs_localizer.tools.smoothed import SmoothedFrames
-
-POSES, TWISTS = "poses.txt", "twists.txt"
 _UNKNOWN_TWIST = (np.nan,) * 6
 
 
@@ -85,7 +80,7 @@ class Track:
         }[pose_time]
         motions = self.motions()
         write_tum(
-            out / POSES,
+            out / POSES_FILE,
             motions.poses,
             [
                 f"pose of {bodies} in {maps}, map_from_body; t: s, {when}",
@@ -94,7 +89,7 @@ class Track:
         )
         if motions.twists is not None:
             write_twists(
-                out / TWISTS,
+                out / TWISTS_FILE,
                 motions.twists,
                 [
                     f"velocity of {bodies} with respect to {maps}, in its own axes; t: s, {when}",
@@ -102,33 +97,6 @@ class Track:
                 ],
             )
         return len(self._stamps_ns) - len(motions.poses), motions.twists is not None
-
-
-RESULT, BRIDGED = "result", "bridged.txt"
-"""What replay writes into its output directory."""
-
-# Notices of a frame that could not follow the one before.
-_RESTARTS = ("time_went_back", "map_changed")
-_WIDTH = 96
-
-
-@contextlib.contextmanager
-def fresh(out: Path, overwrite: bool) -> Iterator[Path]:
-    """Within ``with``, make a result, which then takes the place of ``out``."""
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        if not overwrite:
-            raise ValueError(f"{out} exists; choose another --out, or --overwrite")
-        if not (out / RESULT / "metadata.yaml").is_file():
-            raise ValueError(f"{out} is not a result of replay; --overwrite leaves it as it is")
-    with atomic_directory(out, _remove_results if overwrite else None) as built:
-        built.mkdir()
-        yield built
-
-
-def _remove_results(out: Path) -> None:
-    for name in (POSES, TWISTS, BRIDGED, MARKER, LOG):
-        (out / name).unlink(missing_ok=True)
-    shutil.rmtree(out / RESULT, ignore_errors=True)
 
 
 def write_frame(
@@ -187,14 +155,14 @@ class Tally:
             frame.dropped, frame.twist is not None,
         ))  # fmt: skip
 
-    def smooth(self, part: SmoothedFrames) -> list[Localized]:
-        """Count the frames of a window that was smoothed, and give them."""
+    def smooth(self, part: Any) -> list[Localized]:
+        """Count the frames of a window of ``tools.smoothed``, and give them."""
         self.smoothed = Counter() if self.smoothed is None else self.smoothed
         self.smoothed.update(
             samples=len(part.frames), undetermined=part.undetermined, shaken=part.shaken
         )
         self.bridged.extend(part.bridged.tolist())
-        return part.frames
+        return list(part.frames)
 
     def refuse(self, refusal: Refusal) -> None:
         """Count a message without one."""
@@ -235,60 +203,20 @@ def figures(tally: Tally) -> Figures:
     }
 
 
-def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:
-    """Print it as a table, the reasons of refusals explained below.
-
-    ``timed``: whether to say how fast, which is never the same twice.
-    """
-    rows: list[tuple[str, object]] = [("frames", tally.total), ("localized", tally.localized)]
-    rows += [(f"  refused: {reason}", n) for reason, n in tally.refused.most_common()]
-    for name, (count, _) in sorted(tally.notices.items(), key=lambda item: -item[1][0]):
-        rows.append((f"{'restarted' if name in _RESTARTS else 'noticed'}: {name}", count))
-    for name, count in (
-        ("rows dropped (not finite)", int(tally.column("dropped").sum())),
-        ("stamps repeated, not in the text files", tally.repeated),
-        ("without a transform on /tf", tally.not_sent),
-    ):
-        rows += [(name, count)] if count else []
-    if tally.localized:
-        rolling = find_solver(config.solver).rolling_shutter
-        still = [("  inliers with a global shutter", "global_shutter_inliers", ".0f")]
-        rows += [
-            (name, f"{np.median(tally.column(column)):{form}}")
-            for name, column, form in (
-                ("residual of the inliers (px rms, median)", "residual", ".3f"),
-                ("error of map and lens (px rms, median)", "model_error", ".3f"),
-                ("points of a frame (median)", "points", ".0f"),
-                (f"  inliers{' with a rolling shutter' * rolling}", "inliers", ".0f"),
-                *still * rolling,
-            )
-        ]
-        if rolling:
-            rows.append(("tracked from the frame before", f"{tally.column('tracked').mean():.1%}"))
-    if (imu := tally.imu) is not None:
-        rows.append(("localized with the IMU", f"{imu.used / imu.frames:.1%}"))
-        rows += [(f"  without: {reason}", count) for reason, count in imu.reasons.items()]
-        if imu.used and imu.status is not None and np.isfinite(imu.time_offset):
-            bias = np.linalg.norm(np.degrees(imu.status.bias))
-            rows.append(("  bias of the gyroscope (deg/s)", f"{bias:.2f}"))
-            rows.append(("  time offset of the IMU (ms)", f"{1e3 * imu.time_offset:.2f}"))
-    if timed:
-        rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
-    if (smoothed := tally.smoothed) is not None:
-        rows += [
-            ("samples of the smoothed motion", smoothed["samples"]),
-            (f"  bridged, listed in {BRIDGED}", len(tally.bridged)),
-            ("  left out, not determined", smoothed["undetermined"]),
-            ("  shaken faster than it follows, left as they were", smoothed["shaken"]),
-        ]
-    for name, text in rows:
-        print(f"{name:40} {text!s:>8}")
-    reasons = (*tally.refused, *(tally.imu.reasons if tally.imu else ()))
-    sentences = {reason: explained(reason) for reason in reasons}
-    for name, text in (
-        sentences | {name: text for name, (_, text) in tally.notices.items()}
-    ).items():
-        if text:
-            print(textwrap.fill(f"{name}: {text}", _WIDTH, subsequent_indent="    "))
-    if (fault := readout_fault(config.readout_time, tally.period)) is not None:
-        print(f"warning: {fault}")
+def at_rate(
+    frames: Iterable[tuple[int, Localized]], localizer: FrameLocalizer, rate: float
+) -> Iterator[tuple[int, Localized]]:
+    """The motion so many times a second until each frame; frames where it is not known."""
+    step_ns = max(round(1e9 / rate), 1)
+    last_ns: int | None = None
+    for recorded_ns, frame in frames:
+        now_ns = frame.input_stamp_ns
+        if not localizer.predicts:
+            yield recorded_ns, frame
+        elif last_ns is not None:
+            # A longer gap ends the track.
+            begin = max(last_ns, now_ns - 10**9) // step_ns + 1
+            for time_ns in range(begin * step_ns, now_ns + 1, step_ns):
+                if found := localizer.at(time_ns):
+                    yield time_ns, found
+        last_ns = now_ns
