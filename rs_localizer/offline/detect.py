@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -182,11 +183,12 @@ class _Tally:
 
     def instead(self) -> list[str]:
         """What images that show nothing of the map show otherwise."""
-        names = Counter(
-            name for image in self._empty for name in recognized(image.pixels, self._map.boards)
-        )
+        shown = [recognized(image.pixels, self._map.boards) for image in self._empty]
+        # Images of one pattern show other ones of its markers.
+        names = Counter(_kind(name) for of_image in shown for name in of_image)
+        first = {_kind(name): name for of_image in reversed(shown) for name in of_image}
         # What one of several shows may be chance.
-        return [name for name, count in names.most_common(4) if 2 * count >= len(self._empty)]
+        return [first[kind] for kind, n in names.most_common(4) if 2 * n >= len(self._empty)]
 
     def recorded(self) -> Recorded:
         known = [value for value in self._residuals if np.isfinite(value)]
@@ -210,6 +212,11 @@ class _Tally:
             dict(self._found.carried),
             tuple(faults),
         )
+
+
+def _kind(name: str) -> str:
+    """What was recognized, without the numbers of its markers."""
+    return re.sub(r" \d[\d, .]*$", "", name)
 
 
 class _RollingFit:
