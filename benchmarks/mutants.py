@@ -39,8 +39,7 @@ _UNITS = "test/core/test_units.py"
 MUTANTS = [Mutant(*row) for row in (
     # The five that were found alive.
     ("pipeline/pose_at_time.py", " + 0.25 * delay**2 * change", "", _POSE),
-    ("pipeline/pose_at_time.py", "variance * beyond**2, variance", "variance * beyond, variance",
-     _POSE),
+    ("core/types.py", "variance * beyond**2, variance", "variance * beyond, variance", _POSE),
     ("io/telemetry.py", "np.arange(len(forces)) / (len(forces) - 1)",
      "np.arange(len(forces)) / (len(times) - 1)", "test/io/test_telemetry.py"),
     ("core/camera.py", "offset if sign > 0 else offset + extent - 1",
@@ -54,7 +53,7 @@ MUTANTS = [Mutant(*row) for row in (
     ("pipeline/pose_at_time.py", "covariance=covariance / readout_time**2",
      "covariance=covariance / readout_time", _POSE),
     ("pipeline/pose_at_time.py", "angular=angular / readout_time", "angular=angular", _POSE),
-    ("pipeline/pose_at_time.py", "variance *= 3.0 * (1.0 + 2.0 * beyond) ** 2",
+    ("core/types.py", "variance *= 3.0 * (1.0 + 2.0 * beyond) ** 2",
      "variance *= 3.0 * (1.0 + 2.0 * beyond)", _POSE),
     ("pipeline/pose_at_time.py", "config.stamp_offset - config.readout_time * camera",
      "config.stamp_offset + config.readout_time * camera", "test/pipeline/test_frames.py"),

@@ -12,14 +12,11 @@ from scipy.spatial.transform import Rotation
 import rs_localizer as rsl
 from rs_localizer.config import Acceleration
 from rs_localizer.core.state import step_between
-from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.motion_model import acceleration_covariance, predict, unshaken
+from rs_localizer.estimation.motion_model import acceleration_covariance, predict
 from rs_localizer.estimation.refine import apply_step
 
 READOUT = 0.03
 FADING = 0.03  # s
-# Of the cosines and sines of an in-frame turn: the faster, the smaller.
-SIZES = (1.0 / np.arange(1, 15)[:, None] ** np.array([1.0, 2.0])).ravel()
 ACCELERATIONS = np.array([0.02, -0.01, 0.015, 0.004, 0.003, -0.002])
 
 
@@ -120,49 +117,3 @@ def test_new_accelerations_are_those_of_singers_process(dt, exact):
             np.testing.assert_allclose(block, deviation**2 * expected, rtol=exact)
             found[np.ix_(own, own)] = 0.0
     assert not found.any()
-
-
-def shaking(seed=0, size=0.003):
-    rng = np.random.default_rng(seed)
-    sizes = np.concatenate([np.ones(18), np.repeat(SIZES, 3)])
-    factor = 0.003 * sizes[:, None] * rng.normal(size=(102, 102)) / 3.0
-    vector, nothing = start(ACCELERATIONS), np.zeros(0)
-    motion = motion_of(vector)
-    return Estimate(
-        motion.rotation, motion.translation, motion.angular_velocity, motion.linear_velocity,
-        angular_acceleration=motion.angular_acceleration,
-        linear_acceleration=motion.linear_acceleration,
-        inliers=nothing > 0, residuals=nothing, joint_covariance=factor @ factor.T,
-        global_shutter_inliers=0, iterations=0,
-        shake=size * SIZES[:, None] * rng.normal(size=(28, 3)),
-    )  # fmt: skip
-
-
-def whole_waves(estimate):
-    """Value (3,) and slope (3,) in the middle of the waves that nothing was taken from."""
-    return np.sum(estimate.shake[::2], axis=0), np.pi * np.arange(1, 15) @ estimate.shake[1::2]
-
-
-def test_without_its_shaking_a_motion_is_what_the_shaking_goes_around():
-    """Whole waves vanish on average; those of a frame are taken from the middle row."""
-    estimate = shaking()
-    motion, _, swing, _ = unshaken(estimate)
-    value, slope = whole_waves(estimate)
-    # The camera at tau = 0 is the motion's, turned by the waves in its own axes.
-    turned = motion.rotation.T @ Rotation.from_rotvec(value).as_matrix()
-    np.testing.assert_allclose(turned, estimate.rotation.T, atol=1e-12)
-    np.testing.assert_allclose(
-        motion.rotation.T @ motion.translation, estimate.rotation.T @ estimate.translation,
-        atol=1e-12,
-    )  # fmt: skip
-    np.testing.assert_allclose(motion.angular_velocity + slope, estimate.angular_velocity)
-    np.testing.assert_array_equal(motion.linear_velocity, estimate.linear_velocity)
-    np.testing.assert_array_equal(motion.linear_acceleration, estimate.linear_acceleration)
-    squares = np.mean(estimate.shake**2, axis=1)
-    rates = np.pi * np.arange(1, 15)
-    for part, size in (
-        (slice(0, 3), squares[::2].sum()), (slice(6, 9), rates**2 @ squares[1::2])
-    ):  # fmt: skip
-        np.testing.assert_allclose(swing[part, part], size * np.eye(3), atol=1e-15)
-        swing[part, part] = 0.0
-    assert not swing.any()

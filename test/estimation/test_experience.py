@@ -6,14 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from rs_localizer.config import LocalizerConfig, VelocityPrior
+from rs_localizer.config import VelocityPrior
 from rs_localizer.core import so3
-from rs_localizer.core.camera import Camera
-from rs_localizer.core.rig import Rig
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.experience import Experience
-from rs_localizer.estimation.prior import Prior, assumptions, told_speed
-from rs_localizer.solvers.table import find_solver
 
 
 def estimate_at(position, deviation=1e-3, turn=0.0):
@@ -49,20 +45,3 @@ def test_images_tell_how_fast_cameras_move_within_them():
     # A shutter may be a global one, and poses that are hardly known tell nothing.
     assert calm.scales.speeds[0] == calm.scales.speeds[1]
     assert np.abs(speeds_after(0.003, 0.005, 1.0).scales.speeds).max() < 0.3
-
-
-def test_what_frames_deny_is_no_prior_of_the_next():
-    camera = Camera(640, 480, np.diag([500.0, 500.0, 1.0]), readout_time=0.02)
-    terms, _ = assumptions(
-        camera.readout_time, Rig.of(camera), LocalizerConfig(), find_solver("r6p_vcwt")
-    )
-    calm = Prior(scales=speeds_after(0.003, 0.005).scales)
-    slow, prior = told_speed(terms, calm)
-    own, told = (one.informations[0].diagonal()[6:12] for one in (terms, slow))
-    np.testing.assert_allclose(np.sqrt(told / own), 10.0)
-    assert prior is not None
-    # Of a tenth of the speed: what the frames say of 0, 0.03 and 0.1 stands at 0, 0.3 and 1.
-    np.testing.assert_allclose(prior.scales.speeds[[0, 3, 4]], calm.scales.speeds[:3], atol=1e-9)
-    assert prior.scales.speeds[4] < -4.0
-    for same in (Prior(scales=speeds_after(0.1, 0.2).scales), Prior(), None):
-        assert told_speed(terms, same) == (terms, same)

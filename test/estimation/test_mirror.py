@@ -9,7 +9,6 @@ from rs_localizer.core import so3
 from rs_localizer.estimation.mirror import leaning_less
 
 MOTION = np.linspace(0.01, 0.12, 12)  # velocities and accelerations
-LEAN = so3.exp(np.array([0.4, 0.0, 0.0]))
 
 
 def plane(relief=0.0):
@@ -41,14 +40,3 @@ def test_the_plane_leans_the_other_way_at_the_same_place_or_faces_the_camera(sig
     np.testing.assert_allclose(turned, so3.exp((0.4 - 0.4 * leans) * axis) @ facing, atol=1e-9)
     np.testing.assert_allclose(turned @ points.mean(axis=0) + other[9:12], sight, atol=1e-9)
     np.testing.assert_array_equal(other[12:], MOTION)
-
-
-def test_there_is_none_of_a_plane_that_faces_the_camera_and_of_what_is_no_plane():
-    assert seen(plane(), np.eye(3), 2.0) is None
-    assert seen(plane(relief=0.3), LEAN, 2.0) is None
-    assert seen(plane(relief=0.01), LEAN, 2.0) is not None
-    strewn = np.vstack([plane(), plane()[:10] + np.array([0.0, 0.0, 3.0])])
-    assert seen(strewn, LEAN, 2.0) is None
-    alone = seen(strewn, LEAN, 2.0, counting=np.arange(50) < 40)
-    np.testing.assert_allclose(alone, seen(plane(), LEAN, 2.0), atol=1e-12)
-    assert seen(strewn, LEAN, 2.0, counting=np.zeros(50, dtype=bool)) is None

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.correlated import Noise, nothing_shared, products_at
 from rs_localizer.estimation.mirror import leaning_less
 from rs_localizer.estimation.modes import (
@@ -14,11 +13,9 @@ from rs_localizer.estimation.modes import (
     _mode,
     _over_leans,
     along_arcs,
-    averaged,
 )
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import held_terms
-from rs_localizer.estimation.refine import apply_step
 
 from .frames import observe
 from .projection import in_camera, pixels_of
@@ -108,23 +105,6 @@ def test_leans_are_integrated_as_on_a_fine_grid(tilt, noise):
     square, volume = beside(points, pixels, rotation, translation, np.vstack([normal, across]))
     one = volume - 0.5 * freedom * np.log(square) + 2.0 * np.log(best.noise)
     assert found.evidence - mode.evidence == pytest.approx(whole - one, abs=0.1)
-
-
-STATE = np.concatenate([np.eye(3).ravel(), [0.0, 0.0, 2.0], np.zeros(12)])
-
-
-def test_cameras_on_an_arc_about_the_points_are_as_far_away_as_each_of_them():
-    """Their mean step would be nearer by 0.13 m, and its covariance deep."""
-    states = np.array([apply_step(STATE, np.zeros(PARAMETERS)) for _ in range(2)])
-    for state, angle in zip(states, (-0.5, 0.5), strict=True):
-        state[:9] = Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix().ravel()
-    weights = np.array([0.5, 0.5])
-    mean, covariance, *_ = averaged(states, np.zeros((2, 18, 18)), 0, weights, weights)
-    np.testing.assert_allclose(mean, STATE, atol=1e-12)
-    # Turns about x move the camera along y, which is all that is open.
-    arc = np.zeros(PARAMETERS)
-    arc[0], arc[4] = 0.5, -2.0 * 0.5
-    np.testing.assert_allclose(np.abs(covariance), np.abs(np.outer(arc, arc)), atol=1e-12)
 
 
 CENTRE = np.array([0.3, -0.2, 3.0])

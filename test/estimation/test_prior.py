@@ -12,7 +12,6 @@ from rs_localizer.estimation.prior import (
     add_prior,
     motion_terms,
     state_in,
-    terms_at,
     with_measurements,
     with_motion,
 )
@@ -121,29 +120,3 @@ def test_a_motion_prior_costs_the_mahalanobis_distance_about_its_pivot(size):
 def test_an_impossible_prior_is_refused_with_what_was_found(arguments, said):
     with pytest.raises(ValueError, match=said):
         Prior(**arguments)
-
-
-@pytest.mark.parametrize("size", [12, 18])
-def test_a_motion_of_which_nothing_is_known_adds_and_replaces_nothing(size):
-    prior = Prior(motion=motion(), covariance=np.diag(np.full(size, np.inf)))
-    typical = motion_terms((0.1, 0.2), (0.3, 0.4))
-    for own in (NOTHING, typical):
-        terms, state = with_motion(own, prior, CENTRE), state_in(motion(5), CENTRE)
-        for found, expected in zip(evaluate(terms, state), evaluate(own, state), strict=True):
-            np.testing.assert_array_equal(found, expected)
-
-
-def test_a_slower_motion_is_a_narrower_prior_and_rest_the_narrowest():
-    own = with_measurements(
-        motion_terms((0.2, 0.1), (0.05, 0.03)), Prior(gravity=[0, 1, 0], gravity_deviation=0.1)
-    )
-    precisions = np.diag(own.informations[0])
-    # Who hardly turns may walk, at a tenth of the speed; that has all the jolts.
-    for part, walk, jolts in ((0.3, 0.3, 1.0), (0.01, 0.1, 0.1)):
-        slower = np.diag(terms_at(own, part, False).informations[0])
-        np.testing.assert_allclose(slower[6:9], precisions[6:9] / part**2)
-        np.testing.assert_allclose(slower[9:12], precisions[9:12] / walk**2)
-        np.testing.assert_allclose(slower[12:], precisions[12:] / jolts**2)
-    resting = terms_at(own, 0.0, False)
-    np.testing.assert_array_equal(resting.gravity, own.gravity)
-    assert np.diag(resting.informations[0])[6:].min() > 1e15

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import motion_terms
@@ -16,14 +14,11 @@ from rs_localizer.estimation.ransac import (
     Draws,
     Hypotheses,
     Pools,
-    best_models,
     draw,
     generator,
-    pools_of,
     search,
     state_of_model,
 )
-from rs_localizer.estimation.residuals import truncated_cost
 from rs_localizer.solvers.table import find_solver
 
 FREE = motion_terms((0.0, 0.0), (0.0, 0.0))
@@ -101,23 +96,6 @@ def test_good_pools_stop_the_search_early_and_all_are_drawn_from(problem):
     assert outliers[samples[25:]].any()
 
 
-def test_pools_are_of_each_camera_that_has_enough_points():
-    """Near a start, by rank and not, and of all points; a camera of five has no sample of six."""
-    camera, tau = np.repeat([0, 1, 2], [20, 5, 10]), np.linspace(-0.5, 0.5, 35)
-    near, ranking = np.arange(35) % 2 == 0, np.random.default_rng(0).permutation(35)
-    found = pools_of(camera, tau, 3, 6, near, ranking, True)
-    parts = np.split(found.points, found.ends[:-1])
-    by_rank = [ranking[camera[ranking] == k] for k in (0, 2)]
-    expected = [np.arange(0, 20, 2), *by_rank, np.arange(20), np.arange(25, 35)]
-    assert [part.tolist() for part in parts] == [each.tolist() for each in expected]
-    assert found.ranked.tolist() == [False, True, True, False, False]
-    np.testing.assert_allclose(found.shares * [18, 35, 35, 35, 35], [10, 20, 10, 20, 10])
-    np.testing.assert_allclose(found.row_ranges, np.array([19, 19, 9, 19, 9]) / 34)
-    some = pools_of(camera, tau, 3, 6, near, np.zeros(0, np.int64), False)
-    assert some.points.tolist() == list(range(0, 20, 2))
-    assert len(pools_of(camera, tau, 3, 30, near, ranking, True).ends) == 0
-
-
 def samples_of(pool, count, size, tau=None, seed=0, prefixes=None):
     tau = np.linspace(-0.5, 0.5, 1000) if tau is None else tau
     samples = np.full((count, size), -1, dtype=np.int64)
@@ -125,14 +103,6 @@ def samples_of(pool, count, size, tau=None, seed=0, prefixes=None):
         prefixes = np.full(count, len(pool), dtype=np.int64)
     draw(np.asarray(pool, np.int64), prefixes, tau, float(np.ptp(tau)), generator(seed), samples)
     return samples
-
-
-@given(st.integers(6, 40), st.integers(1, 6), st.integers(0, 2**31 - 1))
-def test_samples_are_distinct_points_of_the_pool(total, size, seed):
-    pool = np.arange(total) * 7
-    samples = samples_of(pool, 20, size, seed=seed)
-    assert np.isin(samples, pool).all()
-    assert all(len(set(sample)) == size for sample in samples)
 
 
 def test_all_points_are_drawn_equally_often():
@@ -159,30 +129,3 @@ def test_models_become_states_by_the_motion_model(scene):
     rotation, c, w, drift = model[:9].reshape(3, 3), model[9:12], model[12:15], model[15:18]
     motion = Motion(rotation, c, -w, np.cross(w, c) - drift)
     np.testing.assert_allclose(state_of_model(model), scene.state_of(motion), atol=1e-15)
-
-
-def models_near(motion, count, rng):
-    """Models (2,18,count) of model A, worse and worse, in shuffled order; some are NaN."""
-    w = -motion.angular_velocity
-    true = np.concatenate(
-        [
-            motion.rotation.ravel(), motion.translation, w,
-            np.cross(w, motion.translation) - motion.linear_velocity,
-        ]
-    )  # fmt: skip
-    size = rng.permutation(2 * count) * 1e-4
-    models = true[:, None] + size * rng.normal(size=(18, 1))
-    models[:, ::5] = np.nan
-    return np.ascontiguousarray(models.reshape(18, 2, count).transpose(1, 0, 2)), models
-
-
-def test_the_best_models_are_those_of_a_full_sort(scene):
-    camera, motion, points, _, measured = scene.frame(noise=1.0, count=50)
-    data = scene.pack(camera, points, measured)
-    models, flat = models_near(motion, 40, np.random.default_rng(1))
-    states, costs = best_models(models, data, 8.0, 4, np.inf)
-    alive = [state_of_model(column) for column in flat.T if np.isfinite(column).all()]
-    expected = sorted(truncated_cost(data, s, 8.0, np.inf) for s in alive)[:4]
-    np.testing.assert_allclose(costs, expected, rtol=1e-12)
-    for state, cost in zip(states, costs, strict=True):
-        assert truncated_cost(data, state, 8.0, np.inf) == cost

@@ -86,17 +86,6 @@ def test_the_minimum_has_no_slope_of_the_posterior(scene):
         assert abs(slope) < 1e-3 * np.sqrt(curvature) * noise
 
 
-@pytest.mark.parametrize("size", [1, 3, 12])
-def test_cholesky_is_numpy_s_solve(size):
-    rng = np.random.default_rng(size)
-    factor = rng.normal(size=(size, size))
-    units = np.diag(10.0 ** rng.uniform(-6, 6, size))
-    matrix, right = units @ (factor @ factor.T + np.eye(size)) @ units, rng.normal(size=size)
-    solution, solved = solve_positive(matrix, right)
-    assert solved
-    np.testing.assert_allclose(solution, np.linalg.solve(matrix, right), rtol=1e-6)
-
-
 def test_a_matrix_that_is_not_positive_is_refused():
     for matrix in (np.zeros((2, 2)), np.ones((2, 2)), -np.eye(2), np.diag([1.0, np.nan])):
         assert not solve_positive(matrix, np.ones(2))[1]

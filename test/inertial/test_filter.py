@@ -40,17 +40,6 @@ def test_the_update_is_that_of_the_whole_filter():
     np.testing.assert_allclose(gyroscope._with_motion / scale, after[:18, 18:] / scale, atol=2e-3)
 
 
-def test_an_image_that_says_nothing_changes_nothing():
-    gyroscope = GyroscopeFilter(InertialSettings(1e-4, 1e-4, True))
-    before = gyroscope.errors
-    covariance = np.eye(18)
-    # Worse than predicted, as where the camera shakes.
-    gyroscope.update(
-        Predicted(STILL, covariance, np.zeros((18, 4))), np.zeros(18), 2.0 * covariance
-    )
-    np.testing.assert_allclose(gyroscope.errors.covariance, before.covariance)
-
-
 @pytest.mark.parametrize("smaller", [1e-9, 1e-4, 0.5, 1.0])
 def test_a_smaller_covariance_of_the_motion_leaves_all_definite(smaller):
     rng = np.random.default_rng(3)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
-from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated, late_at
+from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
 from rs_localizer.core.so3 import hat
 from rs_localizer.inertial.turning import densified
 
@@ -28,29 +28,11 @@ def integrated(rate, tau):
     return found.y[:, -1].reshape(3, 3)
 
 
-def test_rates_are_a_natural_spline():
-    turn = GyroRotation.of(TAU, shaking(TAU))
-    expected = CubicSpline(TAU, shaking(TAU), bc_type="natural")
-    np.testing.assert_allclose(turn.at_rows(ROWS)[1], expected(ROWS), atol=1e-14)
-    np.testing.assert_allclose(turn.change, expected(0.0, 1), atol=1e-12)
-
-
 def test_rotations_are_the_integral_of_the_rates():
     turn = GyroRotation.of(TAU, shaking(TAU))
     spline = CubicSpline(TAU, shaking(TAU), bc_type="natural")
     for tau, rotation in zip(ROWS, turn.at_rows(ROWS)[0], strict=True):
         np.testing.assert_allclose(rotation, integrated(spline, tau), atol=1e-7)
-
-
-def test_a_parabola_leaves_nothing():
-    # A natural spline is none at its ends; a cubic through many samples is one in the middle.
-    dense = np.linspace(-3.0, 3.0, 121)
-    assert GyroRotation.of(dense, np.zeros((121, 3))).roughness == 0.0
-    turn = GyroRotation.of(dense, np.column_stack([1.0 + dense, dense**2, 0.0 * dense]))
-    np.testing.assert_allclose(turn.parabola, [[1, 0, 0], [1, 0, 0], [0, 1, 0]], atol=1e-6)
-    assert turn.roughness < 1e-6
-    late = late_at(0.3, turn.tau, turn.rates, turn.parabola)
-    np.testing.assert_allclose(late, np.zeros((2, 3)), atol=1e-5)
 
 
 def test_compensated_bearings_are_those_of_the_middle_row():
@@ -80,14 +62,6 @@ def test_derivatives_of_compensated_bearings_by_differences():
     by_pixel = np.array(changes).T / (2.0 * step)
     _, found = gyro_compensated(ray[None], np.array([tau]), focal * np.eye(2)[None], gradient, turn)
     np.testing.assert_allclose(found[0] @ by_pixel, np.eye(2), atol=1e-6)
-
-
-def test_bearings_that_turn_behind_the_camera_are_left_out():
-    turn = GyroRotation.of(TAU, np.broadcast_to([0.0, 3.0, 0.0], (len(TAU), 3)).copy())
-    rays = np.array([[0.0, 0.0], [-30.0, 0.0], [30.0, 0.0]])
-    found, _ = gyro_compensated(rays, np.full(3, 0.5), np.ones((3, 2, 2)), np.zeros(2), turn)
-    assert np.isfinite(found[0, 0])
-    assert np.isnan(found[1:]).any()
 
 
 def test_rates_between_the_samples_of_a_fast_vibration():

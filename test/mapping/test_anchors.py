@@ -6,18 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.camera import Camera
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.anchors import (
     Anchors,
     Distance,
     PointSight,
-    marker_constraints,
     placement,
 )
 from rs_localizer.tools.mapping.gauge import Similarity
-from rs_localizer.tools.mapping.observations import MapObservations, Start
 from rs_localizer.tools.mapping.triangulation import Triangulated
 
 WALL = MarkerMap(wall("4x4_50", (3, 2), 0.2, 0.1))
@@ -72,50 +69,3 @@ def test_a_distance_gives_the_scale():
     assert placement.similarity.scale == pytest.approx(1.5)
     # Without anything better, the picture's rows are level: y of the camera's frame is down.
     assert np.allclose(placement.similarity.rotation @ [0.0, 1.0, 0.0], [0.0, 0.0, -1.0])
-
-
-K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
-CAMERA = Camera(640, 480, K)
-IMAGES = 6
-# How the first map lies in the markers' frame.
-TURN = Rotation.from_euler("xyz", [20.0, -30.0, 70.0], degrees=True).as_matrix()
-TO_MARKERS = Similarity(0.7, TURN, np.array([1.0, 2.0, 3.0]))
-RNG = np.random.default_rng(0)
-POINTS = RNG.uniform((-1.0, -1.0, 2.5), (1.0, 1.0, 3.5), (20, 3))
-CORNERS = RNG.uniform((-1.0, -1.0, 2.5), (1.0, 1.0, 3.5), (8, 3))
-ROTATIONS = Rotation.from_rotvec(RNG.normal(0.0, 0.05, (IMAGES, 3))).as_matrix()
-POSITIONS = np.column_stack([np.linspace(-0.5, 0.5, IMAGES), np.zeros((IMAGES, 2))])
-STAMPS = 10**9 + 66_000_000 * np.arange(IMAGES)
-
-
-def sightings(points: np.ndarray, images: range = range(IMAGES)) -> MapObservations:
-    rows, which = (
-        grid.ravel() for grid in np.meshgrid(images, np.arange(len(points)), indexing="ij")
-    )
-    local = np.einsum("nji,nj->ni", ROTATIONS[rows], points[which] - POSITIONS[rows])
-    return MapObservations(STAMPS, rows, which, CAMERA.project(local))
-
-
-def test_the_start_moves_into_the_markers_frame():
-    start = Start(POINTS, ROTATIONS, POSITIONS)
-    places = TO_MARKERS(CORNERS)
-    seen, moved, deviations = marker_constraints(
-        CAMERA, sightings(POINTS), start, sightings(CORNERS), places
-    )
-    assert np.allclose(moved.points, np.concatenate([TO_MARKERS(POINTS), places]), atol=1e-6)
-    assert np.allclose(moved.positions, TO_MARKERS(POSITIONS), atol=1e-6)
-    assert np.allclose(moved.rotations, TURN @ ROTATIONS, atol=1e-6)
-    assert np.isinf(deviations[:20]).all()
-    assert np.all(deviations[20:] < 0.01)
-    assert np.all(np.diff(seen.images) >= 0)
-    # The same keypoints as before, and those of the corners behind the landmarks.
-    assert len(seen.pixels) == IMAGES * 28
-    at = seen.landmarks >= 20
-    local = CAMERA.project(
-        np.einsum(
-            "nji,nj->ni",
-            moved.rotations[seen.images[at]],
-            moved.points[seen.landmarks[at]] - moved.positions[seen.images[at]],
-        )
-    )
-    assert np.allclose(local, seen.pixels[at], atol=1e-3)

@@ -12,13 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.room_mapping import Errors, Piece, Room, localized, without_refinement
 from rs_localizer import data
-from rs_localizer.cli.main import main
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.tools.mapping.build import Built
-from rs_localizer.tools.mapping.colmap import SPARSE
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.views import View
 from rs_localizer.tools.simulation.settings import ImageSettings
@@ -133,20 +131,3 @@ def test_other_images_are_localized(room, views, built):
     assert np.median(ours.positions) < 0.015
     assert np.median(ours.angles) < 0.25
     assert np.median(theirs.positions) > 2.0 * np.median(ours.positions)
-
-
-def test_the_model_of_colmap_becomes_that_of_a_global_shutter(
-    room, views, built, folder, tmp_path, capsys
-):
-    """Reprojection errors fall to the noise."""
-    out = tmp_path / "global"
-    words = [str(folder / SPARSE), str(out), "--rate", f"{WALK.rate}"]
-    shutter = ["-p", f"readout_time:={CAMERA.readout_time}"]
-    assert main(["map", "refine", "--colmap", *words, *shutter]) == 0
-    (line,) = (
-        line
-        for line in capsys.readouterr().out.splitlines()
-        if line.startswith("error with a global")
-    )
-    before, after = (float(line.split()[k]) for k in (5, 9))
-    assert after < 0.5 * before

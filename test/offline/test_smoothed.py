@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -73,26 +72,6 @@ def test_windows_say_what_one_piece_says(
         squared = step @ np.linalg.solve(other.pose.covariance, step) / 6.0
         # Knots lie elsewhere, and the accelerations that are expected are those of the window.
         assert squared < 0.5**2
-
-
-def test_frames_are_forgotten_with_their_window(
-    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    localizer, frames, stamps = recorded
-    in_windows(monkeypatch, 2.0)
-    asked = 0
-
-    def coming() -> Iterator[Localized]:
-        nonlocal asked
-        for frame in frames:
-            asked += 1
-            yield frame
-
-    ahead, given = [], 0
-    for part in smooth_frames(localizer, coming(), stamps, None):
-        given += len(part.frames)
-        ahead.append(asked - given)
-    assert max(ahead) < 30 * (0.5 + 0.2)  # the margin's
 
 
 def test_a_vibrating_camera_is_smoothed_beside_what_its_gyroscope_knows(tmp_path: Path) -> None:

@@ -126,30 +126,6 @@ def refused(result: Localized | Refusal) -> tuple[str, str]:
 
 
 @pytest.mark.usefixtures("mock")
-@pytest.mark.parametrize("lag", [0, 1, 2])
-def test_results_wait_for_as_many_frames_as_output_lag_says(
-    make_cloud_message, make_camera_info, lag
-):
-    frames = FrameLocalizer(NodeConfig(readout_time=READOUT_TIME, output_lag=lag))
-    frames.calibrate(read_camera_info(make_camera_info()))
-    rows = [[i, i, i, 100.0 + i, 200.0] for i in range(8)]
-    found = []
-    for k in range(5):
-        cloud = make_cloud_message(rows[: 8 if k != 2 else 3], FIELDS, point_step=40,
-                                   stamp=(5, 33_000_000 * k))  # fmt: skip
-        found.append(frames.localize(cloud))
-    assert [refused(one)[0] for one in found[:lag]] == ["awaits_frames"] * lag
-    for k, one in enumerate(found[lag:]):
-        if k == 2:
-            assert refused(one)[0] == "too_few_points"
-        else:
-            assert localized(one).input_stamp_ns == 5 * 10**9 + 33_000_000 * k
-            assert len(localized(one).inliers) == 4
-    last = [localized(one).input_stamp_ns for one in frames.flush()]
-    assert last == [5 * 10**9 + 33_000_000 * k for k in range(5 - lag, 5)]
-
-
-@pytest.mark.usefixtures("mock")
 def test_reasons_of_refusals(cloud, make_camera_info):
     frames = FrameLocalizer(NodeConfig())
     assert refused(frames.localize(again(cloud)))[0] == "no_camera_info"

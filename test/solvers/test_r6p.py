@@ -202,23 +202,3 @@ def test_all_real_solutions_are_found_and_nothing_else(family):
     assert np.mean(distances(*found, *expected) < 1e-6) >= 0.999
     # Each of them once.
     assert abs(len(found[0]) - len(expected[0])) <= 0.001 * len(expected[0])
-
-
-@pytest.mark.parametrize(
-    "motion",
-    [
-        {},
-        {"error": 30.0},
-        {"rotation": 0.0, "translation": 0.0, "error": 0.0},
-        {"rotation": 0.0},
-        {"translation": 0.0, "error": 0.0},
-    ],
-)
-def test_the_truth_is_among_the_solutions(motion):
-    p = problems(1000, 9, physical=False, **motion)
-    found = solutions(p)
-    error = sum(
-        np.linalg.norm(x - truth[:, None], axis=2)
-        for x, truth in zip(found, (p.v, p.c, p.w, p.t), strict=True)
-    )
-    assert np.mean(np.nanmin(error, axis=1) < 1e-7) > 0.999

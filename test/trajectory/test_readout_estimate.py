@@ -2,17 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The readout time from neighbouring frames: value, deviation, alarms; on an own projector."""
 
-from dataclasses import replace
-from functools import cache
-
 import numpy as np
-import projector
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.core.camera import Camera
-from rs_localizer.core.types import Estimate
-from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.readout_estimate import (
     Equation,
     MeasuredReadout,
@@ -20,78 +13,8 @@ from rs_localizer.pipeline.readout_estimate import (
     View,
     equation,
 )
-from rs_localizer.tracking import Tracker
 
 READOUT = 0.03
-CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
-
-
-@cache
-def recording(
-    points: str = "room", seconds: float = 2.0, turn: float = 0.14, noise: float = 1.0
-) -> list[projector.Frame]:
-    rng = np.random.default_rng(7)
-    motion = projector.Motion.random(rng, turn, 0.6 * turn)
-    landmarks = projector.room(rng) if points == "room" else projector.board()
-    return projector.record(
-        rng, motion, landmarks, readout=READOUT, seconds=seconds, noise=noise, outliers=0.1
-    )
-
-
-def watch(
-    frames: list[projector.Frame], believed: float, camera: Camera = CAMERA
-) -> list[MeasuredReadout | None]:
-    """The estimate after every fifth frame; tracked where a readout time is given."""
-    localizer = Localizer(replace(camera, readout_time=believed))
-    tracker = Tracker(localizer) if believed > 0.0 else None
-    estimate = ReadoutEstimate()
-    said = []
-    for k, frame in enumerate(frames):
-        time_ns = round((frame.stamp + 0.5 * READOUT) * 1e9)
-        seen = frame.points, frame.pixels
-        result = tracker.localize(time_ns, *seen) if tracker else localizer.localize(*seen)
-        if isinstance(result, Estimate):
-            estimate.add(time_ns, camera, result, *seen)
-        if k % 5 == 4:
-            said.append(estimate.measured)
-    return said
-
-
-@pytest.mark.parametrize(
-    ("points", "believed"),
-    [
-        ("room", READOUT),
-        ("room", 1.2 * READOUT),
-        pytest.param("room", 0.8 * READOUT, marks=pytest.mark.bench),
-        pytest.param("room", 0.0, marks=pytest.mark.bench),
-        pytest.param("board", 1.2 * READOUT, marks=pytest.mark.bench),
-    ],
-)
-def test_the_readout_time_whatever_is_believed(points, believed):
-    noise, turn = (1.0, 0.14) if points == "room" else (0.3, 0.06)
-    said = watch(recording(points, turn=turn, noise=noise), believed)
-    found = said[-1]
-    assert abs(found.readout_time - READOUT) < 3.0 * found.deviation < 0.06 * READOUT
-    alarms = [measured for measured in said if measured and measured.contradicts(believed)]
-    if believed == READOUT:
-        assert not alarms
-    else:
-        assert len(alarms) > len(said) / 2  # from within the first half on
-
-
-def test_a_reversed_direction_is_a_negative_readout_time():
-    camera = replace(CAMERA, scan_direction="bottom_to_top")
-    said = watch(recording(), READOUT, camera)
-    assert said[-1].readout_time == pytest.approx(-READOUT, rel=0.03)
-    assert said[-1].contradicts(READOUT)
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.003])
-def test_no_alarm_at_rest_nor_at_slow_motion(turn):
-    said = watch(recording(turn=turn), READOUT)
-    assert not any(measured and measured.contradicts(READOUT) for measured in said)
-
-
 NOISE = 1e-3
 
 

@@ -6,69 +6,9 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import rs_localizer
-from rs_localizer.core.simd.algebra import least_squares
-from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.simd.tracing import LANES, traced, traced_sums
-
-
-def run(function, values, outputs):
-    """Apply a traced function to values (inputs, LANES)."""
-
-    @kernel
-    def call(source, target):
-        function(source, target)
-
-    target = np.full(outputs * LANES, np.nan)
-    call(np.ascontiguousarray(values, dtype=float).ravel(), target)
-    return target.reshape(outputs, LANES)
-
-
-def values(count, seed=0):
-    return np.random.default_rng(seed).normal(size=(count, LANES))
-
-
-@pytest.mark.parametrize(("rows", "columns"), [(3, 3), (6, 4), (8, 8), (12, 5)])
-def test_least_squares_is_that_of_numpy(rows, columns):
-    given = values(rows * (columns + 1))
-
-    def body(v):
-        matrix = [v[j * rows : (j + 1) * rows] for j in range(columns + 1)]
-        return least_squares(matrix[:-1], matrix[-1])
-
-    solution = run(traced(body, rows * (columns + 1)), given, columns)
-    for lane in range(LANES):
-        system = given[:, lane].reshape(columns + 1, rows).T
-        expected = np.linalg.lstsq(system[:, :-1], system[:, -1], rcond=None)[0]
-        np.testing.assert_allclose(solution[:, lane], expected, rtol=1e-9)
-
-
-def test_a_singular_lane_is_not_finite_and_leaves_the_others_alone():
-    given = values(9 + 3, seed=3)
-    given[3:6, 2] = given[0:3, 2]  # two equal columns in lane 2
-    solution = run(traced(lambda v: least_squares([v[0:3], v[3:6], v[6:9]], v[9:12]), 12), given, 3)
-    size = np.abs(solution).max(axis=0)
-    assert not size[2] < 1e12
-    assert (np.delete(size, 2) < 1e3).all()
-
-
-def test_sums_go_over_all_lanes_of_all_blocks():
-    bodies = ((lambda v: [v[0] * v[1], v[2]], 2), (lambda v: [v[0] + v[2]], 1))
-    sums = traced_sums(3, *bodies)
-
-    @kernel
-    def call(source, blocks, target):
-        sums(source, blocks, target)
-
-    source = np.random.default_rng(0).normal(size=(7, 3, LANES))
-    target = np.full(3, np.nan)
-    call(source.reshape(7, -1), 5, target)
-    x, y, z = source[:5].transpose(1, 0, 2)
-    np.testing.assert_allclose(target, [(x * y).sum(), z.sum(), (x + z).sum()], rtol=1e-13)
-
 
 PACKAGE = Path(rs_localizer.__file__).parent
 FOLDERS = ("core", "solvers", "estimation", "inertial")

@@ -119,17 +119,6 @@ def log() -> Log:
     return Log()
 
 
-def test_details_that_differ_in_numbers_are_one(log):
-    for inliers in range(8, 12):
-        log.add("too_few_inliers", f"{inliers} of 100 points within 2.0 px")
-    log.now += 6.0
-    log.add("too_few_inliers", "7 of 90 points within 2.0 px")
-    assert log.lines == [
-        "too_few_inliers: 8 of 100 points within 2.0 px",
-        "too_few_inliers: 7 of 90 points within 2.0 px (3 more since the last report)",
-    ]
-
-
 def test_ever_new_details_fill_neither_log_nor_memory(log):
     letters = "abcdefghijklmnopqrstuvwxyz"
     for second in range(60):

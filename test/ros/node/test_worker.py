@@ -157,18 +157,6 @@ def test_a_late_mounting_keeps_no_other_frame_waiting(fake):
     assert fake.statistics.summary().total["refused"] == 0
 
 
-def test_a_mounting_that_does_not_come_is_a_refusal(fake):
-    fake.patience = 0.05
-    fake.go_on.release(1)
-    fake.send("late")
-    deadline = time.monotonic() + PATIENCE
-    while not fake.refusals.counts:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    assert fake.refusals.counts == {"no_transform": 1}
-    assert fake.published == []
-
-
 def test_a_frame_waits_for_what_it_needs_but_not_for_long(fake):
     fake.go_on.release(3)
     fake.awaited = {"one"}
