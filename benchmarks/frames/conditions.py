@@ -106,6 +106,7 @@ class Condition:
 
 
 REST, HAND = moving("rest"), moving("hand")
+SEEN: dict[str, Scene] = {"rich": Rich(), "wall": Wall()}
 SLOW_HAND = moving("hand", slower=4.0)  # 17 deg/s
 # A field of view of 45 degrees, as in the experiments of Kukelova et al. (ACCV 2018).
 NARROW = Camera(width=1000, height=1000, focal=1207.0)
@@ -164,7 +165,7 @@ def _grid() -> Iterator[tuple[Any, ...]]:
         moves.items(), scenes.items(), (0.05, 0.3, 1.0, 3.0), (False, True)
     ):
         label = f"{name}/{where}/{noise:g}px{'/tracked' * tracked}"
-        yield label, motion, scene, noise, {"sequence": TRACKED if tracked else SINGLE}
+        yield label, motion, scene, noise, {"sequence": (SINGLE, TRACKED)[tracked]}
 
 
 def _few() -> Iterator[tuple[Any, ...]]:
@@ -262,23 +263,22 @@ def _real() -> Iterator[tuple[Any, ...]]:
 
 def _student() -> Iterator[tuple[Any, ...]]:
     for tails, scene, noise in product((3.0, 5.0), ("rich", "wall"), (0.3, 1.0)):
-        seen = Rich() if scene == "rich" else Wall()
         others = {"points": Points(tails=tails)}
-        yield f"{tails:g} degrees/{scene}/{noise:g}px", HAND, seen, noise, others
+        yield f"{tails:g} degrees/{scene}/{noise:g}px", HAND, SEEN[scene], noise, others
 
 
 def _shared() -> Iterator[tuple[Any, ...]]:
     for scene, noise, tracked in product(("rich", "wall"), (0.3, 1.0), (False, True)):
-        others = {"points": Points(shift=0.3), "sequence": TRACKED if tracked else SINGLE}
+        others = {"points": Points(shift=0.3), "sequence": (SINGLE, TRACKED)[tracked]}
         label = f"{scene}/{noise:g}px{'/tracked' * tracked}"
-        yield label, HAND, Rich() if scene == "rich" else Wall(), noise, others
+        yield label, HAND, SEEN[scene], noise, others
 
 
 def _body() -> Iterator[tuple[Any, ...]]:
     for (name, motion), noise, tracked in product(
         (("hand", HAND), ("rest", REST)), (0.3, 1.0), (False, True)
     ):
-        others = {"points": Points(body=True), "sequence": TRACKED if tracked else SINGLE}
+        others = {"points": Points(body=True), "sequence": (SINGLE, TRACKED)[tracked]}
         yield f"{name}/{noise:g}px{'/tracked' * tracked}", motion, Rich(), noise, others
 
 
@@ -294,9 +294,9 @@ def _camera() -> Iterator[tuple[Any, ...]]:
     for (error, calibration), scene, noise, tracked in product(
         errors.items(), ("rich", "wall"), (0.3, 1.0), (False, True)
     ):
-        others = {"calibration": calibration, "sequence": TRACKED if tracked else SINGLE}
+        others = {"calibration": calibration, "sequence": (SINGLE, TRACKED)[tracked]}
         label = f"{error}/{scene}/{noise:g}px{'/tracked' * tracked}"
-        yield label, HAND, Rich() if scene == "rich" else Wall(), noise, others
+        yield label, HAND, SEEN[scene], noise, others
 
 
 def _map() -> Iterator[tuple[Any, ...]]:
@@ -311,10 +311,10 @@ def _map() -> Iterator[tuple[Any, ...]]:
         others = {
             "points": points,
             "settings": (("map_deviation", 0.01),),
-            "sequence": TRACKED if tracked else SINGLE,
+            "sequence": (SINGLE, TRACKED)[tracked],
         }
         label = f"{name}/{scene}/{noise:g}px{'/tracked' * tracked}"
-        yield label, HAND, Rich() if scene == "rich" else Wall(), noise, others
+        yield label, HAND, SEEN[scene], noise, others
 
 
 def _locks() -> Iterator[tuple[Any, ...]]:
@@ -327,8 +327,7 @@ def _locks() -> Iterator[tuple[Any, ...]]:
 def _bad() -> Iterator[tuple[Any, ...]]:
     for scene, shift, noise in product(("rich", "wall"), (4.0, 15.0), (0.3, 1.0)):
         others = {"sequence": Sequence(18, (13, 18), (10, 13, shift))}
-        seen = Rich() if scene == "rich" else Wall()
-        yield f"{scene}/shift {shift:g}px/{noise:g}px", HAND, seen, noise, others
+        yield f"{scene}/shift {shift:g}px/{noise:g}px", HAND, SEEN[scene], noise, others
 
 
 def _axis() -> Iterator[tuple[Any, ...]]:
@@ -351,31 +350,15 @@ def _global() -> Iterator[tuple[Any, ...]]:
         others = {
             "camera": GLOBAL,
             "calibration": Calibration(readout_time=0.02),
-            "sequence": TRACKED if tracked else SINGLE,
+            "sequence": (SINGLE, TRACKED)[tracked],
         }
         yield f"{name}/{noise:g}px{'/tracked' * tracked}", SLOW_HAND, scene, noise, others
 
 
 BENCHES: dict[str, Callable[[], Iterator[tuple[Any, ...]]]] = {
-    "hand": _hand,
-    "grid": _grid,
-    "few": _few,
-    "many": _many,
-    "planes": _planes,
-    "gyro": _gyro,
-    "locks": _locks,
-    "sine": _sine,
-    "bands": _bands,
-    "noise": _noise,
-    "impacts": _impacts,
-    "real": _real,
-    "student": _student,
-    "shared": _shared,
-    "body": _body,
-    "camera": _camera,
-    "map": _map,
-    "bad": _bad,
-    "axis": _axis,
-    "global": _global,
-}
+    "hand": _hand, "grid": _grid, "few": _few, "many": _many, "planes": _planes, "gyro": _gyro,
+    "locks": _locks, "sine": _sine, "bands": _bands, "noise": _noise, "impacts": _impacts,
+    "real": _real, "student": _student, "shared": _shared, "body": _body, "camera": _camera,
+    "map": _map, "bad": _bad, "axis": _axis, "global": _global,
+}  # fmt: skip
 """By name, of which ``run --bench`` takes some."""

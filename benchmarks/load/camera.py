@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import pickle
 import sys
 import time
 from pathlib import Path
@@ -96,7 +97,7 @@ def _sleep_until(when: float) -> None:
 
 
 def main(namespace: str, frames_file: str, sent_file: str) -> None:
-    frames = Frames.load(Path(frames_file))
+    frames = pickle.loads(Path(frames_file).read_bytes())  # our own
     sent = np.memmap(sent_file, np.float64, mode="r+")
     rclpy.init()
     node = rclpy.create_node("camera", namespace=namespace)

@@ -5,8 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from rclpy.serialization import serialize_message
@@ -48,28 +47,6 @@ class Frames:
     def imu_rate(self) -> float:
         """Hz."""
         return self.rate * len(self.imus) / len(self.clouds)
-
-    def save(self, path: Path) -> None:
-        """For another process, as an NPZ file."""
-        np.savez(
-            path,
-            rate=self.rate,
-            camera_info=np.frombuffer(self.camera_info, np.uint8),
-            clouds=np.frombuffer(b"".join(self.clouds), np.uint8),
-            ends=np.cumsum([len(cloud) for cloud in self.clouds]),
-            imus=np.array([np.frombuffer(imu, np.uint8) for imu in self.imus]),
-        )
-
-    @classmethod
-    def load(cls, path: Path) -> Self:
-        with np.load(path, allow_pickle=False) as file:
-            clouds = np.split(file["clouds"], file["ends"][:-1])
-            return cls(
-                float(file["rate"]),
-                file["camera_info"].tobytes(),
-                [bytearray(cloud.tobytes()) for cloud in clouds],
-                [bytearray(imu.tobytes()) for imu in file["imus"]],
-            )
 
     def cloud(self, index: int) -> bytes:
         """The cloud of the frame with this number; it never ends."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import subprocess
 import sys
 import tempfile
@@ -147,8 +148,8 @@ def _started(namespace: str, log: Path) -> subprocess.Popen[bytes]:
 def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
     """Publish that many frames to each of some nodes at a steady rate, and see what comes of it."""
     with running(cameras) as (peer, nodes), tempfile.TemporaryDirectory() as directory:
-        frames_file = Path(directory) / "frames.npz"
-        frames.save(frames_file)
+        frames_file = Path(directory) / "frames"
+        frames_file.write_bytes(pickle.dumps(frames))
         ears, sents, publishers = [], [], []
         for index, (namespace, _) in enumerate(nodes):
             ears.append(Ear(peer, namespace, frames, count))
