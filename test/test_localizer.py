@@ -157,20 +157,6 @@ def test_a_far_origin_and_turned_map_change_nothing_but_the_map():
     np.testing.assert_array_equal(there.inliers, here.inliers)
 
 
-def test_binning_and_roi_give_the_same_pose():
-    path = Path(6)
-    whole = camera()
-    part = camera(binning=(2, 2), roi=rsl.Roi(64, 48, 512, 384))
-    points, pixels, _ = frame(part, path, 60)
-    result = rsl.Localizer(part, velocity_prior=rsl.VelocityPrior(0, 0)).localize(points, pixels)
-    again = rsl.Localizer(whole, velocity_prior=rsl.VelocityPrior(0, 0)).localize(
-        points, pixels * 2 + (64, 48)
-    )
-    for estimate in (result, again):
-        assert angle(estimate.rotation, path.pose(0)[0].T) < 1e-4
-        np.testing.assert_allclose(estimate.angular_velocity, READOUT * path.rate, atol=1e-5)
-
-
 def test_random_matches_have_no_pose():
     cam = camera()
     rng = np.random.default_rng(0)

@@ -144,23 +144,6 @@ def test_regions_hold_with_an_ordinary_calibration(depth, errors):
     assert inside(rsl.Localizer(camera, calibration=EXACT), depth, 15) < 0.6
 
 
-def test_the_next_frame_is_told_nothing_of_it():
-    """Pose and own covariance, which a tracker goes on from, stay as they are."""
-    points, pixels, _ = frame(1, 2.0)
-    found, exact = (
-        rsl.Localizer(CAMERA, **settings).localize(points, pixels)
-        for settings in ({}, {"calibration": EXACT})
-    )
-    np.testing.assert_array_equal(found.rotation, exact.rotation)
-    np.testing.assert_array_equal(found.joint_covariance, exact.joint_covariance)
-    np.testing.assert_array_equal(exact.calibration_covariance, 0.0)
-    more = found.covariance - exact.covariance
-    np.testing.assert_allclose(more, found.calibration_covariance)
-    assert np.linalg.eigvalsh(more).min() > -1e-12
-    # To first order as far as the camera turns for a principal point that is off by a pixel.
-    assert np.sqrt(more[0, 0]) == pytest.approx(1.0 / 450.0, rel=0.3)
-
-
 @pytest.mark.parametrize(("depth", "least"), [(2.0, 0.9), (0.0, 0.75)], ids=["room", "wall"])
 def test_regions_hold_before_a_bent_map_that_is_declared(depth, least):
     """A map is off in metres, so by more pixels where it is near: the smooth error has a depth.

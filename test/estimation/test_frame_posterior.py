@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from rs_localizer.core.scales import SPEEDS, VIBRATIONS, Scales
-from rs_localizer.core.shake import CYCLES, shake_at
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.frame_posterior import frame_posterior
 from rs_localizer.estimation.posterior import maximum_a_posteriori
@@ -130,30 +129,6 @@ def refused_of(observations, posterior):
     """Whether it is refused."""
     failure = refusal(observations, posterior, 0, min_inliers=12, threshold=2.0, rolling=True)
     return failure is not None
-
-
-def orientations(state, tau, turn):
-    """camera_from_map at row times (n,), turned by (n,3) beside the motion."""
-    moved = tau[:, None] * state[12:15] + 0.5 * tau[:, None] ** 2 * state[18:21]
-    return (
-        Rotation.from_rotvec(-turn)
-        * Rotation.from_rotvec(-moved)
-        * Rotation.from_matrix(state[:9].reshape(3, 3))
-    )
-
-
-@pytest.mark.parametrize("cycles", [1.0, 2.2, 6.0])
-def test_vibration_is_followed_through_all_rows(cycles):
-    observations, state = shaken(3, cycles)
-    found = frame_posterior(observations, state, PRIOR, 2.0, ASSUMED)
-    assert found.shake.shape == (2 * len(CYCLES), 3)
-    assert len(found.covariance) == 18 + 3 * len(found.shake)
-    tau = np.linspace(-0.4, 0.4, 41)
-    followed = orientations(found.state, tau, shake_at(tau, found.shake)[:, :3])
-    off = (followed * orientations(state, tau, wave(cycles, SWING)(tau)).inv()).magnitude()
-    assert np.sqrt(np.mean(off**2)) < np.radians(0.06)  # of 0.3 that it swings
-    assert found.inliers.all()
-    assert found.noise == pytest.approx(0.2, rel=0.25)
 
 
 @pytest.mark.parametrize(

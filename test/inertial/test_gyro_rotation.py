@@ -8,7 +8,6 @@ from scipy.interpolate import CubicSpline
 
 from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
 from rs_localizer.core.so3 import hat
-from rs_localizer.inertial.turning import densified
 
 TAU = np.linspace(-0.8, 0.8, 33)
 ROWS = np.linspace(-0.5, 0.5, 7)
@@ -62,19 +61,3 @@ def test_derivatives_of_compensated_bearings_by_differences():
     by_pixel = np.array(changes).T / (2.0 * step)
     _, found = gyro_compensated(ray[None], np.array([tau]), focal * np.eye(2)[None], gradient, turn)
     np.testing.assert_allclose(found[0] @ by_pixel, np.eye(2), atol=1e-6)
-
-
-def test_rates_between_the_samples_of_a_fast_vibration():
-    def shown(time):
-        waves = (113.0 * np.sin(2 * np.pi * 60.0 * time + p) for p in (0.0, 1.0, 2.0))
-        return np.column_stack(list(waves)) + 75.0 * np.cos(2 * np.pi * 120.0 * time)[:, None]
-
-    times = np.arange(-10, 11) / 400.0 + 3e-4
-    dense, rates = densified(times, shown(times))
-    inside = np.abs(dense) < 0.016
-    cubic = CubicSpline(times, shown(times), bc_type="natural")(dense)
-    error = np.abs(rates - shown(dense))[inside].max()
-    assert error < 0.5
-    assert error < 0.1 * np.abs(cubic - shown(dense))[inside].max()
-    np.testing.assert_array_equal(dense[::2], times)
-    np.testing.assert_array_equal(rates[::2], shown(times))

@@ -364,21 +364,23 @@ def burst(world: World) -> str:
     return "replaced"
 
 
-def slow(world: World) -> Callable[[], None]:
+def slow(
+    world: World, name: str = "localize", message: Callable[[World], Any] = World.cloud
+) -> Callable[[], None]:
     """The next frame is worked on until the returned function is called."""
     started, go_on = threading.Event(), threading.Event()
     frames = world.node._localizer
-    localize = frames.localize
+    localize = getattr(frames, name)
 
     def wait(message: Any) -> Any:
-        del frames.localize
+        delattr(frames, name)
         started.set()
         assert go_on.wait(PATIENCE)
         return localize(message)
 
-    frames.localize = wait
+    setattr(frames, name, wait)
     while not started.wait(0.1):
-        world.send(world.cloud())
+        world.send(message(world))
     return go_on.set
 
 
@@ -446,31 +448,20 @@ def silence(world: World) -> str:
     return "STALE: no frame has come"
 
 
-def landmarks(world: World, frame: str = "map") -> Map:
+def map_message(world: World, frame: str = "map") -> Any:
     """What all frames of the recording show, with a descriptor for each number."""
     tables = [np.unique(world.table_of(cloud)[["id", "x", "y", "z"]]) for cloud in world.clouds]
     table = np.unique(np.concatenate(tables))
     points = np.stack([table[name].astype(np.float64) for name in "xyz"], axis=1)
-    return Map(points, table["id"].astype(np.int64), DESCRIPTORS[table["id"]], frame)
+    shown = Map(points, table["id"].astype(np.int64), DESCRIPTORS[table["id"]], frame)
+    return "map_points", make_cloud(make_message, 0, frame, map_rows(shown))
 
 
-def map_message(
-    world: World, change: Callable[[np.ndarray], np.ndarray] = lambda rows: rows, frame: str = "map"
-) -> Any:
-    rows = change(map_rows(landmarks(world, frame)))
-    return "map_points", make_cloud(make_message, 0, frame, rows)
-
-
-def keypoints(world: World, count: int = 0, **columns: np.ndarray) -> Any:
-    """Those of a good frame, with other marks; repeated up to a count."""
+def keypoints(world: World) -> Any:
+    """Those of a good frame."""
     table = world.table()
-    marks = columns or {"descriptor": DESCRIPTORS[table["id"]]}
-    kinds = [("u", "<f4"), ("v", "<f4")]
-    kinds += [(name, mark.dtype, mark.shape[1:]) for name, mark in marks.items()]
-    rows = np.zeros(len(table), kinds)
-    for name, values in {"u": table["u"], "v": table["v"], **marks}.items():
-        rows[name] = values
-    rows = np.resize(rows, count or len(rows))
+    rows = np.zeros(len(table), [("u", "<f4"), ("v", "<f4"), ("descriptor", "u1", (32,))])
+    rows["u"], rows["v"], rows["descriptor"] = table["u"], table["v"], DESCRIPTORS[table["id"]]
     world.stamp += SECOND // 30
     return "keypoints", make_cloud(make_message, world.stamp, "camera", rows)
 
@@ -493,22 +484,11 @@ def late_map(world: World) -> str:
 
 def replaced_within_a_frame(world: World) -> str:
     """The frame that is worked on is answered by the old map, the next one by the new."""
-    frames = world.node._localizer
-    localize = frames.localize_keypoints
-    started, go_on = threading.Event(), threading.Event()
-
-    def wait(message: Any) -> Any:
-        del frames.localize_keypoints
-        started.set()
-        assert go_on.wait(PATIENCE)
-        return localize(message)
-
-    frames.localize_keypoints = wait
     before = len(world.heard)
-    world.wait(lambda: world.send(keypoints(world)) or started.wait(0.1))
+    go_on = slow(world, "localize_keypoints", keypoints)
     world.send(map_message(world, frame="hall"))
     world.wait(lambda: "map_points" in world.node.worker._updates)
-    go_on.set()
+    go_on()
     world.wait(lambda: len(world.heard) > before)
     assert world.heard[before].header.frame_id == "map"
     world.wait(lambda: world.poses(keypoints(world), within=0.3))

@@ -162,22 +162,6 @@ def test_the_correction_never_stops(made, robot, peer):
         robot.buffer.lookup_transform("map", "base_link", Time(nanoseconds=11_300_000_000))
 
 
-def test_map_to_camera(made, robot, peer):
-    node = made(publish_tf="map_to_camera", transform_tolerance=0.5)
-    node.publish(frame(5 * 10**9, x=4.0), node.config)
-    sent = heard(robot, peer, "map", "base_link")
-    assert sent.header.stamp.sec == 5
-    assert sent.header.stamp.nanosec == 0
-    assert sent.transform.translation.x == 4.0
-    node.publish(frame(0), node.config)
-    ((reason, text),) = node.notes
-    assert reason == "not_broadcast"
-    assert text.startswith("publish_tf map_to_camera: header.stamp of the input is zero")
-    assert node.broadcaster.fault() == {}  # one has been sent just now
-    node.publish(frame(6 * 10**9), NodeConfig())  # switched off meanwhile
-    assert len(node.notes) == 1
-
-
 def test_without_tf2_ros_only_what_needs_it_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "tf2_ros", None)
     check(NodeConfig())
