@@ -168,20 +168,15 @@ class Rig:
 
 def _extrinsics(name: str, given: Any) -> tuple[Array, Array]:
     try:
-        rotation, translation = given
+        rotation, translation = (numbers(f"camera_from_rig[{name!r}]", each) for each in given)
     except (TypeError, ValueError):
+        rotation = translation = np.zeros(0)
+    shapes = rotation.shape == (3, 3) and translation.shape == (3,)
+    if not (shapes and np.all(np.isfinite(rotation)) and np.all(np.isfinite(translation))):
         raise ValueError(
-            f"camera_from_rig[{name!r}] must be a rotation and a translation, got {given!r}"
-        ) from None
-    rotation = numbers(f"rotation of {name}", rotation)
-    translation = numbers(f"translation of {name}", translation)
-    if rotation.shape != (3, 3) or translation.shape != (3,):
-        raise ValueError(
-            f"camera_from_rig[{name!r}] must be of (3,3) and (3,), got {rotation.shape} and "
-            f"{translation.shape}"
+            f"camera_from_rig[{name!r}] must be a rotation and a translation of finite numbers, "
+            f"(3,3) and (3,), got {given!r}"
         )
-    if not (np.all(np.isfinite(rotation)) and np.all(np.isfinite(translation))):
-        raise ValueError(f"camera_from_rig[{name!r}] must be finite")
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if off > _ORTHONORMAL or np.linalg.det(rotation) < 0.0:
         raise ValueError(

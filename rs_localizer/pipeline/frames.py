@@ -33,7 +33,6 @@ from rs_localizer.io.clouds import (
     Keypoints,
     read_correspondences,
     read_keypoints,
-    select_inliers,
     thinned,
 )
 from rs_localizer.io.maps.landmarks import Map
@@ -712,24 +711,14 @@ class FrameLocalizer:
 
     def _localized(self, images: Sequence[Image], result: RigEstimate, origin_ns: int) -> Localized:
         """Pose and twist of the rig's axes at the published moment."""
-        config, cloud = self._config, images[0].cloud
+        config, first = self._config, images[0].cloud
         time_ns = origin_ns + round(1e9 * result.time)
-        stamp_ns = time_ns if config.pose_time == PoseTime.MID_FRAME else cloud.stamp_ns
-        tau = (stamp_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
-        moving = find_solver(config.solver).rolling_shutter
-        table = _table(config.cameras, images)
-        return Localized(
-            input_stamp_ns=cloud.stamp_ns,
-            stamp_ns=stamp_ns,
-            map_frame=cloud.frame,
-            body_frame=self.camera_frame,
-            pose=pose_at(result, tau),
-            twist=twist_at(result, tau, result.span) if moving else None,
-            inliers=select_inliers(table, np.asarray(result.inliers), np.asarray(result.residuals)),
-            dropped=sum(image.cloud.dropped for image in images),
-            estimate=result,
-            cameras=tuple(_share(image, result) for image in images),
-        )
+        stamp_ns = time_ns if config.pose_time == PoseTime.MID_FRAME else first.stamp_ns
+        moment = stamp_ns, (stamp_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
+        dropped = sum(image.cloud.dropped for image in images)
+        cloud = replace(first, table=_table(config.cameras, images), dropped=dropped)
+        made = of_camera(cloud, result, config, self.camera_frame, moment, ReadoutKnown())
+        return replace(made, cameras=tuple(_share(image, result) for image in images))
 
     def mounted(self, localized: Localized) -> Localized | Refusal:
         """The result of ``base_frame``, from that of the camera."""

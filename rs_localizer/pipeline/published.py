@@ -143,12 +143,12 @@ def about_angles(pose: Pose) -> Pose:
 
 @dataclass(frozen=True, slots=True)
 class ReadoutKnown:
-    """How well the readout time is known."""
+    """How well the readout time is known; by default, as it is set."""
 
-    deviation: float  # s
-    first_row_time: float  # from the middle row, in readout times
-    may_be_reversed: bool  # rows may run the other way
-    global_shutter: bool  # all rows are exposed at once, whatever is set
+    deviation: float = 0.0  # s
+    first_row_time: float = 0.0  # from the middle row, in readout times
+    may_be_reversed: bool = False  # rows may run the other way
+    global_shutter: bool = False  # all rows are exposed at once, whatever is set
     other_axis: Estimate | None = None  # the same frame, if its rows may be its columns
 
 
@@ -160,13 +160,13 @@ def of_camera(
     moment: tuple[int, float],
     readout: ReadoutKnown,
 ) -> Localized:
-    """Pose and twist of the camera's optical frame, of this name, at a moment.
+    """Pose and twist of the camera's, or a rig's first camera's, optical frame at a moment.
 
     Args:
         cloud: with the rows of the estimate, or with none.
         moment: its stamp and row time.
     """
-    readout_time = config.readout_time
+    readout_time = estimate.span
     stamp_ns, tau = moment
     moving = readout_time > 0.0 and find_solver(config.solver).rolling_shutter
     if readout.global_shutter and estimate.turn is None:
@@ -187,7 +187,7 @@ def of_camera(
         delay = deviation * readout.first_row_time if tau == 0.0 else 0.0
         share = deviation / readout_time
         pose, twist = with_timing(pose, twist, share, delay, config.acceleration)
-    seen = estimate.inliers if len(cloud.table) else np.zeros(0, np.bool_)
+    seen = np.asarray(estimate.inliers) if len(cloud.table) else np.zeros(0, np.bool_)
     return Localized(
         input_stamp_ns=cloud.stamp_ns,
         stamp_ns=stamp_ns,
@@ -195,7 +195,7 @@ def of_camera(
         body_frame=frame,
         pose=pose,
         twist=twist,
-        inliers=select_inliers(cloud.table, seen, estimate.residuals),
+        inliers=select_inliers(cloud.table, seen, np.asarray(estimate.residuals)),
         dropped=cloud.dropped,
         estimate=estimate,
     )
