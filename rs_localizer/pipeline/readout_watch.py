@@ -35,9 +35,9 @@ _MEMORY = 0.97
 # Odds of e^12 are enough to act, if the motion agrees; e^3 to doubt. Of odds the other way no more
 # than e^4 is remembered: a camera that rests says little, and may start to move.
 _CERTAIN, _DOUBT, _LEAST = 12.0, 3.0, -4.0
-# Frames that are tried at the beginning, and when the axis that is set shows no motion; of others,
-# every so many, as long as nothing speaks for the other axis.
-_TRIED_FIRST, _SUSPECTED, _EVERY = 5, 40, 10
+# Frames that are tried at the beginning; of others, every so many, as long as nothing speaks for
+# the other axis.
+_TRIED_FIRST, _EVERY = 5, 10
 # Odds (logarithms) that motion along the other axis agrees, or does not.
 _AGREES, _CONTRADICTS = 4.6, 2.0
 # A readout time along the other axis counts when it is known to a twelfth, and more than half of
@@ -98,9 +98,7 @@ class ScanAxis:
         self._odds = 0.0  # logarithm, of the other axis
         self._moves = 0.0  # likewise, that its motions agree from frame to frame
         self._enough = _CERTAIN  # odds that make it wrong; until as much speaks against it
-        self._dense = _TRIED_FIRST  # frames that are still to be tried, each
-        self._skipped = 0  # since the last one that was
-        self._suspected = self._confirmed = False
+        self._frames, self._confirmed = 0, False
         # What the last frame is by the other axis, if that may be the right one.
         self.other: Estimate | None = None
         # Along the other axis: how long the readout takes (positive), and its direction.
@@ -122,26 +120,20 @@ class ScanAxis:
         agrees = self.direction is not None or self._moves > _AGREES
         return agrees and self._odds > self._enough
 
-    def suspect(self) -> None:
-        """Look closely for a while: the axis that is set shows no motion."""
-        if not self._suspected:
-            self._suspected, self._dense = True, _SUSPECTED
-
     def confirm(self) -> None:
         """Look no more: the motion along the axis that is set agrees from frame to frame."""
         self._confirmed = self._odds <= _DOUBT
 
     def add(self, frame: Watched) -> None:
         """Compare a frame."""
-        self._skipped += 1
+        self._frames += 1
         self.other = None
         # The wrong axis makes in-frame turns, and refusals.
         odd = not frame.result or len(frame.result.shake) > 0
-        due = self._odds > _DOUBT or self._dense > 0 or self._skipped >= _EVERY
-        due |= odd and self._odds > _LEAST
+        due = self._odds > _DOUBT or (odd and self._odds > _LEAST)
+        due |= self._frames <= _TRIED_FIRST or self._frames % _EVERY == 0
         if self._confirmed or not due:
             return
-        self._skipped, self._dense = 0, self._dense - 1
         cloud, config = frame.cloud, frame.config
         if self._localizer is None:
             other = _OTHER_AXIS[ScanDirection(config.scan_direction)]
@@ -317,7 +309,6 @@ class ReadoutWatch:
         )
         if self.far_off or doubtful:
             self.trusted = False
-            self._axis.suspect()
         elif doubt < -_SUSPICIOUS:
             self.trusted = True
         if enough and found - _SURELY * measured.deviation > FAR_OFF * usual:
