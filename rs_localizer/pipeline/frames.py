@@ -499,9 +499,7 @@ class FrameLocalizer:
         if isinstance(cloud, Refusal):
             yield cloud
             return
-        for notice, text in oddities(cloud, camera, self.calibrations[name].frame).items():
-            self._notice(notice, f"{name}: {text}")
-        cloud = thinned(cloud, self._config.max_points // len(self._config.cameras), camera.size)
+        cloud = self._checked(cloud, name)
         watch, frame = self.rig_watch, self.camera_frame
         start_ns = cloud.stamp_ns + round(own.stamp_offset * 1e9)
         middle_ns = start_ns - round(camera.first_row_time * own.readout_time * 1e9)
@@ -545,9 +543,7 @@ class FrameLocalizer:
         if not self.calibrations:
             return Refusal(Reason.NO_CAMERA_INFO, "no usable camera_info has come yet")
         config, camera, frame = self._config, self._camera, self.camera_frame
-        for name, text in oddities(cloud, camera, frame).items():
-            self._notice(name, text)
-        cloud = self._thinned(cloud)
+        cloud = self._checked(cloud)
         time_ns, context = self._middle_row_ns(cloud.stamp_ns), self._context
         self._expect(time_ns, cloud.frame)
 
@@ -646,16 +642,19 @@ class FrameLocalizer:
             moment = published_moment(self._config, self._camera, cloud.stamp_ns)
         return of_camera(cloud, estimate, self._config, self.camera_frame, moment, readout)
 
-    def _thinned(self, cloud: Correspondences) -> Correspondences:
-        """The cloud with no more points than ``max_points``, which is said once."""
-        most = self.config.max_points
+    def _checked(self, cloud: Correspondences, name: str = "") -> Correspondences:
+        """With no more points than a camera's part of ``max_points``; what is odd is said."""
+        camera, of = self._cameras[name], f"{name}: " if name else ""
+        for notice, text in oddities(cloud, camera, self.calibrations[name].frame).items():
+            self._notice(notice, of + text)
+        most = self.config.max_points // len(self._cameras)
         if len(cloud.points) > most and not self._too_many:
             self._too_many = True
             self._notice(
                 Notice.TOO_MANY_POINTS,
-                f"{len(cloud.points)} points have come; max_points of them, {most}, are used",
+                f"{of}{len(cloud.points)} points have come; max_points of them, {most}, are used",
             )
-        return thinned(cloud, most, self._camera.size)
+        return thinned(cloud, most, camera.size)
 
     def _localize_frame(self, images: Sequence[Image]) -> Localized | Refusal:
         reference = images[0].cloud

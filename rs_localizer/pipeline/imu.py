@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.config import ImuUse, NodeConfig
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.simd.jit import NotCompiled
@@ -241,11 +240,10 @@ class ImuInput:
             if slow:  # which is why they are late, and what is to be said of them
                 return Unused(ImuReason.TOO_SLOW, f"{self._buffer.rate():.0f} Hz")
             return Unused(_OF_LACK[readings.lack], readings.detail)
-        half_ns = round(0.5e9 * config.readout_time)
         times_ns = readings.stamps_ns + round(1e9 * config.imu.time_offset)
-        frames, rows_ns = (camera_frame, self.frame), (time_ns - half_ns, time_ns + half_ns)
         try:
-            return in_camera_axes(readings, times_ns, transforms, frames, rows_ns, _AROUND_NS)
+            frames = camera_frame, self.frame
+            return in_camera_axes(readings, times_ns, transforms, frames, time_ns)
         except TransformError as error:
             text = f"from the IMU {self.frame!r} to the camera {camera_frame!r}: {error}"
             return Unused(ImuReason.NO_TRANSFORM, text)
@@ -305,23 +303,18 @@ def in_camera_axes(
     times_ns: IntArray,
     transforms: Transforms,
     frames: tuple[str, str],
-    exposure_ns: tuple[int, int],
-    around_ns: int,
+    now_ns: int,
 ) -> ImuSamples:
     """The readings as samples: from the axes of the IMU to those of the camera.
 
-    With ``C = camera_from_imu``, a reading's rate ``w`` and force ``f`` are ``C w + u`` and
-    ``C f``; ``u`` is the turn of the camera with respect to the IMU: of a camera on a head that
-    moves, else zero. Lever arms do not matter to a rate; what they do to a force is left out.
+    Lever arms do not matter to a rate; what they do to a force is left out.
 
     Args:
         readings: n of them, in the IMU's axes.
         times_ns: (n,) when they were taken, by the camera's clock.
         transforms: where the two frames are.
         frames: of the camera, and of the IMU.
-        exposure_ns: from the first row to the last. A mounting that moves turns evenly from the
-            one to the other,
-        around_ns: and as long before and after: earlier and later readings are left out then.
+        now_ns: when a mounting counts that may be another one later: of a head that rests.
 
     Raises:
         TransformError: when the transform is not known for that time.
@@ -330,19 +323,6 @@ def in_camera_axes(
     rates, forces = readings.angular_velocities, readings.specific_forces
     if camera == imu:
         return ImuSamples(times_ns, rates, forces)
-    start_ns, end_ns = exposure_ns
-    if end_ns <= start_ns or start_ns <= 0 or not transforms.moves(camera, imu):
-        turn = transforms.lookup(camera, imu, None).rotation.T
-        return ImuSamples(times_ns, rates @ turn, None if forces is None else forces @ turn)
-    first, last = (transforms.lookup(camera, imu, stamp).rotation for stamp in exposure_ns)
-    # C(t) = exp(-u t) C(0)
-    turned = so3.log(np.ascontiguousarray(last @ first.T))
-    own = -turned / ((end_ns - start_ns) * 1e-9)
-    near = (times_ns >= start_ns - around_ns) & (times_ns <= end_ns + around_ns)
-    since = (times_ns[near] - start_ns) / (end_ns - start_ns)
-    mountings = so3.exp_many(since[:, None] * turned) @ first
-    return ImuSamples(
-        times_ns[near],
-        np.einsum("nij,nj->ni", mountings, rates[near]) + own,
-        None if forces is None else np.einsum("nij,nj->ni", mountings, forces[near]),
-    )
+    timed = now_ns > 0 and transforms.moves(camera, imu)
+    turn = transforms.lookup(camera, imu, now_ns if timed else None).rotation.T
+    return ImuSamples(times_ns, rates @ turn, None if forces is None else forces @ turn)
