@@ -65,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     against.add_argument("after", type=Path, metavar="AFTER.csv")
     against.add_argument("--all", action="store_true", help="also conditions that hardly differ")
     against.set_defaults(command=compare)
-    timed = commands.add_parser("times", help="CPU time beside PoseLib's, and calls of a frame")
+    timed = commands.add_parser("times", help="CPU time beside PoseLib's")
     timed.add_argument("--frames", type=int, default=20, metavar="N", help="of a condition (20)")
     timed.add_argument("--rounds", type=int, default=7, metavar="N", help="of each frame (7)")
     timed.set_defaults(command=times)

@@ -1,26 +1,20 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What frames cost beside PoseLib's global-shutter estimate, and how many calls they take; and the
-gate of CI.
-"""
+"""What frames cost beside PoseLib's global-shutter estimate; and the gate of CI."""
 
 from __future__ import annotations
 
 import argparse
-import gc
 import importlib
-import os
 import statistics
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from types import CodeType, FrameType
 from typing import Any
 
 import cv2
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 from scipy.stats import binom
 
 import rs_localizer as rsl
@@ -68,13 +62,13 @@ def localizer_of(condition: Condition) -> rsl.Localizer:
 
 
 def times(options: argparse.Namespace) -> int:
-    """The command: CPU time of both in turns, and the calls of one frame."""
+    """The command: CPU time of both in turns."""
     try:
         poselib: Any = importlib.import_module("poselib")
     except ImportError:
         poselib = None
         sys.stdout.write("PoseLib is not installed (pip install poselib): no ratios\n")
-    heads = ("ours, ms", "PoseLib, ms", "ratio", "calls", "kernels", "files")
+    heads = ("ours, ms", "PoseLib, ms", "ratio")
     sys.stdout.write(f"{'':32}" + "".join(f"{head:>13}" for head in heads) + "\n")
     for condition in CONDITIONS:
         localizer = localizer_of(condition)
@@ -85,9 +79,8 @@ def times(options: argparse.Namespace) -> int:
         spent = in_turns(methods, frames, options.rounds)
         each = [1e3 * statistics.fmean(one) for one in spent]
         figures = [each[0], *(each[1:] or [np.nan])]
-        calls = calls_of(methods[0], frames)
         cells = "".join(f"{figure:13.3f}" for figure in (*figures, figures[0] / figures[1]))
-        sys.stdout.write(f"{condition.name:32}{cells}" + "".join(f"{n:13}" for n in calls) + "\n")
+        sys.stdout.write(f"{condition.name:32}{cells}\n")
         sys.stdout.flush()
     return 0
 
@@ -170,36 +163,3 @@ def in_turns(
         for every, own in zip(spent, turns, strict=True):
             every.append(statistics.median(own))
     return spent
-
-
-def calls_of(method: Callable[[Frame], object], frames: list[Frame]) -> tuple[int, int, int]:
-    """Of a frame, the median: calls of Python functions of the package, calls of its kernels, and
-    files that both are in.
-    """
-    _called(method, frames[0])  # Numba makes the code that a profiler gets when it first asks
-    compiled = {one.py_func.__code__ for one in gc.get_objects() if isinstance(one, Dispatcher)}
-    counts = []
-    for frame in frames:
-        called = _called(method, frame)
-        kernels = sum(code in compiled for code in called)
-        files = {code.co_filename for code in called}
-        counts.append((len(called) - kernels, kernels, len(files)))
-    every = [round(statistics.median(each)) for each in zip(*counts, strict=True)]
-    return every[0], every[1], every[2]
-
-
-def _called(method: Callable[[Frame], object], frame: Frame) -> list[CodeType]:
-    """The functions of the package, each as often as it is called."""
-    home = os.path.dirname(rsl.__file__)
-    called: list[CodeType] = []
-
-    def note(inside: FrameType, event: str, _: object) -> None:
-        if event == "call" and inside.f_code.co_filename.startswith(home):
-            called.append(inside.f_code)
-
-    sys.setprofile(note)
-    try:
-        method(frame)
-    finally:
-        sys.setprofile(None)
-    return called

@@ -8,6 +8,7 @@ import io
 import struct
 import tempfile
 import zlib
+from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,8 +24,10 @@ from benchmarks.simulation.keypoints import keypoint_rows, random_descriptors
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.imu import make_reading
 from rs_localizer.io.maps.files import write_npz
 from rs_localizer.io.maps.landmarks import Map, map_rows
+from rs_localizer.io.recording import make_camera_info
 from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.settings import FrameSettings
@@ -91,6 +94,8 @@ CALIBRATIONS = (
 """Of every program whose files are read."""
 
 _COUNT = 5
+_STAMP = 5_000_000_007  # ns
+_K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 
 
 def _header(frame: str) -> SimpleNamespace:
@@ -127,42 +132,42 @@ UV = (("u", "<f4"), ("v", "<f8"))
 BITS, NUMBERS = ("descriptor", "u1", (32,)), ("descriptor", "<f4", (8,))
 
 
-def camera_info(*, plain: bool = False) -> SimpleNamespace:
-    """A calibrated camera; a plain one has neither distortion nor binning nor region."""
-    message = SimpleNamespace(
-        header=_header("camera"),
-        width=640,
-        height=480,
-        distortion_model="plumb_bob",
-        d=[0.1, -0.05, 0.001, 0.0, 0.0],
-        k=[500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0],
-        binning_x=1,
-        binning_y=2,
-        roi=SimpleNamespace(x_offset=8, y_offset=4, width=320, height=240, do_rectify=False),
-    )
-    if plain:
-        message.d, message.binning_y = [], 1
-        message.roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0, do_rectify=False)
-    return message
+def plain(message: Any) -> Any:
+    """A message of values that can be damaged."""
+    if isinstance(message, np.ndarray):
+        return message.tobytes() if message.dtype == np.uint8 else message.tolist()
+    if isinstance(message, list):
+        return [plain(item) for item in message]
+    if not is_dataclass(message):
+        return message
+    return SimpleNamespace(**{f.name: plain(getattr(message, f.name)) for f in fields(message)})
+
+
+def camera_info(*, whole: bool = False) -> SimpleNamespace:
+    """A calibrated camera; a whole one has neither distortion nor binning nor region."""
+    lens = np.zeros(0) if whole else np.array([0.1, -0.05, 0.001, 0.0, 0.0])
+    made: SimpleNamespace = plain(make_camera_info(Camera(640, 480, _K, lens), _STAMP))
+    if not whole:
+        made.binning_x, made.binning_y = 1, 2
+        made.roi = SimpleNamespace(x_offset=8, y_offset=4, width=320, height=240, do_rectify=False)
+    return made
+
+
+def _reading() -> Any:
+    rate, force = np.array([0.1, -0.2, 0.3]), np.array([0.2, -9.7, 0.4])
+    return make_reading(_STAMP, rate, force, "imu", (1e-4, 1e-2))
 
 
 def imu() -> SimpleNamespace:
     """A reading of gyroscope and accelerometer."""
-    turn, force = {"x": 0.1, "y": -0.2, "z": 0.3}, {"x": 0.2, "y": -9.7, "z": 0.4}
-    return SimpleNamespace(
-        header=_header("imu"),
-        angular_velocity=SimpleNamespace(**turn),
-        angular_velocity_covariance=[1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-4],
-        linear_acceleration=SimpleNamespace(**force),
-        linear_acceleration_covariance=[0.0] * 9,
-    )
+    made: SimpleNamespace = plain(_reading())
+    return made
 
 
 @cache
 def _flight() -> tuple[Map, list[SimulatedFrame]]:
     """A small world and some frames of a fast camera."""
-    K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-    camera = Camera(640, 480, K, readout_time=0.03)
+    camera = Camera(640, 480, _K, readout_time=0.03)
     motion = ConstantVelocity(np.array([0.5, -1.0, 1.0]), np.array([0.5, 0.2, 0.3]), 0.2)
     points = room(np.zeros((1, 3)), np.random.default_rng(0), count=1500)
     rng = np.random.default_rng(1)
@@ -172,22 +177,8 @@ def _flight() -> tuple[Map, list[SimulatedFrame]]:
 
 
 def _message(frame: SimulatedFrame, rows: NDArray[Any]) -> SimpleNamespace:
-    """A cloud of these rows, of plain values as the damages want them."""
-    made = make_cloud(make_message, frame.stamp_ns, "map", rows)
-    fields = [
-        SimpleNamespace(name=f.name, offset=f.offset, datatype=f.datatype, count=f.count)
-        for f in made.fields
-    ]
-    names = "height width is_bigendian point_step row_step is_dense".split()
-    return SimpleNamespace(
-        header=SimpleNamespace(
-            stamp=SimpleNamespace(sec=made.header.stamp.sec, nanosec=made.header.stamp.nanosec),
-            frame_id="map",
-        ),
-        fields=fields,
-        data=made.data.tobytes(),
-        **{name: getattr(made, name) for name in names},
-    )
+    made: SimpleNamespace = plain(make_cloud(make_message, frame.stamp_ns, "map", rows))
+    return made
 
 
 @cache
@@ -295,7 +286,7 @@ def recordings() -> dict[str, list[bytes]]:
             path = Path(folder) / storage
             with BagWriter(path, storage) as bag:
                 for stamp_ns in (5_000_000_007, 6_000_000_007):
-                    bag.write("/imu", _imu_message(), stamp_ns)
+                    bag.write("/imu", _reading(), stamp_ns)
             found[suffix] = [next(path.glob(f"*{suffix}")).read_bytes()]
             found.setdefault("metadata.yaml", [(path / "metadata.yaml").read_bytes()])
         path = Path(folder) / "a.bag"
@@ -306,21 +297,3 @@ def recordings() -> dict[str, list[bytes]]:
             writer.write(connection, 5, store.serialize_ros1(message, "std_msgs/msg/Float64"))
         found[".bag"] = [path.read_bytes()]
     return found
-
-
-def _imu_message() -> Any:
-    def vector(x: float, y: float, z: float) -> Any:
-        return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-
-    turned = make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
-    stamp = make_message("builtin_interfaces/msg/Time", sec=5, nanosec=7)
-    return make_message(
-        "sensor_msgs/msg/Imu",
-        header=make_message("std_msgs/msg/Header", stamp=stamp, frame_id="imu"),
-        orientation=turned,
-        orientation_covariance=np.zeros(9),
-        angular_velocity=vector(0.1, -0.2, 0.3),
-        angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=vector(0.2, -9.7, 0.4),
-        linear_acceleration_covariance=np.zeros(9),
-    )

@@ -210,7 +210,7 @@ class _Localizer:
     def __call__(self, message: Any) -> object:
         # A new one each time, so that a number says all of an execution.
         node = FrameLocalizer(NodeConfig(readout_time=0.03))
-        node.calibrate(read_camera_info(seeds.camera_info(plain=True)))
+        node.calibrate(read_camera_info(seeds.camera_info(whole=True)))
         if self._landmarks is None:
             node.localize(self._good)  # so that the other one is tracked
             return node.localize(message)
