@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How good refined maps and surveyed markers are, on simulated rooms whose truth is known:
 
-python -m benchmarks.mapping bend regions surveys coverage
+python -m benchmarks.mapping bend surveys
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,8 +32,8 @@ _SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, 
 _STEEPEST = 0.35  # cosine of the angle at which markers are still seen
 _LEAST_SIDE = 12.0  # px
 _NOISE, _MARKER_NOISE, _OFF = 0.3, 0.1, 0.02  # px, px, m
-_READOUT = 0.03
-_UNIT = 1.7  # m
+_CAMERA = cameras.Camera()
+_READOUT = _CAMERA.readout_time  # s
 _FAMILY = "4x4_50"
 _START_NS = 10**12
 
@@ -69,10 +69,10 @@ def _walk(rng: np.random.Generator, turning: float, wide: float = 1.2) -> Walk:
     return Walk(rng.uniform(0.0, 2.0 * np.pi, 12), turning, wide)
 
 
-def _believed(camera: cameras.Camera, readout_time: float) -> Camera:
+def _believed(readout_time: float) -> Camera:
     return Camera(
-        width=camera.width, height=camera.height, K=camera.matrix, D=np.array(camera.distortion),
-        readout_time=readout_time, scan_direction=camera.scan,
+        _CAMERA.width, _CAMERA.height, _CAMERA.matrix, np.array(_CAMERA.distortion),
+        readout_time=readout_time, scan_direction=_CAMERA.scan,
     )  # fmt: skip
 
 
@@ -153,16 +153,12 @@ class Film:
             yield shown
 
 
-def _room(rng: np.random.Generator, turning: float) -> tuple[Array, MapObservations, Start]:
-    """Landmarks of a room, what 180 images show of them, and a first guess."""
-    walk, points = _walk(rng, turning), _walls(rng, 1500)
-    film = Film(cameras.Camera(), walk, np.arange(0.0, 12.0, 1.0 / 15.0))
-    return points, film.see(points, rng, 80), film.near(points, rng)
-
-
 def bend(seed: int) -> Iterator[str]:
     """Errors of one map: as given, and adjusted with each shutter."""
-    points, seen, start = _room(np.random.default_rng(seed), 0.6)
+    rng = np.random.default_rng(seed)
+    walk, points = _walk(rng, 0.6), _walls(rng, 1500)
+    film = Film(_CAMERA, walk, np.arange(0.0, 12.0, 1.0 / 15.0))
+    seen, start = film.see(points, rng, 80), film.near(points, rng)
 
     def errors(own: Array) -> str:
         """Of landmarks, but for the whole's place and size."""
@@ -177,8 +173,8 @@ def bend(seed: int) -> Iterator[str]:
         ("rolling, given", _READOUT, False, 0.0),
         ("rolling, found from 20 ms", 0.02, True, 0.0),
     ):
-        camera, freedom = _believed(cameras.Camera(), readout), MapFreedom(readout_time=free)
-        found = refine(camera, seen, start, freedom, stamp_offset=offset)
+        freedom = MapFreedom(readout_time=free)
+        found = refine(_believed(readout), seen, start, freedom, stamp_offset=offset)
         of = found.refined & (found.sights >= 6)
         if not readout:
             yield f"{'as given':28} {np.count_nonzero(of):9} {errors(start.points)}"
@@ -187,20 +183,6 @@ def bend(seed: int) -> Iterator[str]:
             f"{name:28} {np.count_nonzero(of):9} {errors(found.points)} "
             f"{found.after:10.3f}  {1e3 * found.readout_time:.3f}{spread}"
         )
-
-
-def regions(seed: int, walks: int = 8) -> Iterator[str]:
-    """Landmarks of walks, in units of their own, by the deviations that are told of them."""
-    every = []
-    for k in range(walks):
-        points, seen, start = _room(np.random.default_rng([seed, k]), 0.5)
-        start = replace(start, points=start.points / _UNIT, positions=start.positions / _UNIT)
-        found = refine(_believed(cameras.Camera(), _READOUT), seen, start)
-        own, true = found.points[found.refined], points[found.refined]
-        variances = np.einsum("nii->ni", found.covariances[found.refined])
-        every.append(np.abs(own - through(true, own)(true)) / np.sqrt(variances))
-        yield f"walk {k}: inside 68, 95, 99.7 %: {_inside(every[-1:])}"
-    yield f"coordinates of landmarks inside 68, 95, 99.7 %: {_inside(every)}"
 
 
 def _inside(normalised: Sequence[Array]) -> str:
@@ -228,18 +210,8 @@ def grid(columns: int, rows: int, pitch: float) -> list[Pose]:
     return [(facing, np.array([pitch * u, pitch * v, 1.0])) for v in y for u in x]
 
 
-@dataclass(frozen=True, slots=True)
-class _Scene:
-    name: str
-    walls: bool = False
-    seconds: float = 30.0
-    rate: float = 30.0  # Hz
-
-
-_SCENES = (
-    _Scene("printed wall 3x2 of 0.06 m, VGA", walls=True),
-    _Scene("12 of 0.15 m around a room, VGA"),
-)
+_WALLS = {"printed wall 3x2 of 0.06 m": True, "12 of 0.15 m around a room": False}
+"""Scenes of surveys, and whether they are a printed wall."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,8 +230,8 @@ def surveys(seed: int, trials: int = 3) -> Iterator[str]:
         f"{'scene':36} first marker: mm, deg   shape: mm, deg   inside 68, 95, 99.7 %: frame; "
         "shape   by own covariance, by the bound"
     )
-    for scene in _SCENES:
-        found = [_survey(scene, [seed, trial]) for trial in range(trials)]
+    for scene, wall in _WALLS.items():
+        found = [_survey(wall, [seed, trial]) for trial in range(trials)]
         cells = []
         for k in range(2):
             off = np.concatenate([one.off[k] for one in found])
@@ -268,32 +240,16 @@ def surveys(seed: int, trials: int = 3) -> Iterator[str]:
         inside = "; ".join(_inside([one.normalised[k] for one in found]) for k in range(2))
         own = np.sqrt(np.mean([one.squared for one in found]))
         bound = np.sqrt(np.mean([one.squared_by_bound for one in found]))
-        yield f"{scene.name:36} {cells[0]}    {cells[1]}    {inside}   {own:.2f} {bound:.2f}"
+        yield f"{scene:36} {cells[0]}    {cells[1]}    {inside}   {own:.2f} {bound:.2f}"
 
 
-def coverage(seed: int, trials: int = 40) -> Iterator[str]:
-    """How many of the truths lie inside the regions of many rooms, the readout time given and found
-    by turns.
-    """
-    scene = _Scene("12 of 0.15 m around a room", seconds=12.0, rate=15.0)
-    found: list[_Errors] = []
-    yield "rooms  coordinates inside 68, 95, 99.7 %: frame    shape    by own deviations, each room"
-    for trial in range(trials):
-        found.append(_survey(scene, [seed, 1000 + trial], known=trial % 2 == 0))
-        inside = "    ".join(_inside([one.normalised[k] for one in found]) for k in range(2))
-        squared = np.array([error.squared for error in found])
-        every, last = np.sqrt(np.mean(squared)), np.sqrt(squared[-1])
-        yield f"{len(found):5}  {inside}    {every:.2f} ({last:.2f})"
-
-
-def _survey(scene: _Scene, seeds: list[int], known: bool = True) -> _Errors:
+def _survey(wall: bool, seeds: list[int]) -> _Errors:
     rng = np.random.default_rng(seeds)
-    walk = _walk(rng, 0.0, 0.15) if scene.walls else _walk(rng, 0.6, 0.5)
-    poses = grid(3, 2, 0.08) if scene.walls else ring(rng, 12)
-    size = 0.06 if scene.walls else 0.15
-    true_camera = cameras.Camera()
-    film = Film(true_camera, walk, np.arange(0.0, scene.seconds, 1.0 / scene.rate))
-    camera = _believed(true_camera, true_camera.readout_time if known else 0.0)
+    walk = _walk(rng, 0.0, 0.15) if wall else _walk(rng, 0.6, 0.5)
+    poses = grid(3, 2, 0.08) if wall else ring(rng, 12)
+    size = 0.06 if wall else 0.15
+    film = Film(_CAMERA, walk, np.arange(0.0, 30.0, 1.0 / 30.0))
+    camera = _believed(_READOUT)
     found = survey(camera, film.spot(poses, size, rng), every_marker([family(_FAMILY)], size, {}))
     turn, origin = poses[found.markers[0].id]
     true = [(turn.T @ poses[m.id][0], turn.T @ (poses[m.id][1] - origin)) for m in found.markers]
@@ -335,7 +291,7 @@ def _off(found: Survey, true: list[Pose], turn: Array, shift: Array) -> Array:
 
 
 _PARTS: dict[str, Callable[[int], Iterator[str]]] = {
-    "bend": bend, "regions": regions, "surveys": surveys, "coverage": coverage
+    "bend": bend, "surveys": surveys
 }  # fmt: skip
 
 
