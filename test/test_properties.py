@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from benchmarks.fuzzing import seeds
+from benchmarks.simulation.keypoints import map_rows
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud, read_keypoints, read_map
-from rs_localizer.io.maps.files import read_map_file, write_map_file
-from rs_localizer.io.maps.landmarks import Map, MapError, map_rows
+from rs_localizer.io.maps.files import read_map_file, write_npz
+from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.settings import build
 from rs_localizer.settings import settings as all_settings
@@ -60,7 +61,7 @@ def maps(draw: Any) -> Map:
 def test_a_map_is_what_it_was_before_it_was_written(landmarks):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.npz"
-        write_map_file(path, landmarks)
+        write_npz(path, landmarks)
         assert read_map_file(path, "map").equals(landmarks)
 
 

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
-from benchmarks.simulation.keypoints import keypoint_rows, random_descriptors
+from benchmarks.simulation.keypoints import keypoint_rows, map_rows, random_descriptors
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.imu import make_reading
 from rs_localizer.io.maps.files import write_npz
-from rs_localizer.io.maps.landmarks import Map, map_rows
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.scene import room

@@ -21,7 +21,7 @@ from rs_localizer.cli.options import Parser, add_options, option, read
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.maps.files import write_map_file
+from rs_localizer.io.maps.files import write_npz
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.recording import (
     CAMERA_FRAME,
@@ -138,7 +138,7 @@ class _Recorder:
         if isinstance(self.world, Scene) and self.world.marker_map is not None:
             write_marker_map(args.out / MARKER_MAP, self.world.marker_map)
         if self._map is not None:
-            write_map_file(args.out / MAP, self._map)
+            write_npz(args.out / MAP, self._map)
 
 
 def record(*words: object) -> None:

@@ -49,3 +49,20 @@ def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generato
     if landmarks.descriptors is not None:
         rows["descriptor"] = seen_descriptors(landmarks.descriptors[frame.ids], rng)
     return rows
+
+
+def map_rows(landmarks: Map) -> NDArray[Any]:
+    """Rows (n,) of a cloud of landmarks."""
+    kinds: list[tuple[Any, ...]] = [(name, "<f8") for name in "xyz"]
+    if landmarks.ids is not None:
+        kinds.append(("id", landmarks.id_type))
+    if landmarks.descriptors is not None:
+        kinds.append(("descriptor", landmarks.descriptors.dtype, landmarks.descriptors.shape[1:]))
+    rows = np.empty(len(landmarks), kinds)
+    for name, column in zip("xyz", landmarks.points.T, strict=True):
+        rows[name] = column
+    if landmarks.ids is not None:
+        rows["id"] = landmarks.ids
+    if landmarks.descriptors is not None:
+        rows["descriptor"] = landmarks.descriptors
+    return rows

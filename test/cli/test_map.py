@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.cli.main import main
-from rs_localizer.io.maps.files import read_map_file, write_map_file
+from rs_localizer.io.maps.files import read_map_file, write_npz
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.markers.map_files import read_any, read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
@@ -22,7 +22,7 @@ COLMAP = Path(__file__).parents[1] / "io" / "maps" / "colmap"
 def test_info(tmp_path, capsys):
     points = np.array([[0.0, -1.0, 2.0], [1.0, 1.0, 3.5], [5.0, 0.0, 100.0]])
     path = tmp_path / "map.npz"
-    write_map_file(path, Map(points, np.array([7, -3, 5]), np.zeros((3, 32), np.uint8), "map"))
+    write_npz(path, Map(points, np.array([7, -3, 5]), np.zeros((3, 32), np.uint8), "map"))
     assert main(["map", "info", str(path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == str(path)
@@ -30,7 +30,7 @@ def test_info(tmp_path, capsys):
     assert (told["landmarks"], told["first_id"], told["last_id"]) == ("3", "-3", "7")
     assert (told["descriptor_length"], told["descriptor_type"]) == ("32", "uint8")
     assert [told[f"x_{name}_m"] for name in ("min", "median", "max")] == ["0.000", "1.000", "5.000"]
-    write_map_file(path, Map(points, None, None, "map"))
+    write_npz(path, Map(points, None, None, "map"))
     assert main(["map", "info", str(path)]) == 0
     assert "_id" not in capsys.readouterr().out
 

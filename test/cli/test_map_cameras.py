@@ -15,7 +15,7 @@ from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.calibration import write_calibration
-from rs_localizer.io.maps.files import read_map_file, write_map_file
+from rs_localizer.io.maps.files import read_map_file, write_npz
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import MARKER_MAP
 from rs_localizer.io.rigs import RigParts, write_camchain
@@ -137,7 +137,7 @@ def test_a_map_is_refined(film, which, tmp_path, capsys):
     flight, out = film(which, "flight", *words), tmp_path / "refined.npz"
     true = read_map_file(flight / "map.npz", "map")
     off = np.random.default_rng(0).normal(0.0, 0.02, true.points.shape)
-    write_map_file(tmp_path / "off.npz", replace(true, points=true.points + off))
+    write_npz(tmp_path / "off.npz", replace(true, points=true.points + off))
     words = ["--params", str(flight / "parameters.yaml"), "--map", str(tmp_path / "off.npz")]
     words = ["map", "refine", str(flight), *words, "-p", "map_deviation:=0.02", "--out", str(out)]
     assert main(words) == 0

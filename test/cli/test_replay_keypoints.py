@@ -8,11 +8,11 @@ from numpy.lib.recfunctions import repack_fields
 from recorded import SHUTTER
 
 from benchmarks.simulation.__main__ import record
-from benchmarks.simulation.keypoints import keypoint_rows, random_descriptors
+from benchmarks.simulation.keypoints import keypoint_rows, map_rows, random_descriptors
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.maps.landmarks import Map, map_rows
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_motions, read_tum
 from rs_localizer.tools.simulation.recording import write_simulated
 from rs_localizer.tools.simulation.scene import room

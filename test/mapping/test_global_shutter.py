@@ -11,7 +11,7 @@ import pytest
 from scenes import READOUT, camera, hand, walk
 
 from rs_localizer.cli.main import main
-from rs_localizer.io.maps.colmap import ModelImage, Points, read_images, read_model, write_model
+from rs_localizer.io.maps.colmap import ModelImage, Points, read_model, write_model
 from rs_localizer.tools.mapping.gauge import through
 
 pytest.importorskip("pycolmap")
@@ -106,7 +106,7 @@ def test_the_model_is_that_of_a_global_shutter(scene, model, shutter, tmp_path, 
     motion = hand(np.random.default_rng(3))
     rotations, positions = motion.pose(VIDEO + 0.5 * READOUT)
     errors = []
-    for name, image in read_images(out).items():
+    for name, image in read_model(out).images.items():
         k = int(name[6:10])
         away = (scene.points[(image.points - 10) // 3] - positions[k]) @ rotations[k]
         errors.append(camera(0.0).project(away) + 0.5 - image.pixels)

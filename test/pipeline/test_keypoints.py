@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import rs_localizer.pipeline.landmarks
-from benchmarks.simulation.keypoints import keypoint_rows, random_descriptors
+from benchmarks.simulation.keypoints import keypoint_rows, map_rows, random_descriptors
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud, read_map
-from rs_localizer.io.maps.landmarks import Map, map_rows
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Localized
 from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.frames import FrameLocalizer

@@ -107,14 +107,6 @@ def read_model(folder: Path, database: Path | None = None) -> Model:
     )  # fmt: skip
 
 
-def read_images(folder: Path) -> dict[str, ModelImage]:
-    """A model's images by their names; raises MapError as :func:`read_model`."""
-    images = read_model(folder).images
-    if not images:
-        raise MapError(f"the model in {folder} has no images")
-    return images
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
     """The points of a model that is written."""

@@ -139,11 +139,3 @@ def read_map_file(path: Path | str, frame: str, database: Path | None = None) ->
         return read_npz(file, frame)
     except MapError as error:
         raise MapError(f"{path}: {error}") from error
-
-
-def write_map_file(path: Path | str, landmarks: Map) -> None:
-    """Write a map to a .npz file; raises MapError for another name, OSError as any file."""
-    path = Path(path)
-    if path.suffix != SUFFIX:
-        raise MapError(f"{path}: maps are written to files ending in {SUFFIX}")
-    write_npz(path, landmarks)

@@ -146,23 +146,6 @@ def make_map(
     return Map(points, ids, descriptors, frame, dropped, covariances, error_modes)
 
 
-def map_rows(landmarks: Map) -> NDArray[Any]:
-    """Rows (n,) of a cloud of landmarks."""
-    kinds: list[tuple[Any, ...]] = [(name, "<f8") for name in "xyz"]
-    if landmarks.ids is not None:
-        kinds.append(("id", landmarks.id_type))
-    if landmarks.descriptors is not None:
-        kinds.append(("descriptor", landmarks.descriptors.dtype, landmarks.descriptors.shape[1:]))
-    rows = np.empty(len(landmarks), kinds)
-    for name, column in zip("xyz", landmarks.points.T, strict=True):
-        rows[name] = column
-    if landmarks.ids is not None:
-        rows["id"] = landmarks.ids
-    if landmarks.descriptors is not None:
-        rows["descriptor"] = landmarks.descriptors
-    return rows
-
-
 def _equal(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
     if one is None or other is None:
         return one is other

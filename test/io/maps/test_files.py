@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rs_localizer.io.maps.files import read_map_file, write_map_file
+from rs_localizer.io.maps.files import read_map_file, write_npz
 from rs_localizer.io.maps.landmarks import Map, MapError
 
 COLMAP = Path(__file__).parent / "colmap"
@@ -30,7 +30,7 @@ def test_an_archive_with_errors_that_landmarks_share(tmp_path):
     """They come back bit by bit, but for landmarks that are dropped; older archives have none."""
     rng, path = np.random.default_rng(0), tmp_path / "map.npz"
     points, modes = rng.normal(size=(5, 3)), rng.normal(size=(5, 3, 2)).astype(np.float32)
-    write_map_file(path, Map(points, np.arange(5), None, "map", error_modes=modes))
+    write_npz(path, Map(points, np.arange(5), None, "map", error_modes=modes))
     found = read_map_file(path, "map")
     np.testing.assert_array_equal(found.error_modes, modes)
     assert found.error_modes.dtype == np.float32

@@ -33,9 +33,9 @@ from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 
-from benchmarks.simulation.keypoints import random_descriptors
+from benchmarks.simulation.keypoints import map_rows, random_descriptors
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.maps.landmarks import Map, map_rows
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.managed import spin

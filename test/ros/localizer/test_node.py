@@ -14,7 +14,7 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 
-from rs_localizer.io.maps.files import write_map_file
+from rs_localizer.io.maps.files import write_npz
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import TYPES
 
@@ -89,7 +89,7 @@ def test_life_cycle_of_a_node_with_other_names(recording, start_node, peer, tmp_
     assert robot.set("map_file", str(tmp_path / "no.npz"))[0]
     assert not change(Transition.TRANSITION_CONFIGURE)
     node.wait_for_log("not configured: map_file: ")
-    write_map_file(tmp_path / "map.npz", Map(np.eye(3), np.arange(3), None, "map"))
+    write_npz(tmp_path / "map.npz", Map(np.eye(3), np.arange(3), None, "map"))
     for name, value in (("map_file", str(tmp_path / "map.npz")), ("map_frame", "hall")):
         assert robot.set(name, value)[0]
     # Two clients at once: the transition is made once, and both get an answer.
