@@ -147,3 +147,21 @@ def stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
     finally:
         ended.set()
         teller.join()
+
+
+# s between two lines that say what is compiled, where no terminal shows it.
+_PERIOD = 15.0
+
+
+class Compiling:
+    """Says which kernel is compiled: on a terminal in one line, elsewhere now and then."""
+
+    def __init__(self) -> None:
+        self._last = -_PERIOD
+
+    def __call__(self, count: int, name: str) -> None:
+        if sys.stderr.isatty():
+            print(f"\r\033[Kcompiling {count}: {name}\r", end="", file=sys.stderr, flush=True)
+        elif time.monotonic() - self._last > _PERIOD:
+            self._last = time.monotonic()
+            print(f"compiling {count}: {name}", flush=True)

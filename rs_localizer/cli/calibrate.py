@@ -38,8 +38,6 @@ if WORKING:
         lens_parameters,
         write_calibration,
     )
-    from rs_localizer.io.camera_info import read_camera_info
-    from rs_localizer.io.images import Image
     from rs_localizer.io.imu import ImuRecording
     from rs_localizer.io.maps.files import read_map_file
     from rs_localizer.io.rigs import (
@@ -51,6 +49,7 @@ if WORKING:
     from rs_localizer.markers.boards import BoardSizes
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
+    from rs_localizer.offline.detect import seen_by
     from rs_localizer.offline.fleet import Figures
     from rs_localizer.offline.image_sources import (
         Carried,
@@ -292,23 +291,14 @@ def _detected(args: Any, shots: Iterator[Shot | Carried]) -> _Source:
     images: list[Observed] = []
     camera: Camera | None = None
     size = (0, 0)
-    for shot in tqdm(shots, unit="image", desc="detect", disable=None):
-        if isinstance(shot, Carried) or not isinstance(shot.image, Image):
-            continue
-        height, width = shot.image.pixels.shape
-        size = (width, height)
-        found = detector.detect(shot.image).detections
-        sizes.look(shot.image.pixels, len(found.points) > 0)
-        images.append(Observed(shot.image.stamp_ns, found.points, found.pixels))
-        if camera is None and (args.calibration is not None or is_bag(args.recording)):
-            camera = read_camera_info(shot.camera_info).camera(0.0, NodeConfig().scan_direction)
-            if camera.size != size:
-                raise ValueError(
-                    f"the images are of {width}x{height}, the calibration is for "
-                    f"{camera.size[0]}x{camera.size[1]}"
-                )
-    seen = sum(len(image.points) > 0 for image in images)
-    print(f"{seen} of {len(images)} images show the map")
+    seen = seen_by(shots, NodeConfig().scan_direction)
+    for image, own in tqdm(seen, unit="image", desc="detect", disable=None):
+        camera, size = camera or own, image.pixels.shape[::-1]
+        found = detector.detect(image).detections
+        sizes.look(image.pixels, len(found.points) > 0)
+        images.append(Observed(image.stamp_ns, found.points, found.pixels))
+    shown = sum(len(image.points) > 0 for image in images)
+    print(f"{shown} of {len(images)} images show the map")
     if fault := sizes.fault():
         print(f"warning: {fault}", file=sys.stderr)
     new_lens = camera is None

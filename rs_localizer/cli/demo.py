@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rs_localizer.cli import WORKING, import_ros, stage
+from rs_localizer.cli import WORKING, Compiling, import_ros, stage
 from rs_localizer.cli.options import option
 from rs_localizer.config import NodeConfig
 from rs_localizer.tools.simulation.settings import FrameSettings
@@ -52,8 +52,6 @@ _FLIGHT_START, _FLIGHT_DURATION = 8.0, 18.0
 _QUICK_FRAMES = 12
 _SEEN = FrameSettings()
 _METHODS = (NodeConfig().solver, "p3p")
-# s between two lines that say what is compiled, where no terminal shows it.
-_PERIOD = 15.0
 
 _AFTERWARDS = """
 Your own camera, next:
@@ -91,7 +89,7 @@ def run(options: Options) -> None:
         "same command goes on with what has been compiled.",
         flush=True,
     )
-    with tempfile.TemporaryDirectory() as directory, compiler.told(_Compiling()):
+    with tempfile.TemporaryDirectory() as directory, compiler.told(Compiling()):
         camera, hand = cube_clip.CAMERA, read_tum(data.path(data.HAND_MOTION))
         motion = RecordedMotion(hand)
         flight = _fly(camera, motion, most)
@@ -106,20 +104,6 @@ def run(options: Options) -> None:
         _cube(cube_clip.Walls(hand), most, options.out / "cube.gif")
         _live(flight, answers[_METHODS[0]], camera.readout_time, Path(directory) / "node.log")
     print(f"done in {time.monotonic() - started:.0f} s\n{_AFTERWARDS}", end="")
-
-
-class _Compiling:
-    """Says which kernel is compiled: on a terminal in one line, elsewhere now and then."""
-
-    def __init__(self) -> None:
-        self._last = -_PERIOD
-
-    def __call__(self, count: int, name: str) -> None:
-        if sys.stderr.isatty():
-            print(f"\r\033[Kcompiling {count}: {name}\r", end="", file=sys.stderr, flush=True)
-        elif time.monotonic() - self._last > _PERIOD:
-            self._last = time.monotonic()
-            print(f"compiling {count}: {name}", flush=True)
 
 
 def read_frames(path: Path, most: int | None = None) -> list[Frame]:

@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-import sys
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from rs_localizer.cli import WORKING
+from rs_localizer.cli import WORKING, Compiling
 from rs_localizer.cli.options import option
 from rs_localizer.solvers.table import SOLVERS
 
@@ -51,7 +50,7 @@ def run(options: Options) -> dict[str, object]:
         for name, compiles in steps.items():
             started = time.monotonic()
             try:
-                with compiler.told(_tell):
+                with compiler.told(Compiling()):
                     compiles()
             except RuntimeWarning as warning:
                 raise OSError(str(warning)) from warning
@@ -59,8 +58,3 @@ def run(options: Options) -> dict[str, object]:
             print(f"{name:24} {seconds[name]:6.1f} s", flush=True)
     print(f"kernels are in {cache_directory()}")
     return {"seconds": seconds, "kernels": str(cache_directory())}
-
-
-def _tell(count: int, name: str) -> None:
-    if sys.stderr.isatty():
-        print(f"\r\033[Kcompiling {count}: {name}\r", end="", file=sys.stderr, flush=True)

@@ -263,6 +263,16 @@ class Cameras:
         return camera
 
 
+def seen_by(
+    shots: Iterable[Shot | Carried], scan_direction: str
+) -> Iterator[tuple[Image, Camera | None]]:
+    """The images that can be read, each with its camera, without a readout time, if it is known."""
+    cameras = Cameras(scan_direction)
+    for shot in shots:
+        if not isinstance(shot, Carried) and isinstance(shot.image, Image):
+            yield shot.image, None if shot.camera_info is None else cameras.of(shot, shot.image)
+
+
 def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
     """What two sizes of images have to do with each other."""
     if size == calibrated[::-1]:

@@ -42,6 +42,7 @@ def test_the_webcam(tmp_path, capsys):
     assert "times less likely" not in said.out
     assert not out.exists()
     assert main([*words, "--intrinsics", "--plot", str(plots), *alone]) == 1
+    assert "not written: readout time and scan direction" in capsys.readouterr().err
     assert [file.name for file in plots.iterdir()] == ["readout_time.png"]
     values = load_params_file(out)
     assert "readout_time" not in values

@@ -143,32 +143,6 @@ def test_a_film_gives_lens_readout_time_and_direction(film, tmp_path, capsys):
     assert f"a chessboard of {COLUMNS}x{ROWS} inner corners" in capsys.readouterr().err
 
 
-def test_lens_and_board_come_without_a_readout_time(film, tmp_path, capsys):
-    """Few images tell the lens, and not when their rows were exposed; nor the board's shape, which
-    is written as that of paper.
-    """
-    few, out = tmp_path / "few", tmp_path / "camera.yaml"
-    few.mkdir()
-    for file in sorted(film.iterdir())[::4]:
-        (few / file.name).symlink_to(file)
-    assert main(["calibrate", str(few), *BOARD, "--out", str(out)]) == 1
-    said = capsys.readouterr()
-    assert "0 of 3 parts" in said.err
-    assert "beside it: lens, map; not written: readout time and scan direction" in said.err
-    values = load_params_file(out)
-    assert "readout_time" not in values
-    camera = read_calibration(out)
-    focal = values["calibration.focal_length"]
-    assert camera.K[0, 0] == pytest.approx(FOCAL, rel=4.0 * focal)
-    assert focal < 0.02
-    # Twists need it, poses do not; both commands name the same one to come next.
-    line = paste_next(said.out)
-    own = capsys.readouterr().out
-    assert f"next: {line.rpartition(' && ')[2]}" in own
-    assert "-p readout_time:=SECONDS" in own
-    assert len(read_tum(tmp_path / "camera_seen_poses" / "poses.txt").positions) > 20
-
-
 def test_a_video_with_a_gyroscope(film, tmp_path, capsys):
     """Its gyroscope agrees with the images, its readout time does not."""
     images = (cv2.imread(str(file), 0) for file in sorted(film.iterdir()))

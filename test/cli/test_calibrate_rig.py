@@ -80,25 +80,6 @@ def test_a_pair(pair, tmp_path, capsys):
     np.testing.assert_allclose(turn.as_matrix(), rotation.T, atol=1e-12)
 
 
-def test_cameras_are_chosen_with_an_axis_of_their_own(rig, tmp_path):
-    cameras = {
-        "front": rig.cameras["front"],
-        "rear": Camera(640, 480, K, LENS, "plumb_bob", 0.03, "right_to_left"),
-    }
-    sideways = RigParts(cameras, rig.camera_from_rig, rig.time_offset)
-    pair = recorded(tmp_path, sideways, *MOVING)
-    settings = ("cameras:=[rear, front]", "rear.scan_direction:=left_to_right",
-                "rear.stamp_offset:=0.5")  # fmt: skip
-    words = [word for setting in settings for word in ("-p", setting)]
-    assert main(["calibrate", "--rig", pair, *words, "--out", str(tmp_path / "rig.yaml")]) == 0
-    config = build(load_params_file(tmp_path / "rig.yaml"))
-    assert config.cameras == ("rear", "front")
-    rear, front = config.of_cameras["rear"], config.of_cameras["front"]
-    assert (rear.scan_direction, front.scan_direction) == ("right_to_left", "top_to_bottom")
-    assert rear.stamp_offset == 0.5
-    assert front.stamp_offset == pytest.approx(0.5 - OFFSET, abs=1e-3)
-
-
 def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
     words = "--duration 2 --points 40 --angular-velocity 0 0 0 --linear-velocity 0 0 0".split()
     pair = recorded(tmp_path, rig, *words)

@@ -397,7 +397,7 @@ def test_a_lens_profile_takes_the_place_of_a_calibration_and_what_is_given_goes_
 def test_maps_take_the_readout_time_of_a_video(video, telemetry):
     telemetry()
     given = parse("map build", build, [str(video), "--out", "map"])
-    assert build.shutter_of(given).readout_time == pytest.approx(0.0205)
+    assert build.shutter_of(given)[0] == pytest.approx(0.0205)
 
 
 @pytest.mark.parametrize(("focal", "doubted"), [(280.0, False), (300.0, True)])

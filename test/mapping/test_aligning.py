@@ -3,24 +3,18 @@
 """Maps in another frame: what was wished holds, and nothing else changes."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from rs_localizer.cli.map.align import Options, alignment, moved
 from rs_localizer.core import so3
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
+from rs_localizer.tools.mapping.align import alignment, moved
 
 TURN = so3.exp(np.array([0.4, -0.7, 0.2]))
-
-
-def wishes(**given: Any) -> Options:
-    return Options(file=Path("a"), out=Path("b"), **given)
 
 
 def room() -> Map:
@@ -36,8 +30,8 @@ def room() -> Map:
 
 
 def test_floor_size_and_origin():
-    asked = wishes(distance=(4, 9, 1.5), floor=[0, 1, 2, 3], origin=2)
-    found = moved(room(), alignment(room(), asked))
+    by = alignment(room(), distance=(4, 9, 1.5), floor=[0, 1, 2, 3], origin=2)
+    found = moved(room(), by)
     np.testing.assert_allclose(found.points[:4, 2], 0.0, atol=1e-12)
     assert np.all(found.points[4:, 2] > 0.0)
     np.testing.assert_allclose(found.points[2], 0.0, atol=1e-12)
@@ -56,7 +50,7 @@ def test_floor_size_and_origin():
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 2.0), (0.0, 0.0, -1.0), (1.0, -2.0, 0.5)])
 def test_up(up):
-    by = alignment(room(), wishes(up=up))
+    by = alignment(room(), up=up)
     np.testing.assert_allclose(by.rotation @ up, [0.0, 0.0, np.linalg.norm(up)], atol=1e-12)
     assert np.linalg.det(by.rotation) == pytest.approx(1.0)
 
@@ -66,7 +60,7 @@ def test_markers():
     hung = Marker.at("4x4_50", 3, 0.2, Pose(np.array([1.0, 2.0, 3.0]), TURN))
     other = Marker.at("4x4_50", 5, 0.2, Pose(np.array([1.0, 2.0, 5.0])))
     markers = MarkerMap((replace(hung, deviations=known), other))
-    by = alignment(markers, wishes(scale=2.0, up=tuple(TURN[:, 1]), origin=3))
+    by = alignment(markers, scale=2.0, up=tuple(TURN[:, 1]), origin=3)
     found = moved(markers, by).markers
     np.testing.assert_allclose(found[0].pose.rotation[:, 1], [0.0, 0.0, 1.0], atol=1e-12)
     np.testing.assert_allclose(found[0].pose.position, 0.0, atol=1e-12)

@@ -7,7 +7,6 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,107 +25,49 @@ from rs_localizer.cli.options import UsageError, argument, number, option
 from rs_localizer.config import FeatureConfig
 
 if WORKING:
-    import numpy as np
     from tqdm import tqdm
 
     from rs_localizer.cli.marker_map import read_checked_map
-    from rs_localizer.core.camera import Camera
-    from rs_localizer.core.scanning import ScanDirection
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.calibration import write_calibration
     from rs_localizer.io.maps.files import write_npz
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
     from rs_localizer.io.trajectories import Trajectory, write_tum
-    from rs_localizer.offline.detect import Cameras
-    from rs_localizer.offline.image_sources import Carried
-    from rs_localizer.pipeline.refusal import Refusal
     from rs_localizer.settings import build, write_parameters
     from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
-    from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map, check_features
+    from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map
     from rs_localizer.tools.mapping.colmap import Effort, require
+    from rs_localizer.tools.mapping.look import Looked, look
     from rs_localizer.tools.mapping.report import advice, rows, written
-    from rs_localizer.tools.mapping.views import Looker, View
-
-# After so many, images without features are refused: two seconds of a usual video.
-_EARLY_VIEWS = 30
-# Images a hair before their time are in time.
-_EARLY = 0.9
+    from rs_localizer.tools.mapping.views import Looker
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Looked:
-    """What was seen."""
-
-    views: list[View]
-    camera: Camera | None  # without its readout time; None: nobody has calibrated it
-    images: int
-    points: tuple[PointSight, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Shutter:
-    """What is known of it."""
-
-    readout_time: float | None  # s; None: not known
-    scan_direction: str | None
-
-
-def shutter_of(args: Any) -> Shutter:
-    """As given, or as it stands beside the images of a recording."""
+def shutter_of(args: Any) -> tuple[float | None, str | None]:
+    """Readout time and scan direction, given or beside the images; None: not known."""
     values = shutter_values(args)
     settings = build(values)
     # 0 is a global shutter where the user says so, and unknown in a file.
     said = any(text.startswith("readout_time:=") for text in args.assignments)
-    unknown = not said and not settings.readout_time
-    readout_time = None if unknown else settings.readout_time
-    return Shutter(readout_time, settings.scan_direction if "scan_direction" in values else None)
+    readout_time = settings.readout_time if said or settings.readout_time else None
+    return readout_time, settings.scan_direction if "scan_direction" in values else None
 
 
 def look_at_images(args: Any, looker: Looker) -> Looked:
     """Look at the images that are kept: so many a second, and those in which points are given."""
-    wanted = sorted({seconds for _, seconds, _, _ in args.point})
-    cameras, camera = Cameras(ScanDirection.TOP_TO_BOTTOM), None
-    views: list[View] = []
-    size = None
-    images, stamps = 0, list[int]()
-    refused, named = dict[str, str](), dict[float, int]()
     with opened(args, args.images, calibrated=False) as source, tqdm(
         total=source.total, unit="image", desc="look", disable=None
     ) as bar:  # fmt: skip
-        for shot in source.shots:
-            if isinstance(shot, Carried):
-                continue
-            images += 1
-            bar.update()
-            image = shot.image
-            if isinstance(image, Refusal):
-                refused.setdefault(image.reason, image.detail)
-                continue
-            seen_by = None if shot.camera_info is None else cameras.of(shot, image)
-            if size not in (None, image.pixels.shape) or (views and seen_by is not camera):
-                raise ValueError("the camera changes within the recording; cut it there")
-            camera, size = seen_by, image.pixels.shape
-            stamps.append(image.stamp_ns)
-            since = (image.stamp_ns - stamps[0]) * 1e-9
-            asked = [s for s in wanted if s not in named and since >= s - 1e-3]
-            named |= dict.fromkeys(asked, len(views))
-            due_ns = 1e9 * _EARLY / args.images_per_second
-            if asked or not views or image.stamp_ns - views[-1].stamp_ns >= due_ns:
-                views.append(looker.look(image))
-                if len(views) == _EARLY_VIEWS:
-                    check_features(views)
-    if size is None:
-        why = "; ".join(refused.values())
+        moments = [seconds for _, seconds, _, _ in args.point]
+        looked = look(source.shots, looker, args.images_per_second, moments, bar.update)
+    if not looked.views:
+        why = "; ".join(looked.refused.values())
         raise ValueError(f"{args.images} has no image that can be read; {why}")
-    tell_left_out(refused, {})
-    period = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else np.nan
-    tell_times(source.clock, build(shutter_values(args)).readout_time, period)
-    sights = []
-    for name, seconds, u, v in args.point:
-        if seconds not in named:
+    for name, seconds, *_ in args.point:
+        if seconds not in looked.moments:
             raise UsageError(f"--point {name}: the images end before {seconds:g} s")
-        sights.append(PointSight(name, named[seconds], (u, v)))
-    return Looked(views, camera, images, tuple(sights))
+    tell_left_out(looked.refused, {})
+    tell_times(source.clock, build(shutter_values(args)).readout_time, looked.period)
+    return looked
 
 
 COLMAP, POSES, REPORT = "colmap", "poses.txt", "report.md"
@@ -154,28 +95,25 @@ class Options(ImageOptions):
 
 
 def run(options: Options) -> None:
-    points, distances = map(_point, options.point), map(_distance, options.distance)
-    args = with_values(options, point=list(points), distance=list(distances))
-    if args.markers is not None and (args.point or args.distance):
-        raise UsageError("give either --markers or --point and --distance")
-    _check_points(args)
+    args = with_values(options, point=_points(options))
+    distances = _distances(options, [name for name, *_ in args.point])
     require()
     if not args.images.exists():
         raise ValueError(f"{args.images} does not exist")
     markers = None if args.markers is None else read_checked_map(args.markers)
     tell_telemetry(args, lens=False)
-    shutter = shutter_of(args)
+    shutter, frame = shutter_of(args), MAP_FRAME if markers is None else markers.map_frame
     with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
         with TemporaryDirectory(dir=out) as images:
-            looked = look_at_images(
-                args, Looker(FeatureConfig().max_keypoints, Path(images), markers)
-            )
-            anchors = Anchors(markers, looked.points, tuple(args.distance))
-            inputs = Given(
-                looked.views, looked.camera, anchors, shutter.readout_time,
-                shutter.scan_direction, MAP_FRAME if markers is None else markers.map_frame,
-            )  # fmt: skip
+            looker = Looker(FeatureConfig().max_keypoints, Path(images), markers)
+            looked = look_at_images(args, looker)
+            sights = [
+                PointSight(name, looked.moments[seconds], (u, v))
+                for name, seconds, u, v in args.point
+            ]
+            anchors = Anchors(markers, tuple(sights), tuple(distances))
+            inputs = Given(looked.views, looked.camera, anchors, *shutter, frame)
             folder = out / COLMAP
             folder.mkdir()
             built = build_map(inputs, Workshop(folder, Effort(), stage))
@@ -183,17 +121,39 @@ def run(options: Options) -> None:
     _tell(args, built, looked)
 
 
-def _check_points(args: Any) -> None:
-    """Before minutes of work: that each point of a distance is given in two images."""
-    names = [name for name, *_ in args.point]
-    if names and not args.distance:
+def _points(options: Options) -> list[tuple[str, float, float, float]]:
+    return [
+        (name, _number("--point", seconds), _number("--point", u), _number("--point", v))
+        for name, seconds, u, v in options.point
+    ]
+
+
+def _distances(options: Options, names: list[str]) -> list[Distance]:
+    """Before minutes of work: each point of a distance is given in two images."""
+    if options.markers is not None and (options.point or options.distance):
+        raise UsageError("give either --markers or --point and --distance")
+    if options.point and not options.distance:
         raise UsageError("--point needs --distance")
-    for name in (end for distance in args.distance for end in (distance.one, distance.other)):
-        if names.count(name) < 2:
-            raise UsageError(
-                f"--distance: the point {name} must be given by --point in two images or more, "
-                f"it is in {names.count(name)}"
-            )
+    distances = []
+    for one, other, text in options.distance:
+        metres = _number("--distance", text)
+        if not metres > 0.0 or one == other:
+            raise UsageError(f"--distance: must be two points and metres, got {one} {other} {text}")
+        for name in (one, other):
+            if names.count(name) < 2:
+                raise UsageError(
+                    f"--distance: the point {name} must be given by --point in two images or more, "
+                    f"it is in {names.count(name)}"
+                )
+        distances.append(Distance(one, other, metres))
+    return distances
+
+
+def _number(option: str, text: str) -> float:
+    try:
+        return number()(text)
+    except argparse.ArgumentTypeError as error:
+        raise UsageError(f"{option}: {error}") from error
 
 
 def _write(out: Path, built: Built, looked: Looked) -> None:
@@ -232,26 +192,3 @@ def _tell(args: Any, built: Built, looked: Looked) -> None:
         f"seen && rs_localizer replay seen --params {out}/{PARAMETERS} --map {out}/{MAP} --out "
         "poses"
     )
-
-
-def _point(words: Sequence[str]) -> tuple[str, float, float, float]:
-    """NAME SECONDS U V."""
-    name, *numbers = words
-    seconds, u, v = (_number("--point", text) for text in numbers)
-    return name, seconds, u, v
-
-
-def _distance(words: Sequence[str]) -> Distance:
-    """NAME NAME METRES."""
-    one, other, text = words
-    metres = _number("--distance", text)
-    if not metres > 0.0 or one == other:
-        raise UsageError(f"--distance: must be two points and metres, got {' '.join(words)}")
-    return Distance(one, other, metres)
-
-
-def _number(option: str, text: str) -> float:
-    try:
-        return number()(text)
-    except argparse.ArgumentTypeError as error:
-        raise UsageError(f"{option}: {error}") from error

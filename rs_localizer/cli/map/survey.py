@@ -22,13 +22,12 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer.core.arrays import Array
-    from rs_localizer.io.camera_info import Calibration, read_camera_info
-    from rs_localizer.io.images import Image
+    from rs_localizer.core.camera import Camera
     from rs_localizer.markers.map_check import other_units
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.markers.prints import Marker
-    from rs_localizer.offline.image_sources import Carried
+    from rs_localizer.offline.detect import seen_by
     from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey_rig
     from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
 
@@ -111,28 +110,19 @@ def _markers(args: Options) -> tuple[Marker, ...]:
 def _filmed(given: MapCamera, spotter: Spotter) -> Filmed:
     """A camera, and the markers of each image."""
     args, config, spotted = given.args, given.config, dict[int, Spotted]()
-    calibration: Calibration | None = None
+    camera: Camera | None = None
     with opened(args, args.recording) as source:
-        for shot in tqdm(source.shots, unit="image", desc="detect", disable=None):
-            if isinstance(shot, Carried) or not isinstance(shot.image, Image):
-                continue
-            read = read_camera_info(shot.camera_info)
-            if calibration is not None and read != calibration:
+        seen = seen_by(source.shots, config.scan_direction)
+        for image, own in tqdm(seen, unit="image", desc="detect", disable=None):
+            if camera is not None and own is not camera:
                 raise ValueError("camera_info changes within the recording; cut it there")
-            calibration = read
-            camera = calibration.camera(config.readout_time, config.scan_direction)
-            height, width = shot.image.pixels.shape
-            if camera.size != (width, height):
-                raise ValueError(
-                    f"the images are of {width}x{height}, the calibration is for "
-                    f"{camera.size[0]}x{camera.size[1]}"
-                )
-            stamp = shot.image.stamp_ns
-            spotted[stamp] = spotter.spot(shot.image.pixels, stamp)
+            camera, stamp = own, image.stamp_ns
+            spotted[stamp] = spotter.spot(image.pixels, stamp)
     tell_times(source.clock)
-    if calibration is None:
+    if camera is None:
         raise ValueError(f"{args.recording} has no image that can be read")
     every = [spotted[stamp] for stamp in sorted(spotted)]
+    camera = replace(camera, readout_time=config.readout_time)
     return Filmed(camera, config.stamp_offset, given.mounting, every)
 
 
