@@ -18,12 +18,12 @@ from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.inertial import offset_search, turning
+from rs_localizer.inertial import turning
 from rs_localizer.inertial.filter import RATE, GyroscopeFilter, Predicted
 from rs_localizer.inertial.gravity import gravity_seen
 from rs_localizer.inertial.offset_search import OffsetSearch, Orientation
 from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
-from rs_localizer.inertial.samples import ImuSamples, span_of
+from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import OFFSET_DEVIATION, InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.inertial.turning import TurnBetween, TurnWithin
@@ -91,24 +91,6 @@ class GyroscopeAid:
         self._search = OffsetSearch() if settings.estimate_time_offset else None
         self._shaken = False  # in this frame, by the gyroscope
         self._stepped = False  # whether the search is one after a doubt
-
-    def warm_up(self) -> None:
-        """Compile every kernel that frames may need, or load it from the cache."""
-        times = np.arange(-60, 30) * 2_000_000
-        samples = ImuSamples(times, np.zeros((len(times), 3)))
-        filter_ = GyroscopeFilter(self._settings)
-        within = turning.turn_within(samples, 0, 0.02, filter_.errors)
-        between = turning.turn_between(samples, -30_000_000, 0, filter_.errors)
-        assert within is not None
-        assert between is not None
-        span_of(times, 0, 1)
-        offset_search.warm_up()
-        within.known.at(0.0)
-        still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-        identity = np.eye(PARAMETERS)
-        predicted = filter_.predict(still, identity, between, within, 1.0, 1.0)
-        added = predicted.spread(identity)
-        filter_.update(added, np.zeros(PARAMETERS), 0.5 * added.covariance)
 
     @property
     def status(self) -> InertialStatus:

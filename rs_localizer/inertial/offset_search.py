@@ -226,19 +226,6 @@ class OffsetSearch:
         return FoundOffset(self._about + float(self._offsets[best] + shift), float(deviation))
 
 
-def warm_up() -> None:
-    """Compile the kernels, or load them from the cache."""
-    still, rows = np.tile(np.eye(3), (2, 1, 1)), np.zeros(2)
-    base = np.zeros((2, 2, PARAMETERS))
-    times = np.arange(-4.0, 5.0)
-    cubics = spline(times, np.zeros((9, 3)))
-    knots = rotations_at_knots(times, cubics)
-    _row_costs(
-        np.zeros((2, 2)), np.zeros((2, 2, 3)), base, np.zeros((3, PARAMETERS)), rows, still,
-        times, cubics, knots, rows,
-    )  # fmt: skip
-
-
 def _is_whole(times_ns: IntArray) -> bool:
     steps = np.diff(times_ns)
     return len(steps) > 3 and bool(steps.max() < 2.5 * np.median(steps))
