@@ -10,15 +10,17 @@ from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
-from rs_localizer.ros.detector.node import Finder, ImageNode, Picture, Sight
+from rs_localizer.ros.detector.node import Finder, ImageNode, Picture
+from rs_localizer.ros.node.health import State
+from rs_localizer.ros.node.statistics import Told
 from rs_localizer.settings import FEATURES_NAME
 
 
-def tell(extracted: Extracted) -> tuple[int, Sight]:
+def tell(extracted: Extracted) -> tuple[int, Told]:
     """Stamp of an image (ns), and what the statistics keep of it."""
     count = len(extracted.features)
     text = f"{count or 'no'} keypoints in the last image"
-    return extracted.image.stamp_ns, Sight(text, {"Keypoints": str(count)})
+    return extracted.image.stamp_ns, Told(State.DETECTING, text, {"Keypoints": str(count)})
 
 
 class FeatureDetectorNode(ImageNode[FeatureConfig, Extracted]):

@@ -13,12 +13,14 @@ from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import CORRESPONDENCES
 from rs_localizer.markers.overlay import draw_detections
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.ros.detector.node import Finder, ImageNode, Picture, Sight
+from rs_localizer.ros.detector.node import Finder, ImageNode, Picture
+from rs_localizer.ros.node.health import State
+from rs_localizer.ros.node.statistics import Told
 from rs_localizer.ros.node.views import MapView
 from rs_localizer.settings import DETECTOR_NAME
 
 
-def tell(detected: Detected) -> tuple[int, Sight]:
+def tell(detected: Detected) -> tuple[int, Told]:
     """Stamp of an image (ns), and what the statistics keep of it."""
     detections = detected.detections
     markers = sum(int(item.mapped.sum()) for item in detections.markers)
@@ -33,7 +35,7 @@ def tell(detected: Detected) -> tuple[int, Sight]:
         "Corners": str(corners),
         "Markers not in the map": str(len(detections.unknown)),
     }
-    return detected.image.stamp_ns, Sight(text, values)
+    return detected.image.stamp_ns, Told(State.DETECTING, text, values)
 
 
 class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):

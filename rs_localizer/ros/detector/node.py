@@ -40,30 +40,14 @@ from rs_localizer.ros.node.health import (
 )
 from rs_localizer.ros.node.inputs import Silence, Topic
 from rs_localizer.ros.node.managed import ManagedNode
-from rs_localizer.ros.node.statistics import WINDOW, Summary
+from rs_localizer.ros.node.statistics import WINDOW, Summary, Told
 from rs_localizer.ros.node.worker import Worker
 
 Result = TypeVar("Result")
 Picture = NDArray[np.uint8]  # (h,w,3) blue, green, red
 
 
-@dataclass(frozen=True, slots=True)
-class Sight:
-    """What is told of the last image: in one sentence, and by readable names."""
-
-    text: str
-    values: dict[str, str]
-
-
-def values_of(summary: Summary[Sight]) -> dict[str, str]:
-    """What a node says in numbers."""
-    values = counts(summary, "Images", "Images done")
-    return values if summary.last is None else values | summary.last.values
-
-
-def judge(
-    summary: Summary[Sight], silence: Mapping[str, Silence], oddities: Mapping[str, str]
-) -> Health:
+def judge(summary: Summary, silence: Mapping[str, Silence], oddities: Mapping[str, str]) -> Health:
     """Of an active node that somebody listens to: ``waiting for images`` or ``detecting``."""
     causes = [f"{item.topic}: {item.cause}" for item in silence.values() if item.cause]
     if causes or not silence:
@@ -107,7 +91,7 @@ class Work(Generic[Result]):
     finder: Finder[Result]
 
 
-class ImageNode(ManagedNode[Settings, Work[Result], Result, Sight], Generic[Settings, Result]):
+class ImageNode(ManagedNode[Settings, Work[Result], Result], Generic[Settings, Result]):
     """Looks at images; see :class:`rs_localizer.ros.node.managed.ManagedNode`.
 
     A node says what it looks for by overriding :meth:`make_finder`, :meth:`make_cloud`,
@@ -122,7 +106,7 @@ class ImageNode(ManagedNode[Settings, Work[Result], Result, Sight], Generic[Sett
         self,
         name: str,
         kind: Any,  # class of its settings, which mypy cannot follow to the base class
-        tell: Callable[[Result], tuple[int, Sight]],
+        tell: Callable[[Result], tuple[int, Told]],
         **options: Any,
     ) -> None:
         self._outputs: ImageOutputs[Result] | None = None
@@ -203,7 +187,7 @@ class ImageNode(ManagedNode[Settings, Work[Result], Result, Sight], Generic[Sett
             judgement = Health(Level.OK, State.IDLE, message)
         if judgement is None:
             judgement = judge(summary, self.silence, self.refusals.recent(self.odd, WINDOW))
-        return judgement.with_values(values_of(summary)), ""
+        return judgement.with_values(counts(summary, "Images", "Images done")), ""
 
     # -- who listens ------------------------------------------------------------------------
 

@@ -63,8 +63,7 @@ class LiveNode:
         self._status: dict[str, str] = {}
         self._others: dict[str, Any] = {}
         self._words = 0  # of the diagnostics
-        self._heard = time.monotonic()
-        self._logged = 0
+        self._heard = time.time()
 
     def __enter__(self) -> Self:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -186,30 +185,25 @@ class LiveNode:
 
     def _take_pose(self, message: PoseStamped) -> None:
         self._poses[stamp_ns(message) - self._delay_ns] = message
-        self._heard = time.monotonic()
+        self._heard = time.time()
 
     def _take_status(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == f"{self.namespace.lstrip('/')}/{NODE_NAME}: localizer":
                 self._status = {item.key: item.value for item in status.values}
                 self._words += 1
-                self._heard = time.monotonic()
+                self._heard = time.time()
 
     def _lines(self) -> list[str]:
-        size = self._log.stat().st_size
-        if size != self._logged:
-            self._logged, self._heard = size, time.monotonic()
         return self._log.read_text(errors="replace").strip().splitlines()
 
     def _until(self, condition: Callable[[], bool]) -> None:
         assert self._process is not None
         while not condition():
             self._executor.spin_once(timeout_sec=0.05)
-            code, silence = self._process.poll(), time.monotonic() - self._heard
+            code = self._process.poll()
+            silence = time.time() - max(self._heard, self._log.stat().st_mtime)
             if code is None and silence < _SILENCE:
-                continue
-            self._lines()
-            if code is None and time.monotonic() - self._heard < _SILENCE:
                 continue
             fate = f"has said nothing for {silence:.0f} s" if code is None else f"ended with {code}"
             last = "\n  ".join(self._lines()[-_LAST_LINES:] or ["nothing"])

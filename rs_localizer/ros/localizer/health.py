@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rs_localizer.io.outputs import CameraShare, Localized
+from rs_localizer.io.outputs import Localized
 from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.inputs import Role, input_named, said
 from rs_localizer.pipeline.map_to_odom import Holding
@@ -24,38 +24,32 @@ from rs_localizer.ros.node.health import (
     out_of_service,
 )
 from rs_localizer.ros.node.inputs import Silence
-from rs_localizer.ros.node.statistics import Summary
+from rs_localizer.ros.node.statistics import Summary, Told
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What the statistics keep of a frame."""
-
-    points: int
-    inliers: int
-    global_shutter_inliers: int  # what a pose without motion would have explained
-    residual: float  # px, root mean square of the inliers
-    model_error: float  # px, root mean square of what map, lens and motion leave beside the noise
-    iterations: int
-    tracked: bool
-    cameras: tuple[CameraShare, ...] = ()  # of a rig, those that had a part
-
-
-def tell(frame: Localized) -> tuple[int, Answer]:
+def tell(frame: Localized) -> tuple[int, Told]:
     """The stamp of the input (ns), and what is told."""
     estimate = frame.estimate
     residuals = estimate.residuals[estimate.inliers]
-    answer = Answer(
-        points=len(estimate.inliers),
-        inliers=len(residuals),
-        global_shutter_inliers=estimate.global_shutter_inliers,
-        residual=float(np.sqrt(residuals @ residuals / max(len(residuals), 1))),
-        model_error=estimate.model_error,
-        iterations=estimate.iterations,
-        tracked=estimate.tracked,
-        cameras=frame.cameras,
-    )
-    return frame.input_stamp_ns, answer
+    points, inliers = len(estimate.inliers), len(residuals)
+    residual = float(np.sqrt(residuals @ residuals / max(inliers, 1)))
+    values = {
+        "Points": str(points),
+        "Inliers with rolling shutter": str(inliers),
+        "Inliers with global shutter": str(estimate.global_shutter_inliers),
+        "Residual RMS (px)": f"{residual:.3f}",
+        "Model error (px)": f"{estimate.model_error:.3f}",
+        "Iterations": str(estimate.iterations),
+    }
+    for camera in frame.cameras:  # of a rig
+        share = camera.inliers / max(camera.points, 1)
+        values |= {
+            f"Inliers of {camera.name}": f"{camera.inliers} of {camera.points} ({share:.0%})",
+            f"Residual RMS of {camera.name} (px)": f"{camera.residual:.3f}",
+        }
+    state = State.TRACKING if estimate.tracked else State.LOCALIZED
+    text = f"{state} with {inliers} of {points} points"
+    return frame.input_stamp_ns, Told(state, text, values)
 
 
 # Share of the last frames below which it is worth a warning that the IMU is not used.
@@ -145,7 +139,7 @@ def _of_frames(silence: Mapping[str, Silence]) -> list[Silence]:
     return [item for name, item in silence.items() if input_named(name).role == Role.FRAMES]
 
 
-def diagnose(condition: Condition, summary: Summary[Answer]) -> Health:
+def diagnose(condition: Condition, summary: Summary) -> Health:
     """Judge the node.
 
     The states are ``inactive``, ``compiling``, ``waiting for`` what is missing or for frames,
@@ -155,7 +149,7 @@ def diagnose(condition: Condition, summary: Summary[Answer]) -> Health:
     return _judge(condition, summary).with_values(_values(condition, summary))
 
 
-def _judge(condition: Condition, summary: Summary[Answer]) -> Health:
+def _judge(condition: Condition, summary: Summary) -> Health:
     if (idle := out_of_service(condition.life_cycle)) is not None:
         return idle
     if condition.changing:
@@ -197,7 +191,7 @@ def _silent_frames(condition: Condition) -> Health | None:
     return Health(level, State.WAITING, message, subject="frames")
 
 
-def _judge_frames(summary: Summary[Answer], condition: Condition) -> Health:
+def _judge_frames(summary: Summary, condition: Condition) -> Health:
     last, oddities = summary.last, condition.oddities
     if last is None or summary.refused_since_answer >= _LOST:
         if summary.refused_since_answer == 0:
@@ -209,30 +203,14 @@ def _judge_frames(summary: Summary[Answer], condition: Condition) -> Health:
         held = "" if condition.holding is None else str(condition.holding)
         message = "; ".join(filter(None, [message, held, one_line(oddities)]))
         return Health(Level.ERROR, State.LOST, message)
-    state = State.TRACKING if last.tracked else State.LOCALIZED
+    state = State(last.state)
     if message := hindrance(summary, "frames") or one_line(oddities):
         return Health(Level.WARN, state, message)
-    message = f"{state} with {last.inliers} of {last.points} points"
-    return Health(Level.OK, state, message)
+    return Health(Level.OK, state, last.text)
 
 
-def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
+def _values(condition: Condition, summary: Summary) -> dict[str, str]:
     values = counts(summary, "Frames", "Poses out")
-    if summary.last is not None:
-        values |= {
-            "Points": str(summary.last.points),
-            "Inliers with rolling shutter": str(summary.last.inliers),
-            "Inliers with global shutter": str(summary.last.global_shutter_inliers),
-            "Residual RMS (px)": f"{summary.last.residual:.3f}",
-            "Model error (px)": f"{summary.last.model_error:.3f}",
-            "Iterations": str(summary.last.iterations),
-        }
-        for camera in summary.last.cameras:
-            share = camera.inliers / max(camera.points, 1)
-            values |= {
-                f"Inliers of {camera.name}": f"{camera.inliers} of {camera.points} ({share:.0%})",
-                f"Residual RMS of {camera.name} (px)": f"{camera.residual:.3f}",
-            }
     if condition.readout is not None:
         readout, deviation = 1e3 * condition.readout.readout_time, 1e3 * condition.readout.deviation
         values["Readout time seen (ms)"] = f"{readout:.2f} +- {deviation:.2f}"

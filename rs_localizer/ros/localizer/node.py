@@ -31,7 +31,6 @@ from rs_localizer.pipeline.inputs import Input, Results, Role, inputs_of
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.localizer import transforms
 from rs_localizer.ros.localizer.health import (
-    Answer,
     Condition,
     diagnose,
     imu_oddity,
@@ -247,7 +246,7 @@ _ODD = (
 )  # fmt: skip
 
 
-class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
+class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized]):
     """Localizes; see :class:`rs_localizer.ros.node.managed.ManagedNode`."""
 
     task = "localizer"

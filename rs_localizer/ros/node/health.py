@@ -5,7 +5,6 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
@@ -86,7 +85,7 @@ def one_line(oddities: Mapping[str, str]) -> str:
     return "; ".join(f"{name}: {text}" for name, text in oddities.items())
 
 
-def hindrance(summary: Summary[Any], what: str) -> str:
+def hindrance(summary: Summary, what: str) -> str:
     """Why some of the last messages have no result; empty where nearly all have one."""
     lately, lost = summary.lately, summary.recently_missing
     came = lately.get(Event.RECEIVED, 0)
@@ -101,7 +100,7 @@ def hindrance(summary: Summary[Any], what: str) -> str:
     return ""
 
 
-def counts(summary: Summary[Any], what: str, done: str) -> dict[str, str]:
+def counts(summary: Summary, what: str, done: str) -> dict[str, str]:
     """Rates, latency and totals as values of a diagnosis; what is zero and rare is left out."""
     values = {
         f"{what} in (Hz)": f"{summary.rate_in:.1f}",
@@ -118,7 +117,8 @@ def counts(summary: Summary[Any], what: str, done: str) -> dict[str, str]:
             values[f"{what} {event}"] = str(count)
     if summary.recently_missing:
         values[f"{what} missing by their stamps, recently"] = str(summary.recently_missing)
-    return values | {f"Refused: {reason}": str(n) for reason, n in sorted(summary.reasons.items())}
+    values |= {f"Refused: {reason}": str(n) for reason, n in sorted(summary.reasons.items())}
+    return values | ({} if summary.last is None else summary.last.values)
 
 
 _PERIOD = 1.0  # s

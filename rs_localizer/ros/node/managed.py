@@ -33,7 +33,7 @@ from rs_localizer.ros.node import parameters
 from rs_localizer.ros.node.health import Diagnostics, Health
 from rs_localizer.ros.node.inputs import Inputs, Silence, Topic
 from rs_localizer.ros.node.refusals import Refusals, describe
-from rs_localizer.ros.node.statistics import Statistics
+from rs_localizer.ros.node.statistics import Statistics, Told
 from rs_localizer.ros.node.worker import State, Worker, in_thread, wait_for_workers
 from rs_localizer.settings import Config
 
@@ -51,10 +51,9 @@ def _failure(function: Callable[[], None]) -> str:
 # Kernels between two lines of the log that say how far the compiler is.
 _TOLD = 10
 Result = TypeVar("Result")
-Kept = TypeVar("Kept")
 
 
-class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
+class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
     """Only while active it takes and publishes messages.
 
     A node says what it does by overriding :meth:`kernels`, :meth:`check`, :meth:`open`,
@@ -81,7 +80,7 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
         self,
         name: str,
         kind: type[Config],
-        tell: Callable[[Result], tuple[int, Kept]],
+        tell: Callable[[Result], tuple[int, Told]],
         **options: Any,
     ) -> None:
         super().__init__(name, **options)
@@ -107,7 +106,7 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result, Kept]):
         )
         self.autostart: bool = config.autostart
         self.refusals = Refusals(self.warn)
-        self.statistics: Statistics[Result, Kept] = Statistics(
+        self.statistics: Statistics[Result] = Statistics(
             self.refusals, tell, lambda: int(self.get_clock().now().nanoseconds)
         )
         self._diagnostics = Diagnostics(
@@ -312,7 +311,7 @@ _SWITCH_INTERVAL = 0.001
 
 
 def run(
-    make: Callable[[], ManagedNode[Any, Any, Any, Any]],
+    make: Callable[[], ManagedNode[Any, Any, Any]],
     name: str,
     stop: StopRequest,
     args: list[str] | None = None,

@@ -47,7 +47,6 @@ def missing(stamps_ns: Sequence[int]) -> int:
 
 
 Result = TypeVar("Result")
-Kept = TypeVar("Kept")
 
 WINDOW = 5.0
 """What "now" means, in s."""
@@ -71,7 +70,16 @@ class Event(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Summary(Generic[Kept]):
+class Told:
+    """What is told of a frame that was answered."""
+
+    state: str
+    text: str  # one sentence
+    values: dict[str, str]  # by readable names
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
     """How things are now."""
 
     total: Mapping[Event, int]  # frames since the start
@@ -85,10 +93,10 @@ class Summary(Generic[Kept]):
     busy: float | None  # s for which the worker has had the same frame
     latency: Percentiles | None  # from receiving to publishing
     delay: Percentiles | None  # from the header's stamp to publishing, where that makes sense
-    last: Kept | None  # of the last frame that was answered; None: there was none
+    last: Told | None  # of the last frame that was answered; None: there was none
 
 
-class Statistics(Generic[Result, Kept]):
+class Statistics(Generic[Result]):
     """Counts frames; all methods may be called from any thread.
 
     Args:
@@ -101,7 +109,7 @@ class Statistics(Generic[Result, Kept]):
     def __init__(
         self,
         refusals: Refusals,
-        tell: Callable[[Result], tuple[int, Kept]],
+        tell: Callable[[Result], tuple[int, Told]],
         ros_time: Callable[[], int] = time.time_ns,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -110,7 +118,7 @@ class Statistics(Generic[Result, Kept]):
         self._lock = threading.Lock()
         self._total: Counter[Event] = Counter()
         self._in_a_row = 0
-        self._last: Kept | None = None
+        self._last: Told | None = None
         self._started: float | None = None
         # When what happened, with a stamp (topic, ns), a reason, or latency and delay in s.
         self._events: deque[tuple[float, Event, Any]] = deque(maxlen=_MOST_EVENTS)
@@ -154,7 +162,7 @@ class Statistics(Generic[Result, Kept]):
             self._in_a_row = 0
             self._last = kept
 
-    def summary(self) -> Summary[Kept]:
+    def summary(self) -> Summary:
         """How things are now."""
         with self._lock:
             now, started = self._clock(), self._started

@@ -79,7 +79,7 @@ class Worker(Generic[State, Result]):
         self,
         state: State,
         publish: Callable[[Result], None],
-        statistics: Statistics[Result, Any],
+        statistics: Statistics[Result],
         failed: Callable[[str], None],
     ) -> None:
         self._state = state

@@ -18,7 +18,7 @@ from rs_localizer.ros.node.worker import Need, Worker, wait_for_workers
 PATIENCE = 10.0  # s, of a machine that is busy
 
 
-class Count(Statistics[str, str]):
+class Count(Statistics[str]):
     """Frames are plain text here, without stamps."""
 
     def received(self, topic: str, message: Any) -> None:
