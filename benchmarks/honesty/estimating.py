@@ -156,7 +156,7 @@ def record(
     rng = np.random.default_rng(seed)
     samples = []
     for which in range(recordings):
-        stamps, rates, _ = imu.record(made[0], which, first[0] - 0.3, first[-1] + 0.3, rng)
+        stamps, rates = imu.record(made[0], which, first[0] - 0.3, first[-1] + 0.3, rng)
         samples.append(ImuSamples(stamps + begin, rates))
     return Recorded(frames, tuple(samples), imu)
 

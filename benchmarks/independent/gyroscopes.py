@@ -12,9 +12,6 @@ import numpy as np
 from benchmarks.independent.motions import IntArray, Moving
 from benchmarks.independent.rotations import Array
 
-GRAVITY = np.array([0.0, 0.0, -9.80665])  # m/s^2, in the map
-_STEP = 1e-4  # s, for accelerations by differences
-
 
 @dataclass(frozen=True, slots=True)
 class Imu:
@@ -24,12 +21,11 @@ class Imu:
     noise: float = math.radians(0.01)  # rad/s/sqrt(Hz) of the gyroscope
     bias: float = math.radians(0.5)  # rad/s, length of the gyroscope's
     offset: float = 0.0  # s that its stamps are early: to be added to them
-    force_noise: float = 0.002  # m/s^2/sqrt(Hz)
 
     def record(
         self, motions: Moving, which: int, first: float, last: float, rng: np.random.Generator
-    ) -> tuple[IntArray, Array, Array]:
-        """Stamps (n,) in ns, angular velocities (n,3), specific forces (n,3) of one camera.
+    ) -> tuple[IntArray, Array]:
+        """Stamps (n,) in ns and angular velocities (n,3) of one camera.
 
         Args:
             first, last: s, time of its motion.
@@ -42,14 +38,4 @@ class Imu:
         bias = self.bias * direction / np.linalg.norm(direction)
         deviation = self.noise * math.sqrt(self.rate)
         shown = states.angular + bias + deviation * rng.normal(size=(len(times), 3))
-        pushed = _accelerations(motions, camera, times) - GRAVITY
-        force = np.einsum("nji,nj->ni", states.rotation, pushed)
-        force += self.force_noise * math.sqrt(self.rate) * rng.normal(size=force.shape)
-        return np.rint(1e9 * (times - self.offset)).astype(np.int64), shown, force
-
-
-def _accelerations(motions: Moving, which: IntArray, times: Array) -> Array:
-    """Of the camera's places (n,3), m/s^2 in the map."""
-    before, here, after = (motions.poses(which, times + step)[1] for step in (-_STEP, 0.0, _STEP))
-    found: Array = (before - 2.0 * here + after) / _STEP**2
-    return found
+        return np.rint(1e9 * (times - self.offset)).astype(np.int64), shown
