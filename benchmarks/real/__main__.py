@@ -42,13 +42,9 @@ _PARTS = {
             for name in METHODS[1:]
             for what in ("halves", "inside", "turn_claimed", "move_claimed")
         ),
-        "random_turn_claimed",
     ),
     "held-out corners over solvePnP's": (
         "held_px", "single_held", "tracked_held", "reversed_held", "tracked_over_single",
-    ),
-    "held-out corners, one motion through all images, over a global shutter": (
-        "found_ms", "motion_held", "backward_held",
     ),
     "readout, twists (deg/s), time": (
         "readout_ms",

@@ -18,17 +18,12 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.state import ANGULAR, POSE, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
-from rs_localizer.tools.adjust.fit import fit
-from rs_localizer.tools.adjust.observe import Observed, collect
-from rs_localizer.tools.adjust.problem import LIMIT, Problem, View
-from rs_localizer.tools.calibration import calibrate, within
-from rs_localizer.tools.first_lens import first_lens
+from rs_localizer.tools.adjust.observe import Observed
 from rs_localizer.tracking import FrameContext, Memory, Tracker
 
 Pose = Estimate | GlobalPose
@@ -67,7 +62,7 @@ def judged(clip: Clip, lens: Camera, shutter: Shutter, config: NodeConfig) -> di
     for name in METHODS[1:]:
         of_name = _twists(clip, poses[name], poses[PEER], shutter.readout_time)
         row |= {f"{name}_{key}": x for key, x in of_name.items()}
-    row |= _halves(camera, whole, config) | _shutter_gain(clip)
+    row |= _halves(camera, whole, config)
     return row
 
 
@@ -153,14 +148,13 @@ def _halves(camera: Camera, images: Sequence[Observed], config: NodeConfig) -> d
     """Poses of one half of the corners against those of the other, and what each says of the
     other's corners: rolling over global shutter, the direction of the scan, and the reversed one.
 
-    Poses of the two sides of the board are compared with their regions: random halves share
-    the board's bend, which is a part of both regions and of no difference (``random``: for
-    comparison). Corners are held out by random halves.
+    Poses are of the two sides of the board: random halves share its bend. Corners are held out by
+    random halves.
     """
     row: dict[str, float] = {}
     for name in ("single", "tracked"):
         sides = [localized(name, camera, part, config) for part in _parts(images, _sides)]
-        row |= {f"{name}_{key}": x for key, x in _agreement(*sides, shared=False).items()}
+        row |= {f"{name}_{key}": x for key, x in _agreement(*sides).items()}
     parts = _parts(images, lambda image, seed: halved(len(image.points), seed))
     reverse = replace(camera, scan_direction=str(REVERSED[ScanDirection(camera.scan_direction)]))
     cameras = {"single": camera, "tracked": camera, "reversed": reverse, PEER: camera}
@@ -168,9 +162,6 @@ def _halves(camera: Camera, images: Sequence[Observed], config: NodeConfig) -> d
         name: localized("tracked" if name == "reversed" else name, by, parts[0], config)
         for name, by in cameras.items()
     }
-    others = localized("tracked", camera, parts[1], config)
-    halves = _agreement(fits["tracked"], others, shared=True)
-    row["random_turn_claimed"] = halves.get("turn_claimed", math.nan)
     errors = {name: _errors(by, fits[name], parts[1]) for name, by in cameras.items()}
     for name in ("single", "tracked", "reversed"):
         row[f"{name}_held"] = _ratio(errors[name], errors[PEER])
@@ -196,46 +187,11 @@ def _parts(
     return parts
 
 
-def _shutter_gain(clip: Clip) -> dict[str, float]:
-    """One motion through all images from half of the corners, lens and board estimated with it:
-    errors of the other half with the readout time that it finds, and with its reverse, over those
-    with a global shutter.
-    """
-    parts = _parts(clip.images, lambda image, seed: halved(len(image.points), seed))
-    try:
-        camera = first_lens(clip.size, parts[0])
-        found = calibrate(camera, parts[0], intrinsics=True, own_stamps=False)
-    except ValueError:
-        return {}
-    spline, held = found.fit.state.spline, replace(found.fit.freedom, readout_time=False)
-    known = within(found.posed.observations, spline)
-    nothing = Failure(Reason.TOO_FEW_INLIERS, "")
-    unseen = within(collect(camera, parts[1], [nothing] * len(parts[1])).observations, spline)
-    errors = []
-    for sign in (1.0, 0.0, -1.0):
-        start = replace(found.fit.state, readout_time=sign * found.readout_time)
-        state = fit(camera, known, start, held, found.fit.deviation).state
-        squared = Problem([View(camera, unseen, held)], state).errors(state)
-        # Corners that are wrong say nothing of the shutter.
-        squared = np.minimum(squared, (LIMIT * found.fit.deviation) ** 2)
-        counts = np.bincount(unseen.frames, minlength=len(parts[1]))
-        sums = np.bincount(unseen.frames, squared, len(parts[1]))
-        errors.append(np.where(counts > 0, sums / np.maximum(counts, 1), np.nan))
-    return {
-        "found_ms": 1e3 * found.readout_time,
-        "motion_held": _ratio(errors[0], errors[1]),
-        "backward_held": _ratio(errors[2], errors[1]),
-    }
-
-
-def _agreement(ones: Poses, others: Poses, *, shared: bool) -> dict[str, float]:
+def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
     """How two poses of each image agree, and whether their covariances say so.
 
     Poses are compared at the same motion: what the prior says of the velocities is the same
     in both, and would be a part of both regions and of no difference.
-
-    Args:
-        shared: errors of calibration and declared map are the same in both.
     """
     inside, turns, moves = [], [], []
     for one, other in zip(ones, others, strict=True):
@@ -247,8 +203,8 @@ def _agreement(ones: Poses, others: Poses, *, shared: bool) -> dict[str, float]:
                 one.rotation @ (other.position - one.position),
             ]
         )
-        first, _ = _at_known_motion(one, shared)
-        second, gain = _at_known_motion(other, shared)
+        first, _ = _at_known_motion(one)
+        second, gain = _at_known_motion(other)
         step = step + gain @ (_motion(one) - _motion(other))
         spread = first + second
         inside.append(step @ np.linalg.solve(spread, step) < _INSIDE)
@@ -269,11 +225,9 @@ def _motion(estimate: Estimate) -> Array:
     return np.concatenate([estimate.angular_velocity, estimate.linear_velocity])
 
 
-def _at_known_motion(estimate: Estimate, shared: bool) -> tuple[Array, Array]:
-    """Covariance (6,6) of the pose at given velocities, without what all images of a calibration
-    share if the other pose has that, too; and how the pose follows the velocities (6,6).
-    """
-    covariance = estimate.covariance - (estimate.calibration_covariance if shared else 0.0)
+def _at_known_motion(estimate: Estimate) -> tuple[Array, Array]:
+    """Covariance (6,6) of the pose at given velocities, and how it follows them (6,6)."""
+    covariance = estimate.covariance
     gain = covariance[POSE, VELOCITIES] @ np.linalg.inv(covariance[VELOCITIES, VELOCITIES])
     return covariance[POSE, POSE] - gain @ covariance[VELOCITIES, POSE], gain
 
