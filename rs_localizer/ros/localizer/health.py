@@ -75,8 +75,18 @@ def imu_oddity(state: ImuState | None) -> dict[str, str]:
     return oddities
 
 
-def imu_values(state: ImuState) -> dict[str, str]:
+def readout_values(seen: MeasuredReadout | None) -> dict[str, str]:
+    """The readout time as the camera's motion shows it."""
+    if seen is None:
+        return {}
+    readout, deviation = 1e3 * seen.readout_time, 1e3 * seen.deviation
+    return {"Readout time seen (ms)": f"{readout:.2f} +- {deviation:.2f}"}
+
+
+def imu_values(state: ImuState | None) -> dict[str, str]:
     """Values by readable names; what is not known is left out."""
+    if state is None:
+        return {}
     mostly = f"not used: {state.mostly}" if state.share < _FEW else "used"
     values = {"IMU": mostly, "IMU used (share of the last frames)": f"{state.share:.0%}"}
     if state.gravity is not None:
@@ -112,10 +122,8 @@ class Condition:
     missing: Sequence[str]  # inputs without which no frame can be localized
     silence: Mapping[str, Silence]  # by input topic
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
-    readout: MeasuredReadout | None = None  # as the camera's motion shows it
-    imu: ImuState | None = None  # None: there is none
     holding: Holding | None = None  # the correction of odometry; None: none is sent
-    of_rig: Mapping[str, str] = field(default_factory=dict)  # of its cameras, by readable names
+    values: Mapping[str, str] = field(default_factory=dict)  # others, by readable names
 
 
 def of_interest(silence: Mapping[str, Silence], missing: Sequence[str]) -> dict[str, Silence]:
@@ -211,14 +219,9 @@ def _judge_frames(summary: Summary, condition: Condition) -> Health:
 
 def _values(condition: Condition, summary: Summary) -> dict[str, str]:
     values = counts(summary, "Frames", "Poses out")
-    if condition.readout is not None:
-        readout, deviation = 1e3 * condition.readout.readout_time, 1e3 * condition.readout.deviation
-        values["Readout time seen (ms)"] = f"{readout:.2f} +- {deviation:.2f}"
     if condition.holding is not None:
         values["Correction of odometry"] = str(condition.holding)
-    values |= condition.of_rig
-    if condition.imu is not None:
-        values |= imu_values(condition.imu)
+    values |= condition.values
     values |= {f"Topic {item.topic}": _heard(item) for item in condition.silence.values()}
     return values | {f"Notice: {name}": text for name, text in condition.oddities.items()}
 

@@ -34,7 +34,9 @@ from rs_localizer.ros.localizer.health import (
     Condition,
     diagnose,
     imu_oddity,
+    imu_values,
     of_interest,
+    readout_values,
     tell,
 )
 from rs_localizer.ros.localizer.transforms import Broadcaster
@@ -390,9 +392,13 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized]):
     def examine(self) -> tuple[Health, str]:
         frames = self._localizer
         missing = () if frames is None else frames.missing
-        watch = None if frames is None else frames.readout_watch
-        imu = None if frames is None else frames.imu.state
-        rig = None if frames is None else frames.rig_watch
+        oddities = self.refusals.recent(_ODD, WINDOW) | self._broadcaster.fault()
+        values: dict[str, str] = {}
+        if frames is not None:
+            watch, rig, imu = frames.readout_watch, frames.rig_watch, frames.imu.state
+            oddities |= imu_oddity(imu) | rig.faults
+            oddities |= {"readout_time": watch.fault} if watch.fault else {}
+            values = readout_values(watch.measured) | rig.values | imu_values(imu)
         inputs = {
             name: item for name, item in self.silence.items() if name in inputs_of(self.config)
         }
@@ -401,15 +407,9 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized]):
             changing=self._feed is not None and self._feed.changing,
             missing=missing,
             silence=of_interest(inputs, missing),
-            oddities=self.refusals.recent(_ODD, WINDOW)
-            | self._broadcaster.fault()
-            | imu_oddity(imu)
-            | ({"readout_time": watch.fault} if watch and watch.fault else {})
-            | (rig.faults if rig else {}),
-            readout=watch.measured if watch else None,
-            imu=imu,
+            oddities=oddities,
             holding=self._broadcaster.holding,
-            of_rig=rig.values if rig else {},
+            values=values,
         )
         health = diagnose(condition, self.statistics.summary())
         return health, "" if frames is None else frames.camera_frame

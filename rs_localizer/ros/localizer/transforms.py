@@ -14,7 +14,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -174,7 +173,9 @@ class Tf:
             text = _text(error)
         except self._errors.TransformException as error:
             raise TransformError(_text(error)) from error
-        latest_ns = self._latest(buffer, target, source)
+        latest_ns = None
+        with contextlib.suppress(self._errors.TransformException):
+            latest_ns = stamp_of(buffer.lookup_transform(target, source, Time()))
         if stamp_ns is not None and latest_ns is not None:
             if latest_ns < stamp_ns:
                 raise NotYetError(text)
@@ -182,11 +183,6 @@ class Tf:
                 # A recording that starts over: tf2 would ignore all that comes from now on.
                 buffer.clear()
         raise TransformError(text)
-
-    def _latest(self, buffer: Any, target: str, source: str) -> int | None:
-        with contextlib.suppress(self._errors.TransformException):
-            return stamp_of(buffer.lookup_transform(target, source, Time()))
-        return None
 
 
 class _WithoutExecutor:
@@ -234,15 +230,6 @@ _MOST_PENDING = 100
 _RESTART = 500_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class _Pending:
-    """A frame whose transform is to be sent."""
-
-    frame: Localized
-    config: NodeConfig
-    deadline: float  # time.monotonic()
-
-
 class Broadcaster:
     """TF's side of the outputs.
 
@@ -266,7 +253,8 @@ class Broadcaster:
         self._timer: Any = None
         self._config: NodeConfig | None = None
         self._sending = threading.Lock()  # of the next three
-        self._pending: deque[_Pending] = deque(maxlen=_MOST_PENDING)
+        # With when they are given up, time.monotonic().
+        self._pending: deque[tuple[Localized, NodeConfig, float]] = deque(maxlen=_MOST_PENDING)
         self._correction, self._map_frame = MapToOdom(), ""
         self._sent_ns = 0  # the newest stamp of map -> odom
         self._holding: Holding | None = None
@@ -333,7 +321,7 @@ class Broadcaster:
             return
         deadline = time.monotonic() + config.transform_tolerance
         with self._sending:
-            self._pending.append(_Pending(frame, config, deadline))
+            self._pending.append((frame, config, deadline))
         self._flush()
 
     def _hear(self, transforms: list[Any]) -> None:
@@ -348,16 +336,14 @@ class Broadcaster:
         with self._sending:
             waiting = list(self._pending)
             self._pending.clear()
-            for item in waiting:
+            for frame, config, deadline in waiting:
                 try:
-                    self._take(item.frame, item.config)
-                except NotYetError as error:
-                    if time.monotonic() < item.deadline:
-                        self._pending.append(item)
-                    else:
-                        self._say(item.config, error)
+                    self._take(frame, config)
                 except TransformError as error:
-                    self._say(item.config, error)
+                    if isinstance(error, NotYetError) and time.monotonic() < deadline:
+                        self._pending.append((frame, config, deadline))
+                    else:
+                        self._say(config, error)
 
     def _take(self, frame: Localized, config: NodeConfig) -> None:
         if config.publish_tf != PublishTf.MAP_TO_ODOM:
