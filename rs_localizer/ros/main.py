@@ -7,6 +7,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Sequence
+from functools import partial
 
 import rs_localizer
 from rs_localizer.process import limit_threads
@@ -73,23 +74,8 @@ def _help(name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the localizer until Ctrl-C or SIGTERM, which end it with exit code 0 at any time."""
-    return _run("localizer", args)
-
-
-def marker_detector(args: list[str] | None = None) -> int:
-    """Run the marker detector likewise."""
-    return _run("marker_detector", args)
-
-
-def feature_detector(args: list[str] | None = None) -> int:
-    """Run the feature detector likewise."""
-    return _run("feature_detector", args)
-
-
 def example_matcher(args: list[str] | None = None) -> int:
-    """Run the matcher of the bundled recording likewise."""
+    """Run the matcher of the bundled recording until it is stopped likewise."""
     words = sys.argv[1:] if args is None else args
     if not {*_HELP}.isdisjoint(words):
         sys.stdout.write(
@@ -108,7 +94,7 @@ def example_matcher(args: list[str] | None = None) -> int:
     return 0
 
 
-def _run(name: str, args: list[str] | None) -> int:
+def _run(name: str, args: list[str] | None = None) -> int:
     limit_threads()
     with StopRequest() as stop:
         try:
@@ -127,3 +113,9 @@ def _run(name: str, args: list[str] | None) -> int:
             sys.stderr.write(f"{name}: {explain(error)}\n")
             return 1
         return run(make, node, stop, args)
+
+
+main = partial(_run, "localizer")
+"""Run the localizer until Ctrl-C or SIGTERM, which end it with exit code 0 at any time."""
+marker_detector = partial(_run, "marker_detector")
+feature_detector = partial(_run, "feature_detector")
