@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,51 +24,26 @@ from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.inertial.turning import turn_between
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraTurn:
-    """The turn of the camera between two frames."""
-
-    from_ns: int
-    to_ns: int
-    rotation: Array  # (3,3) camera_then_from_camera_now
-    deviation: float  # rad, of each axis
-
-
 # Turns that a rotation explains, as a part of their sum of squares that it leaves.
 _EXPLAINED = 0.1
 # Turns about one axis alone say nothing of the others: second singular value to the first.
 _LEAST_SPREAD = 0.02
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Mounting:
-    """A rotation between the axes of the samples and those of the camera."""
+def turned_by(shown: Array, seen: Array) -> float | None:
+    """The angle (rad) between the axes of a gyroscope, as they are said to be, and the camera's.
 
-    rotation: Array  # (3,3) camera_from_samples; the identity if TF is right
-    left: float  # part of the squared turns that it does not explain
-
-    @property
-    def angle(self) -> float:
-        """rad."""
-        return float(np.linalg.norm(so3.log(self.rotation)))
-
-    @property
-    def explains(self) -> bool:
-        return self.left < _EXPLAINED
-
-
-def fit_mounting(shown: Array, seen: Array) -> Mounting | None:
-    """The rotation that fits turns of the gyroscope (n,3) to those of the camera (n,3), both rad.
-
-    None where they do not tell it.
+    None where no rotation carries turns that it has shown (n,3) into those that the camera has
+    seen (n,3), both rad, or where they do not tell it.
     """
     left, sizes, right = np.linalg.svd(seen.T @ shown)
     if not sizes[1] > _LEAST_SPREAD * sizes[0]:
         return None
     sign = np.sign(np.linalg.det(left @ right))
     rotation = np.ascontiguousarray(left * [1.0, 1.0, sign] @ right)
-    return Mounting(rotation, float(np.sum((seen - shown @ rotation.T) ** 2) / np.sum(seen**2)))
+    if np.sum((seen - shown @ rotation.T) ** 2) >= _EXPLAINED * np.sum(seen**2):
+        return None
+    return float(np.linalg.norm(so3.log(rotation)))
 
 
 # So many of the last frames that contradict the gyroscope are no chance.
@@ -96,7 +70,8 @@ class GyroscopeWatch:
         self.dropped = Alone.NONE
         self.angle = 0.0
         self._contradictions: deque[bool] = deque(maxlen=_WATCHED)
-        self._turns: deque[CameraTurn] = deque(maxlen=_KEPT)
+        # From one time (ns) to another, of the camera as a rotation vector.
+        self._turns: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)
         self._last: Orientation | None = None
         self._search = OffsetSearch(step=BY_TURNS)
         self._samples: deque[tuple[IntArray, Array]] = deque()
@@ -151,39 +126,32 @@ class GyroscopeWatch:
         last, self._last = self._last, frame
         if last is None or not 0 < frame.middle_ns - last.middle_ns <= _LONGEST_PAIR_NS:
             return
-        turn = frame.rotation @ last.rotation.T
-        deviation = math.hypot(frame.deviation, last.deviation)
-        self._turns.append(CameraTurn(last.middle_ns, frame.middle_ns, turn, deviation))
+        turn = so3.log(np.ascontiguousarray(last.rotation @ frame.rotation.T))
+        if np.linalg.norm(turn) > _TELLING * math.hypot(frame.deviation, last.deviation):
+            self._turns.append((last.middle_ns, frame.middle_ns, turn))
 
     def _explain(self) -> None:
         """Take it up where the two agree, or say that the mounting does not."""
         if not self._samples:
             return
-        shown, seen = self._compared(ImuSamples(*self.heard))
+        samples, errors = ImuSamples(*self.heard), self._filter.errors
+        pairs = [
+            (so3.log(between.rotation.T.copy()), turn)
+            for from_ns, to_ns, turn in self._turns
+            if (between := turn_between(samples, from_ns, to_ns, errors)) is not None
+        ]
+        shown, seen = np.array(pairs).reshape(-1, 2, 3).transpose(1, 0, 2)
         if len(seen) and np.sum((seen - shown) ** 2) < _ALLOWED * np.sum(seen**2):
             self.take_up()
             return
-        mounting = fit_mounting(shown, seen) if len(seen) else None
-        if mounting is not None and mounting.explains:
-            self.dropped, self.angle = Alone.TURNED, mounting.angle
-        else:
-            self.dropped, self.angle = Alone.DISAGREES, 0.0
+        angle = turned_by(shown, seen) if len(seen) else None
+        self.dropped = Alone.DISAGREES if angle is None else Alone.TURNED
+        self.angle = angle or 0.0
 
     def take_up(self) -> None:
         """Believe it again."""
         self.dropped, self.angle = Alone.NONE, 0.0
         self._contradictions.clear()
-
-    def _compared(self, samples: ImuSamples) -> tuple[Array, Array]:
-        """Turns (k,3) of gyroscope and camera, as rotation vectors; those that say something."""
-        shown, seen = [], []
-        for turn in self._turns:
-            camera = so3.log(np.ascontiguousarray(turn.rotation.T))
-            between = turn_between(samples, turn.from_ns, turn.to_ns, self._filter.errors)
-            if between is not None and np.linalg.norm(camera) > _TELLING * turn.deviation:
-                shown.append(so3.log(between.rotation.T.copy()))
-                seen.append(camera)
-        return np.array(shown).reshape(-1, 3), np.array(seen).reshape(-1, 3)
 
     def status(self, alone: Alone) -> InertialStatus:
         """What to tell."""
