@@ -20,7 +20,7 @@ from rs_localizer.cli.options import (
     argument,
     option,
 )
-from rs_localizer.cli.rig_input import cameras_of, mounting_lines, numbers
+from rs_localizer.cli.rig_input import cameras_of, mounting_lines
 from rs_localizer.cli.settings_args import given_settings, given_topics, remapped
 from rs_localizer.io.image_clock import DEFAULT_START_NS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
@@ -70,54 +70,6 @@ if WORKING:
     from rs_localizer.tools.calibration import Calibration, calibrate
     from rs_localizer.tools.first_lens import covered, first_lens
     from rs_localizer.tools.rig import Mounted, Recording, calibrate_rig
-
-# A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
-_MOST_TURN, _SIGMAS = 1.0, 4.0
-# Who says how the IMU hangs on the camera.
-_GIVEN = "TF, or the axes of a video,"
-# A scale of the gyroscope that is worth a word.
-_LEAST_SCALE = 0.005
-
-
-def _tell_imu(found: Calibration, imu: ImuRecording, config: NodeConfig) -> None:
-    """Rows of the table, and sentences on what is odd."""
-    one = found.mount
-    if one is None:
-        print(f"imu: {found.no_mount}")
-        return
-    offset, spread = 1e3 * (one.time_offset + config.stamp_offset), 1e3 * one.time_offset_deviation
-    turn = numbers(Rotation.from_matrix(one.mount.camera_from_imu).as_quat(canonical=True), 5)
-    error = numbers(np.degrees(one.rotation_deviations), 3)
-    bias, errors = (numbers(np.degrees(each), 3) for each in (one.mount.bias, one.bias_deviations))
-    for name, text, known in (
-        ("imu.time_offset", f"{offset:+.3f} +- {spread:.3f} ms", one.time_offset_determined),
-        (
-            "rotation camera <- imu", f"{turn} (x y z w) +- {error} deg",
-            one.rotation_determined,
-        ),
-        ("gyroscope bias", f"{bias} +- {errors} deg/s", one.bias_determined),
-        ("gyroscope noise", f"{np.degrees(one.noise):.3f} deg/s, {one.samples} samples", True),
-    ):  # fmt: skip
-        print(f"{name:26} {text if known else f'not observable: {text}'}")
-    if one.inflation > 1.0:
-        print(
-            f"imu: parts of the recording have different offsets: the deviation is "
-            f"{one.inflation:.1f} times that of the noise alone"
-        )
-    if imu.camera_from_imu is None:
-        print("imu: TF has no transform from it to the camera; its rotation is not checked")
-    elif one.rotation_determined:
-        off = np.degrees(one.mount.turned_from(imu.camera_from_imu))
-        chance = _SIGMAS * float(np.degrees(np.linalg.norm(one.rotation_deviations)))
-        if off > max(_MOST_TURN, chance):
-            print(f"imu: {_GIVEN} has another rotation, {off:.1f} deg off: is it right?")
-        else:
-            print(f"imu: {_GIVEN} agrees with the rotation to {off:.2f} deg")
-    scales = one.mount.shape[:3]
-    if np.any(np.abs(scales) > np.maximum(_LEAST_SCALE, _SIGMAS * one.shape_deviations[:3])):
-        percent = " ".join(f"{100.0 * scale:+.1f}" for scale in scales)
-        print(f"imu: the gyroscope's scales are {percent} % off (allowed for)")
-
 
 # Beside FILE.yaml, as FILE_...
 _LENS, _MAP = "camera_info.yaml", "map.yaml"
@@ -219,7 +171,7 @@ def _calibrated(args: Any, source: _Source, camera: Camera, config: NodeConfig) 
             camera, source.images, intrinsics=intrinsics, imu=source.imu,
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
-    _tell(found, args.rate)
+    print("\n".join(verdict.table(found, args.rate)))
     image_input.tell_telemetry(
         with_values(args, images=args.recording),
         verdict.readout_time(found),
@@ -227,9 +179,9 @@ def _calibrated(args: Any, source: _Source, camera: Camera, config: NodeConfig) 
         lens=False,
     )
     if intrinsics:
-        _tell_lens(found)
+        print("\n".join(verdict.of_lens(found)))
     if source.imu is not None:
-        _tell_imu(found, source.imu, config)
+        print("\n".join(verdict.of_imu(found, source.imu, config.stamp_offset)))
     if args.plot is not None:
         from rs_localizer.tools.calibration_plots import save_plots
 
@@ -304,49 +256,6 @@ def _detected(args: Any, shots: Iterator[Shot | Carried]) -> _Source:
     new_lens = camera is None
     camera = first_lens(size, in_order(images)) if camera is None else camera
     return _Source(images, camera, new_lens, map=marker_map)
-
-
-def _tell(found: Calibration, rate: float | None) -> None:
-    for name, text in (
-        ("readout time", f"{1e3 * verdict.readout_time(found):.3f} ms"),
-        ("standard deviation", f"{1e3 * found.deviation:.3f} ms"),
-        ("of it by noise alone", f"{1e3 * found.formal_deviation:.3f} ms"),
-        ("scan_direction", str(verdict.scan_direction(found))),
-        ("interval between images", f"{1e3 * found.stamps.interval:.3f} ms"),
-        ("images with a pose", f"{len(found.posed.times)} of {found.images}"),
-        ("noise of the keypoints", f"{found.fit.deviation:.3f} px"),
-        ("keypoints that fit", f"{np.mean(found.fit.inliers):.1%}"),
-        ("spacing of the knots", f"{1e3 * found.fit.state.spline.layout.spacing:.1f} ms"),
-    ):
-        print(f"{name:26} {text}")
-    along = 1e3 * verdict.sense(found)
-    for block in found.blocks:
-        print(
-            f"  {block.start:6.1f} to {block.end:5.1f} s {'':5}"
-            f"{along * block.readout_time:+.3f} +- {1e3 * block.deviation:.3f} ms"
-        )
-    for remark in verdict.remarks(found):
-        print(remark)
-    if rate is not None:
-        share = abs(found.readout_time) / found.stamps.interval
-        print(
-            f"the readout time is {share:.3f} of the interval: it scales with --rate, "
-            f"assumed to be {rate:g} Hz"
-        )
-
-
-def _tell_lens(found: Calibration) -> None:
-    state = found.fit.state
-    deviations = np.sqrt(np.diag(found.fit.border_covariance)[1 : 1 + len(state.lens)])
-    names = ["fx", "fy", "cx", "cy", *(f"D[{k}]" for k in range(len(state.lens) - 4))]
-    print(f"{'lens':26} {found.fit.camera.distortion_model}")
-    for name, value, deviation in zip(names, state.lens, deviations, strict=True):
-        print(f"{name:26} {value:.5g} +- {found.inflation * deviation:.2g}")
-    errors = found.lens
-    print(
-        f"{'what it is off by':26} centre {errors.principal_point:.2g} px, focal length "
-        f"{100.0 * errors.focal_length:.2g} %, distortion {errors.distortion:.2g} px at the corners"
-    )
 
 
 def _write(
@@ -453,9 +362,10 @@ def _calibrate_rig(args: Any) -> None:
         comments += mounting_lines(name, first, mounted.extrinsics, mounted.deviations)
         print("\n".join(comments[-3:]))
         if np.any(mounted.inflations > 1.0):
+            times = verdict.numbers(mounted.inflations, 1)
             print(
                 "parts of the recording differ by more than their noise: the deviations of "
-                f"rotation, place and offset are {numbers(mounted.inflations, 1)} times that"
+                f"rotation, place and offset are {times} times that"
             )
         if len(args.recordings) == 1 and is_bag(args.recordings[0]):
             _tell_tf(args.recordings[0], mounted, cameras[name].frame, cameras[first].frame)

@@ -27,6 +27,7 @@ if WORKING:
     from rs_localizer.offline.recordings import camera_topics, optical_frame, transform_between
     from rs_localizer.tools.adjust.variables import Extrinsics, Mounting
     from rs_localizer.tools.rig import DETERMINED
+    from rs_localizer.tools.verdict import numbers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,11 +105,6 @@ def mounting_lines(name: str, first: str, mounted: Extrinsics, deviations: Array
         f"{f'place in {first}':26} {numbers(1e3 * mounted.centre, 2)} +- {numbers(moved, 2)} mm",
         f"{'offset of its stamps':26} {1e3 * mounted.offset:+.3f} +- {1e3 * deviations[6]:.3f} ms",
     ]
-
-
-def numbers(values: Array, digits: int) -> str:
-    """Values (n,) beside each other."""
-    return " ".join(f"{value:.{digits}f}" for value in values)
 
 
 # What a map is made from.

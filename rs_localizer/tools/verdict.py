@@ -4,10 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.scanning import REVERSED, ScanDirection
+from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools.calibration import Calibration
 
 # Beyond this (s rms) the images' own times are worth a word.
@@ -19,6 +23,13 @@ _REGIONS = (
     ("top left", "top", "top right"), ("left", "middle", "right"),
     ("bottom left", "bottom", "bottom right"),
 )  # fmt: skip
+
+# A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
+_MOST_TURN, _SIGMAS = 1.0, 4.0
+# Who says how the IMU hangs on the camera.
+_GIVEN = "TF, or the axes of a video,"
+# A scale of the gyroscope that is worth a word.
+_LEAST_SCALE = 0.005
 
 
 def readout_time(result: Calibration) -> float:
@@ -123,3 +134,92 @@ def uncovered(result: Calibration) -> list[str]:
         if share > _EMPTY
     ]
     return [f"{empty.mean():.0%}", *names] if names else []
+
+
+def table(found: Calibration, rate: float | None) -> Iterator[str]:
+    """What was found, its parts, and remarks; ``rate``: of the images, as it was given."""
+    for name, text in (
+        ("readout time", f"{1e3 * readout_time(found):.3f} ms"),
+        ("standard deviation", f"{1e3 * found.deviation:.3f} ms"),
+        ("of it by noise alone", f"{1e3 * found.formal_deviation:.3f} ms"),
+        ("scan_direction", str(scan_direction(found))),
+        ("interval between images", f"{1e3 * found.stamps.interval:.3f} ms"),
+        ("images with a pose", f"{len(found.posed.times)} of {found.images}"),
+        ("noise of the keypoints", f"{found.fit.deviation:.3f} px"),
+        ("keypoints that fit", f"{np.mean(found.fit.inliers):.1%}"),
+        ("spacing of the knots", f"{1e3 * found.fit.state.spline.layout.spacing:.1f} ms"),
+    ):
+        yield f"{name:26} {text}"
+    along = 1e3 * sense(found)
+    for block in found.blocks:
+        yield (
+            f"  {block.start:6.1f} to {block.end:5.1f} s {'':5}"
+            f"{along * block.readout_time:+.3f} +- {1e3 * block.deviation:.3f} ms"
+        )
+    yield from remarks(found)
+    if rate is not None:
+        share = abs(found.readout_time) / found.stamps.interval
+        yield (
+            f"the readout time is {share:.3f} of the interval: it scales with --rate, "
+            f"assumed to be {rate:g} Hz"
+        )
+
+
+def of_lens(found: Calibration) -> Iterator[str]:
+    """The lens with its deviations."""
+    state = found.fit.state
+    deviations = np.sqrt(np.diag(found.fit.border_covariance)[1 : 1 + len(state.lens)])
+    names = ["fx", "fy", "cx", "cy", *(f"D[{k}]" for k in range(len(state.lens) - 4))]
+    yield f"{'lens':26} {found.fit.camera.distortion_model}"
+    for name, value, deviation in zip(names, state.lens, deviations, strict=True):
+        yield f"{name:26} {value:.5g} +- {found.inflation * deviation:.2g}"
+    errors = found.lens
+    yield (
+        f"{'what it is off by':26} centre {errors.principal_point:.2g} px, focal length "
+        f"{100.0 * errors.focal_length:.2g} %, distortion {errors.distortion:.2g} px at the corners"
+    )
+
+
+def of_imu(found: Calibration, imu: ImuRecording, stamp_offset: float) -> Iterator[str]:
+    """Rows of the table, and sentences on what is odd."""
+    one = found.mount
+    if one is None:
+        yield f"imu: {found.no_mount}"
+        return
+    offset, spread = 1e3 * (one.time_offset + stamp_offset), 1e3 * one.time_offset_deviation
+    turn = numbers(Rotation.from_matrix(one.mount.camera_from_imu).as_quat(canonical=True), 5)
+    error = numbers(np.degrees(one.rotation_deviations), 3)
+    bias, errors = (numbers(np.degrees(each), 3) for each in (one.mount.bias, one.bias_deviations))
+    for name, text, known in (
+        ("imu.time_offset", f"{offset:+.3f} +- {spread:.3f} ms", one.time_offset_determined),
+        (
+            "rotation camera <- imu", f"{turn} (x y z w) +- {error} deg",
+            one.rotation_determined,
+        ),
+        ("gyroscope bias", f"{bias} +- {errors} deg/s", one.bias_determined),
+        ("gyroscope noise", f"{np.degrees(one.noise):.3f} deg/s, {one.samples} samples", True),
+    ):  # fmt: skip
+        yield f"{name:26} {text if known else f'not observable: {text}'}"
+    if one.inflation > 1.0:
+        yield (
+            f"imu: parts of the recording have different offsets: the deviation is "
+            f"{one.inflation:.1f} times that of the noise alone"
+        )
+    if imu.camera_from_imu is None:
+        yield "imu: TF has no transform from it to the camera; its rotation is not checked"
+    elif one.rotation_determined:
+        off = np.degrees(one.mount.turned_from(imu.camera_from_imu))
+        chance = _SIGMAS * float(np.degrees(np.linalg.norm(one.rotation_deviations)))
+        if off > max(_MOST_TURN, chance):
+            yield f"imu: {_GIVEN} has another rotation, {off:.1f} deg off: is it right?"
+        else:
+            yield f"imu: {_GIVEN} agrees with the rotation to {off:.2f} deg"
+    scales = one.mount.shape[:3]
+    if np.any(np.abs(scales) > np.maximum(_LEAST_SCALE, _SIGMAS * one.shape_deviations[:3])):
+        percent = " ".join(f"{100.0 * scale:+.1f}" for scale in scales)
+        yield f"imu: the gyroscope's scales are {percent} % off (allowed for)"
+
+
+def numbers(values: Array, digits: int) -> str:
+    """Values (n,) beside each other."""
+    return " ".join(f"{value:.{digits}f}" for value in values)
