@@ -3,9 +3,8 @@
 """``python -m benchmarks.load.changes``: what it costs a live node when a setting is changed.
 
 A hand-held camera, 30 images a second that wait for no answer. Every parameter that a running node
-lets be set is set to another value, and back ten frames later. Of the ten frames after the first
-change: those without a pose and the largest standard deviation of the turn rate, beside those of
-the ten before.
+lets be set is set to another value, and back ten frames later. Counted are frames
+without a pose among the ten after the first change, and among the ten before.
 """
 
 from __future__ import annotations
@@ -19,12 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import TwistWithCovarianceStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
 from benchmarks.load.frames import CAMERA, messages
-from rs_localizer.io import topics
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.ros.graph.live import LiveNode
@@ -61,21 +58,11 @@ class Session:
         self._node, self._frame = node, 0
         self._clouds = messages(_POINTS, 0.2, _RATE, count)
         self._info = make_camera_info(CAMERA, 0)
-        self._deviations: list[float] = []
-        own = f"{node.namespace}/{NODE_NAME}"
-        ros = node._node
-        ros.create_subscription(
-            TwistWithCovarianceStamped, f"{own}/{topics.TWIST_WITH_COVARIANCE}", self._take, 10
-        )
-        self._client = ros.create_client(SetParameters, f"{own}/set_parameters")
+        service = f"{node.namespace}/{NODE_NAME}/set_parameters"
+        self._client = node._node.create_client(SetParameters, service)
 
-    def _take(self, message: Any) -> None:
-        turn = np.array(message.twist.covariance).reshape(6, 6)[3:, 3:]
-        self._deviations.append(float(np.sqrt(np.trace(turn) / 3.0)))
-
-    def send(self, count: int) -> tuple[int, float]:
-        """Frames without a pose among so many, and the largest deviation (rad/s)."""
-        self._deviations.clear()
+    def send(self, count: int) -> int:
+        """Frames without a pose among so many."""
         clouds = self._clouds[self._frame : self._frame + count]
         due = time.monotonic()
         for cloud in clouds:
@@ -89,7 +76,7 @@ class Session:
             return sum(stamp_ns(cloud) not in self._node._poses for cloud in clouds)
 
         self._node._until(lambda: not lost() or time.monotonic() > due + _LATE)
-        return lost(), max(self._deviations, default=np.nan)
+        return lost()
 
     def set(self, name: str, value: Any) -> Any:
         """Ask for a parameter to be set; a future of the answer."""
@@ -117,8 +104,7 @@ def main() -> int:
         if not (one.read_only or one.fixed or name == _LEFT_OUT)
         and (value := another(one)) is not None
     }
-    head = ("lost before", "lost after", "deg/s before", "deg/s after")
-    print(f"{'set':44}" + "".join(f"{name:>14}" for name in head))
+    print(f"{'set':44}   lost before   lost after")
     with (
         tempfile.TemporaryDirectory() as place,
         LiveNode(_SETTINGS, Path(place) / "log", 0) as node,
@@ -128,15 +114,12 @@ def main() -> int:
         session = Session(node, count)
         session.send(_FRAMES)
         for name, value in changes.items():
-            lost_before, before = session.send(_FRAMES)
+            before = session.send(_FRAMES)
             default = _SETTINGS.get(name, settings()[name].default)
             answer = session.set(name, value)
-            lost, after = session.send(_FRAMES)
+            after = session.send(_FRAMES)
             refused = session.refusal(answer)
-            figures = (
-                f"{lost_before:14}{lost:14}{np.degrees(before):14.2f}{np.degrees(after):14.2f}"
-            )
-            print(f"{f'{name}: {value}':44}{refused or figures}", flush=True)
+            print(f"{f'{name}: {value}':44}{refused or f'{before:14}{after:13}'}", flush=True)
             session.refusal(session.set(name, default))
             session.send(_SETTLING)
     return 0
