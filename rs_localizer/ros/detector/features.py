@@ -10,7 +10,7 @@ from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
-from rs_localizer.ros.detector.node import Finder, ImageNode, Picture
+from rs_localizer.ros.detector.node import ImageNode, Picture
 from rs_localizer.ros.node.health import State
 from rs_localizer.ros.node.statistics import Told
 from rs_localizer.settings import FEATURES_NAME
@@ -41,5 +41,5 @@ class FeatureDetectorNode(ImageNode[FeatureConfig, Extracted]):
     def draw(self, extracted: Extracted) -> tuple[Image, Picture]:
         return extracted.image, draw_features(extracted.image.pixels, extracted.features)
 
-    def describe(self, finder: Finder[Extracted]) -> str:
+    def describe(self, finder: FrameExtractor) -> str:
         return f"{self.config.features}, at most {self.config.max_keypoints} keypoints an image"

@@ -13,7 +13,7 @@ from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import CORRESPONDENCES
 from rs_localizer.markers.overlay import draw_detections
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.ros.detector.node import Finder, ImageNode, Picture
+from rs_localizer.ros.detector.node import ImageNode, Picture
 from rs_localizer.ros.node.health import State
 from rs_localizer.ros.node.statistics import Told
 from rs_localizer.ros.node.views import MapView
@@ -73,8 +73,7 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
         super().change(config)
         self._show_map(self.make_finder(config))
 
-    def _show_map(self, finder: Finder[Detected]) -> None:
-        assert isinstance(finder, FrameDetector)
+    def _show_map(self, finder: FrameDetector) -> None:
         corners = [marker.corners for marker, _ in finder.map.all_markers()]
         if self._map_view is not None and corners:
             self._map_view.show(finder.map.map_frame, np.array(corners))
@@ -85,8 +84,7 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
     def draw(self, detected: Detected) -> tuple[Image, Picture]:
         return detected.image, draw_detections(detected.image.pixels, detected.detections)
 
-    def describe(self, finder: Finder[Detected]) -> str:
-        assert isinstance(finder, FrameDetector)
+    def describe(self, finder: FrameDetector) -> str:
         marker_map = finder.map
         markers, boards = len(marker_map.markers), len(marker_map.boards)
         return f"{markers} markers and {boards} boards in {marker_map.map_frame}"

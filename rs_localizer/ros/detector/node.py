@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -27,7 +27,6 @@ from rs_localizer.io import topics
 from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make, make_header
 from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
-from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.node.conversion import create_output, make_message
 from rs_localizer.ros.node.health import (
     Health,
@@ -69,29 +68,16 @@ _IMAGES = {IMAGE: ImageMessage, COMPRESSED_IMAGE: CompressedImage}
 _LOOK_PERIOD = 0.2
 
 Settings = TypeVar("Settings", DetectorConfig, FeatureConfig)
-Result_co = TypeVar("Result_co", covariant=True)
-
-
-class Finder(Protocol[Result_co]):
-    """What looks at the images: the class that works offline, too."""
-
-    def take(self, message: Any) -> Result_co | Refusal:
-        """What a sensor_msgs/Image or CompressedImage shows."""
-        ...
-
-    def warm_up(self) -> None:
-        """Compile the kernels."""
-        ...
 
 
 @dataclass(slots=True)
-class Work(Generic[Result]):
+class Work:
     """What the worker alone touches."""
 
-    finder: Finder[Result]
+    finder: Any
 
 
-class ImageNode(ManagedNode[Settings, Work[Result], Result], Generic[Settings, Result]):
+class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
     """Looks at images; see :class:`rs_localizer.ros.node.managed.ManagedNode`.
 
     A node says what it looks for by overriding :meth:`make_finder`, :meth:`make_cloud`,
@@ -117,8 +103,12 @@ class ImageNode(ManagedNode[Settings, Work[Result], Result], Generic[Settings, R
 
     # -- what a node looks for ---------------------------------------------------------------
 
-    def make_finder(self, config: Settings) -> Finder[Result]:
-        """Raise ``ValueError`` for settings that cannot be used."""
+    def make_finder(self, config: Settings) -> Any:
+        """What looks at images, the class that works offline, too.
+
+        Raises:
+            ValueError: for settings that cannot be used.
+        """
         raise NotImplementedError
 
     def make_cloud(self, result: Result, make: Make) -> Any:
@@ -129,7 +119,7 @@ class ImageNode(ManagedNode[Settings, Work[Result], Result], Generic[Settings, R
         """An image and its debug picture, in the worker's thread."""
         raise NotImplementedError
 
-    def describe(self, finder: Finder[Result]) -> str:
+    def describe(self, finder: Any) -> str:
         """What the node is active with, for the log."""
         raise NotImplementedError
 
@@ -137,7 +127,8 @@ class ImageNode(ManagedNode[Settings, Work[Result], Result], Generic[Settings, R
 
     def kernels(self) -> Callable[[], None]:
         try:
-            return self.make_finder(self.config).warm_up
+            warm_up: Callable[[], None] = self.make_finder(self.config).warm_up
+            return warm_up
         except ValueError:  # of which on_configure tells, at once
             return lambda: None
 
@@ -176,7 +167,7 @@ class ImageNode(ManagedNode[Settings, Work[Result], Result], Generic[Settings, R
         if self.worker is not None:
             self.worker.update("settings", lambda work: self._change(work, config))
 
-    def _change(self, work: Work[Result], config: Settings) -> None:
+    def _change(self, work: Work, config: Settings) -> None:
         work.finder = self.make_finder(config)
 
     def examine(self) -> tuple[Health, str]:
@@ -210,7 +201,7 @@ class ImageNode(ManagedNode[Settings, Work[Result], Result], Generic[Settings, R
         return self._listening[-1] if self._listening else IMAGE
 
 
-def _image_topics(worker: Worker[Work[Result], Result]) -> dict[str, Topic]:
+def _image_topics(worker: Worker[Work, Result]) -> dict[str, Topic]:
     """Both topics of images, whose messages go to the worker."""
 
     def images(topic: str) -> Callable[[Any], None]:
