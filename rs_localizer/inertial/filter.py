@@ -13,7 +13,7 @@ update of the whole filter: given the motion, the image says nothing more of the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -110,9 +110,8 @@ class GyroscopeFilter:
 
     def walk(self, seconds: float) -> None:
         """Let time pass."""
-        errors, covariance = self.errors, self.errors.covariance.copy()
-        covariance.flat[:: turning.PARAMETERS + 1] += seconds * self._walks
-        self.errors = GyroscopeErrors(errors.bias, errors.time_offset, covariance, errors.noise)
+        covariance = self.errors.covariance + np.diag(seconds * self._walks)
+        self.errors = replace(self.errors, covariance=covariance)
 
     def predict(
         self,
@@ -184,7 +183,7 @@ class GyroscopeFilter:
         """Frames contradict the time offset: it is not known as well as it seemed to be."""
         covariance = self.errors.covariance.copy()
         covariance[OFFSET, OFFSET] = (_DOUBT * OFFSET_DEVIATION) ** 2
-        self._set(np.append(self.errors.bias, self.errors.time_offset), covariance)
+        self.errors = replace(self.errors, covariance=covariance)
 
     def hear_delay(self, delay: float, variance: float) -> bool:
         """Take in what the rows of a frame say of the time offset: to be later by ``delay`` (s).
@@ -196,12 +195,10 @@ class GyroscopeFilter:
         """
         covariance = self.errors.covariance
         total = float(covariance[OFFSET, OFFSET]) + variance + JITTER**2
-        if not self._settings.estimate_time_offset:
+        if not self._settings.estimate_time_offset or (math.isinf(variance) and delay == 0.0):
             return True
-        if (math.isinf(variance) and delay != 0.0) or delay * delay > _MOST_DELAY * total:
+        if math.isinf(variance) or delay * delay > _MOST_DELAY * total:
             return False
-        if math.isinf(variance):
-            return True
         gain = covariance[:, OFFSET] / total
         parameters = np.append(self.errors.bias, self.errors.time_offset) + gain * delay
         self._with_motion = self._with_motion - np.outer(self._with_motion[:, OFFSET], gain)
@@ -219,8 +216,7 @@ class GyroscopeFilter:
         if not whole:
             tied = posterior[:, known] @ np.linalg.solve(after, tied)
         self._with_motion = np.ascontiguousarray(tied)
-        bias, time_offset = errors.bias + change[BIAS], errors.time_offset + float(change[OFFSET])
-        self.errors = GyroscopeErrors(bias, time_offset, covariance, errors.noise)
+        self._set(np.append(errors.bias, errors.time_offset) + change, covariance)
         gained = errors.covariance[OFFSET, OFFSET] - covariance[OFFSET, OFFSET]
         return bool(change[OFFSET] ** 2 <= _MOST_MOVED * max(gained, 0.0) + _ROUNDING)
 
