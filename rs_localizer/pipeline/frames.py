@@ -618,7 +618,7 @@ class FrameLocalizer:
             self._notice(Notice.DOUBTFUL, text)
         if result.left_out:
             self._notice(Notice.DOUBTFUL, result.left_out)
-        if (off := self._tracker.smooth_error) > 0.0 and not watch.axis_in_doubt:
+        if (off := self._tracker.smooth_error) > 0.0 and not watch.axis.doubtful:
             self._notice(Notice.LENS, lens_is_off(off))
         return self._made(cloud, result, deviation)
 
@@ -636,7 +636,7 @@ class FrameLocalizer:
             self._camera.first_row_time,
             watch.may_be_reversed,
             watch.surely_global,
-            watch.other_axis,
+            watch.axis.other,
         )
         if moment is None:
             moment = published_moment(self._config, self._camera, cloud.stamp_ns)

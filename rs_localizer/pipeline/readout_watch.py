@@ -199,7 +199,7 @@ class ReadoutWatch:
 
     def reset(self) -> None:
         """Forget all frames."""
-        self._estimate, self._axis = ReadoutEstimate(), ScanAxis()
+        self._estimate, self.axis = ReadoutEstimate(), ScanAxis()
         self._said: set[str] = set()
         # What the last seconds of motion showed; None: nothing yet.
         self.measured: MeasuredReadout | None = None
@@ -220,21 +220,11 @@ class ReadoutWatch:
         self.trusted = True
 
     @property
-    def other_axis(self) -> Estimate | None:
-        """What the last frame is along the other axis, if the shutter may move along that."""
-        return self._axis.other
-
-    @property
-    def axis_in_doubt(self) -> bool:
-        """Whether frames fit better with the other axis: then nothing else that they say holds."""
-        return self._axis.doubtful
-
-    @property
     def wrong_axis(self) -> str:
         """Why no pose may be published: the shutter moves along the other axis; empty: it may."""
-        if self._axis.wrong and self._axis.direction is None:
+        if self.axis.wrong and self.axis.direction is None:
             return "the image fits a shutter along the other axis better than scan_direction"
-        return self.fault if self._axis.wrong else ""
+        return self.fault if self.axis.wrong else ""
 
     @property
     def of_rest(self) -> float:
@@ -248,7 +238,7 @@ class ReadoutWatch:
             its settings, with the readout time and scan direction that were measured where they
             ask for it.
         """
-        config, axis = frame.config, self._axis
+        config, axis = frame.config, self.axis
         estimates = config.estimate_readout_time and config.readout_time == 0.0
         wanted = estimates or config.readout_time > 0.0
         if not (wanted and find_solver(config.solver).rolling_shutter):
@@ -271,7 +261,7 @@ class ReadoutWatch:
 
     def _other_axis(self, config: NodeConfig, estimates: bool) -> NodeConfig:
         """Say that the shutter moves along the other axis, or adopt it."""
-        measured, direction = self._axis.measured, self._axis.direction
+        measured, direction = self.axis.measured, self.axis.direction
         assert measured is not None
         assert direction is not None
         value = _milliseconds(abs(measured.readout_time), measured.deviation)
@@ -312,7 +302,7 @@ class ReadoutWatch:
         elif doubt < -_SUSPICIOUS:
             self.trusted = True
         if enough and found - _SURELY * measured.deviation > FAR_OFF * usual:
-            self._axis.confirm()
+            self.axis.confirm()
 
     def _contradict(self, kind: str, text: str) -> None:
         self.fault = text
