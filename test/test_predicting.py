@@ -13,6 +13,7 @@ import rs_localizer as rsl
 from rs_localizer.config import Acceleration
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.motion_model import acceleration_covariance, predict
+from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.refine import apply_step
 
 READOUT = 0.03
@@ -28,13 +29,7 @@ def motion_of(vector):
 
 
 def state(motion):
-    return np.concatenate(
-        [
-            motion.rotation.ravel(), motion.translation,
-            motion.angular_velocity, motion.linear_velocity,
-            motion.angular_acceleration, motion.linear_acceleration,
-        ]
-    )  # fmt: skip
+    return state_in(motion, np.zeros(3))
 
 
 def start(accelerations):

@@ -12,21 +12,13 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Mounts
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.prior import state_in
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]])
 
 
 def state_of(motion):
-    return np.concatenate(
-        [
-            motion.rotation.ravel(),
-            motion.translation,
-            motion.angular_velocity,
-            motion.linear_velocity,
-            motion.angular_acceleration,
-            motion.linear_acceleration,
-        ]
-    )
+    return state_in(motion, np.zeros(3))
 
 
 def motion_of(state):

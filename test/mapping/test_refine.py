@@ -5,38 +5,27 @@
 from dataclasses import replace
 
 import numpy as np
-import projector
 import pytest
 from dense import normal_of
 from scenes import (
-    BACK,
-    CENTRE,
-    MOUNTED,
     READOUT,
-    UP,
-    Carried,
     Walk,
     camera,
-    hand,
-    is_mounted_back,
     walk,
 )
 from scipy.linalg import eigh
-from scipy.stats import chi2
 
-from rs_localizer.core import so3
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.system import Factored
 from rs_localizer.tools.adjust.variables import Freedom, State
 from rs_localizer.tools.mapping.gauge import through
-from rs_localizer.tools.mapping.observations import MapObservations, RigCamera, Start
+from rs_localizer.tools.mapping.observations import MapObservations, RigCamera
 from rs_localizer.tools.mapping.refine import (
     MapFreedom,
     Preparation,
     RefinedMap,
     refine,
-    refine_rig,
 )
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
@@ -165,49 +154,3 @@ def test_what_is_no_map_is_refused(video):
         refine(camera(), video.seen, video.start, MapFreedom(deviations=one))
     with pytest.raises(ValueError, match="stamps must rise"):
         replace(video.seen, stamps_ns=video.seen.stamps_ns[::-1])
-
-
-def test_cameras_that_never_see_the_same_refine_one_map():
-    rng = np.random.default_rng(8)
-    motion = hand(rng)
-    before, behind = projector.room(rng, 80), projector.room(rng, 80) @ BACK + CENTRE
-    points, stamps = np.concatenate([before, behind]), np.arange(0.0, 1.2, 1.0 / 20.0)
-    moves = (motion, Carried(motion, BACK, CENTRE))
-    exact = [
-        [
-            projector.expose(moving, stamp + 0.007 * k, (1 - 2 * k) * READOUT, points)
-            for stamp in stamps.tolist()
-        ]
-        for k, moving in enumerate(moves)
-    ]
-    pixels = np.concatenate(exact)  # (g,p,2)
-    images, landmarks = np.nonzero(np.isfinite(pixels[..., 0]))
-    times = np.concatenate([stamps, stamps + 0.007])
-    cameras = np.repeat([0, 1], len(stamps))
-    seen = MapObservations(
-        10**12 + np.round(1e9 * times).astype(np.int64),
-        images,
-        landmarks,
-        pixels[images, landmarks] + rng.normal(0.0, 0.3, (len(images), 2)),
-        cameras,
-    )
-    turns, places = zip(
-        *(m.pose(t) for m, t in zip(moves, np.split(times, 2), strict=True)), strict=True
-    )
-    start = Start(
-        points + rng.normal(0.0, 0.02, points.shape),
-        np.concatenate(turns) @ so3.exp_many(rng.normal(0.0, 0.004, (len(times), 3))),
-        np.concatenate(places) + rng.normal(0.0, 0.02, (len(times), 3)),
-    )
-    rig = [RigCamera(camera()), RigCamera(UP, mounting=MOUNTED)]
-    # Landmarks of which each camera knows some hold the map.
-    known = np.full(len(points), np.inf)
-    known[:4] = known[80:84] = 0.02
-    found = refine_rig(rig, seen, start, MapFreedom(deviations=known))
-    off = found.points - points
-    of = found.refined
-    assert np.count_nonzero(of[:80]) > 40
-    assert np.count_nonzero(of[80:]) > 40
-    squared = np.einsum("ni,nij,nj->n", off[of], np.linalg.inv(found.covariances[of]), off[of])
-    assert np.mean(squared < chi2.isf(0.05, 3)) > 0.85
-    is_mounted_back(found.cameras[1])

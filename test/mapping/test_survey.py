@@ -8,18 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenes import (
-    BACK,
-    CENTRE,
-    MOUNTED,
     READOUT,
-    UP,
-    Carried,
     camera,
-    hand,
-    is_mounted_back,
     ring,
     spot,
-    spot_along,
 )
 from scipy.spatial.transform import Rotation
 
@@ -27,8 +19,8 @@ from rs_localizer.io.transforms import Transform
 from rs_localizer.markers.families import family
 from rs_localizer.markers.map_check import other_units
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.tools.mapping.survey import Survey, survey, survey_rig
-from rs_localizer.tools.mapping.unknown_markers import Chained, Filmed, Spotted, chain, every_marker
+from rs_localizer.tools.mapping.survey import Survey, survey
+from rs_localizer.tools.mapping.unknown_markers import Chained, Spotted, chain, every_marker
 
 SIZE = 0.15
 STAMPS = np.arange(0.0, 3.0, 1.0 / 30.0)
@@ -89,14 +81,6 @@ def test_what_does_not_hang_together_is_named(spotted):
     assert [[marker.id for marker in part] for part in found.apart] == [[3, 4]]
 
 
-def test_a_wrong_readout_time_is_named(spotted, right):
-    assert not right.cameras[0].readout_check.differs
-    wrong = survey(camera(0.7 * READOUT), spotted, MARKERS).cameras[0].readout_check
-    assert wrong.differs
-    assert wrong.estimated == pytest.approx(READOUT, abs=3e-3)
-    assert survey(camera(0.0), spotted, MARKERS).cameras[0].readout_check is None
-
-
 def test_a_survey_that_few_corners_fit_is_refused(spotted):
     with pytest.raises(ValueError, match=r"% of the corners fit .* check the readout time"):
         survey(camera(0.3 * READOUT), spotted, MARKERS)
@@ -140,22 +124,3 @@ def test_a_marker_that_was_turned_over_is_turned_back(spotted, poses, origin, mo
     found = survey(camera(), spotted[:40], MARKERS, origin=origin)
     assert found.rare == ()
     check(found, poses, 0.03)
-
-
-def test_cameras_that_never_see_the_same_make_one_map():
-    rng = np.random.default_rng(5)
-    front, behind = ring(rng, 4, SIZE), ring(rng, 4, SIZE)
-    poses = [*front, *((BACK.T @ turn, BACK.T @ place + CENTRE) for turn, place in behind)]
-    motion = hand(rng, 0.25)
-    stamps = np.arange(0.0, 2.5, 1.0 / 20.0)
-    seen = spot_along(rng, motion, poses, SIZE, stamps)
-    carried = Carried(motion, BACK, CENTRE)
-    also = spot_along(rng, carried, poses, SIZE, stamps + 0.007, readout=-READOUT)
-    assert not {*np.concatenate([one.markers for one in seen])} & {
-        *np.concatenate([one.markers for one in also])
-    }
-    rear = Filmed(UP, mounting=MOUNTED, spotted=also)
-    found = survey_rig([Filmed(camera(), spotted=seen), rear], MARKERS)
-    assert [marker.id for marker in found.markers] == list(range(8))
-    check(found, poses, 0.03)
-    is_mounted_back(found.cameras[1])

@@ -84,23 +84,6 @@ def test_rows_say_what_the_messages_say(flights: list[Path], tmp_path: Path) -> 
         assert (row["points"], row["map_frame"]) == (100, "map")
 
 
-def test_what_is_there_is_not_replaced(flights: list[Path], tmp_path: Path, capsys) -> None:
-    """Once said after the replay, whose poses were then gone; a table replaced any file."""
-    notes, out = tmp_path / "notes.txt", tmp_path / "out"
-    notes.write_text("mine")
-    for place, text in (
-        (notes, "notes.txt is no earlier result of --parquet"),
-        (notes / "a.parquet", "a.parquet cannot be written: Not a directory"),
-    ):
-        words = [str(flights[1]), "--out", str(out), "--parquet", str(place), "--overwrite"]
-        assert main(["replay", *words, *SHUTTER]) == 1
-        told = capsys.readouterr()
-        assert text in told.err
-        assert "frames per second" not in told.out
-        assert not out.exists()
-    assert notes.read_text() == "mine"
-
-
 _ALONE = """
 import pickle, sys
 import rs_localizer as rsl

@@ -15,7 +15,6 @@ from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import Observed
 from rs_localizer.tools.calibration import Calibration, calibrate
 from rs_localizer.tools.first_lens import first_lens
-from rs_localizer.tools.readout_belief import examine
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 
@@ -57,17 +56,6 @@ def test_readout_time_and_direction(scene, request):
     assert found.odds > 10.0
     assert found.jitter == 0.0
     assert verdict.refusal(found) == ""
-
-
-def test_the_reversed_direction_is_found_and_images_without_the_board_are_not_missing():
-    images = list(recording(-0.02))
-    nothing = np.zeros((0, 3)), np.zeros((0, 2))
-    images[30:33] = [Observed(image.stamp_ns, *nothing) for image in images[30:33]]
-    found = calibrate(CAMERA, images)
-    agrees(found, -0.02, 1e-4)
-    assert verdict.scan_direction(found) == "bottom_to_top"
-    assert found.stamps.missing == 0
-    assert found.images == len(images) - 3
 
 
 def test_a_global_shutter_is_one():
@@ -140,13 +128,3 @@ def test_the_distortion_model_is_that_of_the_lens(model, deep):
     assert found.distortion_model == model
     corner = np.array([[0.8, 0.6]]) if model == "equidistant" else np.array([[0.5, 0.4]])
     np.testing.assert_allclose(found.distort(corner)[0], camera.distort(corner)[0], atol=1.0)
-
-
-def test_stamps_of_an_even_camera_with_missing_images():
-    times = np.delete(np.arange(100) / 30.0, [10, 11, 50])
-    found = examine(times)
-    assert found.interval == pytest.approx(1 / 30, rel=1e-9)
-    assert found.missing == 3
-    assert not found.irregular
-    rng = np.random.default_rng(0)
-    assert examine(times + 7e-4 * rng.normal(size=len(times))).irregular

@@ -10,10 +10,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools.adjust.observe import Observed
-from rs_localizer.tools.adjust.spline import Layout, Spline
-from rs_localizer.tools.adjust.variables import GyroSamples
 from rs_localizer.tools.calibration import calibrate
-from rs_localizer.tools.imu import first_mount
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 CAMERA_FROM_IMU = Rotation.from_rotvec([0.3, -1.2, 0.7]).as_matrix()
@@ -27,11 +24,6 @@ def gyroscope(
     times = np.arange(-0.1, seconds + 0.1, 0.005)
     rates = motion.twist(times)[0] @ CAMERA_FROM_IMU @ (np.eye(3) + shape)
     return times - OFFSET, rates + BIAS + rng.normal(0.0, 0.01, rates.shape)
-
-
-def spline_of(motion: projector.Motion, seconds: float, spacing: float) -> Spline:
-    layout = Layout.over(np.array([[0.0, seconds]]), spacing)
-    return Spline(layout, *motion.pose(layout.control_times()))
 
 
 def test_offset_rotation_and_bias_are_found():
@@ -61,14 +53,3 @@ def test_offset_rotation_and_bias_are_found():
     assert np.all(np.abs(mount.mount.shape - truth) < 5.0 * mount.shape_deviations)
     assert mount.noise == pytest.approx(0.01, rel=0.2)
     assert abs(found.readout_time - readout) < 4.0 * found.deviation < 2e-4
-
-
-def test_a_turn_about_one_axis_leaves_the_rotation_about_it_open():
-    """A rotation that is given stands in where the motion says nothing."""
-    rng = np.random.default_rng(2)
-    motion = projector.Motion.random(rng)
-    motion.amplitudes[1:3] = 0.0
-    samples = GyroSamples(*gyroscope(rng, motion, 3.0, np.zeros((3, 3))))
-    mount = first_mount(samples, spline_of(motion, 3.0, 1 / 30), CAMERA_FROM_IMU)
-    assert abs(mount.delay - OFFSET) < 5e-3
-    assert mount.turned_from(CAMERA_FROM_IMU) < np.radians(3.0)
