@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer.core.shutter import project_rolling
+from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tracking import FrameContext, Tracker
 
 READOUT = 0.03
@@ -289,3 +290,39 @@ def test_after_a_third_of_a_second_without_the_board_no_pose_jumps():
         true = pose(22 / 30.0)[0].as_matrix()
         errors.append(Rotation.from_matrix(found.rotation @ true.T).magnitude())
     assert np.degrees(np.max(errors)) < 1.5
+
+
+class Shaken(Hand):
+    """The same, shaken by an angle (deg) at so many Hz."""
+
+    def __init__(self, degrees, hertz):
+        self.swing = np.radians(degrees) * np.array([0.6, 0.64, 0.48])
+        self.rate = 2.0 * np.pi * hertz
+
+    def pose(self, t):
+        rotation, place = super().pose(t)
+        return rotation @ Rotation.from_rotvec(
+            np.sin(self.rate * t) * self.swing
+        ).as_matrix(), place
+
+
+def test_turn_rates_of_a_shaken_camera_are_covered():
+    drone, tracker, lengths = Shaken(0.1, 20.0), Tracker(rsl.Localizer(CAMERA)), []
+    for t in times(20):
+        found = tracker.localize(ns(t), *drone.frame(t, 100, WALL, noise=0.1))
+        twist = twist_at(found, 0.0, READOUT)
+        off = twist.angular - drone.motion(t).angular_velocity / READOUT
+        lengths.append(off @ np.linalg.solve(twist.covariance[3:, 3:], off))
+    assert np.mean(np.array(lengths[3:]) < 7.8) > 0.85  # 95 % of three degrees of freedom
+
+
+def test_vibration_within_frames_is_not_remembered_as_an_error_of_the_map():
+    """Either moves points alike: what explains the frame is what the next one hears of."""
+    drone, tracker, off = Shaken(0.3, 60.0), Tracker(rsl.Localizer(CAMERA)), []
+    for t in times(40):
+        found = tracker.localize(ns(t), *drone.frame(t, 80, noise=0.3))
+        assert found
+        step = Rotation.from_matrix(found.rotation @ drone.pose(t)[0]).magnitude()
+        off.append(np.degrees(step))
+    assert np.median(off[10:]) < 0.09
+    assert tracker.smooth_error == 0.0

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.scales import FACTORS, SPEEDS
+from rs_localizer.core.scales import FACTORS, SPEEDS, Scales
 from rs_localizer.core.shake import MIDDLE_RATES, shake_at
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, POSE, POSE_SIZE
@@ -253,26 +253,17 @@ def _with_turn(
             log_sizes.append(math.log(steady.shared))
         fits = [
             fit_turn(
-                observations.packed,
-                observations.count,
-                best.state,
-                terms,
-                threshold,
-                gate,
-                noise,
-                odds,
-                steady.bend,
-                log_size,
-                smooth.log_size,
-                smooth.precision,
+                observations.packed, observations.count, best.state, terms, threshold, gate, noise,
+                odds, steady.bend, log_size, smooth.log_size, smooth.precision,
                 assumed.focal_length,
             )
             for log_size in log_sizes
-        ]
-        fit = max(fits, key=lambda one: one.evidence if one.finite else -math.inf)
+        ]  # fmt: skip
+        evidences = [one.evidence if one.finite else -math.inf for one in fits]
+        fit = fits[(best_size := int(np.argmax(evidences)))]
         kept, had = np.count_nonzero(fit.inliers), np.count_nonzero(best.inliers)
         if fit.finite and kept >= _KEPT * had and not (wide and fit.freedom < kept):
-            shaken = _of_fit(observations, steady, fit, threshold)
+            shaken = _of_fit(observations, steady, fit, threshold, math.exp(log_sizes[best_size]))
             shaken, ratio = _at_any_speed(shaken, fit, terms, assumed, slowest)
             # As if any speed left it, where vibration hardly shows.
             return _either(steady, evidence, max(fit.evidence + ratio, evidence + gain), shaken)
@@ -283,9 +274,12 @@ def _with_turn(
 
 
 def _of_fit(
-    observations: Observations, steady: Posterior, fit: TurnFit, threshold: float
+    observations: Observations, steady: Posterior, fit: TurnFit, threshold: float, size: float
 ) -> Posterior:
-    """The posterior of a camera that turns within the frame."""
+    """The posterior of a camera that turns within the frame, beside a smooth error of a size (px).
+
+    What a steady camera would need of that tells the next frames nothing.
+    """
     lines = linearized(
         observations.packed, observations.count, fit.state,
         shake_at(observations.tau, fit.turns),
@@ -296,8 +290,8 @@ def _of_fit(
         inliers=fit.inliers, squared_errors=fit.squared_errors, shake=fit.turns, arched=None,
         agreement=neighbours_agree(lines.errors, lines.tau, lines.image, fit.inliers),
         near_outliers=near_outliers(lines, fit.squared_errors, fit.inliers, threshold),
-        speeds=np.zeros(0), mirror=None,
-        scales=steady.scales._replace(vibrations=told, speeds=_NOTHING),
+        speeds=np.zeros(0), mirror=None, shared=size,
+        scales=Scales(np.zeros(2), told, _NOTHING),
     )  # fmt: skip
 
 
@@ -379,5 +373,7 @@ def _either(
         covariance=covariance,
         arched=None,
         shake=turns,
-        scales=steady.scales._replace(vibrations=vibrations, speeds=weight * steady.scales.speeds),
+        scales=Scales(
+            steady.scales.size * [1.0, weight], vibrations, weight * steady.scales.speeds
+        ),
     )
