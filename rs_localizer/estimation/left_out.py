@@ -171,9 +171,10 @@ def _not_strewn(observed: Observed, posterior: Posterior) -> float:
 def _with_another_length(
     search: MotionSearch, observed: Observed, posterior: Posterior, threshold: float
 ) -> tuple[int, float]:
-    """How many more points fit with another focal length, and with which (a part of K's)."""
+    """How many more points fit as well with another focal length, and with which part of K's."""
     observations, most = observed.observations, (0, 1.0)
-    inliers, by_ray = int(np.count_nonzero(posterior.inliers)), observed.sighted.usable.by_ray
+    fitting, by_ray = posterior.squared_errors[posterior.inliers], observed.sighted.usable.by_ray
+    gate = max(math.sqrt(fitting.max(initial=0.0)), threshold)
     rough = GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
     for length in _LENGTHS:
         rays, columns = observations.rays / length, by_ray * length
@@ -184,8 +185,8 @@ def _with_another_length(
         found = search.optimize(
             replace(observed, observations=seen), posterior.state, 2.0 * rough, observed.terms
         )
-        fitting = np.count_nonzero(seen.within(found.state, WIDEST_GATE * threshold))
-        most = max(most, (int(fitting) - inliers, length))
+        within = int(np.count_nonzero(seen.within(found.state, gate)))
+        most = max(most, (within - len(fitting), length))
     return most
 
 
