@@ -35,7 +35,8 @@ _MARGIN = 2.0  # px from the rim
 _NEAREST, _FARTHEST = 0.3, 30.0  # m
 _INSIDE = 12.592  # 95 % quantile of chi-squared with six degrees of freedom
 _RATE = 30.0  # Hz
-_AHEAD = (0.01, 0.033)  # s after the middle of an image, for which the tracker is asked
+_AHEAD = (0.01, 0.03, 0.1)  # s after the middle of an image, for which the tracker is asked
+_EVERY = 0.001  # s, within rows and between images
 _ROOM, _POINTS = 3.0, 20_000  # m about a trajectory
 _BAND, _TONES, _SHORT_SPACING = (4.0, 40.0), 24, 0.002  # Hz of shaking; s
 _SPACING = 0.005  # s, of the samples of a trajectory
@@ -175,20 +176,41 @@ def judge(recording: Recording, motion: Motion) -> dict[str, Row]:
     localizer = Localizer(camera)
     single = [(frame.middle_ns, localizer.localize(frame.points, frame.pixels)) for frame in frames]
     rows["single"] = _row([(ns, one) for ns, one in single if one], camera, motion)
-    for ahead in _AHEAD:
-        tracker, predicted = Tracker(Localizer(camera)), []
-        for each in frames:
-            tracker.localize(each.middle_ns, each.points, each.pixels)
-            there = tracker.at(each.middle_ns + round(1e9 * ahead))
-            if there is not None:
-                predicted.append((there.time_ns, there))
-        rows[f"tracked, {1e3 * ahead:.0f} ms ahead"] = _row(predicted, camera, motion)
     for lag in (0, 1, 2):
         tracker = Tracker(Localizer(camera), output_lag=lag)
         found = [tracker.localize(each.middle_ns, each.points, each.pixels) for each in frames]
         tracked = [(one.time_ns, one) for one in [*found, *tracker.flush()] if one]
         rows[f"tracked, {lag} later" if lag else "tracked"] = _row(tracked, camera, motion)
     return rows
+
+
+def at_any_time(recording: Recording, motion: Motion) -> dict[str, Row]:
+    """``Tracker.at`` within rows, between images and ahead; beside poses held, and moved on as the
+    last image moved.
+    """
+    camera, tracker = recording.camera, Tracker(Localizer(recording.camera))
+    found: dict[str, list[tuple[int, Estimate]]] = {}
+    before: Estimate | None = None
+    half = round(0.5e9 * camera.readout_time)
+    for each in recording.frames:
+        one = tracker.localize(each.middle_ns, each.points, each.pixels)
+        if not one:
+            continue
+        asked = [("within rows", half * k // 8) for k in range(-8, 9)]
+        if before is not None:
+            gap = range(before.time_ns + half - each.middle_ns, -half, round(1e9 * _EVERY))
+            asked += [("between images", later) for later in gap]
+        asked += [(f"{1e3 * ahead:.0f} ms ahead", round(1e9 * ahead)) for ahead in _AHEAD]
+        for name, later in asked:
+            there = tracker.at(each.middle_ns + later)
+            others = {"": there}
+            if later > half:
+                others |= {", held": one, ", same velocity": one.at_time(1e-9 * later)}
+            for how, estimate in others.items():
+                if estimate is not None:
+                    found.setdefault(name + how, []).append((each.middle_ns + later, estimate))
+        before = one
+    return {name: _row(some, camera, motion) for name, some in found.items()}
 
 
 def _seconds(middle_ns: int) -> float:
@@ -234,7 +256,7 @@ def _percentiles(errors: Array) -> Array:
     return found
 
 
-def text(rows: dict[str, Row], images: int) -> str:
+def text(rows: dict[str, Row]) -> str:
     """The table."""
     lines = [
         "| | localized | deg | mm | deg/s | m/s | pose, twist inside (%) |",
@@ -244,7 +266,7 @@ def text(rows: dict[str, Row], images: int) -> str:
         cells = [f"{a:.3g}, {b:.3g}" if np.isfinite(a) else "" for a, b in row.errors]
         inside = ", ".join(f"{100.0 * x:.0f}" for x in row.inside if np.isfinite(x))
         lines.append(
-            f"| {name} | {row.localized} of {images} | " + " | ".join([*cells, inside]) + " |"
+            f"| {name} | {row.localized} | " + " | ".join([*cells, inside]) + " |"
         )
     return "\n".join(lines)
 
@@ -267,7 +289,8 @@ def main(argv: Sequence[str]) -> None:
     motion = replace(motion, end=min(motion.end, motion.start + args.seconds))
     camera = TrueCamera(readout_time=args.readout_time)
     recording = simulated(args.folder.name, motion, points, camera, args.points, args.noise)
-    table = text(judge(recording, motion), len(recording.frames))
+    rows = judge(recording, motion) | at_any_time(recording, motion)
+    table = text(rows)
     print(table)
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "aria.md").write_text(table + "\n", encoding="utf-8")
