@@ -265,9 +265,7 @@ def text(rows: dict[str, Row]) -> str:
     for name, row in rows.items():
         cells = [f"{a:.3g}, {b:.3g}" if np.isfinite(a) else "" for a, b in row.errors]
         inside = ", ".join(f"{100.0 * x:.0f}" for x in row.inside if np.isfinite(x))
-        lines.append(
-            f"| {name} | {row.localized} | " + " | ".join([*cells, inside]) + " |"
-        )
+        lines.append(f"| {name} | {row.localized} | " + " | ".join([*cells, inside]) + " |")
     return "\n".join(lines)
 
 

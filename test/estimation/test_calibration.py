@@ -176,3 +176,12 @@ def test_points_of_a_curled_sheet_are_inliers_beside_its_bend():
         found = localizer.localize(flat, pixels + rng.normal(0.0, 0.3, pixels.shape))
         assert found, found
         assert found.inliers.all()
+
+
+def test_regions_before_a_wall_count_the_smooth_errors_of_all_modes():
+    """A calibration with distortion that the lens has not: 0.21 of 14 when the fastest counted.
+
+    It is 1 to 2 px off, so that half of the frames are refused; of 200, 0.69 of 72 are inside.
+    """
+    distorted = rsl.Localizer(replace(CAMERA, D=np.array([0.03, 0.0, 0.0, 0.0, 0.0])))
+    assert inside(distorted, 0.0, noise=1.0, least=0.4) >= 0.6

@@ -10,6 +10,7 @@ import pytest
 
 import rs_localizer as rsl
 from benchmarks.gross import deviations, frame
+from rs_localizer.core.shutter import project_rolling
 
 
 def results(scene, fault, count=6):
@@ -68,3 +69,31 @@ def test_a_moved_corner_is_a_notice():
     assert not result.inliers[moved].any()
     assert "left out at the left of the image have a pose of their own" in result.left_out
     assert np.abs(result.rotation - rotation).max() < 0.01
+
+
+def test_two_fifths_of_the_matches_that_are_shifted_alike_are_left_out():
+    random = np.random.default_rng(3)
+    for shift in (6.0, 12.0, 25.0):
+        camera, points, pixels, rotation = frame("volume", "right", random)
+        some = random.permutation(len(points))[: 2 * len(points) // 5]
+        pixels[some] += (shift, 0.0)
+        result = rsl.Localizer(camera).localize(points, pixels)
+        assert result
+        assert not result.inliers[some].any()
+        assert np.abs(result.rotation - rotation).max() < 0.01
+
+
+def test_a_fast_camera_may_leave_out_a_few_points_that_lie_near():
+    """As a phone in a car, whose matches come from tracks."""
+    random = np.random.default_rng(3)
+    for speed in (5.0, 15.0):
+        velocity = 0.02 * np.array([speed, 0.0, 0.0])
+        camera = rsl.Camera(640, 480, [[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]],
+                            readout_time=0.02)  # fmt: skip
+        points = random.uniform((-9.0, -7.0, 15.0), (9.0, 7.0, 25.0), (300, 3))
+        truth = rsl.Motion(np.eye(3), np.zeros(3), np.zeros(3), velocity)
+        pixels, _ = project_rolling(camera, truth.at_rows, points)
+        seen = camera.inside(pixels)
+        points, pixels = points[seen], pixels[seen] + random.normal(0.0, 0.3, (seen.sum(), 2))
+        pixels[::15] += random.uniform(-30.0, 30.0, (len(pixels[::15]), 2))
+        assert rsl.Localizer(camera).localize(points, pixels)

@@ -154,3 +154,30 @@ def test_what_is_no_map_is_refused(video):
         refine(camera(), video.seen, video.start, MapFreedom(deviations=one))
     with pytest.raises(ValueError, match="stamps must rise"):
         replace(video.seen, stamps_ns=video.seen.stamps_ns[::-1])
+
+
+def test_step_and_covariances_are_those_of_the_dense_system():
+    problem, state = small_problem()
+    matrix, slope = normal_of(problem.groups, problem.terms(state, 5.0))
+    inverse, factored = np.linalg.inv(matrix), Factored(problem.system(state, 5.0))
+    expected = -np.linalg.solve(matrix, slope)
+    found = factored.step()
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
+    of_landmarks, shared = factored.block_covariances()
+    motion, kept = problem.groups.motion, problem.groups.kept
+    for k, covariance in enumerate(of_landmarks):
+        at = slice(kept + 3 * k, kept + 3 * k + 3)
+        np.testing.assert_allclose(covariance, inverse[at, at], rtol=1e-5, atol=1e-12)
+    at = slice(motion, kept)
+    np.testing.assert_allclose(shared, inverse[at, at], rtol=1e-5, atol=1e-12)
+
+
+def test_the_slope_is_the_derivative_of_the_cost():
+    rng = np.random.default_rng(2)
+    problem, state = small_problem()
+    slope = normal_of(problem.groups, problem.terms(state, 5.0))[1]
+    direction = rng.normal(size=len(slope)) * 1e-6
+    costs = [problem.system(problem.moved(state, s * direction), 5.0).cost for s in (-1.0, 1.0)]
+    # Half the cost; noise moves with the flow, whose own derivative is left out.
+    assert 0.25 * (costs[1] - costs[0]) == pytest.approx(slope @ direction, rel=0.02)
+    assert costs[0] > 0.0

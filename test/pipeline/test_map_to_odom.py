@@ -98,3 +98,15 @@ def test_a_jump_that_nothing_explains_is_told():
     assert told.startswith("map -> odom jumps by 45 cm and 23 deg after 1.0 s, ")
     # A recording that starts over is none.
     assert correction.take(found(SECOND, place(9, 0, 0)), odom, two_d=False) == ""
+
+
+def test_it_is_held_for_ever_or_as_long_as_is_wanted():
+    correction = MapToOdom()
+    assert correction.held(SECOND, 0.0) is None
+    assert correction.holding(SECOND, place(0, 0, 0)) is None
+    assert correction.take(found(SECOND, place(1, 0, 0)), place(0, 0, 0), two_d=False) == ""
+    for hold, seconds, there in ((0.0, 1e4, True), (2.0, 1.9, True), (2.0, 2.1, False)):
+        held = correction.held(SECOND + round(seconds * SECOND), hold)
+        assert (held is not None) == there
+    correction.forget()
+    assert correction.held(SECOND, 0.0) is None

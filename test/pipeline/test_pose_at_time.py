@@ -227,3 +227,15 @@ def test_what_no_row_has_seen_grows_with_the_distance(known):
             found = pose_at(there, at).covariance[3:, 3:]
             np.testing.assert_allclose(found, expected * np.eye(3), rtol=1e-6, atol=1e-14)
         assert (moved.covariance.diagonal()[6:9] > 0.5 * seen).all()
+
+
+def test_an_estimate_beside_a_gyroscope_moves_on_in_the_axes_of_then():
+    samples = np.linspace(-1.0, 1.0, 41)
+    turn = GyroRotation.of(samples, 0.3 + 0.1 * np.sin(np.outer(samples, [20.0, 25.0, 30.0])))
+    seen = replace(estimate(0.5, acceleration=0.02), span=READOUT_TIME)
+    seen = seen.turned(turn, (0.0, np.inf))
+    for tau in (-0.5, 0.3, 0.8):
+        moved = seen.at_time(tau * READOUT_TIME)
+        for of in (pose_at, lambda motion, tau: twist_at(motion, tau, READOUT_TIME)):
+            expected, found = of(seen, tau).covariance, of(moved, 0.0).covariance
+            np.testing.assert_allclose(found, expected, atol=0.01 * np.abs(expected).max())

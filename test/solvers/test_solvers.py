@@ -199,3 +199,40 @@ assert calls
 def test_another_global_shutter_solver_of_the_table_is_called():
     """A row was accepted once, and P3P called."""
     subprocess.run([sys.executable, "-c", OF_ANOTHER_GLOBAL_SHUTTER], check=True)
+
+
+def angles(rotations, truth):
+    """Degrees between rotations (h,k,3,3) and (h,3,3)."""
+    relative = np.einsum("hkij,hlj->hkil", rotations, truth)
+    flat = relative.reshape(-1, 3, 3)
+    result = np.full(len(flat), np.nan)
+    finite = np.isfinite(flat).all(axis=(1, 2))
+    result[finite] = np.degrees(Rotation.from_matrix(flat[finite]).magnitude())
+    return result.reshape(relative.shape[:2])
+
+
+def test_relinearising_converges_from_far_where_freezing_does_not(minimal):
+    p = minimal.problem(500, 6, np.radians(10), 0.1, np.radians(30), seed=5)
+    share = {}
+    for as_published in (False, True):
+        rotation = solve("r6p_vcwt", p, iterations=8, as_published=as_published)[0]
+        share[as_published] = np.mean(angles(rotation, p.rotation) < 2.0)
+    assert share[False] > 0.85
+    assert share[True] < 0.5 * share[False]
+
+
+def test_joint_gives_the_solutions_of_both(minimal):
+    p = minimal.problem(20, 6, 0.1, 0.1, 0.05, noise=1e-3, seed=9)
+    both = solve("joint", p)
+    for k, name in enumerate(("r6p_vct_w", "r6p_vcwt")):
+        for together, alone in zip(both, solve(name, p), strict=True):
+            np.testing.assert_array_equal(together[:, k], alone[:, 0])
+
+
+def test_vcwt_converges_to_the_truth_of_the_double_linearised_model(minimal):
+    p = minimal.problem(50, 6, 0.1, 0.1, 0.05, model="double", seed=2)
+    rotation, c, w, t = solve("r6p_vcwt", p, iterations=30, as_published=True)
+    good = (angles(rotation, p.rotation)[:, 0] < 1e-7) & (np.abs(c[:, 0] - p.c).max(axis=1) < 1e-8)
+    assert good.mean() > 0.95
+    assert np.abs(w[good, 0] - p.w[good]).max() < 1e-7
+    assert np.abs(t[good, 0] - p.t[good]).max() < 1e-7

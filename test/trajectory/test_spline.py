@@ -53,3 +53,26 @@ def test_a_constant_turn_and_a_straight_line_are_kept():
     np.testing.assert_allclose(states.positions, t[:, None] * velocity, atol=1e-12)
     np.testing.assert_allclose(states.angular, np.tile(rate, (7, 1)), atol=1e-12)
     np.testing.assert_allclose(states.angular_acceleration, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-6, 0.2, 1.0])
+def test_jacobians_are_finite_differences(turn):
+    rng = np.random.default_rng(2)
+    spline = random_spline(rng, turn)
+    t = np.array([1.0, 1.013, 1.05, 1.171, 1.3])
+    first, analytic = spline.jacobians(t)
+    for k in range(6 * len(spline.positions)):
+        step = np.zeros(6 * len(spline.positions))
+        step[k] = H
+        plus, minus = spline.moved(step).states(t), spline.moved(-step).states(t)
+        numeric = np.column_stack([
+            [so3.log(np.ascontiguousarray(a.T @ b))
+             for a, b in zip(minus.rotations, plus.rotations, strict=True)],
+            plus.positions - minus.positions,
+            plus.angular - minus.angular,
+            plus.linear - minus.linear,
+        ]) / (2 * H)  # fmt: skip
+        for m in range(len(t)):
+            local = k - 6 * first[m]
+            expected = analytic[m, :, local] if 0 <= local < 24 else np.zeros(12)
+            np.testing.assert_allclose(numeric[m], expected, atol=2e-6, rtol=1e-6)

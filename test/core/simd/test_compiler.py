@@ -124,3 +124,10 @@ def test_without_a_compiler_a_kernel_is_compiled_where_it_is_called(start, tmp_p
     assert process.returncode == 0, errors
     assert "kernels are compiled again at the next start" in errors
     assert out.splitlines()[0] == "1 _exp_many"
+
+
+def test_who_must_not_wait_compiles_what_cannot_be_had_elsewhere(start, tmp_path):
+    """Or frames would be refused for ever where the cache cannot be written."""
+    (tmp_path / "cache").write_text("a file")
+    process = start("import warnings\nwarnings.simplefilter('ignore')\n" + AT_ONCE)
+    assert said(process) == ["True True"]
