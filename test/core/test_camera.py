@@ -24,6 +24,11 @@ def pixels(count=200, seed=0):
     return np.random.default_rng(seed).uniform([0, 0], [639, 479], (count, 2))
 
 
+def test_a_matrix_of_nine_numbers_as_camera_info_has_it():
+    K = [500.0, 0.0, 319.5, 0.0, 510.0, 239.5, 0.0, 0.0, 1.0]
+    np.testing.assert_array_equal(Camera(640, 480, K).K, np.reshape(K, (3, 3)))
+
+
 def test_width_and_height_that_are_exchanged():
     K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
     with pytest.raises(ValueError, match="of 640x480, not of 480x640: are width and height exch"):
@@ -144,3 +149,14 @@ def test_inside_is_the_area_of_the_pixels():
 def test_an_impossible_camera_is_refused_with_what_was_found(changes, said):
     with pytest.raises(ValueError, match=said):
         camera(**changes)
+
+
+def test_what_people_and_files_give_is_taken():
+    """Lists, no distortion, and sizes as JSON has them."""
+    K = [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
+    camera = Camera(1280.0, np.int64(720), K, None)
+    assert (camera.width, camera.height) == (1280, 720)
+    assert type(camera.width) is int
+    assert camera.D.shape == (0,)
+    np.testing.assert_array_equal(camera.K, np.array(K, float))
+    assert Camera(640, 480, K, [0.1, 0, 0, 0]).D.tolist() == [0.1, 0, 0, 0]

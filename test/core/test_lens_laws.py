@@ -63,6 +63,13 @@ def test_rays_come_back_from_their_pixels(model):
         np.testing.assert_allclose(camera.rays(camera.distort(RAYS)[0]), RAYS, atol=1e-6)
 
 
+@pytest.mark.parametrize("model", DistortionModel)
+def test_a_single_image_corrects_the_lowest_powers_only(model):
+    orders = model.law.correctable
+    assert orders[:2] == (0, 1)
+    assert all(order is None or order < 2 for order in orders)
+
+
 def khomutenko(x, y, z, alpha, beta):
     """Equation 12 of the paper."""
     rho = math.sqrt(z * z + beta * (x * x + y * y))
@@ -117,6 +124,13 @@ def test_wide_lenses_are_those_of_their_papers(model):
     rays = camera.rays(expected)
     np.testing.assert_allclose(rays[ahead], (points[:, :2] / points[:, 2:])[ahead], atol=1e-5)
     assert np.isnan(rays[points[:, 2] < 0.0]).all()
+
+
+@pytest.mark.parametrize("model", WIDE)
+def test_wide_lenses_say_what_they_do_not_see(model):
+    camera = Camera(640, 480, K, WIDE[model][0], model)
+    assert np.isnan(camera.project(np.array([[0.0, 1e-3, -1.0]]))).all()
+    assert np.isnan(camera.bearings(np.array([[310.0, 1e5]]))).all()
 
 
 @pytest.mark.parametrize("model", [DistortionModel.EUCM, DistortionModel.DOUBLE_SPHERE])

@@ -69,3 +69,12 @@ def test_a_camera_is_where_its_extrinsics_say():
     mounts = pair().exposure().mounts
     seen = mounts.axes[1] @ (np.array([0.3, 0.2, 2.0]) - mounts.centres[1])
     np.testing.assert_allclose(seen, DOWN[0] @ [0.3, 0.2, 2.0] + DOWN[1])
+
+
+def test_stamps_must_be_of_one_frame():
+    with pytest.raises(ValueError, match="no camera 'left'"):
+        pair().exposure(["left"])
+    with pytest.raises(ValueError, match="lack 'down'"):
+        pair().exposure(stamps={"up": 1.0})
+    with pytest.raises(ValueError, match="in seconds"):
+        pair().exposure(stamps={"up": 0.0, "down": 33.3})
