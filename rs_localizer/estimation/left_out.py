@@ -19,6 +19,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.state import MOVE, TURN, step_between
 from rs_localizer.core.types import Failure
+from rs_localizer.estimation.mirror import is_plane
 from rs_localizer.estimation.observations import Observations, Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior
 from rs_localizer.estimation.residuals import linearized
@@ -173,6 +174,8 @@ def _with_another_length(
 ) -> tuple[int, float]:
     """How many more points fit as well with another focal length, and with which part of K's."""
     observations, most = observed.observations, (0, 1.0)
+    if is_plane(observations.points, np.ones(observations.count, np.bool_)):
+        return most  # it fits any, by another distance
     fitting, by_ray = posterior.squared_errors[posterior.inliers], observed.sighted.usable.by_ray
     gate = max(math.sqrt(fitting.max(initial=0.0)), threshold)
     rough = GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
