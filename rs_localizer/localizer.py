@@ -27,6 +27,7 @@ from rs_localizer.estimation.acceptance import refusal, speeding, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
 from rs_localizer.estimation.left_out import LeftOut, left_out
+from rs_localizer.estimation.mirror import is_plane
 from rs_localizer.estimation.observations import (
     NEAREST,
     Observed,
@@ -160,6 +161,7 @@ class Localizer:
         self.localize(points, pixels, np.arange(count, dtype=np.float64), prior=prior)
         self.localize(points, pixels)
         pivot_of(np.eye(18))  # by a tracker
+        is_plane(np.zeros((4, 3)), np.ones(4, np.bool_))  # where points are left out
         # And with one that shakes, rows to and fro.
         swing = 2.0 * self.config.inlier_threshold * np.sin(12.0 * self.camera.row_time(pixels))
         self.localize(points, pixels + np.outer(swing, self.camera.row_time_gradient[::-1] != 0.0))
