@@ -368,7 +368,7 @@ def _replay(
 
 # Notices of a frame that could not follow the one before.
 _RESTARTS = ("time_went_back", "map_changed")
-_WIDTH = 96
+_WIDTH = 96  # columns of a terminal that is not narrow
 
 
 @contextlib.contextmanager

@@ -5,12 +5,15 @@
 import re
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 import rs_localizer as rsl
 from benchmarks.gross import deviations, frame
 from rs_localizer.core.shutter import project_rolling
+
+ZERO, BENT = np.zeros(3), np.array([-0.4, 0.0, 0.0, 0.0])
 
 
 def results(scene, fault, count=6):
@@ -97,3 +100,19 @@ def test_a_fast_camera_may_leave_out_a_few_points_that_lie_near():
         points, pixels = points[seen], pixels[seen] + random.normal(0.0, 0.3, (seen.sum(), 2))
         pixels[::15] += random.uniform(-30.0, 30.0, (len(pixels[::15]), 2))
         assert rsl.Localizer(camera).localize(points, pixels)
+
+
+def test_a_board_before_a_bent_lens_is_told_of_no_focal_length():
+    """A plane fits any, by another distance."""
+    places = 0.03 * np.array([(x, y, 0.0) for y in range(9) for x in range(13)])
+    places -= places.mean(axis=0)
+    camera = rsl.Camera(640, 480, [[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]])
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        turn = cv2.Rodrigues(random.normal(0.0, 0.35, 3))[0]
+        seen = places @ turn.T + [*random.uniform(-0.05, 0.05, 2), 0.42]
+        bent = cv2.projectPoints(seen, ZERO, ZERO, camera.K, BENT)[0]
+        pixels = bent[:, 0] + random.normal(0.0, 0.15, (len(seen), 2))
+        shown = camera.inside(pixels)
+        result = rsl.Localizer(camera, map_deviation=0.0003).localize(places[shown], pixels[shown])
+        assert result or "focal length of" not in result.detail

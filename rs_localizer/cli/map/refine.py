@@ -38,7 +38,7 @@ if WORKING:
     from rs_localizer.tools.mapping.observations import RecordedMap, RigCamera, from_recordings
     from rs_localizer.tools.mapping.refine import MapFreedom, RefinedMap, refine_rig
 
-_HOLD = 0.001  # m, deviation of landmarks of known place
+_HOLD = 0.001  # m, of landmarks of known place: as a tape or a total station measures them
 _step = partial(print, "adjusted:", flush=True)
 
 
