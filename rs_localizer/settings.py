@@ -11,14 +11,21 @@ import contextlib
 import difflib
 import json
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
 from rs_localizer.config import NO_NAMES, CameraSettings, DetectorConfig, FeatureConfig, NodeConfig
-from rs_localizer.io.yaml_text import YamlError, file_faults, load_yaml
+from rs_localizer.io.yaml_text import (
+    LENS,
+    YamlError,
+    file_faults,
+    flat,
+    load_yaml,
+    parameter_blocks,
+)
 
 NODE_NAME = "rs_localizer"
 DETECTOR_NAME = "marker_detector"
@@ -28,10 +35,8 @@ NODES: dict[Kind, str] = {
     DetectorConfig: DETECTOR_NAME,
     FeatureConfig: FEATURES_NAME,
 }
-# Parameters that every ROS 2 node may have; they say nothing about poses.
-_FOREIGN = ("use_sim_time", "qos_overrides", "start_type_description_service")
-# What a camera's file has beside its parameters.
-_LENS = "lens"
+# Parameters that every ROS 2 node may have, and the lens in a camera's file: no settings.
+_FOREIGN = ("use_sim_time", "qos_overrides", "start_type_description_service", LENS)
 
 
 Kind = type[NodeConfig] | type[DetectorConfig] | type[FeatureConfig]
@@ -97,7 +102,7 @@ def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
 def unknown(name: str, kind: Kind = NodeConfig) -> str | None:
     """What to say of a name that is no setting; None for settings and what every node may have."""
     names = settings(kind)
-    if name in names or name.split(".")[0] in (*_FOREIGN, _LENS) or _of_camera(name, kind):
+    if name in names or name.split(".")[0] in _FOREIGN or _of_camera(name, kind):
         return None
     close = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(names)}"
@@ -172,14 +177,18 @@ def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
         tree = load_yaml(path.read_text(encoding="utf-8"))
     values: dict[str, Any] = {}
     node = NODES[kind]
-    blocks = list(_blocks(tree, "", node))
+    blocks = list(parameter_blocks(tree, node))
     for name, parameters in blocks:
         if not isinstance(parameters, dict):
             raise SettingsError(f"{path}: ros__parameters of {name} must be a mapping")
-        values.update(_flatten(parameters, ""))
+        values.update(flat(parameters))
     if not blocks:
         raise SettingsError(f"{path} has no ros__parameters for /{node} (or /**)")
-    return {name: _checked(name, value, str(path), kind) for name, value in values.items()}
+    return {
+        name: _checked(name, value, str(path), kind)
+        for name, value in values.items()
+        if name.split(".")[0] not in _FOREIGN
+    }
 
 
 def camera_values(path: Path) -> dict[str, Any]:
@@ -209,29 +218,6 @@ def parse_assignment(text: str) -> tuple[str, Any]:
         raise SettingsError(f"the value of {text!r} cannot be read") from error
 
 
-def _blocks(tree: Any, path: str, node: str) -> Iterator[tuple[str, Any]]:
-    """Blocks ``ros__parameters`` whose node name, given as a path or nested, is ours."""
-    if not isinstance(tree, dict):
-        return
-    for key, value in tree.items():
-        if key == "ros__parameters":
-            if path.rsplit("/", 1)[-1] in (node, "*", "**"):
-                yield path, value
-        else:
-            yield from _blocks(value, f"{path}/{str(key).strip('/')}", node)
-
-
-def _flatten(parameters: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for key, value in parameters.items():
-        name = f"{prefix}{key}"
-        if name.split(".")[0] in (*_FOREIGN, _LENS):
-            continue
-        if isinstance(value, dict):
-            yield from _flatten(value, f"{name}.")
-        else:
-            yield name, value
-
-
 def _checked(name: str, value: Any, where: str, kind: Kind) -> Any:
     known = _of_camera(name, kind) or name
     if known not in settings(kind):
@@ -248,12 +234,37 @@ def _checked(name: str, value: Any, where: str, kind: Kind) -> Any:
 
 def write_parameters(path: Path, values: Mapping[str, Any]) -> None:
     """Write values by dotted name as a params file, for ``replay --params`` and nodes."""
-    config = build(values)  # refuses wrong ones
-    lines = [
-        f"    {name}: {json.dumps(value.value if isinstance(value, Enum) else value)}\n"
-        for name, value in values.items()
-    ]
-    path.write_text(
-        f"/**/{NODES[type(config)]}:\n  ros__parameters:\n{''.join(lines)}",  # in any namespace
-        encoding="utf-8",
-    )
+    _write(path, f"/**/{NODE_NAME}", values)  # in any namespace
+
+
+def write_camera_file(
+    path: Path,
+    values: Mapping[str, Any],
+    lens: Mapping[str, Any],
+    remarks: Sequence[str] = (),
+) -> None:
+    """Write what is known of a camera or of a rig, for ``--camera`` and ``camera_file``.
+
+    Args:
+        values: the settings, by dotted name.
+        lens: as ``io.calibration.lens_parameters`` or ``io.rigs.mounted_lenses`` have it.
+        remarks: lines of comment.
+    """
+    _write(path, "/**", {**values, LENS: lens}, remarks)  # a node may have any name
+
+
+def _write(path: Path, nodes: str, values: Mapping[str, Any], remarks: Sequence[str] = ()) -> None:
+    build(values)  # refuses wrong ones
+    lines = [*(f"# {text}" for text in remarks), f"{nodes}:", "  ros__parameters:"]
+    lines += _lines(values, "    ")
+    path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+
+
+def _lines(values: Mapping[str, Any], indent: str) -> Iterator[str]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield f"{indent}{name}:"
+            yield from _lines(value, f"{indent}  ")
+        else:
+            plain = value.value if isinstance(value, Enum) else value
+            yield f"{indent}{name}: {json.dumps(plain)}"

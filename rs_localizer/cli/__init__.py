@@ -70,13 +70,12 @@ def _clear(directory: Path) -> None:
             path.unlink()
 
 
-def refuse_existing(args: Any, *beside: str) -> None:
-    """Raise ``ValueError`` if ``args.out`` exists and is not to be replaced, or a file beside it.
+def refuse_existing(args: Any, *others: Path) -> None:
+    """Raise ``ValueError`` if ``args.out`` or another file exists and is not to be replaced.
 
-    So it does if nothing can be written there. Beside ``OUT.yaml``, ``lens.yaml`` stands for
-    ``OUT_lens.yaml``.
+    So it does if nothing can be written there.
     """
-    for path in (args.out, *(args.out.with_name(f"{args.out.stem}_{name}") for name in beside)):
+    for path in (args.out, *others):
         if path.exists() and not args.overwrite:
             raise ValueError(f"{path} exists; choose another OUT, or --overwrite")
     check_writable(args.out)

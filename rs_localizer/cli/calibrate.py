@@ -15,11 +15,7 @@ from typing import Any
 from rs_localizer.cli import WORKING, image_input, refuse_existing, with_values, write_all
 from rs_localizer.cli.image_input import ImageOptions, given_lens
 from rs_localizer.cli.marker_map import TargetOptions, find_map
-from rs_localizer.cli.options import (
-    UsageError,
-    argument,
-    option,
-)
+from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.cli.rig_input import cameras_of, mounting_lines
 from rs_localizer.cli.settings_args import given_settings, given_topics, remapped
 from rs_localizer.io.image_clock import DEFAULT_START_NS
@@ -32,29 +28,18 @@ if WORKING:
 
     from rs_localizer.config import CalibrationErrors, DetectorConfig, NodeConfig
     from rs_localizer.core.camera import Camera, DistortionModel
+    from rs_localizer.io import rigs
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
-    from rs_localizer.io.calibration import (
-        kalibr_fields,
-        lens_parameters,
-        write_calibration,
-    )
+    from rs_localizer.io.calibration import lens_parameters, write_calibration
     from rs_localizer.io.imu import ImuRecording
     from rs_localizer.io.maps.files import read_map_file
-    from rs_localizer.io.rigs import (
-        RigParts,
-        node_parameters,
-        write_camchain,
-        write_static_transforms,
-    )
+    from rs_localizer.io.rigs import RigParts
     from rs_localizer.markers.boards import BoardSizes
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.offline.detect import seen_by
     from rs_localizer.offline.fleet import Figures
-    from rs_localizer.offline.image_sources import (
-        Carried,
-        Shot,
-    )
+    from rs_localizer.offline.image_sources import Carried, Shot
     from rs_localizer.offline.recordings import (
         optical_frame,
         read_imu_recording,
@@ -63,7 +48,7 @@ if WORKING:
     )
     from rs_localizer.offline.replay import find_topics, has_frames
     from rs_localizer.pipeline.images import FrameDetector
-    from rs_localizer.settings import write_parameters
+    from rs_localizer.settings import write_camera_file
     from rs_localizer.tools import verdict
     from rs_localizer.tools.adjust.lens import LensErrors
     from rs_localizer.tools.adjust.observe import Observed, in_order
@@ -72,8 +57,8 @@ if WORKING:
     from rs_localizer.tools.rig import Mounted, Recording, calibrate_rig
 
 # Beside FILE.yaml, as FILE_...
-_LENS, _MAP = "camera_info.yaml", "map.yaml"
-_TRANSFORMS, _CAMCHAIN = "transforms.launch.xml", "camchain.yaml"
+_MAP, _TRANSFORMS = "map.yaml", "transforms.launch.xml"
+Writers = dict[Path, Callable[[Path], object]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +71,7 @@ class Options(TargetOptions, ImageOptions):
         "the recordings are those of cameras on one body, one each, or one bag has topics of "
         "several, or one video several lenses (.insv): find where the cameras are, and their "
         "clocks, too; the first one's axes and clock are the rig's. Cameras are named as their "
-        "files, or as their topics begin; --camera is a camchain, or FILE of all as "
-        "FILE#NAME", default=False,
+        "files, or as their topics begin; so are the lenses of --camera", default=False,
     )  # fmt: skip
     intrinsics: bool = option("find the lens as well", default=False)
     imu: bool = option(
@@ -95,10 +79,12 @@ class Options(TargetOptions, ImageOptions):
         "rotation, bias", default=False,
     )  # fmt: skip
     out: Path | None = option(
-        "what is known of the camera, lens and shutter: --camera of the other commands, params "
-        "file and camera_file of the node", "FILE.yaml",
+        "all that is known of the camera or the rig, lens and shutter: --camera of the other "
+        "commands, params file and camera_file of the node", "FILE.yaml",
     )  # fmt: skip
-    camera_info: Path | None = option("also the lens alone, for ROS drivers", "FILE")
+    camera_info: Path | None = option(
+        "also the lens alone, for ROS drivers (of a rig, FILE_NAME for each)", "FILE"
+    )
     overwrite: bool = option("replace an earlier result", default=False)
     plot: Path | None = option("directory for pictures", "DIR")
 
@@ -118,6 +104,8 @@ class _Source:
 def run(options: Options) -> Figures | None:
     if options.out is not None and options.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {options.out}")
+    if options.camera_info is not None and options.out is None:
+        raise UsageError("--camera-info goes with --out")
     topic = remapped(options).get(IMU, "") if options.imu else None
     args = with_values(options, imu=topic, recording=options.recordings[0])
     if args.rig:
@@ -125,15 +113,15 @@ def run(options: Options) -> Figures | None:
         return None
     if len(args.recordings) > 1:
         raise UsageError("several recordings are those of a --rig")
-    return calibrate_one(args)
+    return _calibrate_one(args)
 
 
-def calibrate_one(args: Any) -> Figures:
+def _calibrate_one(args: Any) -> Figures:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
-        refuse_existing(args, *([_MAP] if args.map or args.board else []))
-    if args.camera_info is not None:
-        refuse_existing(with_values(args, out=args.camera_info))
+        of_images = args.map is not None or args.board is not None
+        maps = [_beside(args, _MAP)] if of_images else []
+        refuse_existing(args, *maps, *_lens_files(args).values())
     config = given_settings(args)
     source = _read(args, config)
     intrinsics = args.intrinsics or source.new_lens
@@ -157,6 +145,20 @@ def calibrate_one(args: Any) -> Figures:
         "with_a_pose": len(found.posed.times),
         "noise_px": float(found.fit.deviation),
     }
+
+
+def _beside(args: Any, name: str) -> Path:
+    """The file beside ``OUT.yaml``, as ``OUT_map.yaml``."""
+    out: Path = args.out
+    return out.with_name(f"{out.stem}_{name}")
+
+
+def _lens_files(args: Any, cameras: Sequence[str] = ("",)) -> dict[str, Path]:
+    """Files of lenses alone by camera, where they are wanted; of a rig, ``FILE_NAME`` of each."""
+    file: Path | None = args.camera_info
+    if file is None:
+        return {}
+    return {name: file.with_stem(f"{file.stem}_{name}") if name else file for name in cameras}
 
 
 def _calibrated(args: Any, source: _Source, camera: Camera, config: NodeConfig) -> Calibration:
@@ -274,47 +276,72 @@ def _write(
     Returns:
         Whether there was anything to write.
     """
-    path: Path = args.out
     shape = args.map
-    text = "/**:\n  ros__parameters:\n" + (
-        f"    # readout_time {refused}\n    scan_direction: {config.scan_direction}\n"
-        if refused
-        else f"    readout_time: {verdict.readout_time(found)!r}\n"
-        f"    readout_time_deviation: {found.deviation!r}\n"
-        f"    scan_direction: {verdict.scan_direction(found)}\n"
-    )
-    mount = found.mount
-    if mount is not None and mount.time_offset_determined and not refused:
-        text += f"    imu.time_offset: {mount.time_offset + config.stamp_offset!r}\n"
-    writers: dict[Path, Callable[[Path], object]] = {}
-    # Those of a lens that was given hold on.
-    errors = found.lens if intrinsics else config.calibration
-    for name in found.lens._fields:
-        value = getattr(errors, name)
-        if intrinsics or value != getattr(CalibrationErrors(), name):
-            text += f"    calibration.{name}: {value:.4g}\n"
+    values: dict[str, Any] = {"scan_direction": config.scan_direction}
+    if not refused:
+        values = {
+            "readout_time": verdict.readout_time(found),
+            "readout_time_deviation": found.deviation,
+            "scan_direction": verdict.scan_direction(found),
+        }
+        if found.mount is not None and found.mount.time_offset_determined:
+            values["imu.time_offset"] = found.mount.time_offset + config.stamp_offset
+    writers = Writers()
     if marker_map is not None:
         if verdict.shape_is_free(found):
             places = verdict.moved(found, marker_map.points)
             marker_map = marker_map.with_points(places, found.shape_deviation)
         if verdict.shape_is_free(found) or shape is None:
-            shape = path.with_name(f"{path.stem}_{_MAP}")
+            shape = _beside(args, _MAP)
             writers[shape] = partial(write_marker_map, marker_map=marker_map)
-        declared = config.map_deviation or marker_map.settings.get("map_deviation", 0.0)
-        text += f"    map_deviation: {declared:.3g}\n" if declared else ""
     if refused and not writers and not intrinsics:
         return False
-    text += lens_parameters(found.fit.camera)
-    if args.camera_info is not None:
-        writers[args.camera_info] = partial(write_calibration, camera=found.fit.camera)
-    writers[path] = lambda part: part.write_text(text, encoding="utf-8")
-    write_all(writers)
-    print(f"next: {_next(args, path, intrinsics, shape)}")
+    values |= _deviations(
+        [found] if intrinsics else [], [] if marker_map is None else [marker_map], config
+    )
+    remarks = [f"readout_time {refused}"] if refused else []
+    camera = found.fit.camera
+    _write_files(args, values, lens_parameters(camera), {"": camera}, writers, remarks)
+    print(f"next: {_next(args, intrinsics, shape)}")
     return True
 
 
-def _next(args: Any, out: Path, intrinsics: bool, shape: Path | None) -> str:
+def _deviations(
+    found: Sequence[Calibration], maps: Sequence[MarkerMap], config: NodeConfig
+) -> dict[str, float]:
+    """The settings of what lenses and maps may be off by.
+
+    Args:
+        found: with lenses that were estimated, of which the worst counts; else those that were
+            given hold on.
+    """
+    usual, known = CalibrationErrors(), dict[str, float]()
+    for name in LensErrors._fields:
+        value = getattr(config.calibration, name)
+        if found:
+            value = max(float(getattr(each.lens, name)) for each in found)
+        if found or value != getattr(usual, name):
+            known[f"calibration.{name}"] = float(f"{value:.4g}")
+    declared = [each.settings.get("map_deviation", 0.0) for each in maps]
+    if map_deviation := config.map_deviation or max(declared, default=0.0):
+        known["map_deviation"] = float(f"{map_deviation:.3g}")
+    return known
+
+
+def _write_files(
+    args: Any, values: Mapping[str, Any], lens: Mapping[str, Any], cameras: Mapping[str, Camera],
+    writers: Writers, remarks: Sequence[str],
+) -> None:  # fmt: skip
+    """FILE.yaml, what goes beside it, and the lenses alone where they are wanted."""
+    for name, file in _lens_files(args, list(cameras)).items():
+        writers[file] = partial(write_calibration, camera=cameras[name])
+    write = partial(write_camera_file, values=values, lens=lens, remarks=remarks)
+    write_all({**writers, args.out: write})
+
+
+def _next(args: Any, intrinsics: bool, shape: Path | None) -> str:
     """The commands that make poses of this recording with what was found."""
+    out: Path = args.out
     recording, seen = str(args.recording), out.with_name(f"{out.stem}_seen")
     lens = intrinsics or args.calibration is not None
     params = ["--camera" if lens else "--params", str(out)]
@@ -322,9 +349,8 @@ def _next(args: Any, out: Path, intrinsics: bool, shape: Path | None) -> str:
     if shape is None:  # a recording of correspondences
         return shlex.join(["rs_localizer", "replay", recording, *params, "--out", poses])
     topics = [word for text in args.remaps for word in ("-r", text)]
-    options = {"--map": shape, "--rate": args.rate}
-    detect = ["rs_localizer", "detect", recording, *_words(options), *topics, *params]
-    detect += ["--out", str(seen)]
+    options = ["--map", str(shape), *(["--rate", str(args.rate)] if args.rate else []), *topics]
+    detect = ["rs_localizer", "detect", recording, *options, *params, "--out", str(seen)]
     return f"{shlex.join(detect)} && {image_input.replay_command(seen)}"
 
 
@@ -337,9 +363,8 @@ def _calibrate_rig(args: Any) -> None:
     config, recordings, maps = given_settings(args), dict[str, Recording](), list[MarkerMap]()
     cameras = cameras_of(args, config)
     if args.out is not None:
-        new = args.calibration is None and not is_bag(args.recordings[0])
-        lenses = [f"{name}_{_LENS}" for name in cameras if args.intrinsics or new]
-        refuse_existing(args, _TRANSFORMS, _CAMCHAIN, *lenses)
+        lenses = _lens_files(args, list(cameras)).values()
+        refuse_existing(args, _beside(args, _TRANSFORMS), *lenses)
     intrinsics = args.intrinsics
     for name, own in cameras.items():
         print(f"{name}:")
@@ -372,15 +397,12 @@ def _calibrate_rig(args: Any) -> None:
     refusals = {name: text for name, one in rig.items() if (text := one.undetermined)}
     if args.out is not None and not refusals:
         frames = {name: own.frame for name, own in cameras.items()}
-        declared = max(
-            config.map_deviation, *(each.settings.get("map_deviation", 0.0) for each in maps), 0.0
-        )
-        values = {"map_deviation": declared} if declared else {}
-        if intrinsics:  # which all cameras share: those of the worst
-            errors = np.max([each.calibration.lens for each in recordings.values()], axis=0)
-            pairs = zip(LensErrors._fields, errors.tolist(), strict=True)
-            values |= {f"calibration.{name}": value for name, value in pairs}
-        _write_rig(args.out, _parts(rig, recordings, config), frames, values, comments, intrinsics)
+        alone = [each.calibration for each in recordings.values()] if intrinsics else []
+        parts = _parts(rig, recordings, config)
+        values = rigs.node_parameters(parts) | _deviations(alone, maps, config)
+        transforms = partial(rigs.write_static_transforms, parts=parts, frames=frames)
+        writers = Writers({_beside(args, _TRANSFORMS): transforms})
+        _write_files(args, values, rigs.mounted_lenses(parts), parts.cameras, writers, comments)
         print(f"next: {_next_of_rig(args)}")
     if refusals:
         raise ValueError(
@@ -425,44 +447,11 @@ def _parts(
     return RigParts(cameras, poses, offsets)
 
 
-def _write_rig(
-    path: Path, parts: RigParts, frames: Mapping[str, str], values: dict[str, float],
-    comments: Sequence[str], intrinsics: bool,
-) -> None:  # fmt: skip
-    """FILE.yaml, and beside it the transforms, the camchain, and lenses that were found."""
-    transforms, chain = (path.with_name(f"{path.stem}_{what}") for what in (_TRANSFORMS, _CAMCHAIN))
-    writers: dict[Path, Callable[[Path], object]] = {
-        transforms: partial(write_static_transforms, parts=parts, frames=frames),
-        chain: partial(write_camchain, parts=parts),
-    }
-    try:
-        [kalibr_fields(camera) for camera in parts.cameras.values()]
-    except ValueError as error:
-        del writers[chain]
-        print(f"no camchain: {error}")
-    for name, camera in parts.cameras.items() if intrinsics else ():
-        lens = path.with_name(f"{path.stem}_{name}_{_LENS}")
-        writers[lens] = partial(write_calibration, camera=camera)
-
-    def write_values(part: Path) -> None:
-        write_parameters(part, node_parameters(parts) | values)
-        text = part.read_text("utf-8")
-        part.write_text("".join(f"# {line}\n" for line in comments) + text, "utf-8")
-
-    writers[path] = write_values
-    write_all(writers)
-
-
 def _next_of_rig(args: Any) -> str:
     """The command that goes on: poses of a video of several lenses, or TF for a live rig."""
-    path, stem, recording = args.out, args.out.stem, args.recordings[0]
+    path, recording = args.out, args.recordings[0]
     if len(args.recordings) > 1 or is_bag(recording) or args.map is None:
-        return shlex.join(["ros2", "launch", str(path.with_name(f"{stem}_transforms.launch.xml"))])
-    chain, poses = path.with_name(f"{stem}_camchain.yaml"), path.with_name(f"{stem}_poses")
-    files = {"--map": args.map, "--camera": chain, "--params": path, "--out": poses}
-    return shlex.join(["rs_localizer", "replay", str(recording), *_words(files)])
-
-
-def _words(options: Mapping[str, object]) -> list[str]:
-    given = {name: str(value) for name, value in options.items() if value is not None}
-    return [word for option in given.items() for word in option]
+        return shlex.join(["ros2", "launch", str(_beside(args, _TRANSFORMS))])
+    poses = str(path.with_name(f"{path.stem}_poses"))
+    words = ["replay", str(recording), "--map", str(args.map), "--camera", str(path)]
+    return shlex.join(["rs_localizer", *words, "--out", poses])

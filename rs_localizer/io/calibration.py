@@ -20,7 +20,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
-from rs_localizer.io.yaml_text import YamlError, file_faults, load_yaml
+from rs_localizer.io.yaml_text import LENS, YamlError, file_faults, load_yaml, parameter_blocks
 
 # Order of OpenCV's coefficients, by their names.
 _ORDER = {
@@ -75,8 +75,6 @@ CALIBRATION_KINDS = (
     "calibration file of ROS' camera_calibration, OpenCV (YAML, XML), Kalibr (camchain), COLMAP "
     "(cameras.txt), PhotonVision, Gyroflow, VINS, ORB-SLAM, or JSON with K, D, width and height"
 )
-# Where a params file has the lens, as calibrate writes it.
-_BESIDE_PARAMETERS = ("/**.ros__parameters.lens", "/**/rs_localizer.ros__parameters.lens")
 # Who writes FILE#cam1 means a camera in a file; a name of a file may hold the sign, too.
 _CHOICE = re.compile(r"(.+)#([^/#]+)")
 
@@ -127,11 +125,12 @@ def _camera(text: str, chosen: str | None) -> Camera:
         return colmap_camera(text, chosen)
     tree = _load_tree(text)
     tree = tree if isinstance(tree, dict) else {}
-    tree = next(iter(_at(tree, _BESIDE_PARAMETERS)), tree)
-    cameras = {name: item for name, item in tree.items() if _is_kalibr(item)}
+    lenses = (own for _, block in parameter_blocks(tree) for own in _at(block, (LENS,)))
+    tree = next(lenses, tree)
+    cameras = {name: item for name, item in tree.items() if _is_camera(item)}
     if cameras:
-        return kalibr_camera(_choose(cameras, chosen))
-    if chosen is not None:
+        tree = _choose(cameras, chosen)
+    elif chosen is not None:
         raise ValueError(f"it has no camera {chosen!r} to choose")
     if _is_kalibr(tree):
         return kalibr_camera(tree)
@@ -239,6 +238,17 @@ def _of_program(tree: dict[str, Any], program: _Program) -> Camera | None:
         model = "rational_polynomial" if len(D) >= _RATIONAL else "plumb_bob"
     seconds = 1e-3 * float(tree.get(program.readout_ms) or 0.0) * (size[1] - 1) / size[1]
     return Camera(*size, _matrix(lens), D, model, readout_time=max(seconds, 0.0))
+
+
+def lens_camera(lens: dict[str, Any]) -> Camera:
+    """The camera of :func:`lens_parameters`.
+
+    Raises:
+        ValueError, KeyError, TypeError: when something is missing or impossible.
+    """
+    if (camera := _of_program(lens, _PROGRAMS[-1])) is None:
+        raise KeyError("camera_matrix")
+    return camera
 
 
 def gyroflow_camera(tree: dict[str, Any]) -> Camera | None:
@@ -377,6 +387,12 @@ def _is_kalibr(tree: Any) -> bool:
     return isinstance(tree, dict) and {"camera_model", "intrinsics", "resolution"} <= set(tree)
 
 
+def _is_camera(item: Any) -> bool:
+    """Whether it is one of several cameras, in Kalibr's file or in that of ``calibrate --rig``."""
+    ours = isinstance(item, dict) and {"camera_matrix", "image_width"} <= set(item)
+    return ours or _is_kalibr(item)
+
+
 def kalibr_camera(tree: dict[str, Any]) -> Camera:
     """The lens of one camera of a camchain.
 
@@ -424,16 +440,16 @@ def kalibr_fields(camera: Camera) -> dict[str, Any]:
     }
 
 
-def lens_parameters(camera: Camera) -> str:
-    """Lines of a ROS params file for :func:`read_calibration`, which nodes pass over."""
-    # Of none ROS could not tell what they are.
-    D = camera.D if len(camera.D) else np.zeros(5)
-    rows = (("camera_matrix", camera.K), ("distortion_coefficients", D))
-    text = f"    lens:\n      image_width: {camera.width}\n      image_height: {camera.height}\n"
-    text += f"      distortion_model: {camera.distortion_model}\n"
-    for name, values in rows:
-        text += f"      {name}: [{', '.join(repr(float(value)) for value in values.ravel())}]\n"
-    return text
+def lens_parameters(camera: Camera) -> dict[str, Any]:
+    """``lens`` of a ROS params file, for :func:`read_calibration`; nodes pass over it."""
+    return {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "distortion_model": str(camera.distortion_model),
+        "camera_matrix": camera.K.ravel().tolist(),
+        # Of an empty list ROS could not tell what it holds.
+        "distortion_coefficients": camera.D.tolist() or [0.0] * 5,
+    }
 
 
 def write_calibration(path: Path, camera: Camera) -> None:

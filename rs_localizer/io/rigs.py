@@ -1,9 +1,12 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How cameras are mounted to each other, in Kalibr's camchain.
+"""Cameras of a rig: lenses, shutters, mounts, clocks, by ``calibrate --rig`` or Kalibr.
 
-A camchain has a mapping for each camera, in their order. Its names are Kalibr's, ``cam0``, or any
-other; besides what Kalibr writes, each may have ``readout_time`` (s) and ``scan_direction``.
+In the params file of ``calibrate --rig``, ``lens`` has an entry for each camera, with the 16
+numbers of ``camera_from_rig`` (``X_camera = T X_rig``); shutters and clocks are settings.
+
+Kalibr's camchain has a mapping for each camera, in their order. Its names are Kalibr's, ``cam0``,
+or any other; besides what Kalibr writes, each may have ``readout_time`` (s) and ``scan_direction``.
 
 =====================  =================================================================
 ``T_cn_cnm1``          ``X_camera = T X_camera_before``, of all but the first
@@ -31,12 +34,15 @@ from rs_localizer.io.calibration import (
     calibration_faults,
     kalibr_camera,
     kalibr_fields,
+    lens_camera,
+    lens_parameters,
 )
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.io.yaml_text import load_yaml
+from rs_localizer.io.yaml_text import LENS, flat, load_yaml, parameter_blocks
 
 RIG_FRAME = "rig"
 _CHAIN, _IMU, _SHIFT = "T_cn_cnm1", "T_cam_imu", "timeshift_cam_imu"
+_MOUNT = "camera_from_rig"
 _SHUTTER = ("readout_time", "scan_direction")
 # Entries of R R^T - I beyond this are no rounding of a file's digits.
 _ORTHONORMAL = 1e-3
@@ -51,13 +57,39 @@ class RigParts(NamedTuple):
 
 
 def read_camchain(path: Path | str) -> RigParts:
-    """The cameras of a camchain; without ``T_cam_imu`` in the axes of the first camera.
+    """The cameras of a camchain or of ``calibrate --rig``.
+
+    Without ``T_cam_imu``, a camchain is in the axes of its first camera.
 
     Raises:
         CalibrationError: for anything else, saying what was found.
     """
     with calibration_faults(path := Path(path), "YAML or JSON", "no usable rig"):
-        return _camchain(load_yaml(path.read_text(encoding="utf-8")))
+        tree = load_yaml(path.read_text(encoding="utf-8"))
+        own = [parameters for _, parameters in parameter_blocks(tree)]
+        return _own(own[0]) if own else _camchain(tree)
+
+
+def mounted_lenses(parts: RigParts) -> dict[str, Any]:
+    """``lens`` of the params file of a rig; :func:`node_parameters` are its settings."""
+    return {
+        name: lens_parameters(camera)
+        | {_MOUNT: _matrix(*parts.camera_from_rig[name]).ravel().tolist()}
+        for name, camera in parts.cameras.items()
+    }
+
+
+def _own(tree: Any) -> RigParts:
+    values = dict(flat(tree))
+    cameras, poses, offsets = {}, {}, {}
+    for name in values["cameras"]:
+        lens = tree[LENS][name]
+        own = {of: values[key] for of in _SHUTTER if (key := f"{name}.{of}") in values}
+        cameras[name] = replace(lens_camera(lens), **own)
+        pose = _rigid(_MOUNT, np.reshape(lens[_MOUNT], (4, 4)))
+        poses[name] = pose[:3, :3].copy(), pose[:3, 3].copy()
+        offsets[name] = float(values.get(f"{name}.stamp_offset", 0.0))
+    return RigParts(cameras, poses, offsets)
 
 
 def write_camchain(path: Path, parts: RigParts) -> None:

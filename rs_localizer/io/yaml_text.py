@@ -10,6 +10,9 @@ from typing import Any
 
 import yaml
 
+LENS = "lens"
+"""The entry of a params file with the lens of the camera, or of each camera of a rig."""
+
 # A file may name a part of itself again; counted at every place, so that few lines do not stand
 # for a thousand million values, or for endlessly many. Programs write more, as JSON.
 _MOST_VALUES, _MOST_JSON, _DEEPEST = 100_000, 1_000_000, 50
@@ -74,6 +77,24 @@ def load_yaml(text: str) -> Any:
         raise
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # dates and numbers that are none
         raise YamlError(" ".join(str(error).split())) from error
+
+
+def parameter_blocks(tree: Any, node: str = "", path: str = "") -> Iterator[tuple[str, Any]]:
+    """Name of a node, given as a path or nested, and its ``ros__parameters``; ``""``: of any."""
+    for key, value in tree.items() if isinstance(tree, dict) else ():
+        if key != "ros__parameters":
+            yield from parameter_blocks(value, node, f"{path}/{str(key).strip('/')}")
+        elif not node or path.rsplit("/", 1)[-1] in (node, "*", "**"):
+            yield path, value
+
+
+def flat(tree: dict[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names of nested mappings, and their values."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def _checked(tree: Any, most: int) -> Any:

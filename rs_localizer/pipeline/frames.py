@@ -181,7 +181,7 @@ class FrameLocalizer:
         self._assembler = FrameAssembler(config.cameras, config.rig.window, notice)
         self._landmarks = Landmarks(notice)
         self._tags: Tags | None = None
-        self._lens: Camera | None = None  # of camera_file
+        self._lenses: dict[str, Camera] = {}  # of camera_file
         self._stream = Stream(notice, self._forget_motion)
         self._pose_prior = PosePrior(notice)
         # Of the last frames, by time of the middle row: with what their results are published.
@@ -358,8 +358,8 @@ class FrameLocalizer:
             MessageError: for one that no camera can have; the previous stays.
         """
         before = self.calibrations.get(name)
-        if self._lens is not None:
-            calibration = calibration.with_lens(self._lens)
+        if name in self._lenses:
+            calibration = calibration.with_lens(self._lenses[name])
         if calibration == before:  # drivers repeat it with every image
             return
         own, frame = _shutters(self._settings)[name], self.camera_frame
@@ -392,10 +392,11 @@ class FrameLocalizer:
         Raises:
             ValueError: for a file that cannot be read or holds no such map.
         """
-        if self.config.camera_file and self._alone:
+        if file := self.config.camera_file:
             from rs_localizer.io.calibration import read_calibration
 
-            self._lens = read_calibration(self.config.camera_file)
+            for name in self.config.cameras:
+                self._lenses[name] = read_calibration(f"{file}#{name}" if name else file)
         if self.config.marker_map:  # others need no detector
             from rs_localizer.pipeline.tags import read_tags
 

@@ -50,18 +50,20 @@ def pair(rig, tmp_path_factory):
 
 
 def test_a_pair(pair, tmp_path, capsys):
-    assert main(["calibrate", "--rig", pair, "--out", str(tmp_path / "rig.yaml")]) == 0
+    words = ["--out", str(tmp_path / "rig.yaml"), "-p", "calibration.distortion:=0.75"]
+    assert main(["calibrate", "--rig", pair, *words]) == 0
     said = capsys.readouterr().out
     assert "rear <- front " in said
     assert "TF has it 0.0" in said
     values = load_params_file(tmp_path / "rig.yaml")
     config = build(values)
     assert config.cameras == ("front", "rear")
+    assert config.calibration.distortion == 0.75  # of a lens that was given
     own = config.of_cameras["rear"]
     assert own.scan_direction == "bottom_to_top"
     assert own.readout_time == pytest.approx(0.03, abs=1e-3)
     assert own.stamp_offset == pytest.approx(OFFSET, abs=1e-3)
-    parts = read_camchain(tmp_path / "rig_camchain.yaml")
+    parts = read_camchain(tmp_path / "rig.yaml")
     assert parts.time_offset == {"front": 0.0, "rear": own.stamp_offset}
     assert parts.cameras["rear"].readout_time == own.readout_time
     rotation, translation = parts.camera_from_rig["rear"]
@@ -78,6 +80,10 @@ def test_a_pair(pair, tmp_path, capsys):
     turn = Rotation.from_quat([float(given[f"--q{axis}"]) for axis in "xyzw"])
     np.testing.assert_allclose(place, -rotation.T @ translation, atol=1e-12)
     np.testing.assert_allclose(turn.as_matrix(), rotation.T, atol=1e-12)
+    # The file alone tells replay the cameras, their shutters and their lenses.
+    words = ["--camera", str(tmp_path / "rig.yaml"), "--out", str(tmp_path / "poses")]
+    assert main(["replay", pair, *words]) == 0
+    assert "inliers with a rolling shutter" in capsys.readouterr().out
 
 
 def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
@@ -105,9 +111,9 @@ def test_what_is_no_rig(words, expected, capsys):
 
 
 def test_faults_are_named_before_anything_is_read(pair, tmp_path, capsys):
-    missing, lens = tmp_path / "rear.mp4", tmp_path / "rig_rear_camera_info.yaml"
+    missing, lens = tmp_path / "rear.mp4", tmp_path / "lens_rear.yaml"
     lens.touch()
-    out = ["--out", str(tmp_path / "rig.yaml"), "--intrinsics"]
+    out = ["--out", str(tmp_path / "rig.yaml"), "--camera-info", str(tmp_path / "lens.yaml")]
     for words, text in (([pair, str(missing)], f"{missing} does not exist"),
                         ([pair, *out], f"{lens} exists")):  # fmt: skip
         assert main(["calibrate", "--rig", *words]) == 1

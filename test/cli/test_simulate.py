@@ -24,7 +24,7 @@ from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.trajectories import read_motions
 from rs_localizer.markers.map_files import read_marker_map
-from rs_localizer.settings import load_params_file
+from rs_localizer.settings import load_params_file, write_camera_file
 
 TURN = ("--angular-velocity", "0.5", "-1", "2", "--linear-velocity", "0.2", "0", "0")
 SHORT = ("--duration", "1", "--points", "60")
@@ -92,10 +92,8 @@ def test_markers_are_where_map_and_truth_put_them(tmp_path):
     """
     file, D = tmp_path / "camera.yaml", np.array([-0.2, 0.05, 0.001, -0.001])
     K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-    shutter = (
-        "/**:\n  ros__parameters:\n    readout_time: 0.03\n    scan_direction: left_to_right\n"
-    )
-    file.write_text(shutter + lens_parameters(Camera(640, 480, K, D)))
+    shutter = {"readout_time": 0.03, "scan_direction": "left_to_right"}
+    write_camera_file(file, shutter, lens_parameters(Camera(640, 480, K, D)))
     words = ("--images", *TURN, "--camera", str(file), "--duration", "0.1")
     words += ("--scan-direction", "right_to_left")
     noise = ("--exposure", "0.002", "--noise", "1")

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From message to pose: refusals and their reasons, times, changes of camera and settings."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,8 +17,10 @@ from rs_localizer.io.calibration import lens_parameters
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
+from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters, read_camchain
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.settings import build, camera_values, write_camera_file
 from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.settings import FrameSettings
@@ -156,7 +159,7 @@ def test_signs_and_frames_against_the_true_motion(make_camera_info, direction, p
 
 def test_the_lens_of_a_camera_file_takes_the_place_of_camera_info(tmp_path, make_camera_info):
     file, K = tmp_path / "camera.yaml", np.array([[400.0, 0, 319], [0, 400, 239], [0, 0, 1]])
-    file.write_text("/**:\n  ros__parameters:\n" + lens_parameters(Camera(640, 480, K)))
+    write_camera_file(file, {}, lens_parameters(Camera(640, 480, K)))
     frames = FrameLocalizer(NodeConfig(camera_file=str(file)))
     frames.load_files()
     frames.calibrate(read_camera_info(make_camera_info(width=640, height=480)))
@@ -167,3 +170,21 @@ def test_the_lens_of_a_camera_file_takes_the_place_of_camera_info(tmp_path, make
     assert tuple(K.ravel()) == frames.calibrations[""].K
     with pytest.raises(MessageError, match="camera_file is of an image of 640x480, camera_info of"):
         frames.calibrate(read_camera_info(make_camera_info(width=320)))
+
+
+def test_the_lenses_of_a_rig_are_those_of_its_file(tmp_path, make_camera_info):
+    file, K = tmp_path / "rig.yaml", np.array([[400.0, 0, 319], [0, 400, 239], [0, 0, 1]])
+    a = Camera(640, 480, K, readout_time=0.02)
+    cameras = {"a": a, "b": replace(a, K=K + np.diag([9.0, 9.0, 0.0]))}
+    poses = dict.fromkeys(cameras, (np.eye(3), np.array([0.1, 0.0, 0.0])))
+    parts = RigParts(cameras, poses, {"b": 0.01})
+    write_camera_file(file, node_parameters(parts), mounted_lenses(parts))
+    again = read_camchain(file)
+    assert again.time_offset == {"a": 0.0, "b": 0.01}
+    assert again.cameras["b"].readout_time == 0.02
+    np.testing.assert_array_equal(again.camera_from_rig["a"][1], [0.1, 0.0, 0.0])
+    frames = FrameLocalizer(build({**camera_values(file), "camera_file": str(file)}))
+    frames.load_files()
+    for name, camera in cameras.items():
+        frames.calibrate(read_camera_info(make_camera_info(width=640, height=480)), name)
+        assert tuple(camera.K.ravel()) == frames.calibrations[name].K

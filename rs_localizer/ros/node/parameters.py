@@ -4,7 +4,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -42,8 +41,9 @@ def declare(node: Node, kind: type[Config]) -> Config:
     Raises:
         ValueError: for a value of a wrong type or out of range, saying what was found.
     """
-    _declare(node, settings(kind), _of_camera_file(node, kind))
-    _declare(node, _of_cameras(node, kind))
+    own = _of_camera_file(node, kind)
+    _declare(node, settings(kind), own)
+    _declare(node, _of_cameras(node, kind), own)
     return read(node, kind)
 
 
@@ -56,7 +56,7 @@ def _of_camera_file(node: Node, kind: Kind) -> dict[str, Any]:
     return {
         name: value
         for name, value in values.items()
-        if name in known and (name not in given or given[name].value == known[name].default)
+        if name not in given or (name in known and given[name].value == known[name].default)
     }
 
 
@@ -67,9 +67,7 @@ def _of_cameras(node: Node, kind: Kind) -> dict[str, Setting]:
     return camera_settings({name: node.get_parameter(name).value for name in settings(kind)})
 
 
-def _declare(
-    node: Node, names: Mapping[str, Setting], own: Mapping[str, Any] = MappingProxyType({})
-) -> None:
+def _declare(node: Node, names: Mapping[str, Setting], own: Mapping[str, Any]) -> None:
     for name, setting in names.items():
         try:
             default = own.get(name, setting.default)
