@@ -224,6 +224,14 @@ class LocalizerConfig:
                 )
 
 
+def meant(name: str, known: Sequence[str], otherwise: str = "") -> str:
+    """The known name that an unknown one may stand for, as ``; did you mean it?``."""
+    close = difflib.get_close_matches(name, known, n=1)
+    if close:
+        return f"; did you mean {close[0]}?"
+    return f"; {otherwise} {', '.join(known)}" if otherwise else ""
+
+
 def localizer_config(settings: Mapping[str, Any]) -> LocalizerConfig:
     """The settings of a localizer by keyword.
 
@@ -234,9 +242,9 @@ def localizer_config(settings: Mapping[str, Any]) -> LocalizerConfig:
     names = [item.name for item in fields(LocalizerConfig)]
     for name in settings:
         if name not in names:
-            close = difflib.get_close_matches(name, names, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(names)}"
-            raise ValueError(f"{name!r} is not a setting of the localizer; {hint}")
+            raise ValueError(
+                f"{name!r} is not a setting of the localizer{meant(name, names, 'there are')}"
+            )
     return LocalizerConfig(**settings)
 
 

@@ -8,7 +8,6 @@ The node declares them, and a params file or ``-p name:=value`` of a command set
 from __future__ import annotations
 
 import contextlib
-import difflib
 import json
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +16,14 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
-from rs_localizer.config import NO_NAMES, CameraSettings, DetectorConfig, FeatureConfig, NodeConfig
+from rs_localizer.config import (
+    NO_NAMES,
+    CameraSettings,
+    DetectorConfig,
+    FeatureConfig,
+    NodeConfig,
+    meant,
+)
 from rs_localizer.io.yaml_text import (
     LENS,
     YamlError,
@@ -104,9 +110,7 @@ def unknown(name: str, kind: Kind = NodeConfig) -> str | None:
     names = settings(kind)
     if name in names or name.split(".")[0] in _FOREIGN or _of_camera(name, kind):
         return None
-    close = difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(names)}"
-    return f"{name!r} is not a setting; {hint}"
+    return f"{name!r} is not a setting{meant(name, list(names), 'there are')}"
 
 
 def _of_camera(name: str, kind: Kind) -> str:

@@ -83,7 +83,7 @@ other_node:
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("/**:\n  ros__parameters:\n    sead: 5\n", "'sead' is not a setting; did you mean 'seed'"),
+        ("/**:\n  ros__parameters:\n    sead: 5\n", "'sead' is not a setting; did you mean seed"),
         ("/**:\n  ros__parameters:\n    velocity_prior: 5\n", "'velocity_prior' is not a setting"),
         ("/**:\n  ros__parameters: 5\n", "ros__parameters of /.* must be a mapping"),
         ("other:\n  ros__parameters:\n    seed: 5\n", "has no ros__parameters for /rs_localizer"),

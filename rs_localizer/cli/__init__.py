@@ -29,22 +29,6 @@ WORKING = True
 more than these need."""
 
 
-# Of every command, wherever they stand behind its name.
-COMMON = (
-    ("--json", "print the result as JSON"),
-    ("--quiet", "print nothing but faults"),
-    ("--verbose", "print the traceback of a fault"),
-)
-
-
-def add_common(parser: argparse.ArgumentParser) -> None:
-    """Show them in the help; whoever reads the command line takes them out before."""
-    group = parser.add_argument_group("of all commands")
-    for name, text in COMMON:
-        short = (name[1:3],) if name != "--json" else ()
-        group.add_argument(*short, name, action="store_true", help=text, dest=f"common{name}")
-
-
 def replaced(args: Any, mark: str, place: Path | None = None) -> Callable[[Path], None] | None:
     """What removes an earlier result (it has a file ``mark``) from a place, where wanted.
 

@@ -9,22 +9,22 @@ when who reads the output goes away (``| head``).
 from __future__ import annotations
 
 import contextlib
-import difflib
 import importlib
 import io
+import itertools
 import json
 import math
 import os
 import sys
 import traceback
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import rs_localizer
-from rs_localizer.cli import COMMON, add_common
-from rs_localizer.cli.options import Parser, UsageError, add_options, read
+from rs_localizer.cli.options import MORE, Common, Parser, UsageError, add_options, read
+from rs_localizer.config import meant
 from rs_localizer.io.atomic_files import remove_unfinished
 from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import INTERRUPTED, StopRequest
@@ -128,43 +128,35 @@ def main(
     Returns:
         the exit code.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
-    common, words = _common_options(words)
-    name = ""
+    name, common = "", Common()
     try:
-        name, rest = _chosen(words)
+        name, words = _chosen(sys.argv[1:] if argv is None else argv)
         with importing(f"rs_localizer {name}"):
             module = importlib.import_module(COMMANDS[name].module)
-        options = parse(name, module, rest)
+        options, common = parse(name, module, words)
+        StopRequest.clean_up.append(remove_unfinished)
+        with _output(common) as kept:
+            result = module.run(options)
+        if common.json and kept is not None:
+            print(_json(name, result, kept.getvalue()))
+        sys.stdout.flush()
     except SystemExit as end:  # argparse has said all there is to say
         return int(end.code or 0)
-    except UsageError as error:
-        return _fail(name, f"{error} (--help says more)", 2)
-    except ImportError as error:
-        return _fail(name, explain(error), 1)
-    StopRequest.clean_up.append(remove_unfinished)
-    try:
-        with _output(common):
-            result = module.run(options)
-            printed = sys.stdout
-        if "--json" in common and isinstance(printed, io.StringIO):
-            print(_json(name, result, printed.getvalue()))
-        sys.stdout.flush()
+    except KeyboardInterrupt:
+        remove_unfinished()  # it may have come while that was being removed
+        return _fail(name, "interrupted", INTERRUPTED)
     except Exception as error:
-        if "--verbose" in common:
+        if common.verbose:
             traceback.print_exc()
         code = _said(name, error)
         if code is None:
             raise
         return code
-    except KeyboardInterrupt:
-        remove_unfinished()  # it may have come while that was being removed
-        return _fail(name, "interrupted", INTERRUPTED)
     return 0
 
 
-def parse(name: str, module: ModuleType, words: Sequence[str]) -> Any:
-    """The options of a command.
+def parse(name: str, module: ModuleType, words: Sequence[str]) -> tuple[Any, Common]:
+    """The options of a command, and those of all.
 
     Raises:
         UsageError: for words that it does not understand.
@@ -175,41 +167,41 @@ def parse(name: str, module: ModuleType, words: Sequence[str]) -> Any:
         description=f"{summary[0].upper()}{summary[1:]}.",
         epilog=f"example:\n  {COMMANDS[name].example}",
     )
-    add_options(parser, module.Options)
-    add_common(parser)
-    return read(module.Options, parser.parse_args(list(words)))
+    add_options(parser, module.Options, Common)
+    found = parser.parse_args(list(words))
+    return read(module.Options, found), read(Common, found)
 
 
-def _chosen(words: Sequence[str]) -> tuple[str, Sequence[str]]:
-    """The command, of one or two words, and what follows it."""
+def _chosen(given: Sequence[str]) -> tuple[str, Sequence[str]]:
+    """The command, of one or two words, and its options, which may stand before it, too."""
+    before = list(itertools.takewhile(lambda word: word.startswith("-"), given))
+    words = given[len(before) :]
     for count in (2, 1):
         if (name := " ".join(words[:count])) in COMMANDS:
-            return name, words[count:]
-    if words and (of_group := [name for name in COMMANDS if name.startswith(f"{words[0]} ")]):
-        if len(words) == 1 or words[1] in ("-h", "--help"):
-            print(_listed(of_group))
-            raise SystemExit(0 if len(words) > 1 else 2)
-        raise UsageError(_unknown(" ".join(words[:2]), of_group))
-    if words and not words[0].startswith("-"):
-        groups = list(dict.fromkeys(name.split()[0] for name in COMMANDS))
-        raise UsageError(_unknown(words[0], groups))
+            return name, [*before, *words[count:]]
+    of_group = [name for name in COMMANDS if words and name.startswith(f"{words[0]} ")]
+    if of_group and (len(words) == 1 or words[1] in ("-h", "--help")):
+        print(_listed(of_group))
+        raise SystemExit(0 if len(words) > 1 else 2)
+    if not words:
+        _top_parser().parse_args(before)
+        raise UsageError(f"give a COMMAND{MORE}")
+    name = " ".join(words[:2]) if of_group else words[0]
+    known = of_group or list(dict.fromkeys(each.split()[0] for each in COMMANDS))
+    raise UsageError(f"there is no command {name!r}{meant(name, known, 'choose from')}{MORE}")
+
+
+def _top_parser() -> Parser:
     parser = Parser(
         prog="rs_localizer",
         usage="rs_localizer COMMAND ...",
         description="Position, orientation and velocity of a rolling-shutter camera.",
         epilog=f"commands:\n{_listed(COMMANDS)}\n\nrs_localizer COMMAND --help says more.",
     )
-    parser.add_argument(
-        "--version", action="version", version=f"rs_localizer {rs_localizer.__version__}"
-    )
-    parser.parse_args(list(words))
-    raise UsageError("give a COMMAND")
-
-
-def _unknown(name: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(known)}"
-    return f"there is no command {name!r}; {hint}"
+    version = f"rs_localizer {rs_localizer.__version__}"
+    parser.add_argument("--version", action="version", version=version)
+    add_options(parser, Common)
+    return parser
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -237,27 +229,19 @@ def _said(name: str, error: Exception) -> int | None:
     return None
 
 
-def _common_options(words: Sequence[str]) -> tuple[set[str], list[str]]:
-    """Options of all commands that are among the words, and the other words."""
-    names = {"-q": "--quiet", "-v": "--verbose"} | {name: name for name, _ in COMMON}
-    end = words.index("--") if "--" in words else len(words)
-    common = {names[word] for word in words[:end] if word in names}
-    return common, [*(word for word in words[:end] if word not in names), *words[end:]]
-
-
 @contextlib.contextmanager
-def _output(common: Collection[str]) -> Iterator[None]:
-    """Within ``with``, what is printed cannot steer the terminal, and goes where options say."""
-    if "--json" in common or "--quiet" in common:
+def _output(common: Common) -> Iterator[io.StringIO | None]:
+    """Within ``with``, what is printed cannot steer the terminal; kept, where it is not shown."""
+    if common.json or common.quiet:
         # No bar either, which is for a person who waits.
         sys.stderr.isatty = lambda: False  # type: ignore[method-assign]
-        with contextlib.redirect_stdout(io.StringIO()):
-            yield
+        with contextlib.redirect_stdout(io.StringIO()) as kept:
+            yield kept
     else:
         output, write = sys.stdout, sys.stdout.write
         output.write = lambda text: write(text.translate(_STEERING))  # type: ignore
         try:
-            yield
+            yield None
         finally:
             output.write = write  # type: ignore[method-assign]
 

@@ -9,7 +9,7 @@ each is the title of its group in the help.
 from __future__ import annotations
 
 import argparse
-import difflib
+import functools
 import math
 import re
 import types
@@ -19,9 +19,13 @@ from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+from rs_localizer.config import meant
+
 T = TypeVar("T")
 CAMERA_FLAGS = "--camera --calibration"
 """One file a camera, and its name where it is a lens alone."""
+MORE = " (--help says more)"
+"""Behind faults of the command line."""
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
 
@@ -116,6 +120,15 @@ class Many:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Common:
+    """of all commands."""
+
+    json: bool = option("print the result as JSON", default=False)
+    quiet: bool = option("print nothing but faults", default=False, flag="-q --quiet")
+    verbose: bool = option("print the traceback of a fault", default=False, flag="-v --verbose")
+
+
 class Parser(argparse.ArgumentParser):
     """Says what is wrong by a :class:`UsageError`, with the option that may be meant."""
 
@@ -125,36 +138,30 @@ class Parser(argparse.ArgumentParser):
         super().__init__(**words)
 
     def error(self, message: str) -> NoReturn:
-        unknown = re.match(r"unrecognized arguments: (-\S+)", message)
-        if unknown:
+        if unknown := re.match(r"unrecognized arguments: (-[^\s=]+)", message):
             known = [name for action in self._actions for name in action.option_strings]
-            close = difflib.get_close_matches(unknown[1].partition("=")[0], known, n=1)
-            message += f"; did you mean {close[0]}?" if close else ""
-        raise UsageError(message)
+            message += meant(unknown[1], known)
+        raise UsageError(f"{message}{MORE}")
 
 
-def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
-    """Add an argument for each field of a dataclass of options."""
-    hints = typing.get_type_hints(kind)
+def add_options(parser: argparse.ArgumentParser, kind: type[Any], *more: type[Any]) -> None:
+    """Add an argument for each field of a dataclass of options, and of ``more`` of them."""
     for item in fields(kind):  # those of bases come first on the command line
         if item.metadata["positional"]:
-            _add(parser, item.name, hints[item.name], item)
-    groups: dict[type[Any], argparse._ActionsContainer] = {kind: parser}
+            _add(parser, kind, item)
     # Bases come last in the help: what is the command's own is looked for first.
-    for owner in kind.__mro__[:-1]:
-        if owner is not kind:
-            groups[owner] = parser.add_argument_group(
-                " ".join((owner.__doc__ or "").split()).rstrip(".")
-            )
-        for item in fields(kind):
+    for owner in (*kind.__mro__[:-1], *more):
+        title = " ".join((owner.__doc__ or "").split()).rstrip(".")
+        group = parser if owner is kind else parser.add_argument_group(title)
+        for item in fields(owner):
             own = item.name in vars(owner).get("__annotations__", {})
             if own and not item.metadata["positional"]:
-                _add(groups[owner], item.name, hints[item.name], item)
+                _add(group, owner, item)
 
 
-def _add(group: argparse._ActionsContainer, name: str, hint: Any, item: Any) -> None:
-    about = item.metadata
-    one, many = _element(hint)
+def _add(group: argparse._ActionsContainer, kind: type[Any], item: Any) -> None:
+    about, name = item.metadata, item.name
+    one, many = _element(typing.get_type_hints(kind)[name])
     repeated = many is list and not about["metavar"].endswith("...")
     if typing.get_origin(one) is tuple:  # each time so many
         one, many = _element(one)
@@ -226,44 +233,36 @@ def path(text: str) -> Path:
 
 
 def number(
-    minimum: float = -math.inf, maximum: float = math.inf, *, above: bool = False
+    minimum: float = -math.inf,
+    maximum: float = math.inf,
+    *,
+    above: bool = False,
+    kind: type[float] | type[int] = float,
 ) -> Callable[[str], float]:
     """A finite number from ``minimum`` to ``maximum``, for ``add_argument(type=...)``.
 
     Args:
         above: the minimum itself is refused.
+        kind: int: a whole number.
     """
 
     def parse(text: str) -> float:
         try:
-            value = float(text)
+            value: float = kind(text)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise argparse.ArgumentTypeError(f"must be a number, got {text!r}")
+            what = "a whole number" if kind is int else "a number"
+            raise argparse.ArgumentTypeError(f"must be {what}, got {text!r}")
         if not minimum <= value <= maximum or (above and value == minimum):
-            raise argparse.ArgumentTypeError(f"{_range(minimum, maximum, above)}, got {text}")
+            wanted = f"must be more than {minimum:g}" if above else f"must be {minimum:g} or more"
+            if math.isfinite(maximum):
+                wanted = f"must lie between {minimum:g} and {maximum:g}"
+            raise argparse.ArgumentTypeError(f"{wanted}, got {text}")
         return value
 
     return parse
 
 
-def integer(minimum: float = -math.inf, maximum: float = math.inf) -> Callable[[str], int]:
-    """A whole number from ``minimum`` to ``maximum``, for ``add_argument(type=...)``."""
-
-    def parse(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"must be a whole number, got {text!r}") from None
-        if not minimum <= value <= maximum:
-            raise argparse.ArgumentTypeError(f"{_range(minimum, maximum, False)}, got {text}")
-        return value
-
-    return parse
-
-
-def _range(minimum: float, maximum: float, above: bool) -> str:
-    if math.isfinite(maximum):
-        return f"must lie between {minimum:g} and {maximum:g}"
-    return f"must be more than {minimum:g}" if above else f"must be {minimum:g} or more"
+integer = functools.partial(number, kind=int)
+"""A whole number, likewise."""

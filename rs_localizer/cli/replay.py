@@ -7,7 +7,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib.util
-import json
 import math
 import shlex
 import shutil
@@ -29,7 +28,7 @@ from rs_localizer.cli.options import (
     argument,
     option,
 )
-from rs_localizer.cli.settings_args import given_settings, given_topics
+from rs_localizer.cli.settings_args import given_topics, given_values
 from rs_localizer.io.atomic_files import (
     atomic_directory,
     check_writable,
@@ -77,6 +76,7 @@ if WORKING:
     from rs_localizer.offline.table import FrameTable, read_parquet, schema, write_parquet
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.pipeline.refusal import explained
+    from rs_localizer.settings import build
     from rs_localizer.solvers.table import find_solver
 
 if TYPE_CHECKING:
@@ -155,10 +155,10 @@ def _check_place(options: Options) -> None:
 
 
 def _settings(options: Options) -> NodeConfig:
-    """The settings that the options give; refuses those that cannot be."""
+    """The settings that the options give."""
     files = {"map_file": options.map, "camera_file": options.calibration}
-    also = [f"{name}:={json.dumps(str(file))}" for name, file in files.items() if file is not None]
-    return given_settings(options, also, FrameLocalizer)
+    given = {name: str(file) for name, file in files.items() if file is not None}
+    return build(given_values(options) | given)
 
 
 def _name(recording: Path) -> str:

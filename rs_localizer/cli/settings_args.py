@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rs_localizer.cli import WORKING
@@ -17,55 +17,35 @@ if WORKING:
     from rs_localizer.settings import build, camera_values, load_params_file, parse_assignment
 
 
-def given_values(
-    args: Any,
-    also: Sequence[str] = (),
-    check: Callable[[NodeConfig], object] | None = None,
-) -> dict[str, Any]:
+def given_values(args: Any) -> dict[str, Any]:
     """The values of a camera's file, of a params file, and single ones, by dotted name.
 
     Each goes over those before.
 
     Args:
         args: with ``params`` and ``assignments``, and ``calibration`` where there is a lens.
-        also: further assignments, ``name:=value``.
-        check: raises ``ValueError`` for settings that cannot be used.
 
     Raises:
         UsageError: for what is no setting, or a wrong value, with where it was given.
     """
-    where, values = "--camera", dict[str, Any]()
-    lens = getattr(args, "calibration", None)
-    try:
-        if lens is not None:
-            values = camera_values(lens)
-            _check(values, check)
-        where = "--params"
-        if args.params is not None:
-            values |= load_params_file(args.params)
-            where = f"--params: {args.params}"
-            _check(values, check)
-        where = "-p"
-        values |= dict(map(parse_assignment, [*args.assignments, *also]))
-        _check(values, check)
-    except ValueError as error:
-        raise UsageError(f"{where}: {error}") from error
+    lens, values = getattr(args, "calibration", None), dict[str, Any]()
+    sources: dict[str, Callable[[], Mapping[str, Any]]] = {
+        "--camera": lambda: {} if lens is None else camera_values(lens),
+        f"--params {args.params}": lambda: (args.params and load_params_file(args.params)) or {},
+        "-p": lambda: dict(map(parse_assignment, args.assignments)),
+    }
+    for where, source in sources.items():
+        try:
+            values |= source()
+            build(values)
+        except ValueError as error:
+            raise UsageError(f"{where}: {error}") from error
     return values
 
 
-def given_settings(
-    args: Any,
-    also: Sequence[str] = (),
-    check: Callable[[NodeConfig], object] | None = None,
-) -> NodeConfig:
+def given_settings(args: Any) -> NodeConfig:
     """The settings of :func:`given_values`."""
-    return build(given_values(args, also, check))
-
-
-def _check(values: dict[str, Any], check: Callable[[NodeConfig], object] | None) -> None:
-    config = build(values)
-    if check is not None:
-        check(config)
+    return build(given_values(args))
 
 
 def remapped(options: Any) -> dict[str, str]:

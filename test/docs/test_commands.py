@@ -47,7 +47,7 @@ def test_commands_and_options_exist(page, words):
     parts = shlex.split(words)
     name = " ".join(parts[:2]) if " ".join(parts[:2]) in COMMANDS else parts[0]
     module = importlib.import_module(COMMANDS[name].module)
-    arguments = parse(name, module, parts[len(name.split()) :])
+    arguments, _ = parse(name, module, parts[len(name.split()) :])
     for assignment in getattr(arguments, "assignments", None) or []:
         parse_assignment(assignment)
 

@@ -396,7 +396,7 @@ def test_a_lens_profile_takes_the_place_of_a_calibration_and_what_is_given_goes_
 
 def test_maps_take_the_readout_time_of_a_video(video, telemetry):
     telemetry()
-    given = parse("map build", build, [str(video), "--out", "map"])
+    given = parse("map build", build, [str(video), "--out", "map"])[0]
     assert build.shutter_of(given)[0] == pytest.approx(0.0205)
 
 

@@ -61,8 +61,8 @@ def test_what_it_says_at_start_and_an_end_by_signals(start_node, tmp_path):
     assert len([line for line in lines[compiling:] if ready.fullmatch(line)]) == 1
     ignored = "a parameter is ignored: {} is not a setting; did you mean {}?"
     assert [line for line in lines if "ignored" in line] == [
-        ignored.format("'min_inlier'", "'min_inliers'"),
-        ignored.format("'readout_tim'", "'readout_time'"),
+        ignored.format("'min_inlier'", "min_inliers"),
+        ignored.format("'readout_tim'", "readout_time"),
     ]
     silent = "readout_time is 0 (unknown): no twist is published and frames are not tracked"
     assert lines.count(silent) == 1
