@@ -97,17 +97,21 @@ def find_readout(name: str, mode: str = "") -> list[Known]:
 
 
 def as_json(entry: Known) -> dict[str, object]:
-    """An entry in s, and in the words of other programs.
+    """An entry, and what other programs take, by identifiers with units.
 
-    ``odm`` (OpenDroneMap's ``--rolling-shutter-readout``) and ``gyroflow``
-    (``frame_readout_time``) are in ms and count all rows; ``kalibr`` (``lineDelay``) is in s, from
-    row to row, None for a mode that does not say how many there are.
+    Those of ``odm`` (OpenDroneMap's ``--rolling-shutter-readout``) and ``gyroflow``
+    (``frame_readout_time``) count all rows; that of ``kalibr`` (``lineDelay``) is from row to row,
+    None for a mode that does not say how many there are.
     """
     size = re.match(r"\d+x(\d+)", entry.mode)
     line = None if size is None else entry.median / (int(size[1]) - 1)
     whole = 1e3 * (entry.median + (line or 0.0))
-    values = asdict(entry) | {"upper_bound": entry.upper_bound}
-    values |= {"odm": whole, "gyroflow": whole, "kalibr": line}
+    values: dict[str, object] = {
+        f"{key}_s" if isinstance(value, float) else key: value
+        for key, value in asdict(entry).items()
+    }
+    values |= {"upper_bound": entry.upper_bound, "kalibr_line_delay_s": line}
+    values |= {"odm_readout_ms": whole, "gyroflow_readout_ms": whole}
     return {k: float(f"{v:.6g}") if isinstance(v, float) else v for k, v in values.items()}
 
 

@@ -133,10 +133,11 @@ def by_evo(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
     """ATE and RPE after Umeyama's alignment of the positions, by name and unit.
 
     Raises:
-        ValueError: where evo is not installed.
+        ValueError: where evo is not installed, or the positions lie on a line.
     """
     try:
         from evo.core import metrics, trajectory
+        from evo.core.geometry import GeometryException
     except ImportError as error:
         raise ValueError("--ate needs evo: pip install 'rs_localizer[evo]'") from error
     rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns)
@@ -148,7 +149,10 @@ def by_evo(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
         )
         for part in (truth.part(true_rows), estimate.part(rows))
     )
-    estimated.align(true)
+    try:
+        estimated.align(true)
+    except GeometryException as error:
+        raise ValueError(f"--ate: positions on a line determine no alignment: {error}") from error
     found = {}
     for name, metric in (("ATE", metrics.APE), ("RPE, next frame", metrics.RPE)):
         for unit, part in (

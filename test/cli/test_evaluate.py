@@ -93,6 +93,10 @@ def test_ate_and_rpe(files, capsys):
     # A shift of all positions goes away in the alignment.
     np.testing.assert_allclose(found["ATE (m rms)"], [0.0], atol=1e-5)
     assert found["RPE, next frame (deg rms)"][0] < 4.0
+    line = TRUTH.positions * [1.0, 0.0, 0.0]
+    write_tum(files / "truth.txt", Trajectory(STAMPS, line, TRUTH.quaternions))
+    assert evaluate(files, "--ate", estimate="truth.txt") == 1
+    assert "positions on a line determine no alignment" in capsys.readouterr().err
 
 
 def test_clocks_that_differ_are_mended(files, tmp_path, capsys):
