@@ -195,27 +195,25 @@ def _read(args: Any, config: NodeConfig) -> _Source:
     path: Path = args.recording
     if not path.exists():
         raise ValueError(f"{path} does not exist")
-    if not is_bag(path):
-        imu = _imu_of_video(args, path)
-        source = image_input.of_files(args, path, given_lens(args))
+    of_bag = is_bag(path)
+    imu = None if args.imu is None else (_imu_of_bag if of_bag else _imu_of_video)(args, path)
+    if of_bag and IMAGE not in remapped(args):
+        with open_bag(path) as bag:
+            if has_frames(bag):
+                return replace(_correspondences(args, bag, config), imu=imu)
+    with image_input.opened(args, path, calibrated=False) as source:
         found = _detected(args, source.shots)
-        image_input.tell_times(source.clock)
-        return replace(found, own_stamps=path.is_dir() and args.rate is None, imu=imu)
-    topics = remapped(args)
+    image_input.tell_times(source.clock)
+    return replace(found, own_stamps=of_bag or (path.is_dir() and args.rate is None), imu=imu)
+
+
+def _imu_of_bag(args: Any, path: Path) -> ImuRecording:
     with open_bag(path) as bag:
-        imu = None
-        if args.imu is not None:
-            frame = optical_frame(bag, topics.get(CAMERA_INFO))
-            imu = read_imu_recording(bag, args.imu or None, frame)
-        if IMAGE not in topics and has_frames(bag):
-            return replace(_correspondences(args, bag, config), imu=imu)
-        shots = image_input.of_bag(bag, given_lens(args), args).shots
-        return replace(_detected(args, shots), imu=imu)
+        frame = optical_frame(bag, remapped(args).get(CAMERA_INFO))
+        return read_imu_recording(bag, args.imu or None, frame)
 
 
-def _imu_of_video(args: Any, path: Path) -> ImuRecording | None:
-    if args.imu is None:
-        return None
+def _imu_of_video(args: Any, path: Path) -> ImuRecording:
     telemetry = image_input.telemetry_of(path)
     if args.imu or telemetry is None or args.rate is not None:
         raise UsageError(

@@ -197,7 +197,7 @@ def opened(args: Any, path: Path, calibrated: bool = True) -> Iterator[Source]:
     """Images with the lens of ``args.calibration`` or, of a bag, its camera_info.
 
     Args:
-        args: with ``rate``, and the ``remaps`` of topics of a bag.
+        args: with ``rate``, the ``remaps`` of topics of a bag, and ``lens`` of a video of several.
         path: of the images.
         calibrated: refuse images without a calibration.
 
@@ -211,31 +211,30 @@ def opened(args: Any, path: Path, calibrated: bool = True) -> Iterator[Source]:
         with open_bag(path) as bag:
             if bag.fault is not None:
                 print(f"warning: {bag.fault}")
-            yield of_bag(bag, camera, args, calibrated)
+            yield _of_bag(bag, camera, remapped(args), calibrated)
         return
     if args.remaps:
         raise UsageError("-r names topics of a bag")
-    telemetry = None
-    if getattr(args, "lens", None) is not None:
-        if args.rate is not None:
-            raise UsageError("--rate is for one camera: leave it out with cameras")
-        if camera is None:
-            raise UsageError("cameras in one file: --camera FILE_camchain.yaml of calibrate --rig")
-    else:
+    lens, telemetry = getattr(args, "lens", None), None
+    if lens is None and calibrated:
         telemetry = telemetry_of(path)
-        if camera is None and calibrated:
-            camera = None if telemetry is None else telemetry.profile
-            if camera is None:
-                raise UsageError("a video or folder has no camera_info: give --camera")
-    source = of_files(args, path, camera)
+        if camera is None and telemetry is not None:
+            camera = telemetry.profile
+    if camera is None and calibrated:
+        file = "FILE of calibrate --rig" if lens is not None else ""
+        raise UsageError(f"a video or folder has no camera_info: give --camera {file}".rstrip())
+    if path.is_dir():
+        source = _of_folder(path, camera, args.rate)
+    else:
+        source = _of_video(path, camera, args.rate, lens)
     if telemetry is not None and source.clock is not None:
         source = replace(source, shots=with_telemetry(source.shots, telemetry, source.clock))
     yield source
 
 
-def of_bag(bag: BagReader, camera: Camera | None, args: Any, calibrated: bool = True) -> Source:
-    """The images of a bag; without a camera, with that of its camera_info."""
-    topics = remapped(args)
+def _of_bag(
+    bag: BagReader, camera: Camera | None, topics: Mapping[str, str], calibrated: bool
+) -> Source:
     topic = find_topic(bag, IMAGE_TYPES, topics.get(IMAGE), "-r image:=")
     info = None
     if camera is None and (calibrated or INFO_TYPE in bag.topics.values()):
@@ -243,23 +242,20 @@ def of_bag(bag: BagReader, camera: Camera | None, args: Any, calibrated: bool = 
     return Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
 
 
-def of_files(args: Any, path: Path, camera: Camera | None) -> Source:
-    """The images of a folder, of a video, or of its lens ``args.lens``, if there is one.
+def _of_folder(path: Path, camera: Camera | None, rate: float | None) -> Source:
+    files, clock = image_files(path), ImageClock(rate)
+    if rate is None and name_times(files) is None:
+        raise UsageError("the names of the files are not times: give --rate")
+    return Source(from_files(files, camera, clock), len(files), clock)
 
-    Raises:
-        UsageError: when they have no times, and there is no ``args.rate``.
-    """
-    lens, clock = getattr(args, "lens", None), ImageClock(args.rate)
-    if lens is not None:  # their common zero is the first image of the first one
-        clock = ImageClock()
-        return Source(from_video(path, camera, clock, lens), None, clock)
-    if path.is_dir():
-        files = image_files(path)
-        if args.rate is None and name_times(files) is None:
-            raise UsageError("the names of the files are not times: give --rate")
-        return Source(from_files(files, camera, clock), len(files), clock)
-    if args.rate is None and not has_times(path):
+
+def _of_video(path: Path, camera: Camera | None, rate: float | None, lens: int | None) -> Source:
+    """The images of one of its lenses, if it has several; their zero is that of the first one."""
+    if lens is not None and rate is not None:
+        raise UsageError("--rate is for one camera: leave it out with cameras")
+    if rate is None and not has_times(path):
         raise UsageError(
             "this video has no presentation times: give --rate; the readout time scales with it"
         )
-    return Source(from_video(path, camera, clock), None, clock)
+    clock = ImageClock(rate)
+    return Source(from_video(path, camera, clock, lens), None, clock)
