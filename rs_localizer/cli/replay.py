@@ -19,20 +19,10 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NoReturn
 
 from rs_localizer.cli import WORKING
-from rs_localizer.cli.options import (
-    CAMERA_FLAGS,
-    Inputs,
-    Many,
-    Settings,
-    UsageError,
-    argument,
-    option,
-)
+from rs_localizer.cli.image_input import ImageOptions
+from rs_localizer.cli.options import Many, UsageError, argument, option
 from rs_localizer.cli.settings_args import given_topics, given_values
-from rs_localizer.io.atomic_files import (
-    atomic_directory,
-    check_writable,
-)
+from rs_localizer.io.atomic_files import atomic_directory, check_writable
 from rs_localizer.io.bags import BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.trajectories import POSES_FILE as POSES
 from rs_localizer.io.trajectories import TWISTS_FILE as TWISTS
@@ -91,7 +81,7 @@ RESULT, BRIDGED = "result", "bridged.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Settings, Inputs, Many):
+class Options(ImageOptions, Many):
     recordings: list[Path] = argument(
         "rosbag2 (MCAP, sqlite3) or ROS 1 bag; with --map, a video, a folder or a bag of images",
         "RECORDING",
@@ -105,15 +95,12 @@ class Options(Settings, Inputs, Many):
         "the map of the keypoints; of images, also markers or the result of map build, which "
         "brings the lens and the shutter", "FILE",
     )  # fmt: skip
-    calibration: Path | None = option(
-        "as calibrate writes it: lens and shutter; or a lens alone", "FILE", flag=CAMERA_FLAGS
-    )
     smooth: bool = option(
         "one motion through all images, from those before and after each; images without a pose "
         f"are bridged where their neighbours determine them, and listed in {BRIDGED}",
         default=False,
     )
-    rate: float | None = option(
+    pose_rate: float | None = option(
         "poses of the motion, as the frames until then tell it, or with --smooth all "
         "(default: one for each image)", "HZ",
         limits=(0.0, math.inf), above=True,
@@ -177,10 +164,15 @@ def _pictures(recording: Path) -> str:
 def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True) -> Tally:
     """Replay a recording into ``out``, and say what came of it (``timed``: how fast, too)."""
     pictures = _pictures(recording)
+    if not pictures and options.rate is not None:
+        raise UsageError("--rate is that of images without times; poses at a rate are --pose-rate")
     if not pictures:
         return _replay_matches(options, recording, recording, out, timed)
     if options.map is None:
-        raise ValueError(f"{recording} {pictures}, not matches: first {_detect_command(recording)}")
+        lens = "" if is_bag(recording) else ", and --camera, as calibrate writes it"
+        raise ValueError(
+            f"{recording} {pictures}, not matches: give --map, of markers or landmarks{lens}"
+        )
     from rs_localizer.cli import detect
 
     with TemporaryDirectory() as place:
@@ -191,7 +183,7 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
         # What was given is in the file beside the matches now, with what the video says.
         own = matches / PARAMETERS
         alone = replace(
-            options, params=own if own.exists() else None, assignments=[],
+            options, params=own if own.exists() else None, assignments=[], rate=None,
             map=None if by_markers else _map_file(options.map), remaps=[], calibration=None,
         )  # fmt: skip
         return _replay_matches(alone, matches, recording, out, timed)
@@ -220,7 +212,7 @@ def _detection(options: Options, recording: Path, out: Path) -> detect.Options:
     return detect.Options(
         images=recording, out=out, map=place if by_markers else None, features=features,
         calibration=calibration, params=params, assignments=options.assignments,
-        remaps=options.remaps,
+        remaps=options.remaps, rate=options.rate,
     )  # fmt: skip
 
 
@@ -271,17 +263,6 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
 def _write_table(tables: list[Table], file: Path) -> None:
     rows = write_parquet(tables, file)
     print(f"written to {file}: {rows} rows, one a frame")
-
-
-def _detect_command(path: Path) -> str:
-    """What finds the matches in images."""
-    calibration = "" if is_bag(path) else " --camera camera.yaml"
-    out = shlex.quote(f"{_name(path)}_seen")
-    return (
-        f"run: rs_localizer detect {shlex.quote(str(path))} --map MAP.yaml{calibration} --out "
-        f"{out} (or --board 6x4 --square 0.03, or --features sift, instead of --map), then: "
-        f"rs_localizer replay {out}"
-    )
 
 
 def _hint(bag: Path, params: Path | None) -> None:
@@ -335,12 +316,14 @@ def _replay(
             from rs_localizer.tools.smoothed import smooth_frames
 
             stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
-            parts = smooth_frames(localizer, (frame for _, frame in frames), stamps, options.rate)
+            parts = smooth_frames(
+                localizer, (frame for _, frame in frames), stamps, options.pose_rate
+            )
             frames = (
                 (frame.input_stamp_ns, frame) for part in parts for frame in tally.smooth(part)
             )
-        elif options.rate is not None:
-            frames = at_rate(frames, localizer, options.rate)
+        elif options.pose_rate is not None:
+            frames = at_rate(frames, localizer, options.pose_rate)
         for recorded_ns, frame in frames:
             tally.not_sent += not write_frame(writer, frame, localizer, recorded_ns)
             tally.track.add(frame)

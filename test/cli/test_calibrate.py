@@ -144,7 +144,7 @@ def test_what_a_lens_is_off_by_stays_with_it(flight, tmp_path):
 def test_smooth(flight, tmp_path, capsys):
     out, words = tmp_path / "out", ["replay", str(flight), "--smooth", "--out"]
     params = ["--params", str(flight / "parameters.yaml")]
-    assert main([*words, str(out), *params, "--rate", "200"]) == 0
+    assert main([*words, str(out), *params, "--pose-rate", "200"]) == 0
     assert np.diff(read_tum(out / "poses.txt").stamps_ns).min() == pytest.approx(5e6, abs=2)
     assert (out / "bridged.txt").read_text() == ""
     assert main([*words, str(tmp_path / "none")]) == 1

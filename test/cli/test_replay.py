@@ -101,7 +101,7 @@ def test_every_kind_of_recording_gives_the_same(recording, tmp_path):
 def test_poses_at_a_rate_of_their_own(recording, tmp_path):
     """Between images as the camera moved: every 5 ms from the first image to the last."""
     out = tmp_path / "out"
-    assert main(["replay", str(recording), "--rate", "200", "--out", str(out), *SHUTTER]) == 0
+    assert main(["replay", str(recording), "--pose-rate", "200", "--out", str(out), *SHUTTER]) == 0
     poses = read_tum(out / "poses.txt")
     truth = read_motions(recording, "/truth/pose", "/truth/twist").poses
     first, last = truth.stamps_ns[0], truth.stamps_ns[-2]

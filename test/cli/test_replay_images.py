@@ -61,15 +61,15 @@ def test_poses_are_those_of_detect_and_replay(kind: str, walls: Path, tmp_path: 
     ("name", "text"),
     [("film.mp4", "is a video"), ("one.PNG", "is an image"), ("folder", "is a folder of 2 images")],
 )
-def test_images_are_sent_to_detect(tmp_path, capsys, name, text):
+def test_images_need_a_map(tmp_path, capsys, name, text):
     path = tmp_path / name
     if not path.suffix:
         path.mkdir()
     for file in [path] if path.suffix else [path / "1.jpg", path / "2.jpg"]:
         file.touch()
     assert main(["replay", str(path)]) == 1
-    said = f"{path} {text}, not matches: first run: rs_localizer detect {path} --map MAP.yaml"
-    assert f"{said} --camera camera.yaml" in capsys.readouterr().err
+    said = f"{path} {text}, not matches: give --map, of markers or landmarks, and --camera"
+    assert said in capsys.readouterr().err
 
 
 def test_what_is_missing_is_said(walls: Path, tmp_path: Path, capsys: Any) -> None:
