@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rs_localizer import data
-from rs_localizer.cli.demo import read_frames
+from rs_localizer.cli.demo_command import read_frames
 from rs_localizer.ros.graph.live import LiveNode
 from rs_localizer.ros.node.conversion import message_class
 

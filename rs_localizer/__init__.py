@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rs_localizer.core.types import Estimate, Failure
     from rs_localizer.core.units import CameraState, camera_state
     from rs_localizer.estimation.prior import Prior
-    from rs_localizer.io.calibration import read_calibration
+    from rs_localizer.io.camera_files import read_calibration
     from rs_localizer.io.rigs import (
         RigParts,
         read_camchain,
@@ -71,7 +71,7 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
         "core.types": ("Estimate", "Failure"),
         "core.units": ("CameraState", "camera_state"),
         "estimation.prior": ("Prior",),
-        "io.calibration": ("read_calibration",),
+        "io.camera_files": ("read_calibration",),
         "io.rigs": ("RigParts", "read_camchain", "write_camchain"),
         "localizer": ("Localizer",),
         "offline.table": ("localize_recording",),

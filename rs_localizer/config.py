@@ -356,7 +356,7 @@ class Imu:
 
 
 @dataclass(frozen=True, slots=True)
-class Rig:
+class RigSettings:
     """How the images of several cameras become frames."""
 
     window: float = setting(
@@ -511,7 +511,7 @@ class NodeConfig(LocalizerConfig):
         "stamp_offset below its name; without names there is one camera",
         read_only=True,
     )
-    rig: Rig = field(default_factory=Rig)
+    rig: RigSettings = field(default_factory=RigSettings)
     gravity_in_map: tuple[float, ...] = setting(
         (0.0, 0.0, -1.0), "Direction in which things fall in the map, of any length: imu.gravity"
     )

@@ -251,7 +251,7 @@ def write_camera_file(
 
     Args:
         values: the settings, by dotted name.
-        lens: as ``io.calibration.lens_parameters`` or ``io.rigs.mounted_lenses`` have it.
+        lens: as ``io.camera_files.lens_parameters`` or ``io.rigs.mounted_lenses`` have it.
         remarks: lines of comment.
     """
     _write(path, "/**", {**values, LENS: lens}, remarks)  # a node may have any name

@@ -17,7 +17,7 @@ from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import Observed
-from rs_localizer.tools.calibration import Calibration, calibrate
+from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
 from rs_localizer.tools.simulation.frames import frame_stamps, simulate_frames
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.settings import FrameSettings
@@ -46,7 +46,7 @@ class Trial:
     direction: ScanDirection
     outliers: float
     truth: float  # s
-    found: Calibration
+    found: CameraCalibration
 
     @property
     def error(self) -> float:

@@ -18,7 +18,7 @@ from benchmarks.fuzzing import seeds
 from benchmarks.fuzzing.mutations import damaged, damaged_message
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import BagError, open_bag
-from rs_localizer.io.calibration import CalibrationError, read_calibration
+from rs_localizer.io.camera_files import CalibrationError, read_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences, read_keypoints, read_map
 from rs_localizer.io.images import read_compressed_image, read_image

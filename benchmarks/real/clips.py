@@ -20,7 +20,7 @@ from rs_localizer.markers.boards import find_chessboard
 from rs_localizer.markers.prints import Chessboard
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import Observed
-from rs_localizer.tools.calibration import calibrate
+from rs_localizer.tools.camera_calibration import calibrate
 from rs_localizer.tools.first_lens import first_lens
 
 INDEX = "index.csv"

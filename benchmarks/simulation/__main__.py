@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from benchmarks.simulation.imu import ImuBagWriter, ImuSettings, Lever, shaken, simulate_imu
 from benchmarks.simulation.keypoints import keypoint_rows, random_descriptors
 from benchmarks.simulation.rig import camera_stamps, rig_parameters, simulate_rig, write_rig_frame
-from rs_localizer.cli import simulate
+from rs_localizer.cli import simulate_command as simulate
 from rs_localizer.cli.options import Parser, add_options, option, read
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagWriter, make_message

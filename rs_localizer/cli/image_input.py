@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from rs_localizer.cli import WORKING, with_values
-from rs_localizer.cli.options import CAMERA_FLAGS, Inputs, Settings, UsageError, option
+from rs_localizer.cli.options import CAMERA_FLAGS, SettingOptions, TopicOptions, UsageError, option
 from rs_localizer.cli.settings_args import given_values, remapped
-from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
+from rs_localizer.io.camera_files import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE
@@ -48,7 +48,7 @@ _SAME = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageOptions(Settings, Inputs):
+class ImageOptions(SettingOptions, TopicOptions):
     """images: their camera and their times."""
 
     calibration: Path | None = option(

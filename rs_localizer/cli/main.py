@@ -23,7 +23,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import rs_localizer
-from rs_localizer.cli.options import MORE, Common, Parser, UsageError, add_options, read
+from rs_localizer.cli.options import MORE, CommonOptions, Parser, UsageError, add_options, read
 from rs_localizer.config import meant
 from rs_localizer.io.atomic_files import remove_unfinished
 from rs_localizer.process.missing import explain
@@ -51,7 +51,7 @@ class Command(NamedTuple):
 
 COMMANDS = {
     name: Command(
-        f"rs_localizer.cli.{name.replace(' ', '.').removesuffix('.make')}",
+        f"rs_localizer.cli.{name.removesuffix(' make').replace(' ', '.')}_command",
         summary,
         f"rs_localizer {name} {words}".rstrip(),
     )
@@ -128,7 +128,7 @@ def main(
     Returns:
         the exit code.
     """
-    name, common = "", Common()
+    name, common = "", CommonOptions()
     try:
         name, words = _chosen(sys.argv[1:] if argv is None else argv)
         with importing(f"rs_localizer {name}"):
@@ -155,7 +155,7 @@ def main(
     return 0
 
 
-def parse(name: str, module: ModuleType, words: Sequence[str]) -> tuple[Any, Common]:
+def parse(name: str, module: ModuleType, words: Sequence[str]) -> tuple[Any, CommonOptions]:
     """The options of a command, and those of all.
 
     Raises:
@@ -167,9 +167,9 @@ def parse(name: str, module: ModuleType, words: Sequence[str]) -> tuple[Any, Com
         description=f"{summary[0].upper()}{summary[1:]}.",
         epilog=f"example:\n  {COMMANDS[name].example}",
     )
-    add_options(parser, module.Options, Common)
+    add_options(parser, module.Options, CommonOptions)
     found = parser.parse_args(list(words))
-    return read(module.Options, found), read(Common, found)
+    return read(module.Options, found), read(CommonOptions, found)
 
 
 def _chosen(given: Sequence[str]) -> tuple[str, Sequence[str]]:
@@ -200,7 +200,7 @@ def _top_parser() -> Parser:
     )
     version = f"rs_localizer {rs_localizer.__version__}"
     parser.add_argument("--version", action="version", version=version)
-    add_options(parser, Common)
+    add_options(parser, CommonOptions)
     return parser
 
 
@@ -230,7 +230,7 @@ def _said(name: str, error: Exception) -> int | None:
 
 
 @contextlib.contextmanager
-def _output(common: Common) -> Iterator[io.StringIO | None]:
+def _output(common: CommonOptions) -> Iterator[io.StringIO | None]:
     """Within ``with``, what is printed cannot steer the terminal; kept, where it is not shown."""
     if common.json or common.quiet:
         # No bar either, which is for a person who waits.

@@ -79,7 +79,7 @@ def option(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class SettingOptions:
     """settings of the localizer."""
 
     params: Path | None = option("a ROS 2 params file, such as calibrate writes", "FILE")
@@ -89,7 +89,7 @@ class Settings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Inputs:
+class TopicOptions:
     """topics of the recording (found by name and type)."""
 
     remaps: list[str] = option(
@@ -101,14 +101,14 @@ class Inputs:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Overwrite:
+class ResultOptions:
     """results."""
 
     overwrite: bool = option("replace an earlier result", default=False)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Many:
+class FleetOptions:
     """many recordings (needs Dask: pip install 'rs_localizer[fleet]')."""
 
     workers: int | None = option(
@@ -121,7 +121,7 @@ class Many:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Common:
+class CommonOptions:
     """of all commands."""
 
     json: bool = option("print the result as JSON", default=False)

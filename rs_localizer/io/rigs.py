@@ -30,7 +30,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
-from rs_localizer.io.calibration import (
+from rs_localizer.io.camera_files import (
     calibration_faults,
     kalibr_camera,
     kalibr_fields,

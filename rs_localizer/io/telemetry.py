@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration import gyroflow_camera
+from rs_localizer.io.camera_files import gyroflow_camera
 from rs_localizer.io.limited import LimitedError, run_limited
 
 # Optical axes (x right, y down, z forward) from telemetry-parser's.

@@ -55,7 +55,7 @@ class DetectError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class DetectedMarkers:
     """What became of the images."""
 
     images: int
@@ -69,7 +69,7 @@ class Recorded:
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class DetectionOptions:
     """How images are recorded."""
 
     with_images: bool = False  # write these, too, as far as they are compressed
@@ -81,11 +81,11 @@ def record(
     shots: Iterable[Shot | Carried],
     detector: FrameDetector,
     bag: BagWriter,
-    options: Options,
+    options: DetectionOptions,
     *,
     done: Callable[[], object] = lambda: None,
     tell: Callable[[str], object] = lambda text: None,
-) -> Recorded:
+) -> DetectedMarkers:
     """Write the corners of all images that show any, each with its CameraInfo.
 
     Args:
@@ -97,7 +97,7 @@ def record(
         DetectError: when no image shows anything, or images and calibration differ in size.
     """
     found = Extraction()
-    tally = _Tally(detector.map, found)
+    tally = _MarkerTally(detector.map, found)
     cameras = Cameras(options.scan_direction)
     for shot, image in _readable(shots, bag, found, done):
         detected = detector.detect(image)
@@ -132,7 +132,7 @@ def _readable(
         done()
 
 
-class _Tally:
+class _MarkerTally:
     """Counts what the images show of a map."""
 
     def __init__(self, marker_map: MarkerMap, found: Extraction) -> None:
@@ -190,7 +190,7 @@ class _Tally:
         # What one of several shows may be chance.
         return [first[kind] for kind, n in names.most_common(4) if 2 * n >= len(self._empty)]
 
-    def recorded(self) -> Recorded:
+    def recorded(self) -> DetectedMarkers:
         known = [value for value in self._residuals if np.isfinite(value)]
         faults = [] if (fault := self._check.misplaced()) is None else [fault]
         if (reading := self._check.other_reading()) is not None:
@@ -202,7 +202,7 @@ class _Tally:
             )
         if self.are_few and (names := self.instead()):
             faults.append(f"images that show nothing of the map show {'; '.join(names)}")
-        return Recorded(
+        return DetectedMarkers(
             self._found.images,
             len(self._found.counts),
             float(np.median(self._found.counts)),
@@ -285,7 +285,7 @@ def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
     return ": another mode or camera; calibrate in the mode that is used"
 
 
-def _write(bag: BagWriter, shot: Shot, topic: str, message: Any, options: Options) -> None:
+def _write(bag: BagWriter, shot: Shot, topic: str, message: Any, options: DetectionOptions) -> None:
     """What the image shows, its camera, and the image itself."""
     own = f"/{options.camera}" if options.camera else ""
     bag.write(own + CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
@@ -324,7 +324,7 @@ def record_features(
     shots: Iterable[Shot | Carried],
     extractor: FrameExtractor,
     bag: BagWriter,
-    options: Options,
+    options: DetectionOptions,
     done: Callable[[], object] = lambda: None,
 ) -> Extraction:
     """Write the keypoints of all images that have any, each with its CameraInfo.

@@ -18,7 +18,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.atomic_files import atomic_files, write_errors
 from rs_localizer.io.bags import open_bag
-from rs_localizer.io.calibration import pixel_intrinsics
+from rs_localizer.io.camera_files import pixel_intrinsics
 from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import NO_FRAMES, prepare, replay
 from rs_localizer.pipeline.frames import FrameLocalizer

@@ -393,7 +393,7 @@ class FrameLocalizer:
             ValueError: for a file that cannot be read or holds no such map.
         """
         if file := self.config.camera_file:
-            from rs_localizer.io.calibration import read_calibration
+            from rs_localizer.io.camera_files import read_calibration
 
             for name in self.config.cameras:
                 self._lenses[name] = read_calibration(f"{file}#{name}" if name else file)

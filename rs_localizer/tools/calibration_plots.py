@@ -9,14 +9,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.tools.calibration import Calibration, likelihood
+from rs_localizer.tools.camera_calibration import CameraCalibration, likelihood
 from rs_localizer.tools.verdict import sense
 
 _BLUE, _ORANGE, _GREY = "#0b3c8c", "#f08a24", "#c9c9c9"
 _DPI = 130
 
 
-def save_plots(camera: Camera, calibration: Calibration, directory: Path) -> None:
+def save_plots(camera: Camera, calibration: CameraCalibration, directory: Path) -> None:
     """Write ``readout_time.png`` into a directory."""
     directory.mkdir(parents=True, exist_ok=True)
     figure = Figure(figsize=(10.0, 4.0), dpi=_DPI, layout="constrained")
@@ -26,7 +26,7 @@ def save_plots(camera: Camera, calibration: Calibration, directory: Path) -> Non
     figure.savefig(directory / "readout_time.png")
 
 
-def _likelihood(axes: Axes, camera: Camera, calibration: Calibration) -> None:
+def _likelihood(axes: Axes, camera: Camera, calibration: CameraCalibration) -> None:
     values, costs = likelihood(camera, calibration)
     middle, along = calibration.readout_time, 1e3 * sense(calibration)
     axes.plot(along * values, np.exp(-0.5 * costs), "o-", color=_BLUE, label="measured")
@@ -37,7 +37,7 @@ def _likelihood(axes: Axes, camera: Camera, calibration: Calibration) -> None:
     axes.legend(frameon=False)
 
 
-def _blocks(axes: Axes, calibration: Calibration) -> None:
+def _blocks(axes: Axes, calibration: CameraCalibration) -> None:
     along = 1e3 * sense(calibration)
     for block in calibration.blocks:
         axes.errorbar(

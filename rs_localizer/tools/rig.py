@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the cameras of a rig are on it, and how their clocks differ, from recordings of each.
 
-One motion runs through the keypoints of all cameras, that of the first one. Beside it each camera
-has what a calibration of its own has (:mod:`rs_localizer.tools.calibration`), and each but the
+One motion runs through the keypoints of all cameras, that of the first one. Beside it each
+camera has what one alone has (:mod:`rs_localizer.tools.camera_calibration`), and each but the
 first :class:`.Extrinsics`. Cameras need not see the same: they see parts of one map.
 """
 
@@ -29,7 +29,7 @@ from rs_localizer.tools.adjust.problem import Problem, View
 from rs_localizer.tools.adjust.spline import Spline, refined
 from rs_localizer.tools.adjust.system import Undetermined
 from rs_localizer.tools.adjust.variables import EXTRINSICS, Extrinsics, Freedom, Mounting, State
-from rs_localizer.tools.calibration import Calibration, cut
+from rs_localizer.tools.camera_calibration import CameraCalibration, cut
 from rs_localizer.tools.imu import middle_row
 from rs_localizer.tools.readout_belief import disagreement, discrepancy
 
@@ -52,7 +52,7 @@ class Recording(NamedTuple):
     """One camera's part: what it was calibrated with, and what came of it."""
 
     camera: Camera
-    calibration: Calibration
+    calibration: CameraCalibration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +127,7 @@ def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
     return {name: _mounted(place, whole, parts) for place, name in enumerate(recordings)}
 
 
-def _freedom(first: Calibration, own: Calibration) -> Freedom:
+def _freedom(first: CameraCalibration, own: CameraCalibration) -> Freedom:
     """What a camera's own calibration freed; the accelerations are the rig's."""
     names = ("lens", "lens_deviations", "landmarks", "paper", "stamps")
     return replace(first.fit.freedom, **{name: getattr(own.fit.freedom, name) for name in names})

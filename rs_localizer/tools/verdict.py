@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.io.imu import ImuRecording
-from rs_localizer.tools.calibration import Calibration
+from rs_localizer.tools.camera_calibration import CameraCalibration
 
 # Beyond this (s rms) the images' own times are worth a word.
 _WORTH_A_WORD = 5e-4
@@ -32,23 +32,23 @@ _GIVEN = "TF, or the axes of a video,"
 _LEAST_SCALE = 0.005
 
 
-def readout_time(result: Calibration) -> float:
+def readout_time(result: CameraCalibration) -> float:
     """The readout time (s) to be set: 0 for a global shutter."""
     return 0.0 if result.global_shutter else abs(result.readout_time)
 
 
-def sense(result: Calibration) -> float:
+def sense(result: CameraCalibration) -> float:
     """The sign by which the readout times of parts are those along :func:`scan_direction`."""
     return 1.0 if result.global_shutter else float(np.copysign(1.0, result.readout_time))
 
 
-def scan_direction(result: Calibration) -> ScanDirection:
+def scan_direction(result: CameraCalibration) -> ScanDirection:
     """The direction that the sign of the readout time says."""
     given = ScanDirection(result.fit.camera.scan_direction)
     return given if result.global_shutter or result.readout_time > 0.0 else REVERSED[given]
 
 
-def lens_refusal(result: Calibration) -> str:
+def lens_refusal(result: CameraCalibration) -> str:
     """One line with the figure when the recording determines no lens; or ''."""
     camera = result.fit.camera
     if np.all((camera.K[:2, 2] > 0.0) & (camera.K[:2, 2] < camera.size)):
@@ -59,17 +59,17 @@ def lens_refusal(result: Calibration) -> str:
     )
 
 
-def refusal(result: Calibration) -> str:
+def refusal(result: CameraCalibration) -> str:
     """One line with the figure when lens or readout time is not determined; or ''."""
     return lens_refusal(result) or result.disbelief(sense(result))
 
 
-def shape_is_free(result: Calibration) -> bool:
+def shape_is_free(result: CameraCalibration) -> bool:
     """Whether the map's shape was estimated."""
     return result.fit.freedom.landmarks > 0.0
 
 
-def moved(result: Calibration, points: Array) -> Array:
+def moved(result: CameraCalibration, points: Array) -> Array:
     """Points (n,3) of the map where they were found; those that no image shows stay."""
     rows = {tuple(place): row for row, place in enumerate(result.posed.observations.landmarks)}
     places = [rows.get(tuple(point)) for point in points]
@@ -79,7 +79,7 @@ def moved(result: Calibration, points: Array) -> Array:
     ])  # fmt: skip
 
 
-def remarks(result: Calibration) -> list[str]:
+def remarks(result: CameraCalibration) -> list[str]:
     """Sentences on what is odd, and on what the value is worth."""
     said = []
     if result.global_shutter:
@@ -119,7 +119,7 @@ def remarks(result: Calibration) -> list[str]:
     return said
 
 
-def uncovered(result: Calibration) -> list[str]:
+def uncovered(result: CameraCalibration) -> list[str]:
     """How much of the image no keypoint covers, and where that is; empty: hardly any."""
     observations, camera = result.posed.observations, result.fit.camera
     pixels = observations.pixels[observations.trusted]
@@ -136,7 +136,7 @@ def uncovered(result: Calibration) -> list[str]:
     return [f"{empty.mean():.0%}", *names] if names else []
 
 
-def table(found: Calibration, rate: float | None) -> Iterator[str]:
+def table(found: CameraCalibration, rate: float | None) -> Iterator[str]:
     """What was found, its parts, and remarks; ``rate``: of the images, as it was given."""
     for name, text in (
         ("readout time", f"{1e3 * readout_time(found):.3f} ms"),
@@ -165,7 +165,7 @@ def table(found: Calibration, rate: float | None) -> Iterator[str]:
         )
 
 
-def of_lens(found: Calibration) -> Iterator[str]:
+def of_lens(found: CameraCalibration) -> Iterator[str]:
     """The lens with its deviations."""
     state = found.fit.state
     deviations = np.sqrt(np.diag(found.fit.border_covariance)[1 : 1 + len(state.lens)])
@@ -180,7 +180,7 @@ def of_lens(found: Calibration) -> Iterator[str]:
     )
 
 
-def of_imu(found: Calibration, imu: ImuRecording, stamp_offset: float) -> Iterator[str]:
+def of_imu(found: CameraCalibration, imu: ImuRecording, stamp_offset: float) -> Iterator[str]:
     """Rows of the table, and sentences on what is odd."""
     one = found.mount
     if one is None:

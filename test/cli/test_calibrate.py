@@ -15,7 +15,7 @@ from benchmarks.simulation.__main__ import record
 from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, open_bag
-from rs_localizer.io.calibration import read_calibration
+from rs_localizer.io.camera_files import read_calibration
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import load_params_file
 from rs_localizer.tools import calibration_plots

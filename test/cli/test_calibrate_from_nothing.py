@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.cli.main import main
 from rs_localizer.cli.marker_map import find_map
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration import read_calibration, write_calibration
+from rs_localizer.io.camera_files import read_calibration, write_calibration
 from rs_localizer.io.rigs import RigParts, read_camchain, write_camchain
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.io.video import count_lenses

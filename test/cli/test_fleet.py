@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.cli import replay
+from rs_localizer.cli import replay_command
 from rs_localizer.cli.main import main
 from rs_localizer.offline import fleet
 from rs_localizer.offline.fleet import Outcome, Task, perform, perform_all, tasks_of
@@ -107,7 +107,7 @@ def test_what_goes_wrong_is_one_line(recordings, tmp_path, monkeypatch, capsys):
     assert "no Dask scheduler answers at tcp://127.0.0.1:9" in capsys.readouterr().err
     assert set(rows(tmp_path / "out")) == {"a_flight", "b_flight"}
     assert main(["replay", "a", "b"]) == 2
-    monkeypatch.setattr(replay.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(replay_command.importlib.util, "find_spec", lambda name: None)
     assert main(["replay", "a", "b", "--out", str(tmp_path / "other")]) == 1
     assert capsys.readouterr().err.endswith("pip install 'rs_localizer[fleet]'\n")
     assert not (tmp_path / "other").exists()

@@ -231,7 +231,7 @@ def test_who_stops_reading_is_not_told_of_it():
         "def run(_):\n"
         "    for _ in range(100_000): print('a line of a long table')\n"
         "Options = dataclass(type('O', (), {}))\n"
-        "sys.modules['rs_localizer.cli.readout'] = N(Options=Options, run=run)\n"
+        "sys.modules['rs_localizer.cli.readout_command'] = N(Options=Options, run=run)\n"
         "sys.exit(c.main(['readout']))"
     )
     with subprocess.Popen(

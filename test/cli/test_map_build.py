@@ -10,7 +10,7 @@ import pytest
 
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration import write_calibration
+from rs_localizer.io.camera_files import write_calibration
 from rs_localizer.tools.simulation.walls import collage
 
 K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])

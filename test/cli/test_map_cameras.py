@@ -14,7 +14,7 @@ from benchmarks.simulation.__main__ import record
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
-from rs_localizer.io.calibration import write_calibration
+from rs_localizer.io.camera_files import write_calibration
 from rs_localizer.io.maps.files import read_map_file, write_npz
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import MARKER_MAP

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from recorded import CAMERA, READOUT_TIME, SHUTTER, flight, write_ros1
 
-from rs_localizer.cli import replay as replay_command
+from rs_localizer.cli import replay_command
 from rs_localizer.cli.main import main
-from rs_localizer.cli.replay import print_summary
+from rs_localizer.cli.replay_command import print_summary
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES, Localized
 from rs_localizer.io.trajectories import read_motions, read_tum, read_twists

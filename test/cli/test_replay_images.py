@@ -13,7 +13,7 @@ from recorded import write_mp4
 
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import open_bag
-from rs_localizer.io.calibration import write_calibration
+from rs_localizer.io.camera_files import write_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.images import decode
 

@@ -18,7 +18,7 @@ from benchmarks.simulation.__main__ import record
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
-from rs_localizer.io.calibration import lens_parameters
+from rs_localizer.io.camera_files import lens_parameters
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.messages import stamp_ns

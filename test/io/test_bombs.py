@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rs_localizer.io import bags
 from rs_localizer.io.bags import BagError, BagWriter, make_message, open_bag
-from rs_localizer.io.calibration import CalibrationError, read_calibration
+from rs_localizer.io.camera_files import CalibrationError, read_calibration
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration import CalibrationError, read_calibration
+from rs_localizer.io.camera_files import CalibrationError, read_calibration
 from rs_localizer.io.rigs import (
     RigParts,
     read_camchain,

@@ -23,7 +23,7 @@ from recorded import field, insta360
 
 from rs_localizer.cli import image_input
 from rs_localizer.cli.main import main, parse
-from rs_localizer.cli.map import build
+from rs_localizer.cli.map import build_command
 from rs_localizer.core.camera import Camera
 from rs_localizer.io import telemetry as files
 from rs_localizer.io.bags import open_bag
@@ -396,8 +396,8 @@ def test_a_lens_profile_takes_the_place_of_a_calibration_and_what_is_given_goes_
 
 def test_maps_take_the_readout_time_of_a_video(video, telemetry):
     telemetry()
-    given = parse("map build", build, [str(video), "--out", "map"])[0]
-    assert build.shutter_of(given)[0] == pytest.approx(0.0205)
+    given = parse("map build", build_command, [str(video), "--out", "map"])[0]
+    assert build_command.shutter_of(given)[0] == pytest.approx(0.0205)
 
 
 @pytest.mark.parametrize(("focal", "doubted"), [(280.0, False), (300.0, True)])

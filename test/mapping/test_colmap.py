@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration import colmap_camera, colmap_parameters
+from rs_localizer.io.camera_files import colmap_camera, colmap_parameters
 from rs_localizer.tools.mapping import MappingError, colmap
 from rs_localizer.tools.mapping.colmap import Effort, build_structure, image_name, pairs_of
 from rs_localizer.tools.simulation.walls import collage

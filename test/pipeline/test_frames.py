@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.config import NodeConfig, PoseTime, VelocityPrior
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.io.calibration import lens_parameters
+from rs_localizer.io.camera_files import lens_parameters
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration of whole recordings of the tests' own projector, and of the real ones."""
+"""CameraCalibration of whole recordings of the tests' own projector, and of the real ones."""
 
 from dataclasses import replace
 from functools import cache
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.camera import Camera
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import Observed
-from rs_localizer.tools.calibration import Calibration, calibrate
+from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
 from rs_localizer.tools.first_lens import first_lens
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
@@ -32,19 +32,19 @@ def recording(
     return tuple(Observed(round(1e9 * (10.0 + f.stamp)), f.points, f.pixels) for f in frames)
 
 
-def agrees(found: Calibration, readout: float, least: float) -> None:
+def agrees(found: CameraCalibration, readout: float, least: float) -> None:
     assert found.determined
     assert abs(found.readout_time - readout) < 4.0 * found.deviation
     assert found.deviation < least
 
 
 @pytest.fixture(scope="module")
-def board() -> Calibration:
+def board() -> CameraCalibration:
     return calibrate(CAMERA, list(recording()))
 
 
 @pytest.fixture(scope="module")
-def room() -> Calibration:
+def room() -> CameraCalibration:
     return calibrate(CAMERA, list(recording(points="room", outliers=0.3, noise=0.5)))
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools.adjust.observe import Observed
-from rs_localizer.tools.calibration import calibrate
+from rs_localizer.tools.camera_calibration import calibrate
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 CAMERA_FROM_IMU = Rotation.from_rotvec([0.3, -1.2, 0.7]).as_matrix()

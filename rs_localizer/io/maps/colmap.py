@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration import colmap_camera, colmap_parameters
+from rs_localizer.io.camera_files import colmap_camera, colmap_parameters
 from rs_localizer.io.limited import LimitedError, run_limited
 from rs_localizer.io.maps.landmarks import Map, MapError, make_map
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration import colmap_camera, colmap_parameters
+from rs_localizer.io.camera_files import colmap_camera, colmap_parameters
 from rs_localizer.io.maps.colmap import read_colmap
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.gauge import Similarity

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.io.calibration import CalibrationError, read_calibration
+from rs_localizer.io.camera_files import CalibrationError, read_calibration
 
 ROS = """
 image_width: 640

@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration import lens_parameters
+from rs_localizer.io.camera_files import lens_parameters
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters
 from rs_localizer.ros.node import parameters
 from rs_localizer.settings import settings, write_camera_file

@@ -30,7 +30,7 @@ if WORKING:
     from rs_localizer.core.camera import Camera, DistortionModel
     from rs_localizer.io import rigs
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
-    from rs_localizer.io.calibration import lens_parameters, write_calibration
+    from rs_localizer.io.camera_files import lens_parameters, write_calibration
     from rs_localizer.io.imu import ImuRecording
     from rs_localizer.io.maps.files import read_map_file
     from rs_localizer.io.rigs import RigParts
@@ -52,7 +52,7 @@ if WORKING:
     from rs_localizer.tools import verdict
     from rs_localizer.tools.adjust.lens import LensErrors
     from rs_localizer.tools.adjust.observe import Observed, in_order
-    from rs_localizer.tools.calibration import Calibration, calibrate
+    from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
     from rs_localizer.tools.first_lens import covered, first_lens
     from rs_localizer.tools.rig import Mounted, Recording, calibrate_rig
 
@@ -90,7 +90,7 @@ class Options(TargetOptions, ImageOptions):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Source:
+class _Input:
     """Images with correspondences, and their camera."""
 
     images: list[Observed]
@@ -161,7 +161,7 @@ def _lens_files(args: Any, cameras: Sequence[str] = ("",)) -> dict[str, Path]:
     return {name: file.with_stem(f"{file.stem}_{name}") if name else file for name in cameras}
 
 
-def _calibrated(args: Any, source: _Source, camera: Camera, config: NodeConfig) -> Calibration:
+def _calibrated(args: Any, source: _Input, camera: Camera, config: NodeConfig) -> CameraCalibration:
     """What the images of a camera say, printed."""
     intrinsics = args.intrinsics or source.new_lens
     shown = covered(camera.size, (image.pixels for image in source.images))
@@ -191,7 +191,7 @@ def _calibrated(args: Any, source: _Source, camera: Camera, config: NodeConfig) 
     return found
 
 
-def _read(args: Any, config: NodeConfig) -> _Source:
+def _read(args: Any, config: NodeConfig) -> _Input:
     path: Path = args.recording
     if not path.exists():
         raise ValueError(f"{path} does not exist")
@@ -224,7 +224,7 @@ def _imu_of_video(args: Any, path: Path) -> ImuRecording:
     return ImuRecording(stamps, telemetry.rates, np.eye(3))
 
 
-def _correspondences(args: Any, bag: BagReader, config: NodeConfig) -> _Source:
+def _correspondences(args: Any, bag: BagReader, config: NodeConfig) -> _Input:
     if args.board is not None:
         raise UsageError("--board is for images; the recording has correspondences")
     topics = find_topics(bag, given_topics(args)).without(IMU)
@@ -232,10 +232,10 @@ def _correspondences(args: Any, bag: BagReader, config: NodeConfig) -> _Source:
     recorded = read_recording(bag, topics, config.matching, landmarks)
     camera = given_lens(args) or recorded.calibration.camera(0.0, config.scan_direction)
     images = [Observed(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in recorded.clouds]
-    return _Source(images, camera)
+    return _Input(images, camera)
 
 
-def _detected(args: Any, shots: Iterator[Shot | Carried]) -> _Source:
+def _detected(args: Any, shots: Iterator[Shot | Carried]) -> _Input:
     marker_map = find_map(args)
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
     detector.warm_up()
@@ -255,12 +255,12 @@ def _detected(args: Any, shots: Iterator[Shot | Carried]) -> _Source:
         print(f"warning: {fault}", file=sys.stderr)
     new_lens = camera is None
     camera = first_lens(size, in_order(images)) if camera is None else camera
-    return _Source(images, camera, new_lens, map=marker_map)
+    return _Input(images, camera, new_lens, map=marker_map)
 
 
 def _write(
     args: Any,
-    found: Calibration,
+    found: CameraCalibration,
     marker_map: MarkerMap | None,
     intrinsics: bool,
     config: NodeConfig,
@@ -305,7 +305,7 @@ def _write(
 
 
 def _deviations(
-    found: Sequence[Calibration], maps: Sequence[MarkerMap], config: NodeConfig
+    found: Sequence[CameraCalibration], maps: Sequence[MarkerMap], config: NodeConfig
 ) -> dict[str, float]:
     """The settings of what lenses and maps may be off by.
 

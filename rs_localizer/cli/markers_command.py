@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rs_localizer.cli import WORKING, read_counts
-from rs_localizer.cli.options import Overwrite, UsageError, argument, option
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.tools.printing import PAGES, page_files, plan, write_pages
 
@@ -33,7 +33,7 @@ _STANDING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Overwrite):
+class Options(ResultOptions):
     out: Path = argument("OUT.pdf or OUT.png to print, and beside it the map OUT.yaml", "OUT")
     grid: str | None = option(
         f"markers, columns x rows (default: {_GRID}); where they do not fit on a page together, "

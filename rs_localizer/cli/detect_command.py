@@ -39,7 +39,7 @@ if WORKING:
     from rs_localizer.io.rigs import make_mounts, read_camchain
     from rs_localizer.io.topics import TF_STATIC
     from rs_localizer.offline import detect as offline
-    from rs_localizer.offline.detect import Extraction, Recorded, record, record_features
+    from rs_localizer.offline.detect import DetectedMarkers, Extraction, record, record_features
     from rs_localizer.offline.fleet import Figures
     from rs_localizer.offline.image_sources import Carried, Shot
     from rs_localizer.pipeline.images import FrameDetector
@@ -103,7 +103,7 @@ def detect(args: Options) -> Figures:
                     shots: Shots = source.shots
                     if name not in ("", settings.cameras[0]):  # what goes along is of the first
                         shots = (shot for shot in shots if not isinstance(shot, Carried))
-                    options = offline.Options(args.with_images, of.scan_direction, name)
+                    options = offline.DetectionOptions(args.with_images, of.scan_direction, name)
                     seen = look(shots, bag, options, bar)
                 print(f"{f'{args.out}, {name}' if name else args.out}: {seen.said}")
                 tell_left_out(seen.found.refused, seen.found.carried)
@@ -126,16 +126,16 @@ _WORST: dict[str, Any] = {
 }  # fmt: skip
 
 
-class _Seen(NamedTuple):
+class _Found(NamedTuple):
     """What the images of a camera show."""
 
-    found: Extraction | Recorded
+    found: Extraction | DetectedMarkers
     said: str
     figures: Figures
     faults: Sequence[str] = ()
 
 
-Look = Callable[["Shots", BagWriter, "offline.Options", Any], _Seen]
+Look = Callable[["Shots", BagWriter, "offline.DetectionOptions", Any], _Found]
 
 
 def _of_markers(args: Options) -> tuple[Mapping[str, float], Look]:
@@ -145,7 +145,7 @@ def _of_markers(args: Options) -> tuple[Mapping[str, float], Look]:
         raise UsageError("give --map, --board or --features")
     marker_map, config = find_map(args), DetectorConfig()
 
-    def look(shots: Shots, bag: BagWriter, options: offline.Options, bar: Any) -> _Seen:
+    def look(shots: Shots, bag: BagWriter, options: offline.DetectionOptions, bar: Any) -> _Found:
         notices: Counter[str] = Counter()
         detector = FrameDetector(config, lambda _, text: notices.update([text]), marker_map)
         detector.warm_up()
@@ -166,7 +166,7 @@ def _of_markers(args: Options) -> tuple[Mapping[str, float], Look]:
             "corners": found.corners,
             "residual_of_a_still_pose_px": found.residual,
         }
-        return _Seen(found, said, figures, found.faults)
+        return _Found(found, said, figures, found.faults)
 
     return marker_map.settings, look
 
@@ -178,7 +178,7 @@ def _of_features(args: Options) -> tuple[Mapping[str, float], Look]:
     most = args.max_keypoints or FeatureConfig().max_keypoints
     extractor = FrameExtractor(FeatureConfig(features=args.features or "", max_keypoints=most))
 
-    def look(shots: Shots, bag: BagWriter, options: offline.Options, bar: Any) -> _Seen:
+    def look(shots: Shots, bag: BagWriter, options: offline.DetectionOptions, bar: Any) -> _Found:
         found = record_features(shots, extractor, bag, options, bar.update)
         figures: Figures = {
             "images": found.images,
@@ -189,6 +189,6 @@ def _of_features(args: Options) -> tuple[Mapping[str, float], Look]:
             f"{len(found.counts)} of {found.images} images, {np.median(found.counts):.0f} "
             f"keypoints ({args.features}) each (median)"
         )
-        return _Seen(found, said, figures)
+        return _Found(found, said, figures)
 
     return {}, look

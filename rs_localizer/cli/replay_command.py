@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from rs_localizer.cli import WORKING
 from rs_localizer.cli.image_input import ImageOptions
-from rs_localizer.cli.options import Many, UsageError, argument, option
+from rs_localizer.cli.options import FleetOptions, UsageError, argument, option
 from rs_localizer.cli.settings_args import given_topics, given_values
 from rs_localizer.io.atomic_files import atomic_directory, check_writable
 from rs_localizer.io.bags import BagReader, BagWriter, is_bag, open_bag
@@ -72,7 +72,7 @@ if WORKING:
 if TYPE_CHECKING:
     from pyarrow import Table  # an extra
 
-    from rs_localizer.cli import detect  # of images only
+    from rs_localizer.cli import detect_command  # of images only
 
 _ORB_BYTES = 32  # of a descriptor; AKAZE's has 61
 # Of each of many recordings.
@@ -81,7 +81,7 @@ RESULT, BRIDGED = "result", "bridged.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ImageOptions, Many):
+class Options(ImageOptions, FleetOptions):
     recordings: list[Path] = argument(
         "rosbag2 (MCAP, sqlite3) or ROS 1 bag; with --map, a video, a folder or a bag of images",
         "RECORDING",
@@ -173,13 +173,13 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
         raise ValueError(
             f"{recording} {pictures}, not matches: give --map, of markers or landmarks{lens}"
         )
-    from rs_localizer.cli import detect
+    from rs_localizer.cli import detect_command
 
     with TemporaryDirectory() as place:
         matches = Path(place) / "matches"
         of_images = _detection(options, recording, matches)
         by_markers = of_images.features is None
-        detect.detect(of_images)
+        detect_command.detect(of_images)
         # What was given is in the file beside the matches now, with what the video says.
         own = matches / PARAMETERS
         alone = replace(
@@ -194,9 +194,9 @@ def _map_file(place: Path) -> Path:
     return place / MAP if (place / MAP).is_file() else place
 
 
-def _detection(options: Options, recording: Path, out: Path) -> detect.Options:
+def _detection(options: Options, recording: Path, out: Path) -> detect_command.Options:
     """What finds the matches of images."""
-    from rs_localizer.cli import detect
+    from rs_localizer.cli import detect_command
 
     place = options.map
     assert place is not None
@@ -209,7 +209,7 @@ def _detection(options: Options, recording: Path, out: Path) -> detect.Options:
         params = params or place / PARAMETERS
         lens = place / CAMERA
         calibration = calibration or (lens if lens.is_file() and not is_bag(recording) else None)
-    return detect.Options(
+    return detect_command.Options(
         images=recording, out=out, map=place if by_markers else None, features=features,
         calibration=calibration, params=params, assignments=options.assignments,
         remaps=options.remaps, rate=options.rate,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, refuse_existing, write_all
-from rs_localizer.cli.map import info
+from rs_localizer.cli.map import info_command
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.io.maps.files import SUFFIX, write_npz
 from rs_localizer.markers.map_files import FORMATS, OWN, SUFFIXES, write_any
@@ -25,7 +25,7 @@ _OUTPUTS = (SUFFIX, *SUFFIXES)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(info.Options):
+class Options(info_command.Options):
     out: Path = argument(f"ends in {', '.join(_OUTPUTS)}", "OUT")
     to: str | None = option(
         "of markers (default: .json is of wpilib, .yaml our own)", choices=list(FORMATS)
@@ -43,7 +43,7 @@ class Options(info.Options):
     origin: int | None = option("id at the origin", "ID")
 
 
-def run(options: Options) -> info.Figures:
+def run(options: Options) -> info_command.Figures:
     suffix = options.out.suffix
     usual = "wpilib" if suffix == ".json" else OWN
     if suffix not in _OUTPUTS:
@@ -54,7 +54,7 @@ def run(options: Options) -> info.Figures:
         if getattr(options, one) and getattr(options, other):
             raise UsageError(f"give one of --{one}, --{other}")
     refuse_existing(options)
-    any_map, kind = info.read(options)
+    any_map, kind = info_command.read(options)
     if isinstance(any_map, Map) and suffix != SUFFIX:
         raise UsageError(f"{options.file} holds landmarks, which go to {SUFFIX}")
     wishes = (options.scale, options.distance, options.up, options.floor, options.origin)
@@ -64,7 +64,7 @@ def run(options: Options) -> info.Figures:
         shift = ", ".join(f"{value:.4f}" for value in by.translation)
         print(f"scaled by {by.scale:.6g}, turned by {turn:.3f} deg, shifted by ({shift}) m")
         any_map = moved(any_map, by)
-    figures = info.describe(options.file, any_map, kind)
+    figures = info_command.describe(options.file, any_map, kind)
 
     def write(part: Path) -> None:
         if isinstance(any_map, Map):

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from rs_localizer.cli import WORKING, replaced
-from rs_localizer.cli.options import Overwrite, UsageError, argument, option
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.io.calibration import pinhole_matrix, read_calibration
+from rs_localizer.io.camera_files import pinhole_matrix, read_calibration
 from rs_localizer.io.recording import MARKER_MAP, PARAMETERS
 from rs_localizer.settings import build, camera_values, settings, write_parameters
 from rs_localizer.tools.simulation.settings import FrameSettings, ImageSettings
@@ -95,7 +95,7 @@ class CameraOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(MotionOptions, CameraOptions, Overwrite):
+class Options(MotionOptions, CameraOptions, ResultOptions):
     out: Path = argument("bag directory to create", "OUT")
     points: int = option(
         "of a frame, if it sees so many", "N", _POINTS.points, limits=(1, math.inf)

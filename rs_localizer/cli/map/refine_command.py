@@ -13,7 +13,14 @@ from pathlib import Path
 
 from rs_localizer.cli import WORKING, refuse_existing, replaced, write_all
 from rs_localizer.cli.map import check_readout
-from rs_localizer.cli.options import CAMERA_FLAGS, Inputs, Settings, UsageError, argument, option
+from rs_localizer.cli.options import (
+    CAMERA_FLAGS,
+    SettingOptions,
+    TopicOptions,
+    UsageError,
+    argument,
+    option,
+)
 from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
 from rs_localizer.cli.settings_args import given_settings, given_topics, given_values
 from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
@@ -26,7 +33,7 @@ if WORKING:
     from rs_localizer.core.arrays import Array
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.bags import open_bag
-    from rs_localizer.io.calibration import read_calibration, write_calibration
+    from rs_localizer.io.camera_files import read_calibration, write_calibration
     from rs_localizer.io.clouds import Correspondences
     from rs_localizer.io.maps.colmap import read_model, write_model
     from rs_localizer.io.maps.landmarks import Map, MapError
@@ -43,7 +50,7 @@ _step = partial(print, "adjusted:", flush=True)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Settings, Inputs):
+class Options(SettingOptions, TopicOptions):
     recordings: list[Path] = argument("a bag of correspondences or keypoints", "RECORDING", list)
     map: Path | None = option("the map (default: the points of the recording)", "MAP")
     out: Path | None = option(f"ends in {SUFFIX}", "OUT")

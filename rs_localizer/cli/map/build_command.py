@@ -29,7 +29,7 @@ if WORKING:
 
     from rs_localizer.cli.marker_map import read_checked_map
     from rs_localizer.io.atomic_files import atomic_directory
-    from rs_localizer.io.calibration import write_calibration
+    from rs_localizer.io.camera_files import write_calibration
     from rs_localizer.io.maps.files import write_npz
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
     from rs_localizer.io.trajectories import Trajectory, write_tum

@@ -43,7 +43,7 @@ from rs_localizer.tools.readout_belief import (
 )
 
 
-def likelihood(camera: Camera, result: Calibration, count: int = 9) -> tuple[Array, Array]:
+def likelihood(camera: Camera, result: CameraCalibration, count: int = 9) -> tuple[Array, Array]:
     """Readout times (count,) within four deviations, and what they cost more than the best."""
     observations = within(result.posed.observations, result.fit.state.spline)
     values = result.readout_time + np.linspace(-4.0, 4.0, count) * result.formal_deviation
@@ -132,7 +132,7 @@ _ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Calibration(Evidence):
+class CameraCalibration(Evidence):
     """What a recording says of its camera."""
 
     formal_deviation: float  # s, of the noise of the readout time alone
@@ -172,7 +172,7 @@ def calibrate(
     imu: ImuRecording | None = None,
     own_stamps: bool = True,
     done: Callable[[], object] = lambda: None,
-) -> Calibration:
+) -> CameraCalibration:
     """Readout time, and lens, of a camera from a recording in which it moves.
 
     Args:
@@ -338,7 +338,7 @@ def _judged(
     stamps: Stamps,
     fitted: Fit,
     images: int,
-) -> Calibration:
+) -> CameraCalibration:
     opposite = cost_at(camera, observations, fitted, -fitted.state.readout_time)
     blocks, halves = (
         blocks_of(camera, observations, fitted),
@@ -356,7 +356,7 @@ def _judged(
     lens = lens_errors(fitted.camera, inflation**2 * fitted.border_covariance[at, at])
     if len(halves) == 2:
         lens = lens.or_half(lens_difference(halves[0].camera, halves[1].camera))
-    return Calibration(
+    return CameraCalibration(
         readout_time=fitted.state.readout_time,
         deviation=math.hypot(
             formal * inflation,
