@@ -53,6 +53,7 @@ from rs_localizer.estimation.motion_window import (
 from rs_localizer.estimation.prior import Prior, offset_between, pivot_of, state_in
 from rs_localizer.integrity import Integrity
 from rs_localizer.localizer import Localizer
+from rs_localizer.prediction_errors import PredictionErrors
 from rs_localizer.solvers.table import find_solver
 
 if TYPE_CHECKING:  # without a gyroscope nobody needs them
@@ -178,6 +179,7 @@ class Tracker:
         self._track: _Track | None = None
         self._given: tuple[int, Prior] | None = None
         self._integrity = Integrity()
+        self._errors = PredictionErrors(max_prediction)
         self._last_ns: int | None = None
         self._too_close = 0
         self._aid: GyroscopeAid | None = None
@@ -191,6 +193,7 @@ class Tracker:
         """Forget all frames so far."""
         self._track = self._given = None
         self._integrity.reset()
+        self._errors.reset()
         self._seen.clear()
         if self._aid is not None:
             self._aid.reset()
@@ -279,9 +282,9 @@ class Tracker:
         """The motion at a time, in ns as :meth:`localize` takes it.
 
         Within the rows of one of the last frames it is that frame's, between frames what those
-        before and after tell, after them predicted under accelerations as they were of late. None
-        before the last frames, more than ``max_prediction`` after them, and where the orientation
-        is too uncertain. Points are those of the frame that is nearest.
+        before and after tell, after them predicted, and as sure as such predictions deserved of
+        late. None before the last frames, more than ``max_prediction`` after them, and where the
+        orientation is too uncertain. Points are those of the frame that is nearest.
         """
         track = self._track
         if track is None or track.window is None:
@@ -302,6 +305,8 @@ class Tracker:
             if motion is None:
                 return None
             there = predicted_estimate(nearest, motion, swing)
+            if (ahead := 1e-9 * (time_ns - track.time_ns)) > 0.0:
+                there = self._errors.widened(there, ahead)
         if isinstance(there, RigEstimate):
             there = replace(there, time=there.time + seconds)
         return there if self.localizer.accepted(there) else None
@@ -488,6 +493,7 @@ class Tracker:
                 if result.turn is not None:
                     self._track.linear_scale = _learnt(track.linear_scale, prior, result)
             self._track.window = self._window(time_ns, prior, result, track, context)
+            self._errors.add(result, self._track.window, unshaken(result)[2])
         if track is None or self._track is None or self._trusts_motion(context):
             return
         seconds = 1e-9 * (time_ns - track.time_ns)

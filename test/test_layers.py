@@ -11,7 +11,8 @@ PACKAGE = Path(__file__).parents[1] / "rs_localizer"
 
 # What each part may import besides itself; every part has a row.
 METHOD = {
-    *("core", "config", "solvers", "estimation", "inertial", "integrity", "localizer", "tracking"),
+    *("core", "config", "solvers", "estimation", "inertial", "integrity", "localizer"),
+    *("prediction_errors", "tracking"),
 }
 MAY_IMPORT: dict[str, set[str]] = {
     "process": set(),
@@ -21,8 +22,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "solvers": {"core"},
     "estimation": {"core", "config", "solvers"},
     "inertial": {"core", "estimation"},
-    "localizer": METHOD - {"inertial", "integrity", "localizer", "tracking"},
+    "localizer": METHOD - {"inertial", "integrity", "localizer", "prediction_errors", "tracking"},
     "integrity": {"core", "estimation"},
+    "prediction_errors": {"core", "estimation"},
     "tracking": METHOD - {"tracking"},
     "io": {"core"},
     "settings": {"config", "io"},

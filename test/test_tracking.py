@@ -6,9 +6,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
+from rs_localizer import data
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.state import step_between
+from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.pose_at_time import twist_at
+from rs_localizer.tools.simulation.frames import simulate_frames
+from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.tracking import FrameContext, Tracker
 
 READOUT = 0.03
@@ -180,6 +186,40 @@ def test_poses_and_twists_at_any_time_are_covered():
     inside = np.mean(np.array(lengths) < 12.6, axis=0)
     assert np.all(inside > 0.8), inside
     assert np.all(np.median(lengths, axis=0) > 0.3)
+
+
+class RecordedHand:
+    """A real one, in s after its start."""
+
+    def __init__(self):
+        self.recorded = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
+        self.start_ns = self.recorded.intervals_ns[0][0]
+
+    def motion(self, t):
+        state = self.recorded.state(self.start_ns, np.array([t]))
+        turn = state.rotations[0].T
+        return rsl.Motion(
+            turn, -turn @ state.positions[0], READOUT * state.angular[0], READOUT * state.linear[0]
+        )
+
+    def frames(self, count):
+        world = room(sampled_states(self.recorded).positions, np.random.default_rng(0), count=5000)
+        stamps = [self.start_ns + round(1e9 * i / 30.0) for i in range(count)]
+        return simulate_frames(
+            CAMERA, self.recorded, world, FrameSettings(150, 0.5, 0.0), stamps_ns=stamps
+        )
+
+
+def test_predictions_are_as_sure_as_a_real_hand_lets_them_be():
+    """Its accelerations outlast those of the model, which predicts the next image best."""
+    hand, tracker, lengths = RecordedHand(), Tracker(rsl.Localizer(CAMERA)), []
+    for k, frame in enumerate(hand.frames(240)):
+        t = 1e-9 * (frame.middle_ns - hand.start_ns)
+        assert tracker.localize(ns(t), frame.points, frame.pixels)
+        if k >= 10:
+            lengths.append([off_at(tracker, hand, t + after) for after in (0.03, 0.06, 0.0999)])
+    inside = np.mean(np.array(lengths) < 12.6, axis=0)
+    assert np.all(inside > 0.9), inside
 
 
 def test_results_of_a_frame_later_know_their_velocities_better():

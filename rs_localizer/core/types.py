@@ -12,7 +12,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.gyro_rotation import GyroRotation
+from rs_localizer.core.gyro_rotation import GyroRotation, late_at
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scales import Scales
 from rs_localizer.core.shake import FUNCTIONS, shake_at, shake_basis, within_rows
@@ -199,6 +199,11 @@ class Estimate(Motion):
         joint = transport @ self.joint_covariance @ transport.T
         for part, variance in zip((TURN, ANGULAR), beyond_rows(self, tau), strict=True):
             joint[part, part] += variance * np.eye(3)
+        if self.turn is not None:  # what its errors and its noise are at one moment
+            late = late_at(tau, self.turn.tau, self.turn.rates, self.turn.parabola)
+            for part, off in zip((TURN, ANGULAR), late, strict=True):
+                joint[part, part] += self.turn.delay**2 * np.outer(off, off)
+            joint[ANGULAR, ANGULAR] += self.turn.rate_noise**2 * np.eye(3)
         return replace(
             self,
             rotation=rotation,

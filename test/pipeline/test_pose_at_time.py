@@ -231,7 +231,8 @@ def test_what_no_row_has_seen_grows_with_the_distance(known):
 
 def test_an_estimate_beside_a_gyroscope_moves_on_in_the_axes_of_then():
     samples = np.linspace(-1.0, 1.0, 41)
-    turn = GyroRotation.of(samples, 0.3 + 0.1 * np.sin(np.outer(samples, [20.0, 25.0, 30.0])))
+    rates = 0.3 + 0.1 * np.sin(np.outer(samples, [20.0, 25.0, 30.0]))
+    turn = GyroRotation.of(samples, rates, rate_noise=0.05, delay=0.01)
     seen = replace(estimate(0.5, acceleration=0.02), span=READOUT_TIME)
     seen = seen.turned(turn, (0.0, np.inf))
     for tau in (-0.5, 0.3, 0.8):
