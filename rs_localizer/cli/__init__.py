@@ -65,11 +65,6 @@ def refuse_existing(args: Any, *others: Path) -> None:
     check_writable(args.out)
 
 
-def with_values(args: Any, **values: Any) -> argparse.Namespace:
-    """The arguments with some of them changed, or added."""
-    return argparse.Namespace(**vars(args) | values)
-
-
 def write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
     """Write files, all at once or none, and say which."""
     next(iter(writers)).parent.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, image_input, refuse_existing, with_values, write_all
+from rs_localizer.cli import WORKING, image_input, refuse_existing, write_all
 from rs_localizer.cli.image_input import ImageOptions, given_lens
 from rs_localizer.cli.marker_map import TargetOptions, find_map
 from rs_localizer.cli.options import UsageError, argument, option
@@ -106,8 +106,7 @@ def run(options: Options) -> Figures | None:
         raise UsageError(f"--out must end in .yaml, got {options.out}")
     if options.camera_info is not None and options.out is None:
         raise UsageError("--camera-info goes with --out")
-    topic = remapped(options).get(IMU, "") if options.imu else None
-    args = with_values(options, imu=topic, recording=options.recordings[0])
+    args = replace(options, recording=options.recordings[0])
     if args.rig:
         _calibrate_rig(args)
         return None
@@ -116,7 +115,7 @@ def run(options: Options) -> Figures | None:
     return _calibrate_one(args)
 
 
-def _calibrate_one(args: Any) -> Figures:
+def _calibrate_one(args: Options) -> Figures:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
         of_images = args.map is not None or args.board is not None
@@ -147,21 +146,28 @@ def _calibrate_one(args: Any) -> Figures:
     }
 
 
-def _beside(args: Any, name: str) -> Path:
+def _out(args: Options) -> Path:
+    assert args.out is not None  # else nothing is written
+    return args.out
+
+
+def _beside(args: Options, name: str) -> Path:
     """The file beside ``OUT.yaml``, as ``OUT_map.yaml``."""
-    out: Path = args.out
+    out = _out(args)
     return out.with_name(f"{out.stem}_{name}")
 
 
-def _lens_files(args: Any, cameras: Sequence[str] = ("",)) -> dict[str, Path]:
+def _lens_files(args: Options, cameras: Sequence[str] = ("",)) -> dict[str, Path]:
     """Files of lenses alone by camera, where they are wanted; of a rig, ``FILE_NAME`` of each."""
-    file: Path | None = args.camera_info
+    file = args.camera_info
     if file is None:
         return {}
     return {name: file.with_stem(f"{file.stem}_{name}") if name else file for name in cameras}
 
 
-def _calibrated(args: Any, source: _Input, camera: Camera, config: NodeConfig) -> CameraCalibration:
+def _calibrated(
+    args: Options, source: _Input, camera: Camera, config: NodeConfig
+) -> CameraCalibration:
     """What the images of a camera say, printed."""
     intrinsics = args.intrinsics or source.new_lens
     shown = covered(camera.size, (image.pixels for image in source.images))
@@ -174,12 +180,7 @@ def _calibrated(args: Any, source: _Input, camera: Camera, config: NodeConfig) -
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
     print("\n".join(verdict.table(found, args.rate)))
-    image_input.tell_telemetry(
-        with_values(args, images=args.recording),
-        verdict.readout_time(found),
-        found.fit.camera,
-        lens=False,
-    )
+    image_input.tell_telemetry(args, verdict.readout_time(found), found.fit.camera, lens=False)
     if intrinsics:
         print("\n".join(verdict.of_lens(found)))
     if source.imu is not None:
@@ -191,31 +192,32 @@ def _calibrated(args: Any, source: _Input, camera: Camera, config: NodeConfig) -
     return found
 
 
-def _read(args: Any, config: NodeConfig) -> _Input:
-    path: Path = args.recording
+def _read(args: Options, config: NodeConfig) -> _Input:
+    path = args.recording
     if not path.exists():
         raise ValueError(f"{path} does not exist")
     of_bag = is_bag(path)
-    imu = None if args.imu is None else (_imu_of_bag if of_bag else _imu_of_video)(args, path)
+    imu = None if not args.imu else (_imu_of_bag if of_bag else _imu_of_video)(args, path)
     if of_bag and IMAGE not in remapped(args):
         with open_bag(path) as bag:
             if has_frames(bag):
                 return replace(_correspondences(args, bag, config), imu=imu)
-    with image_input.opened(args, path, calibrated=False) as source:
+    with image_input.opened(args, calibrated=False) as source:
         found = _detected(args, source.shots)
     image_input.tell_times(source.clock)
     return replace(found, own_stamps=of_bag or (path.is_dir() and args.rate is None), imu=imu)
 
 
-def _imu_of_bag(args: Any, path: Path) -> ImuRecording:
+def _imu_of_bag(args: Options, path: Path) -> ImuRecording:
     with open_bag(path) as bag:
-        frame = optical_frame(bag, remapped(args).get(CAMERA_INFO))
-        return read_imu_recording(bag, args.imu or None, frame)
+        topics = remapped(args)
+        frame = optical_frame(bag, topics.get(CAMERA_INFO))
+        return read_imu_recording(bag, topics.get(IMU), frame)
 
 
-def _imu_of_video(args: Any, path: Path) -> ImuRecording:
+def _imu_of_video(args: Options, path: Path) -> ImuRecording:
     telemetry = image_input.telemetry_of(path)
-    if args.imu or telemetry is None or args.rate is not None:
+    if args.remaps or telemetry is None or args.rate is not None:
         raise UsageError(
             "-r imu:=TOPIC is for bags, and --imu for videos with a gyroscope of their own clock "
             "(without --rate): this one has none that is known"
@@ -224,7 +226,7 @@ def _imu_of_video(args: Any, path: Path) -> ImuRecording:
     return ImuRecording(stamps, telemetry.rates, np.eye(3))
 
 
-def _correspondences(args: Any, bag: BagReader, config: NodeConfig) -> _Input:
+def _correspondences(args: Options, bag: BagReader, config: NodeConfig) -> _Input:
     if args.board is not None:
         raise UsageError("--board is for images; the recording has correspondences")
     topics = find_topics(bag, given_topics(args)).without(IMU)
@@ -235,7 +237,7 @@ def _correspondences(args: Any, bag: BagReader, config: NodeConfig) -> _Input:
     return _Input(images, camera)
 
 
-def _detected(args: Any, shots: Iterator[Shot | Carried]) -> _Input:
+def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
     marker_map = find_map(args)
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
     detector.warm_up()
@@ -259,7 +261,7 @@ def _detected(args: Any, shots: Iterator[Shot | Carried]) -> _Input:
 
 
 def _write(
-    args: Any,
+    args: Options,
     found: CameraCalibration,
     marker_map: MarkerMap | None,
     intrinsics: bool,
@@ -327,19 +329,19 @@ def _deviations(
 
 
 def _write_files(
-    args: Any, values: Mapping[str, Any], lens: Mapping[str, Any], cameras: Mapping[str, Camera],
-    writers: Writers, remarks: Sequence[str],
+    args: Options, values: Mapping[str, Any], lens: Mapping[str, Any],
+    cameras: Mapping[str, Camera], writers: Writers, remarks: Sequence[str],
 ) -> None:  # fmt: skip
     """FILE.yaml, what goes beside it, and the lenses alone where they are wanted."""
     for name, file in _lens_files(args, list(cameras)).items():
         writers[file] = partial(write_calibration, camera=cameras[name])
     write = partial(write_camera_file, values=values, lens=lens, remarks=remarks)
-    write_all({**writers, args.out: write})
+    write_all({**writers, _out(args): write})
 
 
-def _next(args: Any, intrinsics: bool, shape: Path | None) -> str:
+def _next(args: Options, intrinsics: bool, shape: Path | None) -> str:
     """The commands that make poses of this recording with what was found."""
-    out: Path = args.out
+    out = _out(args)
     recording, seen = str(args.recording), out.with_name(f"{out.stem}_seen")
     lens = intrinsics or args.calibration is not None
     params = ["--camera" if lens else "--params", str(out)]
@@ -352,14 +354,14 @@ def _next(args: Any, intrinsics: bool, shape: Path | None) -> str:
     return f"{shlex.join(detect)} && {image_input.replay_command(seen)}"
 
 
-def _calibrate_rig(args: Any) -> None:
+def _calibrate_rig(args: Options) -> None:
     """Calibrate each camera alone, then all together, and say what was found."""
-    if args.imu is not None:
+    if args.imu:
         raise UsageError("--imu is for one camera: leave it out with --rig")
     # Cameras by name need a readout time; what it is does not matter where it is estimated.
-    args.assignments = ["readout_time:=0.03", *args.assignments]
+    args = replace(args, assignments=["readout_time:=0.03", *args.assignments])
     config, recordings, maps = given_settings(args), dict[str, Recording](), list[MarkerMap]()
-    cameras = cameras_of(args, config)
+    cameras = cameras_of(args, args.recordings, config)
     if args.out is not None:
         lenses = _lens_files(args, list(cameras)).values()
         refuse_existing(args, _beside(args, _TRANSFORMS), *lenses)
@@ -369,7 +371,7 @@ def _calibrate_rig(args: Any) -> None:
         axis = config.of_cameras.get(name, config).scan_direction
         of_camera = replace(config, scan_direction=axis)
         plots = None if args.plot is None else args.plot / name
-        of_args = with_values(own.args, plot=plots)
+        of_args = replace(own.args, plot=plots)
         source = _read(of_args, of_camera)
         intrinsics |= source.new_lens
         maps += [] if source.map is None else [source.map]
@@ -445,9 +447,9 @@ def _parts(
     return RigParts(cameras, poses, offsets)
 
 
-def _next_of_rig(args: Any) -> str:
+def _next_of_rig(args: Options) -> str:
     """The command that goes on: poses of a video of several lenses, or TF for a live rig."""
-    path, recording = args.out, args.recordings[0]
+    path, recording = _out(args), args.recordings[0]
     if len(args.recordings) > 1 or is_bag(recording) or args.map is None:
         return shlex.join(["ros2", "launch", str(_beside(args, _TRANSFORMS))])
     poses = str(path.with_name(f"{path.stem}_poses"))

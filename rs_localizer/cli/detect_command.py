@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rs_localizer.cli import WORKING, replaced, with_values
+from rs_localizer.cli import WORKING, replaced
 from rs_localizer.cli.image_input import (
     ImageOptions,
     opened,
@@ -52,7 +52,7 @@ _LEAST_KEYPOINTS = settings(FeatureConfig)["max_keypoints"].minimum or 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class Options(TargetOptions, ImageOptions):
-    images: Path = argument(
+    recording: Path = argument(
         "a video (also a stream of JPEG images, .mjpeg), a rosbag2 or ROS 1 bag with raw or "
         "compressed images, or a folder of .jpg or .png files", "VIDEO|BAG|FOLDER",
     )  # fmt: skip
@@ -87,17 +87,17 @@ def detect(args: Options) -> Figures:
     settings, every, warnings = build(shutter_values(args)), list[Figures](), list[str]()
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
         with BagWriter(out) as bag:
-            cameras: dict[str, Any] = {"": args}
+            cameras = {"": args}
             if settings.of_cameras:
-                rig = cameras_of(with_values(args, recordings=[args.images]), settings)
+                rig = cameras_of(args, [args.recording], settings)
                 cameras = {name: own.args for name, own in rig.items()}
-                if args.calibration is not None and not is_bag(args.images):
+                if args.calibration is not None and not is_bag(args.recording):
                     mounts = make_mounts(read_camchain(args.calibration))
                     bag.write(TF_STATIC, mounts, DEFAULT_START_NS)
             for name, own in cameras.items():
                 of = settings.of_cameras.get(name, settings)
                 with (
-                    opened(own, args.images) as source,
+                    opened(own) as source,
                     tqdm(total=source.total, unit="image", desc="detect", disable=None) as bar,
                 ):
                     shots: Shots = source.shots

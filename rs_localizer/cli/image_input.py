@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, with_values
-from rs_localizer.cli.options import CAMERA_FLAGS, SettingOptions, TopicOptions, UsageError, option
+from rs_localizer.cli import WORKING
+from rs_localizer.cli.options import LensOptions, UsageError, option
 from rs_localizer.cli.settings_args import given_values, remapped
-from rs_localizer.io.camera_files import CALIBRATION_KINDS, read_calibration
+from rs_localizer.io.camera_files import read_calibration
 from rs_localizer.io.image_clock import ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE
@@ -48,32 +48,28 @@ _SAME = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageOptions(SettingOptions, TopicOptions):
-    """images: their camera and their times."""
+class ImageOptions(LensOptions):
+    """images without times of their own."""
 
-    calibration: Path | None = option(
-        f"as calibrate writes it, lens and shutter; or {CALIBRATION_KINDS} (default: the bag's "
-        "camera_info)", "FILE", flag=CAMERA_FLAGS,
-    )  # fmt: skip
     rate: float | None = option(
         "images per second, instead of the presentation times of a video, or for files whose names "
         "are not times in ns", "HZ", limits=(0.0, math.inf), above=True,
     )  # fmt: skip
 
 
-def given_lens(args: Any) -> Camera | None:
+def given_lens(options: ImageOptions) -> Camera | None:
     """The camera of ``--camera``, if there is one."""
-    return None if args.calibration is None else read_calibration(args.calibration)
+    return None if options.calibration is None else read_calibration(options.calibration)
 
 
-def shutter_values(args: Any) -> dict[str, Any]:
+def shutter_values(args: ImageOptions) -> dict[str, Any]:
     """The settings that were given, or that stand beside the images of a bag, by dotted name."""
-    beside, calibration = args.images / PARAMETERS, args.calibration
+    beside, calibration = args.recording / PARAMETERS, args.calibration
     given = args.params is not None or (calibration is not None and camera_values(calibration))
-    if not given and is_bag(args.images) and beside.exists():
-        return given_values(with_values(args, params=beside))
+    if not given and is_bag(args.recording) and beside.exists():
+        return given_values(replace(args, params=beside))
     values = given_values(args)
-    telemetry = telemetry_of(args.images)
+    telemetry = telemetry_of(args.recording)
     if telemetry is not None and telemetry.readout_time is not None:
         values.setdefault("readout_time", telemetry.readout_time)
     if calibration is not None and not {"readout_time", "cameras"} & set(values):
@@ -102,17 +98,17 @@ def _can_read() -> bool:
 
 
 def tell_telemetry(
-    args: Any, used: float | None = None, measured: Camera | None = None, lens: bool = True
+    args: ImageOptions, used: float | None = None, measured: Camera | None = None, lens: bool = True
 ) -> None:
     """Say what a video knows of its camera, and what is not used of it.
 
     Args:
-        args: with ``images``.
+        args: of the video.
         used: the readout time that was measured, s; None: that of the settings is used.
         measured: the camera, if it was measured.
         lens: whether a lens profile takes the place of a calibration.
     """
-    path, settings = args.images, None if measured else build(shutter_values(args))
+    path, settings = args.recording, None if measured else build(shutter_values(args))
     is_rig = settings is not None and bool(settings.of_cameras)
     if path.suffix == ".insv" and importlib.util.find_spec("av") is not None:
         names = LENSES[: count_lenses(path)]
@@ -193,18 +189,17 @@ class Source:
 
 
 @contextlib.contextmanager
-def opened(args: Any, path: Path, calibrated: bool = True) -> Iterator[Source]:
-    """Images with the lens of ``args.calibration`` or, of a bag, its camera_info.
+def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
+    """Images of a recording with the lens of ``--camera`` or, of a bag, its camera_info.
 
     Args:
-        args: with ``rate``, the ``remaps`` of topics of a bag, and ``lens`` of a video of several.
-        path: of the images.
+        args: of one camera.
         calibrated: refuse images without a calibration.
 
     Raises:
         UsageError: for options that do not go with it, or that are missing.
     """
-    camera = given_lens(args)
+    path, camera = args.recording, given_lens(args)
     if is_bag(path):
         if args.rate is not None:
             raise UsageError("--rate is for videos and folders; a bag has its own times")
@@ -215,7 +210,7 @@ def opened(args: Any, path: Path, calibrated: bool = True) -> Iterator[Source]:
         return
     if args.remaps:
         raise UsageError("-r names topics of a bag")
-    lens, telemetry = getattr(args, "lens", None), None
+    lens, telemetry = args.lens, None
     if lens is None and calibrated:
         telemetry = telemetry_of(path)
         if camera is None and telemetry is not None:

@@ -8,7 +8,6 @@ import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -57,7 +56,7 @@ def read_checked_map(path: Path) -> MarkerMap:
     return marker_map
 
 
-def find_map(args: Any) -> MarkerMap:
+def find_map(args: TargetOptions) -> MarkerMap:
     """The map that was given, or that of the board.
 
     Raises:
@@ -70,7 +69,7 @@ def find_map(args: Any) -> MarkerMap:
             if getattr(args, name) is not None:
                 raise UsageError(f"--{name} goes with --board")
         return read_checked_map(args.map)
-    if args.square is None:
+    if args.board is None or args.square is None:
         raise UsageError("--board needs --square")
     columns, rows = read_counts(args.board, "--board")
     pattern = args.pattern or _CHESSBOARD

@@ -20,10 +20,9 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from rs_localizer.config import meant
+from rs_localizer.io.camera_files import CALIBRATION_KINDS
 
 T = TypeVar("T")
-CAMERA_FLAGS = "--camera --calibration"
-"""One file a camera, and its name where it is a lens alone."""
 MORE = " (--help says more)"
 """Behind faults of the command line."""
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
@@ -98,6 +97,19 @@ class TopicOptions:
         list,
         flag="-r",
     )
+    # No options: what is read, of one of several cameras, and which lens of a video it is.
+    recording: Path = Path()
+    lens: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensOptions(SettingOptions, TopicOptions):
+    """the camera."""
+
+    calibration: Path | None = option(
+        f"as calibrate writes it, lens and shutter; or {CALIBRATION_KINDS} (default: the bag's "
+        "camera_info)", "FILE", flag="--camera --calibration",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +159,7 @@ class Parser(argparse.ArgumentParser):
 def add_options(parser: argparse.ArgumentParser, kind: type[Any], *more: type[Any]) -> None:
     """Add an argument for each field of a dataclass of options, and of ``more`` of them."""
     for item in fields(kind):  # those of bases come first on the command line
-        if item.metadata["positional"]:
+        if item.metadata.get("positional"):
             _add(parser, kind, item)
     # Bases come last in the help: what is the command's own is looked for first.
     for owner in (*kind.__mro__[:-1], *more):
@@ -155,7 +167,7 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any], *more: type[An
         group = parser if owner is kind else parser.add_argument_group(title)
         for item in fields(owner):
             own = item.name in vars(owner).get("__annotations__", {})
-            if own and not item.metadata["positional"]:
+            if own and not item.metadata.get("positional", True):
                 _add(group, owner, item)
 
 
@@ -217,6 +229,8 @@ def read(kind: type[T], namespace: argparse.Namespace) -> T:
     hints = typing.get_type_hints(kind)
     given = {}
     for item in fields(kind):  # type: ignore[arg-type]
+        if not item.metadata:
+            continue
         value = getattr(namespace, item.name)
         several = isinstance(value, list) and isinstance(_element(hints[item.name])[1], int)
         given[item.name] = tuple(value) if several else value

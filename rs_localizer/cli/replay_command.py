@@ -210,7 +210,7 @@ def _detection(options: Options, recording: Path, out: Path) -> detect_command.O
         lens = place / CAMERA
         calibration = calibration or (lens if lens.is_file() and not is_bag(recording) else None)
     return detect_command.Options(
-        images=recording, out=out, map=place if by_markers else None, features=features,
+        recording=recording, out=out, map=place if by_markers else None, features=features,
         calibration=calibration, params=params, assignments=options.assignments,
         remaps=options.remaps, rate=options.rate,
     )  # fmt: skip

@@ -8,10 +8,10 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from rs_localizer.cli import WORKING, with_values
-from rs_localizer.cli.options import UsageError
+from rs_localizer.cli import WORKING
+from rs_localizer.cli.options import LensOptions, UsageError
 
 if WORKING:
     import numpy as np
@@ -30,11 +30,14 @@ if WORKING:
     from rs_localizer.tools.verdict import numbers
 
 
+T = TypeVar("T", bound=LensOptions)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class OfRig:
+class OfRig(Generic[T]):
     """One camera of the recordings."""
 
-    args: Any  # as of a recording of this camera alone
+    args: T  # as of a recording of this camera alone
     frame: str  # of its optical axes
 
 
@@ -45,27 +48,27 @@ def check_there(recordings: Sequence[Path]) -> None:
             raise ValueError(f"{path} does not exist")
 
 
-def cameras_of(args: Any, config: NodeConfig) -> dict[str, OfRig]:
-    """The cameras of ``args.recordings``, by name: of one bag, or of a recording of each."""
-    if len(args.recordings) > 1:
-        names = [re.sub(r"\W", "_", path.stem, flags=re.ASCII) for path in args.recordings]
-        topics = [{"recording": path} for path in args.recordings]
+def cameras_of(args: T, recordings: Sequence[Path], config: NodeConfig) -> dict[str, OfRig[T]]:
+    """The cameras of recordings, by name: of one bag, or of a recording of each."""
+    if len(recordings) > 1:
+        names = [re.sub(r"\W", "_", path.stem, flags=re.ASCII) for path in recordings]
+        topics: list[dict[str, Any]] = [{"recording": path} for path in recordings]
         frames = [f"{name}_optical_frame" for name in names]
     else:
-        (path,) = args.recordings
+        (path,) = recordings
         names, topics, frames = _in_one_file(path, config.cameras if config.of_cameras else None)
     if len(set(names)) < max(len(names), 2) or not all(name[:1].isalpha() for name in names):
         raise UsageError(
             f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
         )
-    check_there(args.recordings)
+    check_there(recordings)
     if len(set(frames)) < len(frames):  # as of single recordings put together
         frames = [""] * len(frames)
     lens = args.calibration
     cameras = {}
     for name, own, frame in zip(names, topics, frames, strict=True):
         calibration = None if lens is None else lens.with_name(f"{lens.name}#{name}")
-        of_camera = with_values(args, **own, calibration=calibration)
+        of_camera = replace(args, **own, calibration=calibration)
         cameras[name] = OfRig(of_camera, frame or f"{name}_optical_frame")
     return cameras
 
@@ -111,26 +114,26 @@ def mounting_lines(name: str, first: str, mounted: Extrinsics, deviations: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapCamera:
+class MapCamera(Generic[T]):
     """A camera that a map is made with, alone or of a rig."""
 
     name: str  # empty: it is alone
-    args: Any  # with its ``recording`` and topics
+    args: T  # with its recording and topics
     config: NodeConfig  # with its shutter and clock
     mounting: Mounting | None  # None: the axes are its own
 
 
-def map_cameras(args: Any, config: NodeConfig) -> list[MapCamera]:
-    """The cameras of ``args.recordings``; those of a rig in the axes of the first.
+def map_cameras(args: T, recordings: Sequence[Path], config: NodeConfig) -> list[MapCamera[T]]:
+    """The cameras of recordings; those of a rig in the axes of the first.
 
     Raises:
         UsageError: when it is not known how they are mounted, or what their shutters are.
     """
-    if len(args.recordings) == 1 and not config.of_cameras:
-        check_there(args.recordings)
-        alone = with_values(args, recording=args.recordings[0])
+    if len(recordings) == 1 and not config.of_cameras:
+        check_there(recordings)
+        alone = replace(args, recording=recordings[0])
         return [MapCamera("", alone, config, None)]
-    sources = cameras_of(args, config)
+    sources = cameras_of(args, recordings, config)
     if args.calibration is not None:
         parts = read_camchain(args.calibration)
         known = [name for name in sources if name in parts.cameras]
@@ -151,7 +154,7 @@ def map_cameras(args: Any, config: NodeConfig) -> list[MapCamera]:
     if lacking := [name for name in sources if not shutters[name].readout_time > 0.0]:
         raise UsageError(f"no readout_time of {', '.join(lacking)}: calibrate --rig finds it")
     first = given[next(iter(sources))].inverse()
-    cameras = list[MapCamera]()
+    cameras = list[MapCamera[T]]()
     for name, own in sources.items():
         pose, mounting = given[name] @ first, None
         if cameras:
@@ -162,10 +165,10 @@ def map_cameras(args: Any, config: NodeConfig) -> list[MapCamera]:
     return cameras
 
 
-def _by_tf(sources: Mapping[str, OfRig]) -> dict[str, Transform]:
+def _by_tf(sources: Mapping[str, OfRig[T]]) -> dict[str, Transform]:
     """Where TF of a bag says that the cameras are, in the axes of the first of them."""
     first = next(iter(sources.values()))
-    path: Path = first.args.recording
+    path = first.args.recording
     if not is_bag(path):
         return {}
     with open_bag(path) as bag:

@@ -406,7 +406,7 @@ def test_a_focal_length_that_disagrees_is_named(video, telemetry, capsys, focal,
     lens = Camera(160, 120, [[140.0, 0, 80], [0, 140, 60], [0, 0, 1]], np.zeros(4), "equidistant")
     telemetry(lens="lens profile", profile=lens)
     measured = Camera(320, 240, [[focal, 0, 160], [0, focal, 120], [0, 0, 1]])
-    args = SimpleNamespace(images=video, calibration=None)
+    args = SimpleNamespace(recording=video, calibration=None)
     image_input.tell_telemetry(args, 0.0205, measured, lens=False)
     said = capsys.readouterr().out
     assert "lens profile, not used" in said

@@ -7,12 +7,12 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-from rs_localizer.cli import WORKING, replaced, stage, with_values
+from rs_localizer.cli import WORKING, replaced, stage
 from rs_localizer.cli.image_input import (
     ImageOptions,
     opened,
@@ -42,7 +42,7 @@ if WORKING:
     from rs_localizer.tools.mapping.views import Looker
 
 
-def shutter_of(args: Any) -> tuple[float | None, str | None]:
+def shutter_of(args: Options) -> tuple[float | None, str | None]:
     """Readout time and scan direction, given or beside the images; None: not known."""
     values = shutter_values(args)
     settings = build(values)
@@ -52,17 +52,17 @@ def shutter_of(args: Any) -> tuple[float | None, str | None]:
     return readout_time, settings.scan_direction if "scan_direction" in values else None
 
 
-def look_at_images(args: Any, looker: Looker) -> Looked:
+def look_at_images(args: Options, points: Sequence[_Point], looker: Looker) -> Looked:
     """Look at the images that are kept: so many a second, and those in which points are given."""
-    with opened(args, args.images, calibrated=False) as source, tqdm(
+    with opened(args, calibrated=False) as source, tqdm(
         total=source.total, unit="image", desc="look", disable=None
     ) as bar:  # fmt: skip
-        moments = [seconds for _, seconds, _, _ in args.point]
+        moments = [seconds for _, seconds, _, _ in points]
         looked = look(source.shots, looker, args.images_per_second, moments, bar.update)
     if not looked.views:
         why = "; ".join(looked.refused.values())
-        raise ValueError(f"{args.images} has no image that can be read; {why}")
-    for name, seconds, *_ in args.point:
+        raise ValueError(f"{args.recording} has no image that can be read; {why}")
+    for name, seconds, *_ in points:
         if seconds not in looked.moments:
             raise UsageError(f"--point {name}: the images end before {seconds:g} s")
     tell_left_out(looked.refused, {})
@@ -70,6 +70,7 @@ def look_at_images(args: Any, looker: Looker) -> Looked:
     return looked
 
 
+_Point = tuple[str, float, float, float]
 COLMAP, POSES, REPORT = "colmap", "poses.txt", "report.md"
 # A hand's motion is held by so many images a second.
 _IMAGES_PER_SECOND = 15.0
@@ -77,7 +78,7 @@ _IMAGES_PER_SECOND = 15.0
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ImageOptions):
-    images: Path = argument("images of one camera, as for detect", "VIDEO|BAG|FOLDER")
+    recording: Path = argument("images of one camera, as for detect", "VIDEO|BAG|FOLDER")
     out: Path = option("to create", "DIR", required=True)
     overwrite: bool = option("replace an earlier result", default=False)
     markers: Path | None = option("marker map; some of it is in the images", "FILE")
@@ -94,12 +95,12 @@ class Options(ImageOptions):
     )  # fmt: skip
 
 
-def run(options: Options) -> None:
-    args = with_values(options, point=_points(options))
-    distances = _distances(options, [name for name, *_ in args.point])
+def run(args: Options) -> None:
+    points = _points(args)
+    distances = _distances(args, [name for name, *_ in points])
     require()
-    if not args.images.exists():
-        raise ValueError(f"{args.images} does not exist")
+    if not args.recording.exists():
+        raise ValueError(f"{args.recording} does not exist")
     markers = None if args.markers is None else read_checked_map(args.markers)
     tell_telemetry(args, lens=False)
     shutter, frame = shutter_of(args), MAP_FRAME if markers is None else markers.map_frame
@@ -107,10 +108,9 @@ def run(options: Options) -> None:
         out.mkdir()
         with TemporaryDirectory(dir=out) as images:
             looker = Looker(FeatureConfig().max_keypoints, Path(images), markers)
-            looked = look_at_images(args, looker)
+            looked = look_at_images(args, points, looker)
             sights = [
-                PointSight(name, looked.moments[seconds], (u, v))
-                for name, seconds, u, v in args.point
+                PointSight(name, looked.moments[seconds], (u, v)) for name, seconds, u, v in points
             ]
             anchors = Anchors(markers, tuple(sights), tuple(distances))
             inputs = Given(looked.views, looked.camera, anchors, *shutter, frame)
@@ -121,7 +121,7 @@ def run(options: Options) -> None:
     _tell(args, built, looked)
 
 
-def _points(options: Options) -> list[tuple[str, float, float, float]]:
+def _points(options: Options) -> list[_Point]:
     return [
         (name, _number("--point", seconds), _number("--point", u), _number("--point", v))
         for name, seconds, u, v in options.point
@@ -170,7 +170,7 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")
 
 
-def _tell(args: Any, built: Built, looked: Looked) -> None:
+def _tell(args: Options, built: Built, looked: Looked) -> None:
     print(args.out / MAP)
     for name, text in rows(built, looked.images, len(looked.views)):
         print(f"  {name:30} {text}")

@@ -13,14 +13,7 @@ from pathlib import Path
 
 from rs_localizer.cli import WORKING, refuse_existing, replaced, write_all
 from rs_localizer.cli.map import check_readout
-from rs_localizer.cli.options import (
-    CAMERA_FLAGS,
-    SettingOptions,
-    TopicOptions,
-    UsageError,
-    argument,
-    option,
-)
+from rs_localizer.cli.options import LensOptions, UsageError, argument, option
 from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
 from rs_localizer.cli.settings_args import given_settings, given_topics, given_values
 from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
@@ -50,7 +43,7 @@ _step = partial(print, "adjusted:", flush=True)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(SettingOptions, TopicOptions):
+class Options(LensOptions):
     recordings: list[Path] = argument("a bag of correspondences or keypoints", "RECORDING", list)
     map: Path | None = option("the map (default: the points of the recording)", "MAP")
     out: Path | None = option(f"ends in {SUFFIX}", "OUT")
@@ -60,11 +53,6 @@ class Options(SettingOptions, TopicOptions):
         "landmarks of known place, three or more: they hold frame and size of the map (default: "
         "the map as a whole stays where it is, with the size that it has)", "ID ...", list,
     )  # fmt: skip
-    calibration: Path | None = option(
-        "instead of camera_info; of a rig, a camchain as calibrate --rig writes it",
-        "FILE",
-        flag=CAMERA_FLAGS,
-    )
     colmap: tuple[Path, Path] | None = option(
         "instead of RECORDING: folder of a sparse model of COLMAP, text or binary, of one camera, "
         "and one to create, for programs that know a global shutter only", "IN OUT",
@@ -86,7 +74,7 @@ def run(args: Options) -> None:
     config = given_settings(args)
     refuse_existing(args)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
-    cameras = map_cameras(args, config)
+    cameras = map_cameras(args, args.recordings, config)
     known = all(of.config.readout_time > 0.0 for of in cameras)
     rig, clouds = zip(*(_recorded(of, landmarks) for of in cameras), strict=True)
     with tqdm(total=sum(map(len, clouds)), unit="image", desc="localize", disable=None) as bar:
@@ -102,7 +90,7 @@ def run(args: Options) -> None:
 
 
 def _recorded(
-    of: MapCamera, landmarks: Map | None
+    of: MapCamera[Options], landmarks: Map | None
 ) -> tuple[RigCamera, tuple[Correspondences, ...]]:
     """A camera, and what it saw of the map."""
     config, args = of.config, of.args

@@ -65,7 +65,7 @@ def run(args: Options) -> None:
         if origin is None:
             raise UsageError(f"--origin: {' and '.join(args.family)} have no id {args.origin}")
     refuse_existing(args)
-    spotter, cameras = Spotter(markers), map_cameras(args, config)
+    spotter, cameras = Spotter(markers), map_cameras(args, args.recordings, config)
     filmed = [_filmed(camera, spotter) for camera in cameras]
     found = survey_rig(filmed, markers, origin=origin)
     every = found.deviations_of_shape
@@ -107,11 +107,11 @@ def _markers(args: Options) -> tuple[Marker, ...]:
     return every_marker(families, size, sizes)
 
 
-def _filmed(given: MapCamera, spotter: Spotter) -> Filmed:
+def _filmed(given: MapCamera[Options], spotter: Spotter) -> Filmed:
     """A camera, and the markers of each image."""
     args, config, spotted = given.args, given.config, dict[int, Spotted]()
     camera: Camera | None = None
-    with opened(args, args.recording) as source:
+    with opened(args) as source:
         seen = seen_by(source.shots, config.scan_direction)
         for image, own in tqdm(seen, unit="image", desc="detect", disable=None):
             if camera is not None and own is not camera:
@@ -127,7 +127,7 @@ def _filmed(given: MapCamera, spotter: Spotter) -> Filmed:
 
 
 def _tell(
-    found: Survey, every: Array, cameras: Sequence[MapCamera], filmed: Sequence[Filmed]
+    found: Survey, every: Array, cameras: Sequence[MapCamera[Options]], filmed: Sequence[Filmed]
 ) -> None:
     """The table of the markers, with their deviations (m,6)."""
     fit = found.fit
