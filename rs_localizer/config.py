@@ -154,7 +154,7 @@ class Acceleration:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationErrors:
-    """What the calibration of the lens may be off by: parts of an error that do not overlap.
+    """Errors of the lens's calibration: parts that do not overlap.
 
     The defaults are those of a board that was held before an ordinary camera for half a minute;
     ``rs_localizer calibrate`` writes those of its own.
@@ -256,7 +256,7 @@ class PoseTime(StrEnum):
 
 
 class PublishTf(StrEnum):
-    """What goes out on TF."""
+    """Transform that is published on TF."""
 
     NONE = "none"
     MAP_TO_CAMERA = "map_to_camera"
@@ -264,14 +264,14 @@ class PublishTf(StrEnum):
 
 
 class OrientationCovariance(StrEnum):
-    """What the covariances of published orientations are about."""
+    """Convention of the covariances of published orientations."""
 
     FIXED_AXES = "fixed_axes"
     ROLL_PITCH_YAW = "roll_pitch_yaw"
 
 
 class MatchBy(StrEnum):
-    """What keypoints and landmarks are compared by."""
+    """Basis of the comparison of keypoints with landmarks."""
 
     AUTO = "auto"
     DESCRIPTOR = "descriptor"
@@ -314,7 +314,7 @@ class Matching:
 
 
 class ImuUse(StrEnum):
-    """Whether an IMU is used."""
+    """Use of an IMU."""
 
     AUTO = "auto"
     NONE = "none"
@@ -372,7 +372,7 @@ class RigSettings:
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """What each camera of a rig has of its own: ``NAME.readout_time`` and so on."""
+    """Settings that each camera of a rig has of its own: ``NAME.readout_time`` and so on."""
 
     readout_time: float
     scan_direction: str
@@ -383,7 +383,7 @@ class CameraSettings:
 _NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
 LONGEST_READOUT_TIME = 0.2
-"""What a camera may take from the first row to the last, in s."""
+"""Longest time from the first row to the last, in s."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What others know of a camera's readout time, and how their conventions become ours.
+"""Published readout times of cameras, and how their conventions become ours.
 
 Ours: ``readout_time`` runs from the first row to the last, ``height - 1`` line times;
 ``stamp_offset`` from the stamp to the middle of the first row's exposure.
@@ -34,7 +34,7 @@ _UPPER_BOUND = 0.95
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What is known of one mode of a camera."""
+    """Published readout times of one mode of a camera."""
 
     name: str
     mode: str
@@ -46,7 +46,7 @@ class Known:
 
     @property
     def upper_bound(self) -> bool:
-        """Whether it is about the whole interval between images, which says little."""
+        """True if it is about the whole interval between images, which says little."""
         words = self.mode.split()
         rate = float(words[-2]) if words[-1] == "Hz" else 0.0
         return self.median * rate > _UPPER_BOUND
@@ -130,7 +130,7 @@ def from_all_rows(duration: float, rows: int) -> float:
 
 
 class StampAt(StrEnum):
-    """What of a row's exposure a stamp stands for."""
+    """Part of a row's exposure that a stamp stands for."""
 
     START = "start"
     MIDDLE = "middle"

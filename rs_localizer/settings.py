@@ -106,7 +106,7 @@ def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
 
 
 def unknown(name: str, kind: Kind = NodeConfig) -> str | None:
-    """What to say of a name that is no setting; None for settings and what every node may have."""
+    """Fault of a name that is no setting; None for settings and what every node may have."""
     names = settings(kind)
     if name in names or name.split(".")[0] in _FOREIGN or _of_camera(name, kind):
         return None
@@ -136,7 +136,7 @@ def build(values: Mapping[str, Any], kind: Any = NodeConfig) -> Any:
 
 
 def _of_cameras(values: Mapping[str, Any]) -> dict[str, CameraSettings]:
-    """What the cameras have of their own; ValueError for a camera that there is not."""
+    """Settings of each camera; ValueError for a camera that there is not."""
     own = camera_settings(values)
     for name in values:
         if _of_camera(name, NodeConfig) and name not in own:
@@ -162,7 +162,7 @@ def _build(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
 
 
 def _as_tuple(value: Any) -> Any:
-    """What ROS and YAML have as a list or an array of numbers; anything else as it is."""
+    """Tuple of what ROS and YAML have as a list or an array; anything else as it is."""
     return tuple(value) if isinstance(value, (list, array)) else value
 
 

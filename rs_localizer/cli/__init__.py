@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import shutil
 import sys
@@ -25,12 +24,11 @@ from rs_localizer.io.atomic_files import atomic_files, check_writable
 tqdm.set_lock(threading.RLock())
 
 WORKING = True
-"""Whether commands work: where one only shows or completes its arguments, its module imports no
-more than these need."""
+"""True where commands work: one that only shows its arguments imports no more than these need."""
 
 
 def replaced(args: Any, mark: str, place: Path | None = None) -> Callable[[Path], None] | None:
-    """What removes an earlier result (it has a file ``mark``) from a place, where wanted.
+    """Function that removes an earlier result, which has a file ``mark``; None: nothing to remove.
 
     The place is ``--out`` where none is given.
 

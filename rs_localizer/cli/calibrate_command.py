@@ -168,7 +168,7 @@ def _lens_files(args: Options, cameras: Sequence[str] = ("",)) -> dict[str, Path
 def _calibrated(
     args: Options, source: _Input, camera: Camera, config: NodeConfig
 ) -> CameraCalibration:
-    """What the images of a camera say, printed."""
+    """Calibration of a camera by its images, printed."""
     intrinsics = args.intrinsics or source.new_lens
     shown = covered(camera.size, (image.pixels for image in source.images))
     print(f"all images together show the map in {shown:.0%} of the image")
@@ -418,7 +418,7 @@ def _without_k3(camera: Camera) -> Camera:
 
 
 def _tell_tf(path: Path, found: Mounted, own: str, first: str) -> None:
-    """What TF of a bag says of a camera's frame in that of the first one."""
+    """Difference to what TF of a bag says of a camera's frame in that of the first one."""
     with open_bag(path) as bag:
         given = transform_between(bag, own, first)
     if given is not None:

@@ -127,7 +127,7 @@ _WORST: dict[str, Any] = {
 
 
 class _Found(NamedTuple):
-    """What the images of a camera show."""
+    """Findings in the images of a camera."""
 
     found: Extraction | DetectedMarkers
     said: str

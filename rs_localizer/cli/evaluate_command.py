@@ -80,7 +80,7 @@ def run(options: Options) -> Figures:
 
 
 def _other_frames(estimate: Trajectory, truth: Trajectory) -> str:
-    """What to say of orientations of the same times that all differ by one rotation, or ''."""
+    """Warning of orientations of the same times that all differ by one rotation, or ''."""
     before = np.median(errors.angles(estimate.quaternions, truth.quaternions))
     shifted = truth.quaternions[:, [1, 2, 3, 0]]
     after = np.median(errors.angles(estimate.quaternions, shifted))

@@ -79,7 +79,7 @@ def shutter_values(args: ImageOptions) -> dict[str, Any]:
 
 
 def telemetry_of(path: Path) -> Telemetry | None:
-    """What a video says of its camera; None: nothing, or what stabilization has made wrong.
+    """Telemetry of a video; None: there is none, or stabilization has made it wrong.
 
     Raises:
         ValueError: for telemetry that cannot be read.
@@ -93,7 +93,7 @@ def _has_telemetry(path: Path) -> bool:
 
 
 def _can_read() -> bool:
-    """Whether the extra ``video`` is there; PyAV has one clock for images and gyroscope."""
+    """True with the extra ``video``: PyAV has one clock for images and gyroscope."""
     return all(importlib.util.find_spec(name) is not None for name in ("telemetry_parser", "av"))
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What to look for in images: a marker map, or a board on its own."""
+"""Targets in images: a marker map, or a board on its own."""
 
 from __future__ import annotations
 

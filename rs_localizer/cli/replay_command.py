@@ -154,7 +154,7 @@ def _name(recording: Path) -> str:
 
 
 def _pictures(recording: Path) -> str:
-    """What a recording holds instead of matches, as ``is a video``; empty: nothing of the kind."""
+    """Content of a recording without matches, as ``is a video``; empty: it has matches."""
     if not is_bag(recording):
         return holds_images(recording)
     with open_bag(recording) as bag:
@@ -195,7 +195,7 @@ def _map_file(place: Path) -> Path:
 
 
 def _detection(options: Options, recording: Path, out: Path) -> detect_command.Options:
-    """What finds the matches of images."""
+    """Options of ``detect`` that find the matches of images."""
     from rs_localizer.cli import detect_command
 
     place = options.map

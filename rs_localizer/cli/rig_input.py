@@ -100,7 +100,7 @@ def _in_one_file(
 
 
 def mounting_lines(name: str, first: str, mounted: Extrinsics, deviations: Array) -> list[str]:
-    """Where a camera is beside the first one, and its clock; of deviations (7,) in rad, m, s."""
+    """Mounting of a camera beside the first one, and its clock; deviations (7,) in rad, m, s."""
     turn = Rotation.from_matrix(mounted.axes).as_quat(canonical=True)
     turned, moved = np.degrees(deviations[:3]), 1e3 * deviations[3:6]
     return [
@@ -166,7 +166,7 @@ def map_cameras(args: T, recordings: Sequence[Path], config: NodeConfig) -> list
 
 
 def _by_tf(sources: Mapping[str, OfRig[T]]) -> dict[str, Transform]:
-    """Where TF of a bag says that the cameras are, in the axes of the first of them."""
+    """Poses of the cameras by TF of a bag, in the axes of the first of them."""
     first = next(iter(sources.values()))
     path = first.args.recording
     if not is_bag(path):

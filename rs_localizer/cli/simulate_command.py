@@ -159,7 +159,7 @@ def stamps_of(args: Options, camera: Camera, motion: TrueMotion) -> list[int]:
 
 
 def world_of(args: Options, motion: TrueMotion, rng: np.random.Generator) -> Scene | Array:
-    """What is around a motion: a scene to be rendered, or the points (n,3) of a room."""
+    """Surroundings of a motion: a scene to be rendered, or the points (n,3) of a room."""
     if args.images:
         return SCENES[args.walls](sampled_states(motion))
     ways = [
@@ -173,7 +173,7 @@ def see(
     args: Options, world: Scene | Array, camera: Camera, motion: TrueMotion, stamps: list[int],
     place: int = 0,
 ) -> Iterator[SimulatedFrame | RenderedFrame]:  # fmt: skip
-    """What a camera sees; ``place`` is its own among the random numbers."""
+    """Frames that a camera sees; ``place`` is its own among the random numbers."""
     seed = args.seed + place
     if isinstance(world, Scene):
         noise = _PICTURES.noise if args.noise is None else args.noise

@@ -14,7 +14,7 @@ HAND_MOTION = "motion/tum_vi_room5.txt.gz"
 
 
 def path(name: str) -> Path:
-    """Where a bundled recording lies on disk.
+    """Place of a bundled recording on disk.
 
     Raises:
         FileNotFoundError: when the package was installed without it.

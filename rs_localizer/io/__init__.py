@@ -1,3 +1,3 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What goes in and out: messages, recordings, trajectories; no ROS needed."""
+"""Inputs and outputs: messages, recordings, trajectories; no ROS needed."""

@@ -67,7 +67,7 @@ def _unpacked(decompressor: Any, data: bytes) -> bytes:
 
 
 class _BoundedZstd:
-    """What rosbags takes of its module zstd, which unpacks without a limit."""
+    """Functions that rosbags takes of its module zstd, which unpacks without a limit."""
 
     def __init__(self, module: Any) -> None:
         self._module = module
@@ -264,7 +264,7 @@ def _fields_of(name: str, defined: Mapping[str, Any]) -> Any:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a recording by what it holds, and no video or folder of images."""
+    """True for a recording by what it holds, and no video or folder of images."""
     if path.is_dir():
         return (path / METADATA).exists() or bool(data_files(path))
     return bool(magic(path))

@@ -39,7 +39,7 @@ _MODELS = {
 
 
 class _Program(NamedTuple):
-    """Where a program's files have a lens: dotted paths in the tree, the first that is there.
+    """Places of a lens in a program's files: dotted paths in the tree, the first that is there.
 
     ``K`` is a matrix, or a mapping of ``fx fy cx cy``; ``D`` a list, or a mapping of ``k1 k2 p1 p2
     k3 ...``; an empty path is the tree itself.
@@ -195,7 +195,7 @@ def _xml_value(item: ElementTree.Element) -> Any:
 
 
 def _at(tree: dict[str, Any], paths: tuple[str, ...]) -> Iterator[Any]:
-    """What the tree has at each dotted path."""
+    """Values of the tree at each dotted path."""
     for path in paths:
         item: Any = tree
         for name in path.split(".") if path else ():
@@ -261,7 +261,7 @@ def gyroflow_camera(tree: dict[str, Any]) -> Camera | None:
 
 
 def _numbers(item: Any) -> bool:
-    """Whether it is a list, or a matrix of ROS or OpenCV, and no mapping of names."""
+    """True for a list, or a matrix of ROS or OpenCV, and no mapping of names."""
     return not isinstance(item, dict) or "data" in item
 
 
@@ -388,7 +388,7 @@ def _is_kalibr(tree: Any) -> bool:
 
 
 def _is_camera(item: Any) -> bool:
-    """Whether it is one of several cameras, in Kalibr's file or in that of ``calibrate --rig``."""
+    """True for one of several cameras, in Kalibr's file or in that of ``calibrate --rig``."""
     ours = isinstance(item, dict) and {"camera_matrix", "image_width"} <= set(item)
     return ours or _is_kalibr(item)
 
@@ -417,7 +417,7 @@ def kalibr_camera(tree: dict[str, Any]) -> Camera:
 
 
 def kalibr_fields(camera: Camera) -> dict[str, Any]:
-    """What Kalibr's camchain says of a camera's lens, by its names.
+    """Entries of Kalibr's camchain for a camera's lens.
 
     Raises:
         ValueError: for a lens that it has no name for, or a binned or cropped image.

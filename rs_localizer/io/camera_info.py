@@ -16,7 +16,7 @@ from rs_localizer.io.messages import MessageError, frame_id
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What a CameraInfo says, by value: equal calibrations compare equal."""
+    """Content of a CameraInfo, by value: equal calibrations compare equal."""
 
     frame: str  # the camera's optical frame
     width: int

@@ -308,7 +308,7 @@ def read_map(message: Any) -> Map:
 
 
 def _marks(rows: _Rows, message: Any) -> tuple[Ids | None, Descriptors | None]:
-    """What the points are recognized by: ids (n,), descriptors (n,d)."""
+    """Ids (n,) and descriptors (n,d) that the points are recognized by."""
     if not rows.has("id") and not rows.has("descriptor"):
         names = ", ".join(str(item.name) for item in message.fields)
         raise MessageError(f"the cloud has neither a field id nor descriptor; found {names}")

@@ -37,7 +37,7 @@ class Storage(NamedTuple):
 
 
 def magic(path: Path) -> bytes:
-    """What a file begins with, of those that may be recordings; empty: it is none."""
+    """First bytes of a file, of those that may be recordings; empty: it is none."""
     with contextlib.suppress(OSError), path.open("rb") as file:
         start = file.read(16)
         kind = next((known for known in (*_SUFFIX, ZSTD) if start.startswith(known)), b"")
@@ -46,7 +46,7 @@ def magic(path: Path) -> bytes:
 
 
 def _has_messages(path: Path) -> bool:
-    """Whether a database is a recording, and not one of COLMAP, say; a damaged one may be."""
+    """True for a database that is a recording, and not one of COLMAP, say; a damaged one may be."""
     try:
         with contextlib.closing(
             sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
@@ -114,7 +114,7 @@ def storage(
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether a file is no MCAP, or one with an end and the profile of ROS 2."""
+    """True for a file that is no MCAP, or one with an end and the profile of ROS 2."""
     if magic(path) != _MCAP:
         return True
     with path.open("rb") as file:

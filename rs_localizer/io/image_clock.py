@@ -82,7 +82,7 @@ class ImageClock:
         return (self._timed - 1) * 1e9 / span if span > 0 else None
 
     def description(self) -> str:
-        """Where the stamps come from, in one sentence."""
+        """Origin of the stamps, in one sentence."""
         own = "the names of the files" if self._absolute else "the presentation times of the video"
         source = own if self.rate is None else f"--rate {self.rate:g}"
         own_rate = self.own_rate
@@ -91,7 +91,7 @@ class ImageClock:
         return f"times: {source}{pace}; the first image at {round(first_ns * 1e-9, 3):.14g} s"
 
     def fault(self) -> str | None:
-        """What speaks against the images, or else against a given rate."""
+        """Fault of the images' times, or else of a given rate."""
         own_rate = self.own_rate
         if self.missing is not None or self.rate is None or own_rate is None:
             return self.missing
@@ -105,7 +105,7 @@ class ImageClock:
 
 
 def readout_fault(readout_time: float, period: float) -> str | None:
-    """What to say of a readout that takes longer than from one image to the next.
+    """Fault of a readout that takes longer than from one image to the next.
 
     Args:
         readout_time: s.

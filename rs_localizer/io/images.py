@@ -234,7 +234,7 @@ def _still_png(data: bytes) -> bytes:
 
 
 def _ends_with(data: Gray, mark: bytes) -> bool:
-    """Whether the mark is at the end; zeros may follow, of drivers that send whole buffers."""
+    """True if the mark is at the end; zeros may follow, of drivers that send whole buffers."""
     last = np.flatnonzero(data)
     end = int(last[-1]) + 1 if len(last) else 0
     return data[max(0, end - len(mark)) : end].tobytes() == mark

@@ -16,7 +16,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuRecording:
-    """What a gyroscope measured while the camera ran."""
+    """Readings of a gyroscope while the camera ran."""
 
     stamps_ns: IntArray  # (k,)
     angular_velocities: Array  # (k,3) rad/s, in its own axes

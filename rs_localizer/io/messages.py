@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What all readers of messages share: the error, the stamp, and the headers.
+"""Shared parts of readers of messages: the error, the stamp, and the headers.
 
 Messages are taken by their attributes, so that those of rclpy and those of rosbags, which differ
 only in their containers, are read by the same code.

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is published of a localized frame, and its messages."""
+"""Published parts of a localized frame, and their messages."""
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class Twist:
 
 @dataclass(frozen=True, slots=True)
 class CameraShare:
-    """What one camera of a rig has contributed to a frame."""
+    """Contribution of one camera of a rig to a frame."""
 
     name: str
     points: int

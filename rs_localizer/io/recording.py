@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the package records: topics, and an image or its correspondences as messages of a bag."""
+"""Recordings of the package: topics, and an image or its correspondences as messages."""
 
 from typing import Any
 

@@ -49,7 +49,7 @@ _ORTHONORMAL = 1e-3
 
 
 class RigParts(NamedTuple):
-    """What :class:`rs_localizer.Rig` is made of: ``Rig(*parts)``."""
+    """Arguments of :class:`rs_localizer.Rig`: ``Rig(*parts)``."""
 
     cameras: dict[str, Camera]
     camera_from_rig: dict[str, tuple[Array, Array]]  # (3,3) and (3,) m, X_camera = R X_rig + t

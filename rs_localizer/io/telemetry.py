@@ -54,7 +54,7 @@ class TelemetryError(ValueError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Telemetry:
-    """What a video says of its camera and of its motion."""
+    """Camera and motion, by the telemetry of a video."""
 
     camera: str  # its name
     times: Array  # (n,) s of the video's clock
@@ -72,7 +72,7 @@ class Telemetry:
 
 
 def has_telemetry(path: Path) -> bool:
-    """Whether a file looks as if it had any, without reading it."""
+    """True for a file that looks as if it had any, without reading it."""
     with path.open("rb") as file:
         looked_at = file.read(_LOOKED_AT)
         file.seek(max(0, path.stat().st_size - _LOOKED_AT))
@@ -113,7 +113,7 @@ def read_telemetry(path: Path) -> Telemetry | None:
 
 
 def interpreted(found: dict[str, Any]) -> Telemetry | None:
-    """What the numbers and words of :mod:`rs_localizer.io.telemetry_process` mean.
+    """Telemetry of the numbers and words of :mod:`rs_localizer.io.telemetry_process`.
 
     Raises:
         TelemetryError: for numbers that no gyroscope gives.

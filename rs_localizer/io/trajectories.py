@@ -219,7 +219,7 @@ def _write_table(
 
 
 POSES_FILE, TWISTS_FILE = "poses.txt", "twists.txt"
-"""What replay calls its text files."""
+"""Names of replay's text files."""
 
 _POSE, _TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
 

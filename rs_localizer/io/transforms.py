@@ -60,7 +60,7 @@ class Transforms(Protocol):
         """
 
     def moves(self, target: str, source: str) -> bool:
-        """Whether the transform may differ from one time to the next.
+        """True where the transform may differ from one time to the next.
 
         Raises:
             TransformError: when it is not known at all.
@@ -201,7 +201,7 @@ class TransformTree:
         return of_target[meeting].inverse() @ of_source[meeting]
 
     def moves(self, target: str, source: str) -> bool:
-        """Whether a link between the two frames comes with a time."""
+        """True if a link between the two frames comes with a time."""
         target, source = target.removeprefix("/"), source.removeprefix("/")
         return target != source and self._latest(target, source) is not None
 

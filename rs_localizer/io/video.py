@@ -206,7 +206,7 @@ def _from_stream(path: Path) -> Iterator[VideoImage]:
 
 
 def has_times(path: Path | str) -> bool:
-    """Whether a video has presentation times; a single image needs none.
+    """True for a video with presentation times; a single image needs none.
 
     Raises:
         VideoError: when it cannot be read.

@@ -53,7 +53,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 
 
 def load_yaml(text: str) -> Any:
-    """What the text, YAML or JSON, holds: mappings, lists, and plain values.
+    """Content of the text, YAML or JSON: mappings, lists, and plain values.
 
     Raises:
         YamlError: for anything else, saying what was found.

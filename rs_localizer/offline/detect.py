@@ -56,7 +56,7 @@ class DetectError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class DetectedMarkers:
-    """What became of the images."""
+    """Counts of what became of the images, and what they show."""
 
     images: int
     with_corners: int
@@ -159,11 +159,11 @@ class _MarkerTally:
 
     @property
     def are_few(self) -> bool:
-        """Whether so few images show anything that it may be another board, seen in part."""
+        """True if so few images show anything that it may be another board, seen in part."""
         return len(self._found.counts) < _FEW * self._found.images
 
     def nothing(self) -> str:
-        """What is to be said of images that show nothing of the map."""
+        """Sentence on images that show nothing of the map."""
         families = sorted({marker.family.name for marker in self._map.markers})
         wanted = ", ".join([*families, *(board.name for board in self._map.boards)])
         text = f"shows anything of the map ({wanted})"
@@ -182,7 +182,7 @@ class _MarkerTally:
         return text
 
     def instead(self) -> list[str]:
-        """What images that show nothing of the map show otherwise."""
+        """Other targets in images that show nothing of the map."""
         shown = [recognized(image.pixels, self._map.boards) for image in self._empty]
         # Images of one pattern show other ones of its markers.
         names = Counter(_kind(name) for of_image in shown for name in of_image)
@@ -215,7 +215,7 @@ class _MarkerTally:
 
 
 def _kind(name: str) -> str:
-    """What was recognized, without the numbers of its markers."""
+    """Name of what was recognized, without the numbers of its markers."""
     return re.sub(r" \d[\d, .]*$", "", name)
 
 
@@ -242,7 +242,7 @@ class Cameras:
         self._last: tuple[Calibration, Camera] | None = None
 
     def of(self, shot: Shot, image: Image) -> Camera:
-        """Of one image.
+        """Camera of one image.
 
         Raises:
             DetectError: when its camera_info cannot be used, or is of another size.
@@ -274,7 +274,7 @@ def seen_by(
 
 
 def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
-    """What two sizes of images have to do with each other."""
+    """Relation of two sizes of images, in words."""
     if size == calibrated[::-1]:
         return (
             ": they are turned by a quarter; calibrate with images as they are recorded (the scan "
@@ -305,7 +305,7 @@ def static_residual(camera: Camera, detected: Detected) -> float:
 
 @dataclass(slots=True)
 class Extraction:
-    """What became of the images."""
+    """Counts of what became of the images, and what they show."""
 
     images: int = 0
     counts: list[int] = field(default_factory=list)  # keypoints or corners, where there are any

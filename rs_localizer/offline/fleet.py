@@ -27,7 +27,7 @@ from typing import Any
 from rs_localizer.io.atomic_files import atomic_files, write_errors
 
 Figures = dict[str, float | int | str]
-"""What the summary says of a recording, by identifiers with their units."""
+"""Figures of a recording, by identifiers with their units."""
 
 MARKER, LOG = "fleet.json", "log.txt"
 """In each complete result: what it is of, written last; and what the command would have said."""
@@ -60,7 +60,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a task."""
+    """Outcome of a task."""
 
     figures: Figures | None  # None: it failed
     reason: str = ""  # why, in one line
@@ -228,7 +228,7 @@ def do_all(
     tasks: Sequence[Task], out: Path, scheduler: str | None, workers: int | None,
     heard: Callable[[Task, Outcome], object],
 ) -> dict[Path, Outcome]:  # fmt: skip
-    """What became of each, by its folder; the summary in ``out`` is written however it ends.
+    """Outcome of each, by its folder; the summary in ``out`` is written however it ends.
 
     Args:
         heard: called as tasks end that had not been done before.

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where images come from, offline: a video, a folder of files, a bag."""
+"""Sources of images, offline: a video, a folder of files, a bag."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -139,7 +139,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def holds_images(path: Path) -> str:
-    """What a path that is not a recording holds of images, as ``is a video``; empty: nothing."""
+    """Images of a path that is no recording, as ``is a video``; empty: none."""
     if path.is_dir():
         count = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
         return f"is a folder of {count} images" if count else ""

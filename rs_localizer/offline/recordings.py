@@ -31,7 +31,7 @@ class RecordingError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What a recording shows of a map."""
+    """Correspondences of a recording with a map."""
 
     calibration: Calibration
     clouds: tuple[Correspondences, ...]
@@ -86,7 +86,7 @@ def read_recording(
 
 
 def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> ImuRecording:
-    """What an IMU measured, and how TF says that it hangs on the camera, if it does.
+    """Readings of an IMU, and how TF says that it hangs on the camera, if it does.
 
     Args:
         topic: None: the only one of its type.

@@ -82,7 +82,7 @@ CARRIED_TYPES = (TF_TYPE, _OLD_TF_TYPE, IMU_TYPE)
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """Where a recording has the inputs of the node: frames are correspondences or keypoints."""
+    """Topics of the node's inputs in a recording: frames are correspondences or keypoints."""
 
     of: Mapping[str, str]  # by the input
 
@@ -98,7 +98,7 @@ class Topics:
 
     @property
     def lacks_map(self) -> bool:
-        """Whether the frames need a map that the recording does not have."""
+        """True if the frames need a map that the recording does not have."""
         names = (input_named(name) for name in self.of)
         frames = next(item for item in names if item.role == Role.FRAMES)
         return frames.needs == MAP_POINTS and MAP_POINTS not in self.of
@@ -212,7 +212,7 @@ def imu_topics(bag: BagReader) -> list[str]:
 
 
 def has_frames(bag: BagReader) -> bool:
-    """Whether there is anything to localize: a cloud of any kind."""
+    """True if there is anything to localize: a cloud of any kind."""
     return any(set(item.types) & set(bag.topics.values()) for item in with_role(Role.FRAMES))
 
 
@@ -304,7 +304,7 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
 
 
 def _frame_of(bag: BagReader, topic: str) -> str | None:
-    """Of the first message on a topic."""
+    """Frame of the first message on a topic."""
     return next((message.header.frame_id for _, _, message in bag.messages((topic,))), None)
 
 
@@ -322,7 +322,7 @@ def prepare(
     given: Mapping[str, str | None] | None = None,
     notice: Notify = unheard,
 ) -> tuple[Topics, FrameLocalizer]:
-    """What :func:`replay` needs: where the inputs are, and a localizer with its map.
+    """Inputs of :func:`replay`: topics, and a localizer with its map.
 
     Args:
         given: topics, as for :func:`find_topics`.
@@ -347,7 +347,7 @@ def prepare(
 
 
 class Answer(NamedTuple):
-    """What became of a frame."""
+    """Result of a frame."""
 
     recorded_ns: int
     stamp_ns: int  # of its message

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What comes of a recording: poses, twists, messages, and what a summary says.
+"""Results of a recording: poses, twists, messages, and their summary.
 
 Frames are written as they come; of each, some numbers stay (250 bytes).
 """
@@ -126,7 +126,7 @@ _COLUMNS = (
 
 @dataclass(slots=True)
 class Tally:
-    """What became of the frames of a recording."""
+    """Counts of what became of the frames of a recording."""
 
     total: int
     notices: dict[str, tuple[int, str]]  # by name: how often, and the latest sentence
@@ -188,7 +188,7 @@ class Tally:
 
 
 def figures(tally: Tally) -> Figures:
-    """What the summary of many recordings says of this one."""
+    """Figures of a recording, for the summary of many."""
     readout_time, deviation = tally.readout or (np.nan, np.nan)
     return {
         "frames": tally.total,

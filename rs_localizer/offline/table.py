@@ -208,7 +208,7 @@ def write_parquet(tables: Iterable[Table], place: Path) -> int:
 
 
 def read_parquet(file: Path) -> Table:
-    """What :func:`write_parquet` wrote."""
+    """Table that :func:`write_parquet` wrote."""
     import pyarrow.parquet as pq
 
     return pq.read_table(file)

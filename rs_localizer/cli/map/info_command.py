@@ -24,7 +24,7 @@ if WORKING:
     from rs_localizer.markers.maps import MarkerMap
 
 Figures = dict[str, Any]
-"""What is printed, and by ``--json``: identifiers, with their units."""
+"""Printed figures, and those of ``--json``: identifiers, with their units."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -175,7 +175,7 @@ def _tell(
 
 
 def _tell_frame(found: Survey) -> None:
-    """What the errors of the origin's own pose make of all others in its frame."""
+    """Effect of the origin's own errors on all other poses in its frame, printed."""
     origin = found.markers[0]
     turn = np.degrees(np.linalg.norm(found.deviations_of_shape[0, 3:]))
     far = int(np.argmax([np.linalg.norm(marker.pose.position) for marker in found.markers]))
