@@ -254,7 +254,8 @@ def write_camera_file(
         lens: as ``io.camera_files.lens_parameters`` or ``io.rigs.mounted_lenses`` have it.
         remarks: lines of comment.
     """
-    _write(path, "/**", {**values, LENS: lens}, remarks)  # a node may have any name
+    known = {**values, LENS: lens} if lens else values
+    _write(path, "/**", known, remarks)  # a node may have any name
 
 
 def _write(path: Path, nodes: str, values: Mapping[str, Any], remarks: Sequence[str] = ()) -> None:

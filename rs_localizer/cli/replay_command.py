@@ -205,10 +205,11 @@ def _detection(options: Options, recording: Path, out: Path) -> detect_command.O
     if not by_markers:
         features = _features_of(read_map_file(_map_file(place), MAP_FRAME))
     calibration, params = options.calibration, options.params
-    if (place / MAP).is_file():  # a result of map build
-        params = params or place / PARAMETERS
-        lens = place / CAMERA
-        calibration = calibration or (lens if lens.is_file() and not is_bag(recording) else None)
+    if (place / MAP).is_file():  # a result of map build; a bag has a lens of its own
+        if is_bag(recording):
+            params = params or place / CAMERA
+        else:
+            calibration = calibration or place / CAMERA
     return detect_command.Options(
         recording=recording, out=out, map=place if by_markers else None, features=features,
         calibration=calibration, params=params, assignments=options.assignments,

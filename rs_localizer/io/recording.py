@@ -21,9 +21,9 @@ CORRESPONDENCES_TOPIC = f"/{topics.CORRESPONDENCES}"
 KEYPOINTS_TOPIC = f"/{topics.KEYPOINTS}"
 IMAGE_TOPIC = f"/{topics.COMPRESSED_IMAGE}"
 RAW_IMAGE_TOPIC = "/image_raw/compressed"
-# A params file, a lens and maps in the directory of a recording, or of a map that was built.
+# Settings and maps in the directory of a recording, or a camera of a map that was built.
 PARAMETERS = "parameters.yaml"
-CAMERA = "camera_info.yaml"
+CAMERA = "camera.yaml"
 MARKER_MAP = "marker_map.yaml"
 MAP = "map.npz"
 

@@ -8,7 +8,7 @@ import argparse
 import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -29,11 +29,11 @@ if WORKING:
 
     from rs_localizer.cli.marker_map import read_checked_map
     from rs_localizer.io.atomic_files import atomic_directory
-    from rs_localizer.io.camera_files import write_calibration
+    from rs_localizer.io.camera_files import lens_parameters
     from rs_localizer.io.maps.files import write_npz
-    from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
+    from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME
     from rs_localizer.io.trajectories import Trajectory, write_tum
-    from rs_localizer.settings import build, write_parameters
+    from rs_localizer.settings import build, write_camera_file
     from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
     from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map
     from rs_localizer.tools.mapping.colmap import Effort, require
@@ -162,11 +162,12 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
         "readout_time": built.camera.readout_time,
         "scan_direction": str(built.camera.scan_direction),
     }
-    write_parameters(out / PARAMETERS, shutter)
+    camera = built.camera
+    # A file has the lens of a whole image; of a part of it, camera_info says which.
+    whole = camera.roi is None and camera.binning == (1, 1)
+    write_camera_file(out / CAMERA, shutter, lens_parameters(camera) if whole else {})
     stamps, positions, quaternions = built.middle_rows([view.stamp_ns for view in looked.views])
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
-    if looked.camera is None:
-        write_calibration(out / CAMERA, replace(built.camera, readout_time=0.0))
     (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")
 
 
@@ -186,9 +187,4 @@ def _tell(args: Options, built: Built, looked: Looked) -> None:
     for text in advice(built, looked.views):
         print(f"to film otherwise: {text}")
     out = shlex.quote(str(args.out))
-    lens = f" --camera {out}/{CAMERA}" if looked.camera is None else ""
-    print(
-        f"next, for images of another walk: rs_localizer detect IMAGES --features sift{lens} --out "
-        f"seen && rs_localizer replay seen --params {out}/{PARAMETERS} --map {out}/{MAP} --out "
-        "poses"
-    )
+    print(f"next, for images of another walk: rs_localizer replay IMAGES --map {out} --out poses")
