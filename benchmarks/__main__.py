@@ -18,13 +18,10 @@ from typing import TypeVar
 from tqdm import tqdm
 
 from benchmarks.experiments import (
-    convergence,
     linearisation,
     motion,
     noise,
-    p3p_initialisation,
     readout_time,
-    real,
     timings,
     translation,
 )
@@ -43,12 +40,9 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "motion": motion.run,
     "translation": translation.run,
     "noise": noise.run,
-    "convergence": convergence.run,
     "linearisation": linearisation.run,
-    "p3p-initialisation": p3p_initialisation.run,
     "timings": timings.run,
     "readout-time": readout_time.run,
-    "real": real.run,
 }
 
 _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:

@@ -10,8 +10,8 @@ from rs_localizer import data
 
 _FOLDER = Path(__file__).parent
 
-HAND_MOTION, WEBCAM = data.path(data.HAND_MOTION), data.path(data.WEBCAM)
-"""Of the package: a trajectory of a hand, and a camera before a chessboard."""
+HAND_MOTION = data.path(data.HAND_MOTION)
+"""Of the package: a trajectory of a hand."""
 SLOW_HAND_MOTION = _FOLDER / "motion" / "tum_rgbd_fr1_xyz.txt.gz"
 """TUM trajectory at 100 Hz of a hand-held camera that moves slowly; optical axes."""
 GLOBAL_SHUTTER_TAGS = _FOLDER / "global_shutter_tags" / "recording"

@@ -29,7 +29,6 @@ _LOOKS: Mapping[str, tuple[str, str, bool]] = {  # color, marker and line, wheth
     m.VCT_W.name: ("#4fae5b", "^:", False),
     m.VCT_WT.name: ("#2a6b34", "s:", False),
     m.VCWT.name: ("#5aa0e0", "+-", True),
-    m.VCWT_ONCE.name: ("#96c4ee", "<--", False),
     m.R9P.name: ("#a03070", "D--", False),
     m.VCWT_OURS.name: ("#2f6fc0", "P-", False),
     m.R9P_OURS.name: ("#701848", "D-", True),

@@ -31,8 +31,6 @@ _SIX = 6
 _TRIPLETS = np.array(list(combinations(range(_SIX), 3)))
 # Minimal models are scored at this multiple of the inlier threshold, as by the Localizer.
 _SCORE_SCALE = 4.0
-# px: no point of the image is farther off, so that none is cut off.
-_ALL_POINTS_SCALE = 1e4
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +52,6 @@ VCT_W = Method("r6p_vct_w", "r6p_vct_w", "r6p_vct_w")
 VCT_WT = Method("r6p_vct_wt", "r6p_vct_wt", "r6p_vct_wt")
 VCWT = Method("r6p_vcwt", "r6p_vcwt", "r6p_vcwt")
 R9P = Method("r9p", "r9p", "r9p")
-VCWT_ONCE = Method("r6p_vcwt_1", "r6p_vcwt, one iteration", "r6p_vcwt", iterations=1)
 VCWT_OURS = Method("r6p_vcwt_relinearized", "r6p_vcwt, relinearized", "r6p_vcwt",
                    as_published=False)  # fmt: skip
 R9P_OURS = Method("r9p_trace_fixed", "r9p, trace fixed", "r9p", as_published=False)
@@ -95,14 +92,6 @@ def best_triplet(trials: Trials) -> Motions:
                    trials.truth.rotation[:, None])  # fmt: skip
     best = np.argmin(np.where(np.isnan(apart), np.inf, apart), axis=1)
     return _motions(models[np.arange(len(models)), best])
-
-
-def plausible_triplet(trials: Trials) -> Motions:
-    """P3P's pose of three of the first six points with the least squared error over all points.
-
-    What can be had without the truth.
-    """
-    return _best(_triplet_models(trials), trials, _ALL_POINTS_SCALE)
 
 
 def states(motions: Motions) -> Array:

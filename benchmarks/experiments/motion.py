@@ -15,9 +15,9 @@ from benchmarks.experiments.results import Claim, Context, Result, limited
 from benchmarks.experiments.sweeps import ORIENTATION, POSE, POSITION, Curves, T, W, sweep
 from benchmarks.experiments.trials import Setting
 
-SPEEDS = tuple(np.linspace(0.0, 30.0, 11).tolist())
-TRANSLATION = 0.01  # per degree
-X_LABEL = "rotation (deg per frame); translation: 0.01 of it"
+_SPEEDS = tuple(np.linspace(0.0, 30.0, 11).tolist())
+_TRANSLATION = 0.01  # per degree
+_X_LABEL = "rotation (deg per frame); translation: 0.01 of it"
 # Medians below these are rounding, not error.
 _FLOOR = np.array([1e-6, 1e-8, 1e-6, 1e-8])
 # What a user chooses from, in the form in which they get it.
@@ -30,8 +30,8 @@ def run(context: Context) -> Result:
 
     def curves(noise: float, drifting: bool = False) -> Curves:
         return sweep(
-            context, "deg_per_frame", SPEEDS,
-            lambda speed: Setting(speed, TRANSLATION * speed, noise, drifting), m.ALL,
+            context, "deg_per_frame", _SPEEDS,
+            lambda speed: Setting(speed, _TRANSLATION * speed, noise, drifting), m.ALL,
         )  # fmt: skip
 
     exact, noisy, drifting = curves(0.0), curves(1.0), curves(0.0, drifting=True)
@@ -83,34 +83,29 @@ def run(context: Context) -> Result:
             "motion_drifting": drifting.table(),
         },
         {
-            "motion": charts.error_figure(exact, (*m.PAPERS, m.REFINED), X_LABEL),
-            "motion_noisy": charts.error_figure(noisy, (*m.PAPERS, m.REFINED), X_LABEL),
-            "choosing_motion": charts.error_figure(noisy, CHOICE, X_LABEL, (ORIENTATION, POSITION)),
+            "motion": charts.error_figure(exact, (*m.PAPERS, m.REFINED), _X_LABEL),
+            "motion_noisy": charts.error_figure(noisy, (*m.PAPERS, m.REFINED), _X_LABEL),
+            "choosing_motion": charts.error_figure(
+                noisy, CHOICE, _X_LABEL, (ORIENTATION, POSITION)
+            ),
         },
     )  # fmt: skip
 
 
-def equal_to_r6p(
-    experiment: str,
-    sweeps: Sequence[Curves],
-    method: Method = m.VCWT,
-    up_to: float = np.inf,
-    why: str = "",
-) -> Claim:
-    """Whether all medians of a linear solver are those of the polynomial one.
+def equal_to_r6p(experiment: str, sweeps: Sequence[Curves], up_to: float = np.inf) -> Claim:
+    """Whether all medians of the linear solver are those of the polynomial one.
 
     Args:
         up_to: place of the sweep beyond which the polynomial one has no solutions.
-        why: what to say if not.
     """
     apart = []
     for curves in sweeps:
-        one, other = (curves.medians(x)[curves.x <= up_to] for x in (method, m.R6P))
+        one, other = (curves.medians(x)[curves.x <= up_to] for x in (m.VCWT, m.R6P))
         apart.append(np.max(np.abs(one - other) / np.maximum(np.abs(other), _FLOOR)))
     return limited(
-        f"{experiment}.{method.name}_equals_r6p",
-        f"paper: {method.label} is as accurate as the polynomial R6P",
-        "relative difference of the medians", max(apart), most=0.05, why=why,
+        f"{experiment}.{m.VCWT.name}_equals_r6p",
+        f"paper: {m.VCWT.label} is as accurate as the polynomial R6P",
+        "relative difference of the medians", max(apart), most=0.05,
     )  # fmt: skip
 
 

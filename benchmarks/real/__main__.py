@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from benchmarks.real import gyro, motion, solvers
+from benchmarks.real import gyro, motion
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
 from benchmarks.real.peers import PEERS
@@ -54,7 +54,7 @@ _PARTS = {
 }  # fmt: skip
 
 
-JUDGES = {"gyro": gyro.main, "solvers": solvers.main, "aria": motion.main}
+JUDGES = {"gyro": gyro.main, "aria": motion.main}
 """Beside the boards, by the first argument."""
 
 

@@ -34,18 +34,14 @@ HELD = _names(
             "joint_solvers_alike six_point_bound refined_reaches_bound few_inliers_seen_2 "
             "few_inliers_seen_4 few_inliers_seen_8"
         ),
-        "convergence": "others_slow basin_30 basin_30_frozen basin_60 basin_60_frozen",
         "linearisation": "r6p_vcwt_equals_r6p useful_orientation useful_centre relinearized_flat",
-        "p3p-initialisation": "relinearized",
         "readout-time": "direction global",
-        "real": "vcwt_equals_r6p vcwt_ahead_of_p3p vc_wt_unstable r9p_hardest localizer_most",
     }
 )
 NOT_HELD = _names(
     {
         "motion": "r9p_ahead_noisy r9p_no_velocity",
         "noise": "all_alike",
-        "convergence": "flat_after_eight",
     }
 )
 
