@@ -2,12 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ours beside P3P where a rolling shutter may be imagined, condition by condition:
 
-python -m benchmarks.honesty p3p --only board 0.1px --frames 100
-python -m benchmarks.honesty tags
+python -m benchmarks.honesty --only board 0.1px --frames 100
 
-p3p: the default against a global shutter, frame by frame, where maps and lenses are a little off
-and the readout time is short, zero or not known. tags: a real global shutter before real tags, in
-whose frames no motion must be found.
+The default against a global shutter, frame by frame, where maps and lenses are a little off and the
+readout time is short, zero or not known.
 """
 
 from __future__ import annotations
@@ -17,34 +15,23 @@ import csv
 import re
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from itertools import pairwise, product
+from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks.data import GLOBAL_SHUTTER_TAGS
 from benchmarks.frames.judged import REGION
 from benchmarks.honesty.estimating import believed, estimate, frames_of, scored
-from benchmarks.honesty.scores import Scores, motion_evidence, percent
+from benchmarks.honesty.scores import Scores, percent
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.motions import hand
-from benchmarks.independent.rotations import logarithm
 from benchmarks.independent.scenes import Board
 from rs_localizer.cli.options import integer
-from rs_localizer.config import LocalizerConfig, NodeConfig
-from rs_localizer.io.bags import open_bag
-from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.outputs import Localized
+from rs_localizer.config import LocalizerConfig
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.pose_at_time import twist_at
-from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.solvers.table import find_solver
 
 Row = tuple[str | float | int, ...]
 
@@ -135,67 +122,6 @@ def _quantile(values: np.ndarray, at: float) -> float:
     return float(np.quantile(values, at)) if len(values) else np.nan
 
 
-_INFO, _CLOUD = "/camera/camera_info", "/camera/correspondences"
-_TAG_COLUMNS = (
-    "condition", "frames", "jitter_deg", "jitter_deg_95", "insignificant", "refused", "reasons",
-)  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class _Replay:
-    """How the recording is replayed: what differs from the node's defaults."""
-
-    name: str
-    config: NodeConfig
-
-
-def _tag_conditions() -> Sequence[_Replay]:
-    return [
-        _Replay("p3p", NodeConfig(solver="p3p")),
-        _Replay("default", NodeConfig()),
-        _Replay("20 ms, tracked", NodeConfig(readout_time=0.02)),
-        _Replay("20 ms, single", NodeConfig(readout_time=0.02, tracking=False)),
-    ]
-
-
-def _tag_row(condition: _Replay, frames: int, seed: int) -> Row:
-    """Second differences of the orientation, and frames whose velocities' 95 % region contains
-    zero, in %; always of the whole recording.
-    """
-    localizer = FrameLocalizer(condition.config)
-    results: list[Localized | Refusal] = []
-    with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
-        for topic, _, message in bag.messages((_INFO, _CLOUD)):
-            if topic == _INFO:
-                localizer.calibrate(read_camera_info(message))
-            else:
-                results.append(localizer.localize(message))
-    found = [result for result in results if isinstance(result, Localized)]
-    reasons = Counter(result.reason for result in results if isinstance(result, Refusal))
-    still = []
-    if find_solver(condition.config.solver).rolling_shutter:
-        # Per readout: a readout time is not always set.
-        still = [motion_evidence(twist_at(frame.estimate, 0.0, 1.0)) < REGION for frame in found]
-    turns = [
-        logarithm(before.pose.rotation.T @ after.pose.rotation) for before, after in pairwise(found)
-    ]
-    jitter = np.degrees(np.linalg.norm(np.diff(turns, axis=0), axis=1))
-    return (
-        condition.name,
-        len(results),
-        *np.quantile(jitter, [0.5, 0.95]).tolist(),
-        percent(np.array(still, dtype=np.bool_)),
-        100.0 * (1.0 - len(found) / len(results)),
-        ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()),
-    )
-
-
-_Bench = tuple[tuple[str, ...], Callable[[], Sequence[Any]], Callable[[Any, int, int], Row]]
-_BENCHES: Mapping[str, _Bench] = {
-    "p3p": (_COLUMNS, _conditions, _row), "tags": (_TAG_COLUMNS, _tag_conditions, _tag_row)
-}  # fmt: skip
-
-
 def matching(names: Sequence[str], words: Sequence[str]) -> list[str]:
     """Names in which each of these begins a word: ``3px`` is not ``0.3px``."""
     patterns = [re.compile(rf"(^|[/ ]){re.escape(word)}") for word in words]
@@ -209,48 +135,40 @@ def main() -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "names", nargs="+", metavar="BENCH", choices=_BENCHES, help=", ".join(_BENCHES)
-    )
-    parser.add_argument(
         "--only", nargs="+", default=[], metavar="WORD",
         help="conditions with all of these words in their names, such as: board 0.1px 5ms unset",
     )  # fmt: skip
     parser.add_argument(
         "--frames", type=integer(1), default=100, metavar="N",
-        help="of each condition of p3p (default: %(default)s)",
+        help="of each condition (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument("--seed", type=integer(0), default=0, metavar="N")
-    parser.add_argument("--csv", type=Path, metavar="DIR", help="write the tables there, too")
+    parser.add_argument("--csv", type=Path, metavar="DIR", help="write the table there, too")
     options = parser.parse_args()
-    return max(_run(name, options) for name in options.names)
-
-
-def _run(name: str, options: argparse.Namespace) -> int:
-    columns, make, row = _BENCHES[name]
-    conditions = {condition.name: condition for condition in make()}
+    conditions = {condition.name: condition for condition in _conditions()}
     chosen = matching(list(conditions), options.only)
     if not chosen:
         names = ", ".join(list(conditions)[:4])
-        sys.stderr.write(f"{name}: no condition has {options.only} in its name, as {names} have\n")
+        sys.stderr.write(f"no condition has {options.only} in its name, as {names} have\n")
         return 2
     start = time.perf_counter()
-    rows: list[Row] = [columns]
+    rows: list[Row] = [_COLUMNS]
     width = max(map(len, chosen))
-    print("".join(_cells(columns, columns, width)))
+    print("".join(_cells(_COLUMNS, width)))
     for one in chosen:
-        rows.append(row(conditions[one], options.frames, options.seed))
-        print("".join(_cells(columns, rows[-1], width)), flush=True)
+        rows.append(_row(conditions[one], options.frames, options.seed))
+        print("".join(_cells(rows[-1], width)), flush=True)
     print(f"{time.perf_counter() - start:.0f} s")
     if options.csv is not None:
         options.csv.mkdir(parents=True, exist_ok=True)
-        with (options.csv / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+        with (options.csv / "p3p.csv").open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows(rows)
     return 0
 
 
-def _cells(columns: Sequence[str], row: Sequence[str | float | int], width: int) -> Iterator[str]:
+def _cells(row: Row, width: int) -> Iterator[str]:
     yield f"{row[0]:{width}}"
-    for name, value in zip(columns[1:], row[1:], strict=True):
+    for name, value in zip(_COLUMNS[1:], row[1:], strict=True):
         text = f"{value:.3g}" if isinstance(value, float) else str(value)
         yield f"  {text}" if name == "reasons" else f"{text:>{max(9, len(name) + 1)}}"
 

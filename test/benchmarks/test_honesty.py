@@ -56,11 +56,11 @@ def test_too_small_and_too_large_covariances_are_seen(wider, least, most):
 
 def test_the_command(tmp_path, capsys, monkeypatch):
     only = ["--only", "markers", "lens 30%", "0.5px", "30ms/set", "--frames", "3"]
-    monkeypatch.setattr(sys, "argv", ["honesty", "p3p", *only, "--csv", str(tmp_path)])
+    monkeypatch.setattr(sys, "argv", ["honesty", *only, "--csv", str(tmp_path)])
     assert command.main() == 0
     assert "markers/lens 30% bend 0mm/0.5px/30ms/set" in capsys.readouterr().out
     with (tmp_path / "p3p.csv").open() as file:
         assert len(list(csv.reader(file))) == 2
-    monkeypatch.setattr(sys, "argv", ["honesty", "p3p", "--only", "nowhere"])
+    monkeypatch.setattr(sys, "argv", ["honesty", "--only", "nowhere"])
     assert command.main() == 2
     assert "no condition" in capsys.readouterr().err
