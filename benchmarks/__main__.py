@@ -55,7 +55,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   mutants                          planted bugs, and whether tests catch them
   mapping                          refined maps and surveyed markers
   fuzzing                          wrong input for everything that reads
-  load, load.changes               live nodes under load, and set anew
+  load                             live nodes under load
   simulation                       bags as of simulate, of more sensors
   start                            memory and time of a start of the node
 """
