@@ -24,6 +24,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.real.gyroscopes import Gyroscope, aligned, read_board_video
+from benchmarks.real.motion import AHEAD
 from benchmarks.real.peers import PEERS, GlobalPose, solve_pnp_ransac
 from benchmarks.real.recordings import Recording, add_settings, read_bag
 from rs_localizer.cli.settings_args import given_settings
@@ -41,6 +42,7 @@ _QUANTILE = 1.96  # of a normal number, both sides of 95 %
 _NEAR = 1.0  # px
 _FASTEST = 15  # images
 _NS = 1e-9
+_MOMENT = 0.002  # s, half of what counts as one
 _LAGS = (0, 1, 2)  # images that a tracked result waits for
 SINGLE, TRACKED = "single", "tracked"
 _LATER = f"{TRACKED}, 1 later"
@@ -130,6 +132,28 @@ def _row(
         float(np.mean(list(near.values()))),
         float(np.mean([value for k, value in near.items() if is_fast[k]])),
     )  # fmt: skip
+
+
+def predicted(recording: Recording, gyroscope: Gyroscope, config: LocalizerConfig) -> list[str]:
+    """Lines of turn rates that ``Tracker.at`` predicts, before those of that moment."""
+    tracker = Tracker(Localizer(recording.camera, config))
+    errors: dict[float, list[tuple[Array, Array]]] = {ahead: [] for ahead in AHEAD}
+    for each in recording.frames:
+        tracker.localize(each.middle_ns, each.points, each.pixels)
+        for ahead, of in errors.items():
+            if there := tracker.at(each.middle_ns + round(1e9 * ahead)):
+                time = np.array([_NS * each.middle_ns + ahead])
+                (rate,), (covariance,) = rates_of({0: there}, recording.camera.readout_time)
+                of.append(
+                    (rate - gyroscope.mean_rate(time - _MOMENT, time + _MOMENT)[0], covariance)
+                )
+    lines = []
+    for ahead, of in errors.items():
+        inside = np.mean([off @ np.linalg.solve(spread, off) < _INSIDE for off, spread in of])
+        median, high = _spread(np.array([off for off, _ in of]))
+        lines.append(f"{1e3 * ahead:.0f} ms ahead: {len(of)} rates, {median:.2f}, {high:.1f}"
+                     f" deg/s, {inside:.0%} inside")  # fmt: skip
+    return lines
 
 
 def rates_of(estimates: Mapping[int, Estimate], readout_time: float) -> tuple[Array, Array]:
@@ -242,7 +266,7 @@ def main(argv: Sequence[str]) -> None:
         gyroscope, said = aligned(gyroscope, recording)
         print(said)
     judged = judge(recording, gyroscope, config)
-    table = text(judged)
+    table = "\n".join([text(judged), "", *predicted(recording, gyroscope, config)])
     print(table)
     (args.out / "gyro.md").write_text(table + "\n", encoding="utf-8")
     draw(judged, gyroscope, recording.camera.readout_time, args.out / "gyro.png")

@@ -35,7 +35,7 @@ _MARGIN = 2.0  # px from the rim
 _NEAREST, _FARTHEST = 0.3, 30.0  # m
 _INSIDE = 12.592  # 95 % quantile of chi-squared with six degrees of freedom
 _RATE = 30.0  # Hz
-_AHEAD = (0.01, 0.03, 0.1)  # s after the middle of an image, for which the tracker is asked
+AHEAD = (0.01, 0.03, 0.1)  # s after the middle of an image, for which the tracker is asked
 _EVERY = 0.001  # s, within rows and between images
 _ROOM, _POINTS = 3.0, 20_000  # m about a trajectory
 _BAND, _TONES, _SHORT_SPACING = (4.0, 40.0), 24, 0.002  # Hz of shaking; s
@@ -200,7 +200,7 @@ def at_any_time(recording: Recording, motion: Motion) -> dict[str, Row]:
         if before is not None:
             gap = range(before.time_ns + half - each.middle_ns, -half, round(1e9 * _EVERY))
             asked += [("between images", later) for later in gap]
-        asked += [(f"{1e3 * ahead:.0f} ms ahead", round(1e9 * ahead)) for ahead in _AHEAD]
+        asked += [(f"{1e3 * ahead:.0f} ms ahead", round(1e9 * ahead)) for ahead in AHEAD]
         for name, later in asked:
             there = tracker.at(each.middle_ns + later)
             others = {"": there}
