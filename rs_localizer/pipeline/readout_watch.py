@@ -93,7 +93,7 @@ class ScanAxis:
     """
 
     def __init__(self) -> None:
-        self._localizer: Localizer | None = None  # by the other axis
+        self._localizers: tuple[Localizer, Localizer] | None = None  # by this axis, by the other
         self._estimate = ReadoutEstimate()
         self._odds = 0.0  # logarithm, of the other axis
         self._moves = 0.0  # likewise, that its motions agree from frame to frame
@@ -135,19 +135,26 @@ class ScanAxis:
         if self._confirmed or not due:
             return
         cloud, config = frame.cloud, frame.config
-        if self._localizer is None:
+        if self._localizers is None:
             other = _OTHER_AXIS[ScanDirection(config.scan_direction)]
-            self._localizer = Localizer(replace(frame.camera, scan_direction=other), config)
-        found = self._localizer.find(cloud.points, cloud.pixels, cloud.scores)
-        sideways = replace(frame, result=found, camera=self._localizer.camera)
-        rms = [result.residual_rms for result in (frame.result, found) if result]
+            sideways = replace(frame.camera, scan_direction=other)
+            self._localizers = Localizer(frame.camera, config), Localizer(sideways, config)
+        # Alone both: what other frames or a gyroscope know of a motion is no fit of this one's
+        # noise, of which a free motion takes some 4 units of the logarithm more.
+        alone = [
+            replace(
+                frame, camera=it.camera, result=it.find(cloud.points, cloud.pixels, cloud.scores)
+            )
+            for it in self._localizers
+        ]
+        found = alone[1].result
+        rms = [it.result.residual_rms for it in alone if it.result]
         noise = max(min(rms, default=math.inf) / math.sqrt(2.0), _LEAST_NOISE)
-        ours, others = (it.cost(_TRUNCATED * config.inlier_threshold, noise)
-                        for it in (frame, sideways))  # fmt: skip
+        ours, others = (it.cost(_TRUNCATED * config.inlier_threshold, noise) for it in alone)
         ratio = min(max(ours - others, -_MOST_OF_A_FRAME), _MOST_OF_A_FRAME)
         self._odds = max(_MEMORY * self._odds + ratio, _LEAST)
         if found and self._odds > _DOUBT:
-            self._measure(sideways)
+            self._measure(alone[1])
         known = self.direction is not None
         self._enough = 0.0 if known and self.wrong else _CERTAIN
         if found and self._odds > 0.0 and not self._contradicted:
@@ -173,9 +180,12 @@ _WELL_KNOWN, _ENOUGH = 0.02, 60
 _SURELY = 4.0
 # Of the setting: from here on nothing tells the shutter from a global one.
 _GLOBAL = 0.2
-# Logarithms of odds: of a global shutter or a reversed one that are enough to doubt, and of a
-# global one to be certain; and what is then said of rest.
-_SUSPICIOUS, _ALL_BUT_SURE, _AT_REST = 2.0, math.log(100.0), math.log(1e9)
+# Logarithms of odds: of a global shutter or a reversed one that are enough to doubt, and those for
+# the setting that end the doubt. A robot that drives slowly shows neither: by 2 of both, one in
+# four of such drives was doubted by chance, for ever.
+_SUSPICIOUS, _SHOWN = 4.0, 2.0
+# Those of a global shutter to be certain; and what is then said of rest.
+_ALL_BUT_SURE, _AT_REST = math.log(100.0), math.log(1e9)
 # A shaken camera turns differently between its frames than within them, whatever its shutter: then
 # at no readout time squared errors are those of noise.
 _MOST_MISFIT = 1.5
@@ -299,7 +309,7 @@ class ReadoutWatch:
         )
         if self.far_off or doubtful:
             self.trusted = False
-        elif doubt < -_SUSPICIOUS:
+        elif doubt < -_SHOWN:
             self.trusted = True
         if enough and found - _SURELY * measured.deviation > FAR_OFF * usual:
             self.axis.confirm()

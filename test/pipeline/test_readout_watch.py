@@ -28,7 +28,12 @@ from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.tools.simulation.frames import simulate_frames
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.settings import FrameSettings
-from rs_localizer.tools.simulation.true_motion import RecordedMotion, TrueState, sampled_states
+from rs_localizer.tools.simulation.true_motion import (
+    ConstantVelocity,
+    RecordedMotion,
+    TrueState,
+    sampled_states,
+)
 
 from .clouds import cloud_of
 
@@ -101,6 +106,19 @@ def test_a_wrong_readout_time_is_said_once(factor, tracking):
     twist = seen.last().twist
     speed = np.concatenate([twist.linear, twist.angular])
     assert np.linalg.solve(twist.covariance, speed) @ speed < (factor * READOUT / error) ** 2
+
+
+@pytest.mark.parametrize("seed", [4, 7])
+def test_a_robot_that_drives_slowly_is_not_doubted(seed):
+    """Half a metre and 14 degrees a second tell nothing of the shutter, nor against it."""
+    motion = ConstantVelocity(np.array([0.0, -0.25, 0.0]), np.array([0.0, 0.0, 0.5]), 2.5)
+    world = room(motion.state(0, np.linspace(0, 2.5, 6)).positions, np.random.default_rng(0), 5000)
+    frames = FrameLocalizer(NodeConfig(readout_time=READOUT))
+    frames.calibrate(CALIBRATION)
+    seen = FrameSettings(100, 0.7, 0.2)
+    for k, frame in enumerate(simulate_frames(CAMERA, motion, world, seen, seed=seed)):
+        assert frames.localize(cloud_of(frame.stamp_ns + 10**18, frame.points, frame.pixels))
+        assert frames.readout_watch.trusted, k
 
 
 @pytest.mark.parametrize(("curl", "rate", "told"), [(0.0, 0.3, 0.015), (0.001, 0.05, 0.03)])
