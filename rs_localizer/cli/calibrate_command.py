@@ -101,15 +101,14 @@ class _Input:
     own_stamps: bool = True
 
 
-def run(options: Options) -> Figures | None:
+def run(options: Options) -> Mapping[str, object]:
     if options.out is not None and options.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {options.out}")
     if options.camera_info is not None and options.out is None:
         raise UsageError("--camera-info goes with --out")
     args = replace(options, recording=options.recordings[0])
     if args.rig:
-        _calibrate_rig(args)
-        return None
+        return _calibrate_rig(args)
     if len(args.recordings) > 1:
         raise UsageError("several recordings are those of a --rig")
     return _calibrate_one(args)
@@ -136,6 +135,10 @@ def _calibrate_one(args: Options) -> Figures:
             )
     if refusal:
         raise ValueError(refusal)
+    return _figures(found)
+
+
+def _figures(found: CameraCalibration) -> Figures:
     return {
         "readout_time_ms": 1e3 * verdict.readout_time(found),
         "deviation_ms": 1e3 * found.deviation,
@@ -354,7 +357,7 @@ def _next(args: Options, intrinsics: bool, shape: Path | None) -> str:
     return f"{shlex.join(detect)} && {image_input.replay_command(seen)}"
 
 
-def _calibrate_rig(args: Options) -> None:
+def _calibrate_rig(args: Options) -> dict[str, Figures]:
     """Calibrate each camera alone, then all together, and say what was found."""
     if args.imu:
         raise UsageError("--imu is for one camera: leave it out with --rig")
@@ -408,6 +411,7 @@ def _calibrate_rig(args: Options) -> None:
         raise ValueError(
             "not observable: " + "; ".join(f"{name}: {text}" for name, text in refusals.items())
         )
+    return {name: _figures(each.calibration) for name, each in recordings.items()}
 
 
 def _without_k3(camera: Camera) -> Camera:

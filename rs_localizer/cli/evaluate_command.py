@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, write_all
-from rs_localizer.cli.options import UsageError, argument, option
+from rs_localizer.cli.options import argument, option
+from rs_localizer.cli.settings_args import remapped
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.recording import CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC
 
@@ -41,11 +42,7 @@ class Options:
 
 
 def run(options: Options) -> Figures:
-    topics = dict[str, str]()
-    for text in options.remaps:
-        name, _, topics[name] = text.partition(":=")
-        if name not in _TOPICS or not topics[name]:
-            raise UsageError(f"-r: expected NAME:=TOPIC of {', '.join(_TOPICS)}; got {text!r}")
+    topics = remapped(options, _TOPICS)
     estimate = read_motions(options.estimate, topics.get("pose"), topics.get("twist"))
     truth = read_motions(options.truth, topics.get("truth_pose"), topics.get("truth_twist"))
     for part in (estimate.poses, estimate.twists):

@@ -40,18 +40,8 @@ if WORKING:
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
     from rs_localizer.io.topics import IMU
     from rs_localizer.markers.map_files import is_marker_file
-    from rs_localizer.offline.fleet import (
-        LOG,
-        MARKER,
-        SUMMARY,
-        Figures,
-        Outcome,
-        Task,
-        do_all,
-        finished,
-        refuse_others,
-        tasks_of,
-    )
+    from rs_localizer.offline import fleet, table
+    from rs_localizer.offline.fleet import Figures, Outcome, Task
     from rs_localizer.offline.image_sources import holds_images, image_topics
     from rs_localizer.offline.replay import (
         NO_FRAMES,
@@ -63,7 +53,6 @@ if WORKING:
         replay,
     )
     from rs_localizer.offline.results import Tally, at_rate, figures, write_frame
-    from rs_localizer.offline.table import FrameTable, read_parquet, schema, write_parquet
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.pipeline.refusal import explained
     from rs_localizer.settings import build
@@ -130,7 +119,7 @@ def _check_place(options: Options) -> None:
     file = options.parquet
     if file is None:
         return
-    schema()  # what is not installed is said now
+    table.schema()  # what is not installed is said now
     check_writable(file)
     if not file.is_file():
         return  # nothing is there, or what takes all that comes, such as /dev/stdout
@@ -244,16 +233,15 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
         if options.smooth and config.readout_time == 0.0 and not config.of_cameras:
             raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
         localizer.warm_up()
-        table = None
+        tally = Tally(bag.count([topics.frames]), notices)
         if options.parquet is not None:
-            table = FrameTable(recording, localizer, options.smooth)
-        tally = Tally(bag.count([topics.frames]), notices, table)
+            tally.table = table.FrameTable(recording, localizer, options.smooth)
         with fresh(out, options.overwrite) as built:
             _hint(path, options.params)
             _replay(bag, topics, localizer, tally, built, options)
         _tell(tally, config, out, timed)
-        if table is not None and options.parquet is not None:
-            _write_table([table.table()], options.parquet)
+        if tally.table is not None and options.parquet is not None:
+            _write_table([tally.table.table()], options.parquet)
         if not tally.localized:
             raise ValueError(
                 f"no frame of {recording} was localized; of the last one, {tally.last_refusal}"
@@ -262,7 +250,7 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
 
 
 def _write_table(tables: list[Table], file: Path) -> None:
-    rows = write_parquet(tables, file)
+    rows = table.write_parquet(tables, file)
     print(f"written to {file}: {rows} rows, one a frame")
 
 
@@ -369,7 +357,7 @@ def fresh(out: Path, overwrite: bool) -> Iterator[Path]:
 
 
 def _remove_results(out: Path) -> None:
-    for name in (POSES, TWISTS, BRIDGED, MARKER, LOG):
+    for name in (POSES, TWISTS, BRIDGED, fleet.MARKER, fleet.LOG):
         (out / name).unlink(missing_ok=True)
     shutil.rmtree(out / RESULT, ignore_errors=True)
 
@@ -469,10 +457,10 @@ def _replay_all(options: Options) -> None:
     )  # fmt: skip
     files = [file for file in (params, landmarks, lens) if file is not None]
     work = functools.partial(_replay_of_many, own)
-    tasks = tasks_of(options.recordings, out.absolute(), work, repr(own), files)
+    tasks = fleet.tasks_of(options.recordings, out.absolute(), work, repr(own), files)
     if not options.overwrite:
-        refuse_others(tasks)
-    before = sum(finished(task) is not None for task in tasks)
+        fleet.refuse_others(tasks)
+    before = sum(fleet.finished(task) is not None for task in tasks)
     print(f"{before} of {len(tasks)} recordings have been done before")
     with tqdm(total=len(tasks) - before, unit="recording", disable=None) as bar:
 
@@ -480,13 +468,15 @@ def _replay_all(options: Options) -> None:
             bar.update()
             bar.write(f"{task.folder.name}: {outcome.reason or 'done'}")
 
-        outcomes = do_all(tasks, out, options.scheduler, options.workers, heard)
-    print(f"written to {out / SUMMARY}")
+        outcomes = fleet.do_all(tasks, out, options.scheduler, options.workers, heard)
+    print(f"written to {out / fleet.SUMMARY}")
     done = [task for task in tasks if outcomes[task.folder].figures is not None]
     if options.parquet is not None:
-        _write_table([read_parquet(task.folder / TABLE) for task in done], options.parquet)
+        _write_table([table.read_parquet(task.folder / TABLE) for task in done], options.parquet)
     if failed := len(tasks) - len(done):
-        raise ValueError(f"{failed} of {len(tasks)} recordings failed; {out / SUMMARY} says why")
+        raise ValueError(
+            f"{failed} of {len(tasks)} recordings failed; {out / fleet.SUMMARY} says why"
+        )
 
 
 def _replay_of_many(options: Options, recording: Path, out: Path) -> Figures:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rs_localizer.cli import WORKING
@@ -48,21 +48,21 @@ def given_settings(args: Any) -> NodeConfig:
     return build(given_values(args))
 
 
-def remapped(options: Any) -> dict[str, str]:
-    """Topics that were given by ``-r``, by input, images among them.
+def remapped(options: Any, known: Sequence[str] = (*INPUTS, IMAGE)) -> dict[str, str]:
+    """Topics that were given by ``-r``, by input; images are one.
 
     Raises:
         UsageError: for what is no input.
     """
-    known, topics = (*INPUTS, IMAGE), dict[str, str]()
+    topics = dict[str, str]()
     for text in options.remaps:
         name, given, topic = text.partition(":=")
         if not given or not topic or name not in known:
-            raise UsageError(f"-r: expected INPUT:=TOPIC of {', '.join(known)}; got {text!r}")
+            raise UsageError(f"-r: expected NAME:=TOPIC of {', '.join(known)}; got {text!r}")
         topics[name] = topic if topic.startswith("/") else f"/{topic}"
     return topics
 
 
 def given_topics(options: Any) -> dict[str, str | None]:
-    """Those of the localizer's inputs."""
+    """Topics of the localizer's inputs."""
     return {name: topic for name, topic in remapped(options).items() if name in INPUTS}

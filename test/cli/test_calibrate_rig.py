@@ -84,6 +84,10 @@ def test_a_pair(pair, tmp_path, capsys):
     words = ["--camera", str(tmp_path / "rig.yaml"), "--out", str(tmp_path / "poses")]
     assert main(["replay", pair, *words]) == 0
     assert "inliers with a rolling shutter" in capsys.readouterr().out
+    words = ["--rig", pair, "--json", "--camera", str(tmp_path / "rig.yaml")]
+    assert main(["calibrate", *words]) == 0
+    told = json.loads(capsys.readouterr().out)["result"]
+    assert told["rear"]["readout_time_ms"] == pytest.approx(30.0, abs=1.0)
 
 
 def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
