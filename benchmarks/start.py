@@ -37,7 +37,8 @@ class Start(NamedTuple):
     first_work: float
     refused: int  # frames before it
     resident: float  # MB of the node when it has settled
-    peak: float  # MB, what processes share counted once
+    peak: float  # MB until active, what processes share counted once
+    later_peak: float  # MB, while the rest is compiled
 
 
 def tree(pid: int) -> Iterator[tuple[int, float]]:
@@ -50,6 +51,8 @@ def tree(pid: int) -> Iterator[tuple[int, float]]:
         except OSError:
             continue
         one = int(path.parent.name)
+        if fields[0] == "Z":  # it has ended, and its parent has not asked
+            continue
         parents.setdefault(int(fields[1]), []).append(one)
         work[one] = sum(map(int, fields[11:15])) / _TICK
     waiting = [pid]
@@ -100,7 +103,7 @@ def measure(settings: Mapping[str, Any], imu: bool) -> Start:
             watch = Watch(node.pid)
             try:
                 node.wait(lambda line: None)
-                active, work = time.monotonic() - began, watch.work()
+                active, work, peak = time.monotonic() - began, watch.work(), watch.peak
                 refused, pose = 0, None
                 while pose is None:
                     stamp_ns, info, cloud = frames[refused % len(frames)]
@@ -110,12 +113,12 @@ def measure(settings: Mapping[str, Any], imu: bool) -> Start:
                     refused += pose is None
                 first, first_work = time.monotonic() - began, watch.work()
                 time.sleep(_SETTLED)
-                resident = memory(node.pid, "Rss")
+                resident = memory(node.pid, "Pss")
                 while len(list(tree(node.pid))) > 1:  # what compiles the rest
                     time.sleep(_POLLED)
             finally:
                 watch.close()
-    return Start(active, work, first, first_work, refused, resident, watch.peak)
+    return Start(active, work, first, first_work, refused, resident, peak, watch.peak)
 
 
 def _send_imu(node: LiveNode, stamp_ns: int) -> None:
@@ -134,7 +137,7 @@ def main() -> None:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 100 + 1)
     os.environ.pop("NUMBA_CACHE_DIR", None)
-    head = ("active s", "CPU s", "pose s", "CPU s", "refused", "RSS MB", "peak MB")
+    head = ("active s", "CPU s", "pose s", "CPU s", "refused", "node MB", "peak MB", "later MB")
     print(f"{'':34}" + "".join(f"{name:>10}" for name in head))
     rows: tuple[tuple[str, dict[str, Any], bool], ...] = (
         ("no readout_time", {"solver": "r6p_vcwt"}, False),

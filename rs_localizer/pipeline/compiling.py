@@ -9,11 +9,10 @@ kernels by calling them, in the order in which they are likely to be needed.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
-import os
 import re
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -23,21 +22,13 @@ import numpy as np
 from numba.core.registry import cpu_target
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.simd.jit import cache_directory, digest
+from rs_localizer.core.simd import compiler
+from rs_localizer.core.simd.jit import NotCompiled, at_once, cache_directory, digest
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 
-# The same sources as here; the end of its input says that whoever waits for it has ended.
-_REST = """
-import os, sys, threading
-threading.Thread(target=lambda: os._exit(sys.stdin.read() == ""), daemon=True).start()
-os.nice(10)
-from rs_localizer.config import NodeConfig
-from rs_localizer.pipeline.frames import FrameLocalizer
-FrameLocalizer(NodeConfig(solver=sys.argv[1], readout_time=0.03)).warm_up_rest()
-"""
 _LAST = "markers"  # last folder with kernels of frames
 _READOUT_TIME, _PERIOD_NS = 0.03, 33_000_000
 _POINTS, _FRAMES = 60, 3  # beside fewer than min_inliers
@@ -51,12 +42,15 @@ _MAPPING = re.compile(
 _MADV_DONTNEED = 4  # Linux, <bits/mman-linux.h>
 
 
-def plain_frames(localizer: Localizer, inertial: InertialSettings | None = None) -> None:
+def plain_frames(
+    localizer: Localizer, inertial: InertialSettings | None = None, patient: bool = True
+) -> None:
     """Call what frames of a moving camera before a scene that is no plane need.
 
     Args:
         localizer: of the settings; its camera may be another.
         inertial: of the IMU beside it; None: there is none.
+        patient: wait for what joins frames, too; else it is ordered, and frames stand alone.
     """
     camera = next(iter(localizer.rig.cameras.values()))
     rng = np.random.default_rng(0)
@@ -81,7 +75,11 @@ def plain_frames(localizer: Localizer, inertial: InertialSettings | None = None)
         times = time_ns + np.arange(-300, 30) * 2_000_000
         rates = np.tile([0.0, 0.0, -_TURN_RATE], (len(times), 1))
         samples = None if inertial is None else ImuSamples(times, rates)
-        tracker.localize(time_ns, points, each, scores, imu=samples)
+        with contextlib.nullcontext() if patient or k == 0 else at_once():
+            try:
+                tracker.localize(time_ns, points, each, scores, imu=samples)
+            except NotCompiled:
+                return
 
 
 def _timed(camera: Camera) -> Camera:
@@ -105,15 +103,19 @@ def note_whole(solver: str) -> None:
     note.touch()
 
 
-def compile_rest(solver: str) -> subprocess.Popen[bytes] | None:
-    """Compile the rest in a process beside this one, unless that has been done."""
+def compile_rest(solver: str) -> bool:
+    """Have the rest compiled beside the frames, unless that has been done; whether it was not."""
     if is_whole(solver):
-        return None
-    return subprocess.Popen(
-        [sys.executable, "-c", _REST, solver], stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-    )  # fmt: skip
+        return False
+    compiler.order(compiler.Request(__name__, _all_kernels.__name__, (solver,), False))
+    return True
+
+
+def _all_kernels(solver: str) -> None:
+    from rs_localizer.config import NodeConfig
+    from rs_localizer.pipeline.frames import FrameLocalizer  # which imports this
+
+    FrameLocalizer(NodeConfig(solver=solver, readout_time=_READOUT_TIME)).warm_up_rest()
 
 
 def give_back_compiler() -> None:

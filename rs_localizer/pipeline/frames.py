@@ -327,13 +327,16 @@ class FrameLocalizer:
         self.readout_watch.reset()
         self._tracker.reset()
 
-    def warm_up(self) -> None:
-        """Have compiled, or load, what a plain frame needs, from points to messages."""
-        plain_frames(self._tracker.localizer)
+    def warm_up(self, patient: bool = True) -> None:
+        """Have compiled, or load, what a plain frame needs, from points to messages.
+
+        ``patient``: what joins frames, too; else it is loaded if it is there, and ordered if not.
+        """
         so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
         twist_at(_STILL, 0.5, 1.0)
         if not self._alone:
             matching.warm_up()
+        plain_frames(self._tracker.localizer, patient=patient)
 
     def warm_up_rest(self) -> None:
         """The same of what any frame may need but for an IMU's; notes that it is there.
@@ -550,7 +553,11 @@ class FrameLocalizer:
 
         def localized(samples: ImuSamples | None) -> Estimate | Failure:
             matches = cloud.points, cloud.pixels, cloud.scores
-            return self._tracker.localize(time_ns, *matches, imu=samples, context=context)
+            try:
+                return self._tracker.localize(time_ns, *matches, imu=samples, context=context)
+            except NotCompiled:  # what joins frames, perhaps: this one may stand alone
+                self._tracker.reset()
+                return self._tracker.localize(time_ns, *matches, imu=samples, context=context)
 
         self.imu.track(self._tracker, config, time_ns, frame, self.transforms, localized)
         result = self._tracker.newest

@@ -29,7 +29,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
 from operator import attrgetter
 from pathlib import Path
-from queue import SimpleQueue
+from queue import PriorityQueue
 from typing import Any, NamedTuple, NoReturn
 
 # The paths of who asks come first, so that both import the same sources.
@@ -43,9 +43,10 @@ serve(asked)
 """
 # s without a request after which the process ends; the next one starts it again.
 _IDLE = 20.0
-# kB from which a fork is replaced. One for each kernel takes a third more of the processor, since
-# what is Numba's own is compiled in each; one for all comes to 1,260 MB.
-_MOST, _GROWN = 400_000, 3
+# kB from which a fork is replaced: what is Numba's own is compiled again in each, and one for all
+# comes to 600 MB.
+_MOST, _GROWN = 300_000, 3
+_NICE = 10  # of what nobody waits for
 _PR_SET_PDEATHSIG = 1  # Linux, <linux/prctl.h>
 # s: kernels of other versions, in other environments, may be at work beside this one.
 _KEPT = 30.0 * 86400.0
@@ -53,11 +54,12 @@ _OURS = re.compile(r"[0-9a-f]{16}")
 
 
 class Request(NamedTuple):
-    """A kernel, and the types of its arguments."""
+    """A kernel and the types of its arguments, or a function that calls kernels, and its own."""
 
     module: str
     name: str
     arguments: tuple[Any, ...]
+    is_kernel: bool = True
 
 
 class _Compiler:
@@ -66,7 +68,7 @@ class _Compiler:
     def __init__(self) -> None:
         self._child: subprocess.Popen[bytes] | None = None
         self._lock = threading.Lock()
-        self._orders: SimpleQueue[Request] | None = None
+        self._orders: PriorityQueue[tuple[bool, int, Request]] | None = None
         self._ordered: set[Request] = set()
         self._failed: set[Request] = set()
         self.count = 0
@@ -77,30 +79,44 @@ class _Compiler:
             self.count += 1
             for listener in self.listeners:
                 listener(self.count, request.name)
-            for _ in range(2):  # it may just have ended, for want of work
-                with contextlib.suppress(OSError, EOFError):
-                    return self._ask(request)
-                self._end()
-        return False
+            answer = None
+            while answer is None:
+                answer = self._ask(request)
+            return answer
 
     def order(self, request: Request) -> bool:
         if request in self._ordered:
             return request not in self._failed
         self._ordered.add(request)
         if self._orders is None:
-            self._orders = SimpleQueue()
+            self._orders = PriorityQueue()
             # Of an executor the end of the program would wait for what it is at.
             threading.Thread(target=self._follow, args=(self._orders,), daemon=True).start()
-        self._orders.put(request)
+        self._orders.put((not request.is_kernel, len(self._ordered), request))
         return True
 
-    def _follow(self, orders: SimpleQueue[Request]) -> NoReturn:
+    def _follow(self, orders: PriorityQueue[tuple[bool, int, Request]]) -> NoReturn:
         while True:
-            request = orders.get()
-            if not self.obtain(request):
-                self._failed.add(request)
+            order = orders.get()
+            request = order[2]
+            if request.is_kernel:
+                if not self.obtain(request):
+                    self._failed.add(request)
+                continue
+            with self._lock:
+                answer = self._ask(request)
+            if answer is None:  # kernels that a frame has asked for since come first
+                orders.put(order)
 
-    def _ask(self, request: Request) -> bool:
+    def _ask(self, request: Request) -> bool | None:
+        """The answer of the process; None: it goes on when it is asked again."""
+        for _ in range(2):  # it may just have ended, for want of work
+            with contextlib.suppress(OSError, EOFError):
+                return self._exchange(request)
+            self._end()
+        return False
+
+    def _exchange(self, request: Request) -> bool | None:
         from numba.core import serialize
 
         dumps: Callable[[Any], bytes] = serialize.dumps
@@ -117,7 +133,8 @@ class _Compiler:
             self._child.stdout.close()
             self._ask_by.send(sys.path)
         self._ask_by.send_bytes(dumps(request))
-        return bool(self._hear_by.recv())
+        answer: bool | None = self._hear_by.recv()
+        return answer
 
     def _end(self) -> None:
         if self._child is not None:
@@ -200,13 +217,25 @@ def _compile_all(asked: Connection[Any, Any], answers: Connection[Any, Any]) -> 
     from rs_localizer.core.simd import jit
 
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    gc.disable()  # collections would look through all that the compiler keeps: a seventh
-    jit.compile_here()
+
+    def leave_if_grown() -> None:
+        # Later collections would look through all that the compiler keeps: a seventh of the work.
+        gc.collect()
+        gc.freeze()
+        if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > _MOST:
+            answers.send(None)
+            os._exit(_GROWN)
+
+    jit.compile_here(leave_if_grown)
     with contextlib.suppress(EOFError):
         while asked.poll(_IDLE):
-            answers.send(_kept(Request(*pickle.loads(asked.recv_bytes()))))
-            if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > _MOST:
-                os._exit(_GROWN)
+            request = Request(*pickle.loads(asked.recv_bytes()))
+            if request.is_kernel:
+                answers.send(_kept(request))
+            else:
+                os.nice(_NICE)
+                answers.send(_called(request))
+                os._exit(_GROWN)  # there is no way back from nice
     os._exit(0)
 
 
@@ -236,6 +265,15 @@ def _kept(request: Request) -> bool:
             return bool(holds())
     except Exception:  # whoever asks compiles it itself, and says what is wrong
         return False
+
+
+def _called(request: Request) -> bool:
+    """Call a function that calls kernels; whether it came to its end."""
+    try:
+        attrgetter(request.name)(importlib.import_module(request.module))(*request.arguments)
+    except Exception:  # whoever calls these kernels is told of it
+        return False
+    return True
 
 
 def _remove_old(caches: Path) -> None:

@@ -70,7 +70,8 @@ class _Missing(Exception):
 class _Thread(threading.local):
     waits = True  # for kernels that are not there
     asks = False  # whether the cache has a kernel
-    compiles = False  # what it needs, by itself
+    # What is called whenever it has kept a kernel, if it compiles what it needs by itself.
+    kept: Callable[[], None] | None = None
 
 
 _thread = _Thread()
@@ -89,9 +90,12 @@ def at_once() -> Iterator[None]:
         _thread.waits = before
 
 
-def compile_here() -> None:
-    """From now on compile in this thread what is not in the cache."""
-    _thread.compiles = True
+def compile_here(kept: Callable[[], None]) -> None:
+    """From now on compile in this thread what is not in the cache.
+
+    ``kept`` is called whenever a kernel has come into the cache; it may end the process.
+    """
+    _thread.kept = kept
 
 
 def cache_directory() -> Path:
@@ -174,7 +178,7 @@ def is_global(function: Any) -> bool:
 
 def _obtained(compiled: Any, compile_or_load: Callable[..., Any], signature: Any) -> Any:
     """The entry point of a kernel: from the cache, where a process of its own compiles to."""
-    if _thread.compiles:
+    if _thread.kept is not None:
         return compile_or_load(signature)
     loaded = compiled.overloads.get(tuple(signature))
     if loaded is not None:
@@ -352,6 +356,9 @@ class _Cache(FunctionCache):
             super().save_overload(signature, compiled)
         except OSError as error:
             _say(f"kernels are compiled again at the next start: {error.strerror or error}")
+            return
+        if _thread.kept is not None:
+            _thread.kept()
 
 
 @functools.cache

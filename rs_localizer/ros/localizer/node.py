@@ -209,7 +209,7 @@ def described(landmarks: Map) -> str:
 def load_kernels(frames: FrameLocalizer) -> float:
     """Load what a plain frame needs, compiled where it has to be; how many seconds it took."""
     started = time.monotonic()
-    frames.warm_up()
+    frames.warm_up(patient=False)
     give_back_compiler()
     return time.monotonic() - started
 
@@ -333,12 +333,10 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized]):
                 self._broadcaster.publish(frame, frames.config)
 
         self._publish_now = publish_now
-        rest = compile_rest(config.solver)
-        if rest is not None:
+        if compile_rest(config.solver):
             self.get_logger().info(
                 "compiling what few frames need, beside them; they are refused meanwhile: compiling"
             )
-            self._undo.callback(rest.kill)
         self._localizer = frames
         worker = self.employ(frames, publish_all)
         say, needs_tf = self.get_logger().info, self._imu_came.trigger

@@ -41,6 +41,22 @@ from rs_localizer.core import so3
 print("begins", flush=True)
 so3.exp_many(np.zeros((1, 3)))
 """
+CALLS = """
+import time
+import numpy as np
+from rs_localizer.core import so3
+from rs_localizer.core.simd.compiler import Request, order
+from rs_localizer.core.simd.jit import NotCompiled, at_once
+order(Request("rs_localizer.estimation.observations", "warm_up", (), False))
+order(Request("rs_localizer.core.so3", "no_such_function", (), False))
+while True:
+    try:
+        with at_once():
+            assert np.all(so3.log(np.eye(3)) == 0.0)
+        break
+    except NotCompiled:
+        time.sleep(0.1)
+"""
 
 
 @pytest.fixture
@@ -81,6 +97,13 @@ def test_two_processes_that_need_a_kernel_at_once_have_the_same_bits(start, tmp_
 
 def test_who_must_not_wait_is_told_until_it_is_there(start):
     assert said(start(AT_ONCE)) == ["True True"]
+
+
+def test_a_function_is_called_where_its_kernels_are_compiled_and_others_go_on(start, tmp_path):
+    """Also after one that fails."""
+    assert said(start(CALLS)) == []
+    kept = {path.name.partition("-")[0] for path in (tmp_path / "cache").rglob("*.nbc")}
+    assert {"observations.thin", "so3.log"} <= kept
 
 
 def test_the_compiler_ends_with_who_asks_it(start):
