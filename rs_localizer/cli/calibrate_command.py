@@ -204,6 +204,8 @@ def _read(args: Options, config: NodeConfig) -> _Input:
     if of_bag and IMAGE not in remapped(args):
         with open_bag(path) as bag:
             if has_frames(bag):
+                if args.rate is not None:
+                    raise UsageError("--rate is for images; a bag has its own times")
                 return replace(_correspondences(args, bag, config), imu=imu)
     with image_input.opened(args, calibrated=False) as source:
         found = _detected(args, source.shots)

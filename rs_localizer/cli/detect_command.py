@@ -7,10 +7,10 @@ from __future__ import annotations
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rs_localizer.cli import WORKING, replaced
 from rs_localizer.cli.image_input import (
@@ -39,7 +39,7 @@ if WORKING:
     from rs_localizer.io.rigs import make_mounts, read_camchain
     from rs_localizer.io.topics import TF_STATIC
     from rs_localizer.offline import detect as offline
-    from rs_localizer.offline.detect import DetectedMarkers, Extraction, record, record_features
+    from rs_localizer.offline.detect import Extraction, record, record_features
     from rs_localizer.offline.fleet import Figures
     from rs_localizer.offline.image_sources import Carried, Shot
     from rs_localizer.pipeline.images import FrameDetector
@@ -104,14 +104,15 @@ def detect(args: Options) -> Figures:
                     if name not in ("", settings.cameras[0]):  # what goes along is of the first
                         shots = (shot for shot in shots if not isinstance(shot, Carried))
                     options = offline.DetectionOptions(args.with_images, of.scan_direction, name)
-                    seen = look(shots, bag, options, bar)
-                print(f"{f'{args.out}, {name}' if name else args.out}: {seen.said}")
-                tell_left_out(seen.found.refused, seen.found.carried)
-                for fault in seen.faults:
+                    found = look(shots, bag, options, bar)
+                every.append(_figures(args, found))
+                print(f"{f'{args.out}, {name}' if name else args.out}: {_said(args, found)}")
+                print("".join(f"note {note}\n" for note in found.notes), end="")
+                tell_left_out(found.refused, found.carried)
+                for fault in found.faults:
                     print(f"warning: {fault}")
-                tell_times(source.clock, of.readout_time, seen.found.period)
-                warnings += seen.faults
-                every.append(seen.figures)
+                tell_times(source.clock, of.readout_time, found.period)
+                warnings += found.faults
         if values := {**of_map, **shutter_values(args)}:
             write_parameters(out / PARAMETERS, values)
     tell_telemetry(args)
@@ -126,16 +127,25 @@ _WORST: dict[str, Any] = {
 }  # fmt: skip
 
 
-class _Found(NamedTuple):
-    """Findings in the images of a camera."""
+def _figures(args: Options, found: Extraction) -> Figures:
+    kind = "corners" if args.features is None else "keypoints"
+    count, median = len(found.counts), float(np.median(found.counts))
+    figures: Figures = {"images": found.images, f"with_{kind}": count, kind: median}
+    if not args.features:
+        figures["residual_of_a_still_pose_px"] = found.residual
+    return figures
 
-    found: Extraction | DetectedMarkers
-    said: str
-    figures: Figures
-    faults: Sequence[str] = ()
+
+def _said(args: Options, found: Extraction) -> str:
+    kind = f"keypoints ({args.features})" if args.features else "corners"
+    median = f"{np.median(found.counts):.0f} {kind} each (median)"
+    said = f"{len(found.counts)} of {found.images} images, {median}"
+    if np.isfinite(found.residual):
+        said += f", within {found.residual:.3f} px rms of a global-shutter pose (median)"
+    return said
 
 
-Look = Callable[["Shots", BagWriter, "offline.DetectionOptions", Any], _Found]
+Look = Callable[["Shots", BagWriter, "offline.DetectionOptions", Any], "Extraction"]
 
 
 def _of_markers(args: Options) -> tuple[Mapping[str, float], Look]:
@@ -145,7 +155,9 @@ def _of_markers(args: Options) -> tuple[Mapping[str, float], Look]:
         raise UsageError("give --map, --board or --features")
     marker_map, config = find_map(args), DetectorConfig()
 
-    def look(shots: Shots, bag: BagWriter, options: offline.DetectionOptions, bar: Any) -> _Found:
+    def look(
+        shots: Shots, bag: BagWriter, options: offline.DetectionOptions, bar: Any
+    ) -> Extraction:
         notices: Counter[str] = Counter()
         detector = FrameDetector(config, lambda _, text: notices.update([text]), marker_map)
         detector.warm_up()
@@ -153,20 +165,9 @@ def _of_markers(args: Options) -> tuple[Mapping[str, float], Look]:
             shots, detector, bag, options, done=bar.update,
             tell=lambda text: bar.write(f"note: {text}", file=sys.stderr),
         )  # fmt: skip
-        said = (
-            f"{found.with_corners} of {found.images} images, {found.corners:.0f} corners each "
-            "(median)"
-        )
-        if np.isfinite(found.residual):
-            said += f", within {found.residual:.3f} px rms of a global-shutter pose (median)"
-        said += "".join(f"\nnote ({n} images): {text}" for text, n in notices.most_common(3))
-        figures: Figures = {
-            "images": found.images,
-            "with_corners": found.with_corners,
-            "corners": found.corners,
-            "residual_of_a_still_pose_px": found.residual,
-        }
-        return _Found(found, said, figures, found.faults)
+        texts = notices.most_common(3)
+        found.notes = tuple(f"({number} images): {text}" for text, number in texts)
+        return found
 
     return marker_map.settings, look
 
@@ -178,17 +179,9 @@ def _of_features(args: Options) -> tuple[Mapping[str, float], Look]:
     most = args.max_keypoints or FeatureConfig().max_keypoints
     extractor = FrameExtractor(FeatureConfig(features=args.features or "", max_keypoints=most))
 
-    def look(shots: Shots, bag: BagWriter, options: offline.DetectionOptions, bar: Any) -> _Found:
-        found = record_features(shots, extractor, bag, options, bar.update)
-        figures: Figures = {
-            "images": found.images,
-            "with_keypoints": len(found.counts),
-            "keypoints": float(np.median(found.counts)),
-        }
-        said = (
-            f"{len(found.counts)} of {found.images} images, {np.median(found.counts):.0f} "
-            f"keypoints ({args.features}) each (median)"
-        )
-        return _Found(found, said, figures)
+    def look(
+        shots: Shots, bag: BagWriter, options: offline.DetectionOptions, bar: Any
+    ) -> Extraction:
+        return record_features(shots, extractor, bag, options, bar.update)
 
     return {}, look

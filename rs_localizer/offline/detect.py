@@ -54,18 +54,24 @@ class DetectError(ValueError):
     """Images without a use; the message says what was found."""
 
 
-@dataclass(frozen=True, slots=True)
-class DetectedMarkers:
+@dataclass(slots=True)
+class Extraction:
     """Counts of what became of the images, and what they show."""
 
-    images: int
-    with_corners: int
-    corners: float  # median of the images that show any
-    refused: dict[str, str]  # why images could not be read: the first detail of each reason
-    residual: float  # px rms of a global-shutter pose, median; NaN where none was possible
-    period: float  # s from one image to the next, median; NaN for a single one
-    carried: dict[str, int]  # messages of each other topic that replay may need
-    faults: tuple[str, ...]  # what speaks against map or calibration
+    images: int = 0
+    counts: list[int] = field(default_factory=list)  # keypoints or corners, where there are any
+    refused: dict[str, str] = field(default_factory=dict)  # the first detail of each reason
+    carried: Counter[str] = field(default_factory=Counter)  # messages of other topics
+    stamps_ns: list[int] = field(default_factory=list)
+    residual: float = np.nan  # px rms of a global-shutter pose, median; NaN where none was possible
+    faults: tuple[str, ...] = ()  # what speaks against map or calibration
+    notes: tuple[str, ...] = ()  # what the detector says of some images
+
+    @property
+    def period(self) -> float:
+        """s from one image to the next, median; NaN for a single one."""
+        steps = np.diff(np.array(self.stamps_ns, np.int64))
+        return float(np.median(steps)) * 1e-9 if len(steps) else np.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +91,7 @@ def record(
     *,
     done: Callable[[], object] = lambda: None,
     tell: Callable[[str], object] = lambda text: None,
-) -> DetectedMarkers:
+) -> Extraction:
     """Write the corners of all images that show any, each with its CameraInfo.
 
     Args:
@@ -190,7 +196,7 @@ class _MarkerTally:
         # What one of several shows may be chance.
         return [first[kind] for kind, n in names.most_common(4) if 2 * n >= len(self._empty)]
 
-    def recorded(self) -> DetectedMarkers:
+    def recorded(self) -> Extraction:
         known = [value for value in self._residuals if np.isfinite(value)]
         faults = [] if (fault := self._check.misplaced()) is None else [fault]
         if (reading := self._check.other_reading()) is not None:
@@ -202,16 +208,10 @@ class _MarkerTally:
             )
         if self.are_few and (names := self.instead()):
             faults.append(f"images that show nothing of the map show {'; '.join(names)}")
-        return DetectedMarkers(
-            self._found.images,
-            len(self._found.counts),
-            float(np.median(self._found.counts)),
-            self._found.refused,
-            float(np.median(known)) if known else np.nan,
-            self._found.period,
-            dict(self._found.carried),
-            tuple(faults),
-        )
+        self._found.faults = tuple(faults)
+        if known:
+            self._found.residual = float(np.median(known))
+        return self._found
 
 
 def _kind(name: str) -> str:
@@ -301,23 +301,6 @@ def static_residual(camera: Camera, detected: Detected) -> float:
         return np.nan
     predict = still_fit(camera, detections.points, detections.pixels)
     return np.nan if predict is None else rms(predict(detections.points) - detections.pixels)
-
-
-@dataclass(slots=True)
-class Extraction:
-    """Counts of what became of the images, and what they show."""
-
-    images: int = 0
-    counts: list[int] = field(default_factory=list)  # keypoints or corners, where there are any
-    refused: dict[str, str] = field(default_factory=dict)  # the first detail of each reason
-    carried: Counter[str] = field(default_factory=Counter)  # messages of other topics
-    stamps_ns: list[int] = field(default_factory=list)
-
-    @property
-    def period(self) -> float:
-        """s from one image to the next, median; NaN for a single one."""
-        steps = np.diff(np.array(self.stamps_ns, np.int64))
-        return float(np.median(steps)) * 1e-9 if len(steps) else np.nan
 
 
 def record_features(

@@ -108,7 +108,8 @@ def test_faults(flight, tmp_path, capsys):
     board = ["--board", "5x4", "--square", "0.1"]
     for code, words in (
         (1, [str(tmp_path / "none")]), (2, [str(flight), "--out", str(tmp_path / "x.txt")]),
-        (2, [str(flight), *board]), (2, [str(video), *board]), (1, [str(nothing), *board]),
+        (2, [str(flight), *board]), (2, [str(flight), "--rate", "5"]), (2, [str(video), *board]),
+        (1, [str(nothing), *board]),
     ):  # fmt: skip
         assert main(["calibrate", *words]) == code
     earlier = tmp_path / "earlier.yaml"

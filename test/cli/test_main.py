@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import make_dataclass
+from dataclasses import fields, make_dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -62,6 +62,12 @@ def test_every_command_has_help_and_takes_its_example(name, capsys):
     assert COMMANDS[name].example in text
     module = importlib.import_module(COMMANDS[name].module)
     parse(name, module, COMMANDS[name].example.split()[1 + len(name.split()) :])
+
+
+def test_options_are_few():
+    modules = [importlib.import_module(command.module) for command in COMMANDS.values()]
+    every = [item.metadata for module in modules for item in fields(module.Options)]
+    assert sum(not about.get("positional", True) for about in every) <= 120
 
 
 def test_help_waits_for_nothing_that_only_work_needs():
