@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 import rs_localizer as rsl
 from rs_localizer import data
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.core.state import step_between
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tools.simulation.frames import simulate_frames
@@ -393,31 +392,3 @@ def test_residuals_are_those_of_the_published_motion():
         shown, _ = project_rolling(CAMERA, found.at_rows, points)
         errors = np.linalg.norm(shown - pixels, axis=1)
         np.testing.assert_allclose(found.residuals, errors, atol=1e-3)
-
-
-def state(motion):
-    return np.concatenate(
-        [
-            motion.rotation.ravel(), motion.translation,
-            motion.angular_velocity, motion.linear_velocity,
-            motion.angular_acceleration, motion.linear_acceleration,
-        ]
-    )  # fmt: skip
-
-
-@pytest.mark.bench
-def test_the_prediction_is_covered_by_its_covariance():
-    hand = Hand()
-    tracker = Tracker(rsl.Localizer(CAMERA))
-    distances = []
-    for t in times(90):
-        prior = tracker.prediction(ns(t))
-        if prior is not None:
-            truth = hand.motion(t)
-            off = step_between(state(prior.motion), state(truth))
-            distances.append(off @ np.linalg.solve(prior.covariance, off))
-        assert tracker.localize(ns(t), *hand.frame(t, 60))
-    # The default accelerations are wider than this hand's: never too sure, and not absurdly wide.
-    # Of 18 dimensions: the median is 17.3, and 95 % lie below 28.87.
-    assert 3.0 < np.median(distances) < 18.0
-    assert np.mean(np.array(distances) < 28.87) > 0.95

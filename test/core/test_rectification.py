@@ -58,28 +58,3 @@ def test_without_depths_it_is_exact_for_what_is_far_away():
     np.testing.assert_allclose(
         rsl.rectify(camera, MOTION, pixels, np.inf), rsl.rectify(camera, MOTION, pixels)
     )
-
-
-@pytest.mark.parametrize("tau", [0.0, -0.5, 0.3])
-def test_states_are_derivatives_of_the_poses(tau):
-    """Position and velocities in SI units, against finite differences of the motion."""
-    readout, step = 0.02, 1e-6
-    camera = rsl.Camera(640, 480, K, readout_time=readout)
-    motion = rsl.Motion(MOTION.rotation, np.array([0.3, -0.2, 1.0]), OMEGA, V)
-    state = rsl.camera_state(motion, camera, tau)
-
-    def place(at: float) -> tuple[Any, Any]:
-        rotation, translation = motion.at(at)
-        return rotation.T, -rotation.T @ translation
-
-    (before_turn, before_place), (turn, here), (after_turn, after_place) = (
-        place(tau + k * step) for k in (-1, 0, 1)
-    )
-    np.testing.assert_allclose(state.position, here, atol=1e-12)
-    np.testing.assert_allclose(state.rotation, turn, atol=1e-12)
-    np.testing.assert_allclose(Rotation.from_quat(state.orientation).as_matrix(), turn, atol=1e-12)
-    seconds = 2 * step * readout
-    velocity = (after_place - before_place) / seconds
-    np.testing.assert_allclose(state.linear_velocity_in_map, velocity, atol=1e-6)
-    rate = Rotation.from_matrix(after_turn @ before_turn.T).as_rotvec() / seconds
-    np.testing.assert_allclose(state.angular_velocity_in_map, rate, atol=1e-5)

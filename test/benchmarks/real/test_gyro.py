@@ -92,14 +92,6 @@ def test_the_command_writes_table_and_picture(recording, gyroscope, tmp_path):
     assert (tmp_path / "gyro.png").stat().st_size > 10_000
 
 
-def test_what_is_no_gyroscope_is_refused(tmp_path):
-    (tmp_path / "three.txt").write_text("0 1 2\n1 1 2\n")
-    with pytest.raises(ValueError, match=r"in the order of time, found 2 of 3"):
-        Gyroscope.read(tmp_path / "three.txt")
-    with pytest.raises(ValueError, match=r"readout_time:=0\.03"):
-        read_bag(tmp_path, NodeConfig())
-
-
 def test_clock_axes_and_bias_of_a_gyroscope_are_found():
     frames, camera = (
         simulate(TRUE, motions.hand, Rich(80), 1, 60, seed=3),

@@ -84,8 +84,3 @@ def test_shaking_has_the_size_that_was_asked_for(folder):
     shaking, times = motions.shaken(moving, 0.2), np.arange(0.1, 0.8, 0.001)
     beside = shaking.turns(times, 1) - moving.turns(times, 1)
     assert np.sqrt(np.mean(np.sum(beside**2, axis=1))) == pytest.approx(0.2, rel=0.15)
-
-
-def test_what_is_missing_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"closed_loop_trajectory\.csv"):
-        motions.read_aria(tmp_path)
