@@ -3,7 +3,7 @@
 """Every lens law: derivatives are finite differences, and rays come back from their pixels.
 
 Those that see behind the image plane are compared with the formulas of their papers, written out
-point by point.
+point by point; distortion that a calibration lacks, with Brown's and Kannala's.
 """
 
 from __future__ import annotations
@@ -144,11 +144,47 @@ def test_closed_formulas_have_limits_and_corrections_keep_them(model):
     edge = np.array([[corner_of(camera), 0.0]])
     moved = by_lens(camera, edge)[0, 0, :2]
     np.testing.assert_allclose(moved, 520.0 * corner_of(camera), rtol=1e-9)
-    small = np.zeros(count)
-    small[:2] = 1e-5, -2e-5
-    mended = with_lens(camera, small)
-    np.testing.assert_allclose(
-        mended.distort(RAYS)[0] - camera.distort(RAYS)[0], by_lens(camera, RAYS) @ small, atol=1e-5
+    for size in (0.01, 10.0):
+        with_lens(camera, np.append([size, -2.0 * size], np.zeros(count - 2)))
+
+
+FOUND = np.array([-0.03, 0.01, 4e-4, -3e-4])
+
+
+def test_a_mended_lens_draws_points_along_the_radius_and_aside():
+    given = Camera(640, 480, K)
+    x, y = RAYS.T
+    square = (x * x + y * y) / corner_of(given) ** 2
+    radial = 1.0 + FOUND[0] * square + FOUND[1] * square**2
+    c, d = FOUND[2:] / corner_of(given)
+    seen = np.column_stack([
+        x * radial + 2.0 * c * x * y + d * (3.0 * x * x + y * y),
+        y * radial + c * (x * x + 3.0 * y * y) + 2.0 * d * x * y,
+    ])  # fmt: skip
+    pixels = with_lens(given, FOUND).distort(RAYS)[0]
+    np.testing.assert_allclose(pixels, seen * (520.0, 500.0) + (310.0, 250.0), atol=1e-9)
+
+
+def test_fisheyes_have_powers_of_the_angle():
+    square = np.diag([420.0, 420.0, 1.0])
+    given = Camera(
+        640,
+        480,
+        square + K * [[0, 0, 1], [0, 0, 1], [0, 0, 0]],
+        WIDE["equidistant"][0],
+        "equidistant",
     )
-    with_lens(camera, 1e3 * small)
-    with_lens(camera, 1e6 * small)
+    assert coefficients_of(given) == 6
+    angle = np.arctan(np.hypot(*RAYS.T))
+    powers = (angle / corner_of(given)) ** 2, (angle / corner_of(given)) ** 4
+    moved = with_lens(given, FOUND[:2]).distort(RAYS)[0] - given.distort(RAYS)[0]
+    more = 420.0 * angle * (FOUND[0] * powers[0] + FOUND[1] * powers[1])
+    np.testing.assert_allclose(np.hypot(*moved.T), np.abs(more), atol=1e-9)
+
+
+@pytest.mark.parametrize("model", DistortionModel)
+def test_derivatives_say_where_pixels_move(model):
+    given = Camera(640, 480, K, coefficients(model), model)
+    small = 1e-5 * np.array([1.0, -2.0, 0.5, 0.3, 1.5, -1.0, 0.7, 2.0])[: coefficients_of(given)]
+    moved = with_lens(given, small).distort(RAYS)[0] - given.distort(RAYS)[0]
+    np.testing.assert_allclose(by_lens(given, RAYS) @ small, moved, atol=1e-5)
