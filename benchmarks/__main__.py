@@ -51,7 +51,6 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   rigs                             several cameras, against their bounds
   real                             videos of real cameras
   gross                            grossly wrong lenses and maps: what is published
-  honesty                          against P3P, condition by condition
   mutants                          planted bugs, and whether tests catch them
   mapping                          refined maps and surveyed markers
   fuzzing                          wrong input for everything that reads

@@ -108,9 +108,11 @@ class Condition:
 REST, HAND = moving("rest"), moving("hand")
 SEEN: dict[str, Scene] = {"rich": Rich(), "wall": Wall()}
 SLOW_HAND = moving("hand", slower=4.0)  # 17 deg/s
+FILMING = moving("hand", slower=67.0 / 12.0)  # 12 deg/s, as one who films a board
 # A field of view of 45 degrees, as in the experiments of Kukelova et al. (ACCV 2018).
 NARROW = Camera(width=1000, height=1000, focal=1207.0)
 GLOBAL = Camera(readout_time=0.0)
+_WRONG_READOUT = 0.02  # s, that a user sets for a global shutter
 _FEWEST_INLIERS = 12  # that are accepted
 
 
@@ -349,16 +351,36 @@ def _global() -> Iterator[tuple[Any, ...]]:
     ):
         others = {
             "camera": GLOBAL,
-            "calibration": Calibration(readout_time=0.02),
+            "calibration": Calibration(readout_time=_WRONG_READOUT),
             "sequence": (SINGLE, TRACKED)[tracked],
         }
         yield f"{name}/{noise:g}px{'/tracked' * tracked}", SLOW_HAND, scene, noise, others
+
+
+def _boards() -> Iterator[tuple[Any, ...]]:
+    # Share of the distortion that the calibration lacks, and bend (m) that the map does not know.
+    lenses = [(lens, 0.0) for lens in (0.0, 0.1, 0.3)]
+    faults = [*lenses, (0.0, 2e-4), (0.0, 5e-4), (0.0, 2e-3), (0.1, 5e-4)]
+    for markers, (lens, bend), noise, readout, told in product(
+        (False, True), faults, (0.1, 0.5), (0.0, 0.005, 0.011, 0.03), ("unset", "set", "tracked")
+    ):
+        if told == "tracked" and readout == 0.0:
+            continue
+        believed = 0.0 if told == "unset" else readout or _WRONG_READOUT
+        others = {
+            "camera": Camera(readout_time=readout),
+            "calibration": Calibration(distortion=lens, readout_time=believed),
+            "sequence": TRACKED if told == "tracked" else SINGLE,
+        }
+        label = f"{'markers' if markers else 'board'}/lens {lens:.0%}/bend {1e3 * bend:g}mm"
+        label += f"/{noise:g}px/{1e3 * readout:g}ms/{told}"
+        yield label, FILMING, Board(markers, bend), noise, others
 
 
 BENCHES: dict[str, Callable[[], Iterator[tuple[Any, ...]]]] = {
     "hand": _hand, "grid": _grid, "few": _few, "many": _many, "planes": _planes, "gyro": _gyro,
     "locks": _locks, "sine": _sine, "bands": _bands, "noise": _noise, "impacts": _impacts,
     "real": _real, "student": _student, "shared": _shared, "body": _body, "camera": _camera,
-    "map": _map, "bad": _bad, "axis": _axis, "global": _global,
+    "map": _map, "bad": _bad, "axis": _axis, "global": _global, "boards": _boards,
 }  # fmt: skip
 """By name, of which ``run --bench`` takes some."""

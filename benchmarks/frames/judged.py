@@ -130,7 +130,9 @@ def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, A
     config = configured(rsl.LocalizerConfig(), own, exact)
     variants = 1 if condition.calibration == EXACT else len(_DIRECTIONS)
     localizers = [rsl.Localizer(camera_of(condition, k), config) for k in range(variants)]
-    trackers = [rsl.Tracker(one) for one in localizers] if condition.sequence.length > 1 else None
+    # P3P finds no velocities, and tracks nothing.
+    tracks = condition.sequence.length > 1 and config.solver != "p3p"
+    trackers = [rsl.Tracker(one) for one in localizers] if tracks else None
     figures: list[list[float]] = []
     reasons: list[str] = []
     for frame in generate(condition, frames, seed):
@@ -226,7 +228,7 @@ def _scored(result: Any, frame: Frame, condition: Condition) -> list[float]:
     pose_s, turn_s, _, deg_s, _ = _pose(pose_at(result, -0.5), frame.stamp)
     pose, turn, way, deg, mm = _pose(pose_at(result, 0.0), frame.middle)
     twist = [math.nan] * 5
-    if condition.camera.readout_time > 0.0:
+    if condition.camera.readout_time > 0.0 and readout > 0.0:
         twist = _twist(twist_at(result, 0.0, readout), frame.middle)
     return [pose_s, pose, twist[0], turn_s, turn, way, *twist[1:3], deg_s, deg, mm, *twist[3:]]
 

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -22,13 +21,8 @@ from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 
-LENGTH = 8  # frames of a recording
-COUNTED = 5  # the last ones: the tracker has had three to settle
-
 _BIAS_WALK = 1e-4  # rad/s^2/sqrt(Hz)
 _BEFORE, _AFTER = 0.6, 0.03  # s of samples before the middle row and behind it
-
-_simulated = lru_cache(maxsize=4)(simulate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,19 +31,6 @@ class Found:
 
     stamp: Scores
     middle: Scores
-
-
-def frames_of(
-    camera: Camera,
-    make_motions: MakeMotions,
-    scene: Scene,
-    frames: int,
-    seed: int,
-    length: int = LENGTH,
-) -> Frames:
-    """Recordings of ``length`` frames with at least ``frames`` counted ones."""
-    recordings = max(1, -(-frames // min(length, COUNTED)))
-    return _simulated(camera, make_motions, scene, recordings, length, seed)
 
 
 def believed(
@@ -65,31 +46,6 @@ def believed(
         readout_time=camera.readout_time if readout_time is None else readout_time,
         scan_direction=camera.scan.value,
     )
-
-
-def estimate(
-    frames: Frames, localizer: Localizer, noise: float, tracking: bool
-) -> dict[int, Estimate | Failure]:
-    """Results of the counted frames, by their place in ``frames``."""
-    found: dict[int, Estimate | Failure] = {}
-    tracker = Tracker(localizer) if tracking else None
-    first_counted = int(frames.place.max()) + 1 - COUNTED
-    for frame in range(len(frames)):
-        place = int(frames.place[frame])
-        if place == 0 and tracker is not None:
-            tracker.reset()
-        counted = place >= first_counted
-        if tracker is None and not counted:
-            continue
-        seen = frames.seen(frame, noise)
-        result = (
-            localizer.localize(*seen)
-            if tracker is None
-            else tracker.localize(frames.middle_ns(frame), *seen)
-        )
-        if counted:
-            found[frame] = result
-    return found
 
 
 def scored(frames: Frames, results: dict[int, Estimate | Failure], camera: core.Camera) -> Found:

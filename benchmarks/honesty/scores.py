@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.frames.judged import FIVE_SIGMA, REGION, normalised
+from benchmarks.frames.judged import normalised
 from benchmarks.independent.rotations import logarithm
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.types import Estimate, Failure
@@ -43,8 +42,6 @@ class Score:
     position: float = np.inf  # m
     angular: float = np.inf  # deg/s
     linear: float = np.inf  # m/s
-    # Squared normalised distance of the velocities from zero.
-    moving: float = np.nan
 
 
 def score(pose: Pose, twist: Twist | None, truth: Truth, recording: int = 0) -> Score:
@@ -68,7 +65,6 @@ def score(pose: Pose, twist: Twist | None, truth: Truth, recording: int = 0) -> 
         twist=normalised(np.concatenate([linear, angular]), twist.covariance),
         angular=float(np.degrees(np.linalg.norm(angular))),
         linear=float(np.linalg.norm(linear)),
-        moving=motion_evidence(twist),
     )
 
 
@@ -79,21 +75,7 @@ def score_at(
     if not result:
         return Score(recording, reason=str(result.reason))
     twist = twist_at(result, tau, readout_time) if readout_time > 0.0 else None
-    found = score(pose_at(result, tau), twist, truth, recording)
-    if readout_time > 0.0:
-        return found
-    # Per readout the velocities are known all the same.
-    return replace(found, moving=motion_evidence(twist_at(result, tau, 1.0)))
-
-
-def motion_evidence(twist: Twist) -> float:
-    """Squared normalised distance of the velocities from zero; 0 of a camera held to be at rest."""
-    return normalised(np.concatenate([twist.linear, twist.angular]), twist.covariance)
-
-
-def percent(hits: BoolArray) -> float:
-    """Share of true ones in %; NaN of none."""
-    return 100.0 * float(np.mean(hits)) if len(hits) else np.nan
+    return score(pose_at(result, tau), twist, truth, recording)
 
 
 class Scores:
@@ -112,26 +94,6 @@ class Scores:
     @property
     def localized(self) -> BoolArray:
         return np.array([one.reason == "" for one in self.scores], dtype=np.bool_)
-
-    @property
-    def refused(self) -> float:
-        """Share without a pose."""
-        return 1.0 - float(np.mean(self.localized)) if len(self) else 0.0
-
-    def reasons(self) -> str:
-        """``12 residual, 3 mirrored``: most frequent first; empty when nothing was refused."""
-        counts = Counter(one.reason for one in self.scores if one.reason)
-        return ", ".join(f"{count} {reason}" for reason, count in counts.most_common())
-
-    def inside(self, name: str) -> BoolArray:
-        """Of the localized frames (k,), which truths lie in the 95 % region of a column."""
-        known: BoolArray = self.of(name)[self.localized] < REGION
-        return known
-
-    def far_off(self, name: str = "pose") -> BoolArray:
-        """Of the localized frames (k,), which are beyond five standard deviations."""
-        beyond: BoolArray = ~(self.of(name)[self.localized] < FIVE_SIGMA)
-        return beyond
 
     def median(self, name: str) -> float:
         """Of the localized frames."""

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmarks.honesty.estimating import believed, frames_of, scored
+from benchmarks.honesty.estimating import believed, scored
 from benchmarks.independent.cameras import Camera, Scan
 from benchmarks.independent.frames import simulate
 from benchmarks.independent.motions import rest, steady
@@ -28,7 +28,7 @@ def test_a_bent_board_is_flat_in_its_map_only():
 def test_the_estimator_finds_the_truth_of_exact_pixels(scan):
     # Steady motion, which every version of the estimator models: signs, axes and moments agree.
     moving = partial(steady, rate=1.5, speed=0.7)
-    frames = frames_of(Camera(scan=scan), moving, Rich(), 4, 0, length=1)
+    frames = simulate(Camera(scan=scan), moving, Rich(), 4, 1, 0)
     camera = believed(frames.camera)
     localizer = Localizer(camera)
     results = {k: localizer.localize(*frames.seen(k, 0.0)) for k in range(4)}
