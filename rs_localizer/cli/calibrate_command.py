@@ -291,6 +291,8 @@ def _write(
         }
         if found.mount is not None and found.mount.time_offset_determined:
             values["imu.time_offset"] = found.mount.time_offset + config.stamp_offset
+    if config.stamp_offset:
+        values["stamp_offset"] = config.stamp_offset
     writers = Writers()
     if marker_map is not None:
         if verdict.shape_is_free(found):
@@ -307,7 +309,7 @@ def _write(
     remarks = [f"readout_time {refused}"] if refused else []
     camera = found.fit.camera
     _write_files(args, values, lens_parameters(camera), {"": camera}, writers, remarks)
-    print(f"next: {_next(args, intrinsics, shape)}")
+    print(f"next: {_next(args, intrinsics or args.calibration is not None, shape)}")
     return True
 
 
@@ -344,19 +346,19 @@ def _write_files(
     write_all({**writers, _out(args): write})
 
 
-def _next(args: Options, intrinsics: bool, shape: Path | None) -> str:
-    """The commands that make poses of this recording with what was found."""
+def _next(args: Options, lens: bool, shape: Path | None) -> str:
+    """The command that makes poses of this recording with what was found.
+
+    Args:
+        lens: whether that of the file takes the place of camera_info's.
+        shape: the map of images; None: the recording has matches.
+    """
     out = _out(args)
-    recording, seen = str(args.recording), out.with_name(f"{out.stem}_seen")
-    lens = intrinsics or args.calibration is not None
-    params = ["--camera" if lens else "--params", str(out)]
-    poses = str(out.with_name(f"{out.stem}_poses"))
-    if shape is None:  # a recording of correspondences
-        return shlex.join(["rs_localizer", "replay", recording, *params, "--out", poses])
-    topics = [word for text in args.remaps for word in ("-r", text)]
-    options = ["--map", str(shape), *(["--rate", str(args.rate)] if args.rate else []), *topics]
-    detect = ["rs_localizer", "detect", recording, *options, *params, "--out", str(seen)]
-    return f"{shlex.join(detect)} && {image_input.replay_command(seen)}"
+    words = ["replay", str(args.recording), "--camera" if lens else "--params", str(out)]
+    if shape is not None:
+        words += ["--map", str(shape), *(["--rate", str(args.rate)] if args.rate else [])]
+        words += [word for text in args.remaps for word in ("-r", text)]
+    return shlex.join(["rs_localizer", *words, "--out", f"{out.with_suffix('')}_poses"])
 
 
 def _calibrate_rig(args: Options) -> dict[str, Figures]:
@@ -455,9 +457,6 @@ def _parts(
 
 def _next_of_rig(args: Options) -> str:
     """The command that goes on: poses of a video of several lenses, or TF for a live rig."""
-    path, recording = _out(args), args.recordings[0]
-    if len(args.recordings) > 1 or is_bag(recording) or args.map is None:
+    if len(args.recordings) > 1 or is_bag(args.recording) or args.map is None:
         return shlex.join(["ros2", "launch", str(_beside(args, _TRANSFORMS))])
-    poses = str(path.with_name(f"{path.stem}_poses"))
-    words = ["replay", str(recording), "--map", str(args.map), "--camera", str(path)]
-    return shlex.join(["rs_localizer", *words, "--out", poses])
+    return _next(args, True, args.map)

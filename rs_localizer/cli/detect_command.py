@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -16,7 +17,6 @@ from rs_localizer.cli import WORKING, replaced
 from rs_localizer.cli.image_input import (
     ImageOptions,
     opened,
-    replay_command,
     shutter_values,
     tell_left_out,
     tell_telemetry,
@@ -76,8 +76,10 @@ def run(args: Options) -> Figures:
             "the readout time is not known: poses come without twists; calibrate measures it, and "
             "-p readout_time:=SECONDS gives it to the next command"
         )
-    known, more = (args.out / PARAMETERS).exists(), " --map MAP" if args.features else ""
-    print(f"next: {replay_command(args.out, known=known)}{more}")
+    parameters = args.out / PARAMETERS
+    params = ["--params", str(parameters)] if parameters.exists() else []
+    words = ["rs_localizer", "replay", str(args.out), *params, "--out", f"{args.out}_poses"]
+    print(f"next: {shlex.join(words)}{' --map MAP' if args.features else ''}")
     return figures
 
 

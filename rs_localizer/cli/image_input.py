@@ -7,7 +7,6 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import math
-import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -170,13 +169,6 @@ def tell_times(clock: ImageClock | None, readout_time: float = 0.0, period: floa
     for fault in (clock and clock.fault(), readout_fault(readout_time, period)):
         if fault:
             print(f"warning: {fault}")
-
-
-def replay_command(recording: Path, *, known: bool = True) -> str:
-    """The command that makes poses of what ``detect`` wrote, with the parameters beside it."""
-    params = ["--params", str(recording / PARAMETERS)] if known else []
-    words = ["replay", str(recording), *params, "--out", f"{recording}_poses"]
-    return shlex.join(["rs_localizer", *words])
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,7 +62,7 @@ def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path, caps
             limits.append(axes.dataLim)
 
         monkeypatch.setattr(calibration_plots, name, drawn)
-    words = ["-p", "scan_direction:=bottom_to_top", "--out", str(out)]
+    words = ["-p", "scan_direction:=bottom_to_top", "-p", "stamp_offset:=0.001", "--out", str(out)]
     pictures = ["--plot", str(tmp_path / "plots")]
     assert main(["calibrate", str(flight), *words, *pictures]) == 0
     parts = re.findall(r" to +[\d.]+ s +([-+][\d.]+) \+- ", capsys.readouterr().out)
@@ -73,6 +73,7 @@ def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path, caps
     assert 10.0 < blocks.y0 < blocks.y1 < 30.0
     values = load_params_file(out)
     assert values["scan_direction"] == "top_to_bottom"
+    assert values["stamp_offset"] == 0.001
     assert abs(values["readout_time"] - 0.02) < 4.0 * values["readout_time_deviation"]
 
 

@@ -135,7 +135,7 @@ def test_a_film_gives_lens_readout_time_and_direction(film, tmp_path, capsys):
     assert values["map_deviation"] == pytest.approx(measured, 0.01)
     assert 0.0 < measured < 2e-4
     assert f"--camera {out}" in line
-    poses = read_tum(tmp_path / "camera_seen_poses" / "poses.txt")
+    poses = read_tum(tmp_path / "camera_poses" / "poses.txt")
     assert len(poses.positions) > 0.9 * SECONDS * RATE
     # A board of another size is named.
     smaller = ["--board", f"{COLUMNS - 2}x{ROWS}", "--square", str(SQUARE)]
