@@ -121,13 +121,14 @@ class ResultOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FleetOptions:
-    """many recordings (needs Dask: pip install 'rs_localizer[fleet]')."""
+    """many recordings."""
 
     workers: int | None = option(
         "processes of this machine (default: one for each core)", "N", limits=(1, math.inf)
     )
     scheduler: str | None = option(
-        "instead: the workers of a Dask scheduler, such as tcp://host:8786, which see these files",
+        "instead: the workers of a Dask scheduler, such as tcp://host:8786, which see these files "
+        "(pip install 'rs_localizer[fleet]')",
         "ADDRESS",
     )
 

@@ -439,9 +439,9 @@ def _replay_all(options: Options) -> None:
         raise UsageError("many recordings need --out DIR, for a folder of each")
     if options.workers is not None and options.scheduler is not None:
         raise UsageError("--workers are of this machine; give it or --scheduler")
-    if importlib.util.find_spec("distributed") is None:
+    if options.scheduler is not None and importlib.util.find_spec("distributed") is None:
         raise ValueError(
-            "many recordings need Dask, which is not installed: pip install 'rs_localizer[fleet]'"
+            "--scheduler needs Dask, which is not installed: pip install 'rs_localizer[fleet]'"
         )
     config = _settings(options)  # refuses wrong ones before there are workers
     if options.map is None and config.map_file:  # where it is from here, not from a worker

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Many recordings by Dask: each a task of its own, whichever process or machine does it."""
+"""Many recordings, each a task of its own, whichever process or machine does it."""
 
 from __future__ import annotations
 
@@ -12,17 +12,20 @@ import hashlib
 import io
 import json
 import logging
+import multiprocessing
 import os
 import shutil
 import signal
 import socket
 import threading
 import uuid
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 from rs_localizer.io.atomic_files import atomic_files, write_errors
 
@@ -35,16 +38,17 @@ SUMMARY = "summary.csv"
 """A row of each recording."""
 
 _PACKAGE = Path(__file__).parents[1]
-# How often a recording may take its worker with it until it counts as failed.
-_DEATHS = 3
 # Scheduler that answers nothing for so long is none, s.
 _CONNECT_TIMEOUT = 5.0
 # What is printed can be told apart only while one task of a process prints.
 _PRINTING = threading.Lock()
 
 
+Performed = Generator["tuple[Task, Outcome]"]
+
+
 class ClusterError(ValueError):
-    """No workers; the message says why."""
+    """No scheduler that answers; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,34 +180,81 @@ def _unfinished(task: Task) -> str:
     return f".unfinished-{task.identity[:16]}-"
 
 
-def perform_all(
-    tasks: Sequence[Task], scheduler: str | None, workers: int | None
-) -> Iterator[tuple[Task, Outcome]]:
+def perform_all(tasks: Sequence[Task], scheduler: str | None, workers: int | None) -> Performed:
     """The outcome of each task, as they come; close the iterator to stop all.
 
     Args:
         tasks: what is not done yet.
-        scheduler: address of one that runs; None: processes of this machine.
-        workers: so many of them; None: one for each core.
+        scheduler: address of Dask's; None: processes of this machine.
+        workers: so many of them at a time; None: one for each core.
 
     Raises:
         ClusterError: when no scheduler answers.
-        ImportError: without Dask.
+        ImportError: without Dask, for a scheduler.
     """
+    if scheduler is None:
+        return _perform_here(tasks, workers or len(os.sched_getaffinity(0)))
+    return _perform_by_dask(tasks, scheduler)
+
+
+def _perform_here(tasks: Sequence[Task], workers: int) -> Performed:
+    """Outcomes of tasks, each in a process of its own: whatever ends it, the others go on."""
+    context = multiprocessing.get_context("spawn")  # a fork would share threads that stand still
+    waiting, running = deque(tasks), dict[Connection, tuple[Task, SpawnProcess]]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < workers:
+                ours, theirs = context.Pipe(duplex=False)
+                process = context.Process(target=_perform_to, args=(theirs, waiting[0]))
+                process.start()
+                theirs.close()
+                running[ours] = waiting.popleft(), process
+            for ours in cast(list[Connection], wait(list(running))):
+                task, process = running[ours]
+                try:
+                    outcome = ours.recv()
+                    process.join()
+                except EOFError:
+                    process.join()
+                    outcome = Outcome(None, f"lost: its process {_ended(process.exitcode)}")
+                ours.close()
+                del running[ours]
+                yield task, outcome
+    finally:
+        for _, process in running.values():
+            process.kill()  # who is asked to end goes on with its recording for seconds
+            process.join()
+        _clear(tasks)
+
+
+def _perform_to(asked: Connection, task: Task) -> None:
+    """Perform a task in a process of its own, which ends with the one that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's: all hear it, one decides
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    end = functools.partial(wait, [parent.sentinel])
+    threading.Thread(target=lambda: end() and os._exit(1), daemon=True).start()
+    asked.send(perform(task))
+
+
+def _ended(code: int | None) -> str:
+    """How a process came to its end, by its exit code."""
+    if code is None or code >= 0:
+        return f"ended with exit code {code}"
+    memory = ", as when memory runs out" if -code == signal.SIGKILL else ""
+    return f"was ended by {signal.Signals(-code).name}{memory}"
+
+
+def _perform_by_dask(tasks: Sequence[Task], scheduler: str) -> Performed:
     from distributed import Client, as_completed
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
-    with contextlib.ExitStack() as stack:
-        where: Any = scheduler
-        if scheduler is None:
-            stack.callback(_clear, tasks)  # once the workers have ended
-            cores = len(os.sched_getaffinity(0))
-            where = stack.enter_context(_local(max(1, min(len(tasks), workers or cores))))
-        try:
-            client = stack.enter_context(Client(where, timeout=_CONNECT_TIMEOUT))
-        except (OSError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise ClusterError(f"no Dask scheduler answers at {scheduler}: {reason}") from error
+    try:
+        client = Client(scheduler, timeout=_CONNECT_TIMEOUT)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ClusterError(f"no Dask scheduler answers at {scheduler}: {reason}") from error
+    with client:
         # Not by what they are: a result that has been removed would be taken as done.
         futures = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
         for future in as_completed(list(futures)):
@@ -248,9 +299,10 @@ def do_all(
         }
         waiting = [task for task in tasks if task.folder not in outcomes]
         try:
-            for task, outcome in perform_all(waiting, scheduler, workers) if waiting else ():
-                outcomes[task.folder] = outcome
-                heard(task, outcome)
+            with contextlib.closing(perform_all(waiting, scheduler, workers)) as performed:
+                for task, outcome in performed:
+                    outcomes[task.folder] = outcome
+                    heard(task, outcome)
         finally:
             for task in tasks:  # what is done and has not been heard of, as after Ctrl-C
                 known = finished(task)
@@ -280,42 +332,3 @@ def _clear(tasks: Sequence[Task]) -> None:
     for task in tasks:
         for rest in task.folder.parent.glob(f"{_unfinished(task)}*"):
             shutil.rmtree(rest, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _local(workers: int) -> Iterator[Any]:
-    """A cluster of processes with one thread each."""
-    import dask
-    from distributed import LocalCluster
-
-    settings = {
-        "distributed.scheduler.allowed-failures": _DEATHS - 1,
-        # A worker that dies takes no task along but the one that it is at.
-        "distributed.scheduler.worker-saturation": 1.0,
-        "distributed.worker.preload": [__name__],
-        "distributed.worker.profile.enabled": False,
-    }
-    # Of worker processes that were killed, Python's clean-up would tell on the screen.
-    quiet = "ignore:resource_tracker:UserWarning"
-    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), quiet]))
-    with dask.config.set(settings):
-        cluster = LocalCluster(
-            n_workers=workers, threads_per_worker=1, memory_limit=0,
-            dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL + 1,
-        )  # fmt: skip
-        try:
-            yield cluster
-        except BaseException:
-            # One that is asked to end goes on with its recording for seconds.
-            for nanny in cluster.workers.values():
-                with contextlib.suppress(AttributeError, ProcessLookupError, TypeError):
-                    os.kill(nanny.process.pid, signal.SIGKILL)
-            raise
-        finally:
-            with contextlib.suppress(Exception):
-                cluster.close(timeout=5)
-
-
-def dask_setup(worker: Any) -> None:
-    """Leave Ctrl-C, which a terminal sends to all processes, to the one that started them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

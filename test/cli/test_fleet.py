@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import fcntl
 import filecmp
+import importlib
 import os
 import shutil
 import signal
@@ -21,8 +22,6 @@ from rs_localizer.cli import replay_command
 from rs_localizer.cli.main import main
 from rs_localizer.offline import fleet
 from rs_localizer.offline.fleet import Outcome, Task, perform, perform_all, tasks_of
-
-pytest.importorskip("distributed", reason="needs Dask")
 
 SHUTTER = ["-p", "readout_time:=0.03"]
 
@@ -108,7 +107,8 @@ def test_what_goes_wrong_is_one_line(recordings, tmp_path, monkeypatch, capsys):
     assert set(rows(tmp_path / "out")) == {"a_flight", "b_flight"}
     assert main(["replay", "a", "b"]) == 2
     monkeypatch.setattr(replay_command.importlib.util, "find_spec", lambda name: None)
-    assert main(["replay", "a", "b", "--out", str(tmp_path / "other")]) == 1
+    elsewhere = ["--scheduler", "tcp://127.0.0.1:9"]
+    assert main(["replay", "a", "b", "--out", str(tmp_path / "other"), *elsewhere]) == 1
     assert capsys.readouterr().err.endswith("pip install 'rs_localizer[fleet]'\n")
     assert not (tmp_path / "other").exists()
 
@@ -131,17 +131,38 @@ def _fail(recording: Path, out: Path) -> dict[str, float]:
     raise ZeroDivisionError(f"of {out}")
 
 
-def test_a_recording_that_kills_its_workers_does_not_stop_the_others(tmp_path):
-    def work(recording: Path, out: Path) -> dict[str, float | int | str]:
-        if recording.name == "deadly":
-            os.kill(os.getpid(), signal.SIGKILL)
-        out.mkdir()
-        return {"frames": 1}
+# A module that other processes find by its name, as they do not find this one.
+DEADLY = """
+import os, signal
 
-    tasks = tasks_of([tmp_path / name for name in ("good", "deadly")], tmp_path, work, "")
-    outcomes = {task.recording.name: outcome for task, outcome in perform_all(tasks, None, 1)}
-    assert outcomes["good"].figures == {"frames": 1}
-    assert outcomes["deadly"].reason.startswith("lost: ")
+def kill(recording, out):
+    if recording.name == "deadly":
+        os.kill(os.getpid(), signal.SIGKILL)
+    out.mkdir()
+    return {"frames": 1}
+
+def leave(recording, out):
+    os._exit(7)
+"""
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_a_recording_that_kills_its_process_does_not_stop_the_others(
+    tmp_path, monkeypatch, workers
+):
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code" / "deadly_work.py").write_text(DEADLY)
+    monkeypatch.syspath_prepend(tmp_path / "code")
+    work, out = importlib.import_module("deadly_work"), tmp_path / "out"
+    out.mkdir()
+    tasks = tasks_of([tmp_path / name for name in ("deadly", "good", "fine")], out, work.kill, "")
+    tasks += tasks_of([tmp_path / "another"], out, work.leave, "")
+    outcomes = {task.recording.name: outcome for task, outcome in perform_all(tasks, None, workers)}
+    assert outcomes["good"].figures == outcomes["fine"].figures == {"frames": 1}
+    lost = "lost: its process was ended by SIGKILL, as when memory runs out"
+    assert outcomes["deadly"].reason == lost
+    assert outcomes["another"].reason == "lost: its process ended with exit code 7"
+    assert sorted(path.name for path in out.iterdir()) == ["fine", "good"]
 
 
 def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(

@@ -93,8 +93,7 @@ write_parquet((function(place, None, settings) for place in places), file)
 """
 
 
-def test_the_same_bytes_from_one_process_and_from_dask(flights: list[Path], tmp_path: Path) -> None:
-    pytest.importorskip("distributed", reason="needs Dask")
+def test_the_same_bytes_from_one_process_and_from_two(flights: list[Path], tmp_path: Path) -> None:
     one, two = tmp_path / "one.parquet", tmp_path / "two.parquet"
     given = pickle.dumps((rsl.localize_recording, flights, SETTINGS, one))
     words = [*map(str, flights), "--out", str(tmp_path / "out"), "--parquet", str(two), *SHUTTER]
