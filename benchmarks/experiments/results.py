@@ -5,17 +5,16 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, TypeVar
 
 from matplotlib.figure import Figure
 
 T = TypeVar("T")
-SUMMARY, SUMMARY_DATA = "summary.md", "summary.json"
+SUMMARY = "summary.md"
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +107,7 @@ def write_result(folder: Path, result: Result) -> None:
 
 
 def write_summary(folder: Path, results: Mapping[str, Result], context: Context) -> None:
-    """Every claim with our figure and its verdict, for people (md) and programs (json)."""
+    """Every claim with our figure and its verdict."""
     claims = [claim for result in results.values() for claim in result.claims]
     lines = [
         f"# Experiments\n\n{context.trials} trials, seed {context.seed}; **{verdicts(claims)}**.",
@@ -127,12 +126,6 @@ def write_summary(folder: Path, results: Mapping[str, Result], context: Context)
         lines += [f"![{figure}]({figure}.png)" for figure in result.figures]
         lines.append("Data: " + ", ".join(f"[{x}.csv]({x}.csv)" for x in result.tables))
     (folder / SUMMARY).write_text("\n\n".join(lines) + "\n", encoding="utf-8")
-    data = {
-        "trials": context.trials,
-        "seed": context.seed,
-        "claims": [asdict(claim) for claim in claims],
-    }
-    (folder / SUMMARY_DATA).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 def verdicts(claims: Sequence[Claim]) -> str:
