@@ -225,15 +225,16 @@ def _scored(result: Any, frame: Frame, condition: Condition) -> list[float]:
     """Behind recording and time, in the order of FIGURES."""
     believed = condition.calibration.readout_time
     readout = condition.camera.readout_time if believed is None else believed
-    pose_s, turn_s, _, deg_s, _ = _pose(pose_at(result, -0.5), frame.stamp)
-    pose, turn, way, deg, mm = _pose(pose_at(result, 0.0), frame.middle)
+    pose_s, turn_s, _, deg_s, _ = of_pose(pose_at(result, -0.5), frame.stamp)
+    pose, turn, way, deg, mm = of_pose(pose_at(result, 0.0), frame.middle)
     twist = [math.nan] * 5
     if condition.camera.readout_time > 0.0 and readout > 0.0:
-        twist = _twist(twist_at(result, 0.0, readout), frame.middle)
+        twist = of_twist(twist_at(result, 0.0, readout), frame.middle)
     return [pose_s, pose, twist[0], turn_s, turn, way, *twist[1:3], deg_s, deg, mm, *twist[3:]]
 
 
-def _pose(pose: Any, truth: tuple[Array, ...]) -> tuple[float, ...]:
+def of_pose(pose: Any, truth: tuple[Array, ...]) -> tuple[float, ...]:
+    """Squared normalised errors of 6, 3 and 3 dimensions; deg and mm."""
     turn = logarithm(truth[0] @ pose.rotation.T)  # in the axes of the map, as the covariance
     way = truth[1] - pose.position
     return (
@@ -245,7 +246,8 @@ def _pose(pose: Any, truth: tuple[Array, ...]) -> tuple[float, ...]:
     )
 
 
-def _twist(twist: Any, truth: tuple[Array, ...]) -> list[float]:
+def of_twist(twist: Any, truth: tuple[Array, ...]) -> list[float]:
+    """Squared normalised errors of 6, 3 and 3 dimensions; deg/s and m/s."""
     angular, linear = truth[2] - twist.angular, truth[3] - twist.linear
     return [
         normalised(np.concatenate([linear, angular]), twist.covariance),

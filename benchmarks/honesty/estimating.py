@@ -64,7 +64,7 @@ def scored(frames: Frames, results: dict[int, Estimate | Failure], camera: core.
 
 def truth_of(states: States, frame: int) -> Truth:
     """One of many states."""
-    return Truth(*(getattr(states, name)[frame] for name in Truth.__slots__))
+    return Truth(*(getattr(states, name)[frame] for name in Truth._fields))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

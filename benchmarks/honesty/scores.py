@@ -6,19 +6,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.frames.judged import normalised
-from benchmarks.independent.rotations import logarithm
+from benchmarks.frames.judged import of_pose, of_twist
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.outputs import Pose, Twist
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Truth:
+class Truth(NamedTuple):
     """The camera at one instant."""
 
     rotation: Array  # (3,3) map_from_camera
@@ -46,26 +45,15 @@ class Score:
 
 def score(pose: Pose, twist: Twist | None, truth: Truth, recording: int = 0) -> Score:
     """What is published, against the truth of that moment."""
-    turn = logarithm(truth.rotation @ pose.rotation.T)  # in the axes of the map, as the covariance
-    way = truth.position - pose.position
+    squared, _, _, degrees, millimetres = of_pose(pose, truth)
     found = Score(
-        recording,
-        pose=normalised(np.concatenate([way, turn]), pose.covariance),
-        orientation=float(np.degrees(np.linalg.norm(turn))),
-        position=float(np.linalg.norm(way)),
-        twist=np.nan,
-        angular=np.nan,
-        linear=np.nan,
-    )
+        recording, pose=squared, orientation=degrees, position=1e-3 * millimetres,
+        twist=np.nan, angular=np.nan, linear=np.nan,
+    )  # fmt: skip
     if twist is None:
         return found
-    linear, angular = truth.linear - twist.linear, truth.angular - twist.angular
-    return replace(
-        found,
-        twist=normalised(np.concatenate([linear, angular]), twist.covariance),
-        angular=float(np.degrees(np.linalg.norm(angular))),
-        linear=float(np.linalg.norm(linear)),
-    )
+    squared, _, _, angular, linear = of_twist(twist, truth)
+    return replace(found, twist=squared, angular=angular, linear=linear)
 
 
 def score_at(
