@@ -4,15 +4,22 @@ import cv2
 import numpy as np
 import pytest
 
+from rs_localizer.core.bearings import bearings
 from rs_localizer.core.camera import Camera, Roi
 
 K = np.array([[500.0, 0.0, 321.0], [0.0, 510.0, 238.0], [0.0, 0.0, 1.0]])
+CURVED = [0.5, 0.1, 0.001, 0.001, 0.01, 0.8, 0.2, 0.03]
 LENSES = [
     ("plumb_bob", []),
+    ("plumb_bob", [-0.3, 0.1, 0.002, -0.001]),
     ("plumb_bob", [-0.3, 0.1, 0.002, -0.001, 0.01]),
-    ("rational_polynomial", [0.5, 0.1, 0.001, 0.001, 0.01, 0.8, 0.2, 0.03]),
+    ("plumb_bob", [0.4, 0.1, 0.002, -0.001, 0.01]),
+    ("rational_polynomial", CURVED),
+    ("rational_polynomial", [*CURVED, 0.01, 0.003, -0.02, 0.004]),
+    ("rational_polynomial", [*CURVED, 0.01, 0.003, -0.02, 0.004, 0.02, -0.03]),
     ("equidistant", [0.05, 0.01, 0.001, 0.0]),
 ]
+PART = {"binning": (2, 3), "roi": Roi(100, 60, 400, 300)}
 DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
 
 
@@ -22,11 +29,6 @@ def camera(**changes):
 
 def pixels(count=200, seed=0):
     return np.random.default_rng(seed).uniform([0, 0], [639, 479], (count, 2))
-
-
-def test_a_matrix_of_nine_numbers_as_camera_info_has_it():
-    K = [500.0, 0.0, 319.5, 0.0, 510.0, 239.5, 0.0, 0.0, 1.0]
-    np.testing.assert_array_equal(Camera(640, 480, K).K, np.reshape(K, (3, 3)))
 
 
 def test_width_and_height_that_are_exchanged():
@@ -42,18 +44,18 @@ def test_width_and_height_that_are_exchanged():
 def test_rays_lead_back_to_their_pixels_by_opencv(model, D):
     raw = pixels()
     rays = camera(D=D, distortion_model=model).rays(raw)
-    bearings = np.column_stack([rays, np.ones(len(rays))])[:, None]
+    there = np.column_stack([rays, np.ones(len(rays))])[:, None]
     zero = np.zeros(3)
     if model == "equidistant":
-        back = cv2.fisheye.projectPoints(bearings, zero, zero, K, np.array(D))[0][:, 0]
+        back = cv2.fisheye.projectPoints(there, zero, zero, K, np.array(D))[0][:, 0]
     else:
-        back = cv2.projectPoints(bearings, zero, zero, K, np.array(D))[0][:, 0]
+        back = cv2.projectPoints(there, zero, zero, K, np.array(D))[0][:, 0]
     np.testing.assert_allclose(back, raw, atol=1e-6)
 
 
 @pytest.mark.parametrize(("model", "D"), LENSES)
 def test_projecting_undoes_rays_also_with_binning_and_roi(model, D):
-    cropped = camera(D=D, distortion_model=model, binning=(2, 3), roi=Roi(100, 60, 400, 300))
+    cropped = camera(D=D, distortion_model=model, **PART)
     raw = np.random.default_rng(1).uniform([0, 0], [199, 99], (50, 2))
     rays = cropped.rays(raw)
     points = 3.0 * np.column_stack([rays, np.ones(len(rays))])
@@ -79,6 +81,27 @@ def test_pixel_jacobian_is_the_finite_difference_of_projecting(model, D):
         np.testing.assert_allclose(
             jacobian[:, :, k], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-3
         )
+
+
+@pytest.mark.parametrize(("model", "D"), LENSES)
+@pytest.mark.parametrize("part", [{}, PART])
+def test_kernels_of_many_pixels_give_the_same(model, D, part):
+    """203: some blocks of lanes, and a part of one."""
+    lens = camera(D=D, distortion_model=model, **part)
+    raw = pixels(203) / lens.binning
+    for ours, theirs in zip(bearings(lens, raw), lens.rays_and_jacobian(raw), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-7, atol=1e-9)
+
+
+def test_what_has_no_bearing_has_none_and_harms_no_neighbour():
+    strong = camera(D=[-0.5, 0.0, 0.0, 0.0, 0.0])
+    raw = np.array([321.0, 238.0]) + 0.3 * (pixels(19) - (320, 240))
+    # The polynomial r (1 - r^2/2) never exceeds 0.55: no bearing reaches these pixels.
+    raw[[2, 5]] = [1500.0, 238.0], [321.0, -900.0]
+    rays, _ = bearings(strong, raw)
+    np.testing.assert_array_equal(np.isnan(rays[:, 0]), np.isin(np.arange(19), [2, 5]))
+    np.testing.assert_allclose(rays, strong.rays(raw), rtol=1e-7, atol=1e-9)
+    assert [a.shape for a in bearings(strong, np.zeros((0, 2)))] == [(0, 2), (0, 2, 2)]
 
 
 def test_row_time_runs_from_first_to_last_exposed_pixel():
@@ -120,8 +143,6 @@ def test_row_time_of_a_crop_is_that_of_the_sensor_row(direction):
 
 def test_what_lies_behind_or_beyond_the_lens_is_nan():
     strong = camera(D=[-0.5, 0.0, 0.0, 0.0, 0.0])
-    # The polynomial r (1 - r^2/2) never exceeds 0.55: no bearing reaches these pixels.
-    assert np.isnan(strong.rays(np.array([[1500.0, 238.0]]))).all()
     assert np.isnan(camera().project(np.array([[0.0, 0.0, -1.0], [0.1, 0.0, 0.0]]))).all()
     assert np.isnan(strong.rays(np.array([[np.nan, 3.0]]))).all()
     assert strong.rays(np.zeros((0, 2))).shape == (0, 2)
@@ -152,11 +173,12 @@ def test_an_impossible_camera_is_refused_with_what_was_found(changes, said):
 
 
 def test_what_people_and_files_give_is_taken():
-    """Lists, no distortion, and sizes as JSON has them."""
+    """Lists, nine numbers as camera_info has them, no distortion, and sizes as JSON has them."""
     K = [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
     camera = Camera(1280.0, np.int64(720), K, None)
     assert (camera.width, camera.height) == (1280, 720)
     assert type(camera.width) is int
     assert camera.D.shape == (0,)
     np.testing.assert_array_equal(camera.K, np.array(K, float))
+    np.testing.assert_array_equal(Camera(640, 480, np.ravel(K).tolist()).K, camera.K)
     assert Camera(640, 480, K, [0.1, 0, 0, 0]).D.tolist() == [0.1, 0, 0, 0]
