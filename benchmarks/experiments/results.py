@@ -62,6 +62,12 @@ class Table:
             "".join(x.rjust(width) for x, width in zip(row, widths, strict=True)) for row in cells
         )
 
+    def write(self, file: Path) -> None:
+        """As CSV."""
+        rows = [self.columns, *([_cell(x) for x in row] for row in self.rows)]
+        with file.open("w", newline="", encoding="utf-8") as stream:
+            csv.writer(stream).writerows(rows)
+
 
 @dataclass(frozen=True, slots=True)
 class Result:
@@ -97,10 +103,7 @@ class Context:
 def write_result(folder: Path, result: Result) -> None:
     """Tables and figures of one experiment."""
     for name, table in result.tables.items():
-        with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows(
-                [table.columns, *([_cell(x) for x in r] for r in table.rows)]
-            )
+        table.write(folder / f"{name}.csv")
     for name, figure in result.figures.items():
         figure.suptitle(result.title)
         figure.savefig(folder / f"{name}.png")
