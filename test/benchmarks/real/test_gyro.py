@@ -87,8 +87,10 @@ def test_the_command_writes_table_and_picture(recording, gyroscope, tmp_path):
     np.savetxt(text, np.column_stack([gyroscope.times, gyroscope.rates]), fmt="%.9f")
     command.main(["gyro", str(recording), "--gyroscope", str(text), "--out", str(tmp_path),
                   "-p", f"readout_time:={TRUE.readout_time}"])  # fmt: skip
-    table = (tmp_path / "gyro.md").read_text().splitlines()
-    assert len(table) == 2 + len(PEERS) + 4  # single, and tracked at once, one later, two later
+    table = (tmp_path / "gyro.md").read_text()
+    rows, ahead = (part.splitlines() for part in table.split("\n\n"))
+    assert len(rows) == 2 + len(PEERS) + 4  # single, and tracked at once, one later, two later
+    assert [line.split(":")[0] for line in ahead] == [f"{ms} ms ahead" for ms in (10, 30, 100)]
     assert (tmp_path / "gyro.png").stat().st_size > 10_000
 
 
