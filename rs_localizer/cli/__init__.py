@@ -27,22 +27,6 @@ WORKING = True
 """True where commands work: one that only shows its arguments imports no more than these need."""
 
 
-def replaced(args: Any, mark: str, place: Path | None = None) -> Callable[[Path], None] | None:
-    """Function that removes an earlier result, which has a file ``mark``; None: nothing to remove.
-
-    The place is ``--out`` where none is given.
-
-    Raises:
-        ValueError: when what is there is something else.
-    """
-    out: Path = place or args.out
-    if not args.overwrite or not out.is_dir() or not any(out.iterdir()):
-        return None
-    if not (out / mark).is_file():
-        raise ValueError(f"{out} has no {mark}: it is no earlier result, and stays as it is")
-    return _clear
-
-
 def _clear(directory: Path) -> None:
     for path in directory.iterdir():
         if path.is_dir() and not path.is_symlink():
@@ -52,15 +36,42 @@ def _clear(directory: Path) -> None:
             path.unlink()
 
 
-def refuse_existing(args: Any, *others: Path) -> None:
-    """Raise ``ValueError`` if ``args.out`` or another file exists and is not to be replaced.
+def replaced(
+    args: Any,
+    mark: str,
+    place: Path | None = None,
+    clear: Callable[[Path], None] = _clear,
+) -> Callable[[Path], None] | None:
+    """Function that removes an earlier result from a directory; None: nothing is there.
 
-    So it does if nothing can be written there.
+    Args:
+        mark: a file that each result has.
+        place: of the result; None: ``--out``.
+        clear: the function; without it, all that is there goes.
+
+    Raises:
+        ValueError: when what is there is not to be replaced, or is something else.
     """
-    for path in (args.out, *others):
+    out: Path = place or args.out
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return None
+    if not args.overwrite:
+        raise ValueError(f"{out} exists; choose another OUT, or --overwrite")
+    if not (out / mark).is_file():
+        raise ValueError(f"{out} has no {mark}: it is no earlier result, and stays as it is")
+    return clear
+
+
+def refuse_existing(args: Any, *files: Path) -> None:
+    """Raise ``ValueError`` if one of the files (default: ``--out``) exists and is to stay.
+
+    So it does if the first cannot be written.
+    """
+    files = files or (args.out,)
+    for path in files:
         if path.exists() and not args.overwrite:
             raise ValueError(f"{path} exists; choose another OUT, or --overwrite")
-    check_writable(args.out)
+    check_writable(files[0])
 
 
 def write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:

@@ -119,7 +119,7 @@ def _calibrate_one(args: Options) -> Figures:
     if args.out is not None:
         of_images = args.map is not None or args.board is not None
         maps = [_beside(args, _MAP)] if of_images else []
-        refuse_existing(args, *maps, *_lens_files(args).values())
+        refuse_existing(args, args.out, *maps, *_lens_files(args).values())
     config = given_settings(args)
     source = _read(args, config)
     intrinsics = args.intrinsics or source.new_lens
@@ -371,7 +371,7 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
     cameras = cameras_of(args, args.recordings, config)
     if args.out is not None:
         lenses = _lens_files(args, list(cameras)).values()
-        refuse_existing(args, _beside(args, _TRANSFORMS), *lenses)
+        refuse_existing(args, args.out, _beside(args, _TRANSFORMS), *lenses)
     intrinsics = args.intrinsics
     for name, own in cameras.items():
         print(f"{name}:")

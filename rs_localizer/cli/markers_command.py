@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import WORKING, read_counts
+from rs_localizer.cli import WORKING, read_counts, refuse_existing
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.tools.printing import PAGES, page_files, plan, write_pages
@@ -64,9 +64,7 @@ def run(options: Options) -> dict[str, object]:
     prints = options.out if options.out.suffix in (".pdf", ".png") else Path(f"{options.out}.pdf")
     pages = plan(marker_map, options.page)
     written = (*page_files(prints, len(pages)), prints.with_suffix(".yaml"))
-    for path in written:
-        if path.exists() and not options.overwrite:
-            raise ValueError(f"{path} exists already; it is replaced with --overwrite")
+    refuse_existing(options, *written)
     with atomic_files(*written) as (*_, map_part):
         write_pages(pages, map_part.with_name(prints.name))
         write_marker_map(map_part, marker_map)

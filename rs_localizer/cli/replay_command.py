@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import importlib.util
 import math
@@ -18,7 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NoReturn
 
-from rs_localizer.cli import WORKING
+from rs_localizer.cli import WORKING, replaced
 from rs_localizer.cli.image_input import ImageOptions
 from rs_localizer.cli.options import FleetOptions, UsageError, argument, option
 from rs_localizer.cli.settings_args import given_topics, given_values
@@ -236,7 +235,9 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
         tally = Tally(bag.count([topics.frames]), notices)
         if options.parquet is not None:
             tally.table = table.FrameTable(recording, localizer, options.smooth)
-        with fresh(out, options.overwrite) as built:
+        earlier = replaced(options, f"{RESULT}/metadata.yaml", out, _remove_results)
+        with atomic_directory(out, earlier) as built:
+            built.mkdir()
             _hint(path, options.params)
             _replay(bag, topics, localizer, tally, built, options)
         _tell(tally, config, out, timed)
@@ -341,19 +342,6 @@ def _replay(
 # Notices of a frame that could not follow the one before.
 _RESTARTS = ("time_went_back", "map_changed")
 _WIDTH = 96  # columns of a terminal that is not narrow
-
-
-@contextlib.contextmanager
-def fresh(out: Path, overwrite: bool) -> Iterator[Path]:
-    """Within ``with``, make a result, which then takes the place of ``out``."""
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        if not overwrite:
-            raise ValueError(f"{out} exists; choose another --out, or --overwrite")
-        if not (out / RESULT / "metadata.yaml").is_file():
-            raise ValueError(f"{out} is not a result of replay; --overwrite leaves it as it is")
-    with atomic_directory(out, _remove_results if overwrite else None) as built:
-        built.mkdir()
-        yield built
 
 
 def _remove_results(out: Path) -> None:

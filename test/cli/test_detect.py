@@ -160,7 +160,7 @@ def test_video_of_a_board(here, capsys):
     assert settings(here) == pytest.approx({"map_deviation": paper, "readout_time": 0.011})
     # Nothing is overwritten without being asked; the next command asks for the shutter.
     assert detect(here, here.video, *words) == 1
-    assert capsys.readouterr().err.endswith("exists already; it is not overwritten\n")
+    assert capsys.readouterr().err.endswith("exists; choose another OUT, or --overwrite\n")
     assert detect(here, here.video, *words, "--overwrite", "-p", "map_deviation:=0.0") == 0
     assert "-p readout_time:=SECONDS" in capsys.readouterr().out
     assert settings(here) == {"map_deviation": 0.0}

@@ -97,7 +97,7 @@ def test_make_and_check(tmp_path, capsys):
     assert re.search(r"ids_4x4_50 +\[0, 1, 2, 3, 4, 5\]\n", said)
     # Nothing is overwritten.
     assert make(out, "--size", "0.05") == 1
-    assert "exists already" in capsys.readouterr().err
+    assert "exists; choose another OUT, or --overwrite" in capsys.readouterr().err
     assert make(out, "--size", "0.05", "--overwrite", "--json") == 0
     pages = {"pages": [f"{out}.pdf"], "map": f"{out}.yaml", "corners": 24}
     assert json.loads(capsys.readouterr().out)["result"] == pages
