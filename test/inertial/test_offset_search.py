@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmarks.honesty.estimating import believed, record, truth_of
+from benchmarks.aided import believed, record
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, rest, shaken_hand
@@ -95,5 +95,5 @@ def test_a_step_of_the_stamps_is_found(shaking):
 def rate_error(recorded, frame, found):
     """Squared error of the turn rate in deviations, of three numbers."""
     twist = twist_at(found, 0.0, recorded.frames.camera.readout_time)
-    off = twist.angular - truth_of(recorded.frames.middle, frame).angular
+    off = twist.angular - recorded.frames.middle.angular[frame]
     return off @ np.linalg.solve(twist.covariance[3:, 3:], off)

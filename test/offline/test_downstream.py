@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.honesty.estimating import believed
+from benchmarks.aided import believed
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.frames import Frames, simulate
 from benchmarks.independent.motions import Motions, States, hand

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from benchmarks.honesty.scores import Truth, score
+from benchmarks.frames.judged import of_pose, of_twist
 from benchmarks.simulation.__main__ import record
 from rs_localizer.cli.main import main
 from rs_localizer.config import NodeConfig
@@ -107,8 +107,9 @@ def errors(frames: list[Localized], truth: Motions) -> np.ndarray:
     found = []
     for frame in frames:
         row = rows.index(frame.stamp_ns)
-        angular, linear = truth.twists.angular[row], truth.twists.linear[row]
-        true = Truth(rotations[row], truth.poses.positions[row], angular, linear)
-        one = score(frame.pose, frame.twist, true)
-        found.append((one.position, one.orientation, one.pose, one.linear, one.angular, one.twist))
+        twists = truth.twists.angular[row], truth.twists.linear[row]
+        true = rotations[row], truth.poses.positions[row], *twists
+        pose, _, _, degrees, millimetres = of_pose(frame.pose, true)
+        twist, _, _, angular, linear = of_twist(frame.twist, true)
+        found.append((1e-3 * millimetres, degrees, pose, linear, angular, twist))
     return np.array(found)

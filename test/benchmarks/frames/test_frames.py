@@ -6,14 +6,24 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.frames import __main__ as command
 from benchmarks.frames.compared import changes_of, read
 from benchmarks.frames.conditions import HAND, NARROW, Condition, Points, turning
 from benchmarks.frames.generated import generate
-from benchmarks.frames.judged import FIGURES, Judged, judge
+from benchmarks.frames.judged import (
+    FIGURES,
+    FIVE_SIGMA,
+    REGION,
+    Judged,
+    judge,
+    of_pose,
+    of_twist,
+)
 from benchmarks.independent.rotations import logarithm
 from benchmarks.independent.scenes import Rich, SmallPlane
+from rs_localizer.io.outputs import Pose, Twist
 
 CONDITION = Condition("hand", "some", HAND, Rich(40), 1.0)
 
@@ -30,6 +40,38 @@ def judged(count: int, wider: float = 1.0, farther: float = 1.0, seed: int = 0) 
     for name in ("deg_s", "deg", "mm", "deg/s", "m/s"):
         figures[:, FIGURES.index(name)] = farther * rng.rayleigh(size=count)
     return Judged(figures, [""] * count)
+
+
+def published(rng: np.random.Generator, wider: float) -> tuple[float, float]:
+    """Squared errors of a pose and twist, drawn from covariances that are then multiplied."""
+    spread = rng.normal(size=(6, 6)) * np.repeat([1e-3, 1e-2], 3)[:, None]
+    covariance = spread @ spread.T
+    rotation, position, *velocities = (
+        Rotation.random(random_state=rng.integers(2**31)).as_matrix(),
+        rng.normal(size=3), rng.normal(size=3), rng.normal(size=3),
+    )  # fmt: skip
+    way, turn = np.split(spread @ rng.normal(size=6), 2)
+    pose = Pose(
+        position - way,
+        # In the fixed axes of the map, as REP-103's covariances.
+        Rotation.from_rotvec(-turn).as_matrix() @ rotation,
+        covariance * wider,
+    )
+    linear, angular = np.split(spread @ rng.normal(size=6), 2)
+    twist = Twist(velocities[1] - linear, velocities[0] - angular, covariance * wider)
+    truth = (rotation, position, *velocities)
+    return of_pose(pose, truth)[0], of_twist(twist, truth)[0]
+
+
+@pytest.mark.parametrize(
+    ("wider", "least", "most"), [(1.0, 0.938, 0.962), (0.5, 0.5, 0.7), (3.0, 0.99, 1.0)]
+)
+def test_errors_are_weighed_by_the_covariances_that_are_published(wider, least, most):
+    rng = np.random.default_rng(0)
+    squared = np.array([published(rng, wider) for _ in range(2000)])
+    inside = np.mean(squared < REGION, axis=0)
+    assert np.all((least < inside) & (inside <= most)), inside
+    assert wider < 1.0 or squared.max() < FIVE_SIGMA
 
 
 def test_honest_regions_hold_and_are_sharp():

@@ -1,0 +1,84 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of the independent simulator with an IMU, as the package takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.independent.cameras import Camera
+from benchmarks.independent.frames import Frames, MakeMotions, first_row_times, simulate
+from benchmarks.independent.gyroscopes import Imu
+from benchmarks.independent.motions import Moving
+from benchmarks.independent.scenes import Scene
+from rs_localizer.core import camera as core
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.settings import InertialSettings
+
+_BIAS_WALK = 1e-4  # rad/s^2/sqrt(Hz)
+_BEFORE, _AFTER = 0.6, 0.03  # s of samples before the middle row and behind it
+
+
+def believed(camera: Camera) -> core.Camera:
+    """The same camera, as the package has it."""
+    return core.Camera(
+        width=camera.width,
+        height=camera.height,
+        K=camera.matrix,
+        D=np.array(camera.distortion),
+        distortion_model="plumb_bob",
+        readout_time=camera.readout_time,
+        scan_direction=camera.scan.value,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """Frames, and the samples of the IMU beside each recording."""
+
+    frames: Frames
+    samples: tuple[ImuSamples, ...]
+    imu: Imu
+
+    def around(self, frame: int) -> ImuSamples:
+        """The samples that come with a frame."""
+        every = self.samples[int(self.frames.recording[frame])]
+        middle = self.frames.middle_ns(frame)
+        first, last = np.searchsorted(
+            every.times_ns, [middle - round(1e9 * _BEFORE), middle + round(1e9 * _AFTER)]
+        )
+        return ImuSamples(every.times_ns[first:last], every.angular_velocity[first:last])
+
+    @property
+    def settings(self) -> InertialSettings:
+        return InertialSettings(self.imu.noise, _BIAS_WALK, True)
+
+
+def record(
+    camera: Camera,
+    make_motions: MakeMotions,
+    scene: Scene,
+    size: tuple[int, int],
+    seed: int,
+    imu: Imu | None = None,
+) -> Recorded:
+    """Simulate recordings and their IMU: so many, and so many frames of each."""
+    recordings, length = size
+    imu = imu or Imu()
+    made: list[Moving] = []
+
+    def remembered(count: int, rng: np.random.Generator) -> Moving:
+        made.append(make_motions(count, rng))
+        return made[-1]
+
+    frames = simulate(camera, remembered, scene, recordings, length, seed)
+    first = first_row_times(camera, length)
+    begin = int(frames.stamp_ns[0]) - round(1e9 * first[0])  # time 0 of the motions
+    rng = np.random.default_rng(seed)
+    samples = []
+    for which in range(recordings):
+        stamps, rates = imu.record(made[0], which, first[0] - 0.3, first[-1] + 0.3, rng)
+        samples.append(ImuSamples(stamps + begin, rates))
+    return Recorded(frames, tuple(samples), imu)
