@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from rs_localizer.cli import WORKING
-from rs_localizer.cli.options import LensOptions, UsageError, option
+from rs_localizer.cli.options import SettingOptions, TopicOptions, UsageError, option
 from rs_localizer.cli.settings_args import given_values, remapped
-from rs_localizer.io.camera_files import read_calibration
+from rs_localizer.io.camera_files import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE
@@ -44,6 +44,16 @@ if WORKING:
 # Readout times and focal lengths that differ by less are called the same: what a file says counts
 # rows its own way, and is of no single camera.
 _SAME = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensOptions(SettingOptions, TopicOptions):
+    """the camera."""
+
+    calibration: Path | None = option(
+        f"as calibrate writes it, lens and shutter; or {CALIBRATION_KINDS} (default: the bag's "
+        "camera_info)", "FILE", flag="--camera --calibration",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from rs_localizer.config import meant
-from rs_localizer.io.camera_files import CALIBRATION_KINDS
 
 T = TypeVar("T")
 MORE = " (--help says more)"
@@ -100,16 +99,6 @@ class TopicOptions:
     # No options: what is read, of one of several cameras, and which lens of a video it is.
     recording: Path = Path()
     lens: int | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class LensOptions(SettingOptions, TopicOptions):
-    """the camera."""
-
-    calibration: Path | None = option(
-        f"as calibrate writes it, lens and shutter; or {CALIBRATION_KINDS} (default: the bag's "
-        "camera_info)", "FILE", flag="--camera --calibration",
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from rs_localizer.cli import WORKING
-from rs_localizer.cli.options import LensOptions, UsageError
+from rs_localizer.cli.image_input import LensOptions
+from rs_localizer.cli.options import UsageError
 
 if WORKING:
     import numpy as np

@@ -85,6 +85,7 @@ for words in {[name.split() for name in COMMANDS]}:
     done = run("map", "build", "--help", PYTHONPROFILEIMPORTTIME="1")
     assert "usage: rs_localizer map build " in done.stdout
     assert "numba" not in done.stderr
+    assert "numpy" not in run("--help", PYTHONPROFILEIMPORTTIME="1").stderr
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,9 @@ from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, refuse_existing, replaced, write_all
+from rs_localizer.cli.image_input import LensOptions
 from rs_localizer.cli.map import check_readout
-from rs_localizer.cli.options import LensOptions, UsageError, argument, option
+from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
 from rs_localizer.cli.settings_args import given_settings, given_topics, given_values
 from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
