@@ -154,8 +154,8 @@ class Tracker:
         max_prediction: s after the last frame until which :meth:`at` predicts.
 
     Raises:
-        ValueError: without a readout time, with a global-shutter solver, or with something else
-            than a localizer.
+        ValueError: without a readout time, with a global-shutter solver, with something else than
+            a localizer, or for numbers out of range.
     """
 
     def __init__(
@@ -171,10 +171,12 @@ class Tracker:
             _check_motion(localizer)
         elif inertial is not None:
             inertial = replace(inertial, estimate_time_offset=False)
-        if not 0 <= output_lag < LENGTH:
-            raise ValueError(f"output_lag must be 0 to {LENGTH - 1} frames, got {output_lag}")
+        if output_lag not in range(LENGTH):
+            raise ValueError(f"output_lag must be 0 to {LENGTH - 1} frames, got {output_lag!r}")
+        if not 0.0 <= max_prediction < math.inf:
+            raise ValueError(f"max_prediction must be 0 s or more, got {max_prediction!r}")
         self.localizer, self._memory = localizer, memory
-        self.output_lag, self.max_prediction = output_lag, max_prediction
+        self.output_lag, self.max_prediction = int(output_lag), max_prediction
         self._seen: deque[_Seen] = deque(maxlen=LENGTH)  # the newest last
         self._track: _Track | None = None
         self._given: tuple[int, Prior] | None = None

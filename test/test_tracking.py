@@ -221,6 +221,16 @@ def test_predictions_are_as_sure_as_a_real_hand_lets_them_be():
     assert np.all(inside > 0.9), inside
 
 
+@pytest.mark.parametrize("settings", [
+    {"output_lag": 1.5}, {"output_lag": -1}, {"output_lag": 6}, {"max_prediction": -1.0},
+    {"max_prediction": np.nan}, {"max_prediction": np.inf},
+])  # fmt: skip
+def test_a_tracker_refuses_settings_out_of_range(settings):
+    (name,) = settings
+    with pytest.raises(ValueError, match=f"^{name} must be 0 "):
+        Tracker(rsl.Localizer(CAMERA), **settings)
+
+
 def test_results_of_a_frame_later_know_their_velocities_better():
     hand, errors = Hand(), {}
     for lag in (0, 1, 2):
