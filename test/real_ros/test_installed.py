@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +34,11 @@ def ros2(*words: str, timeout: float = 60.0) -> subprocess.CompletedProcess[str]
 def until(text: str, *words: str) -> str:
     """What a command says, once it has said this."""
     deadline = time.monotonic() + TIMEOUT
-    while text not in (said := ros2(*words).stdout):
-        assert time.monotonic() < deadline, f"ros2 {' '.join(words)} never said {text!r}: {said}"
+    while text not in (said := ros2(*words)).stdout:
+        last = said.stdout + said.stderr
+        assert time.monotonic() < deadline, f"ros2 {' '.join(words)} never said {text!r}: {last}"
         time.sleep(1.0)
-    return said
+    return said.stdout
 
 
 @pytest.fixture(scope="module")
@@ -49,12 +51,11 @@ def flight(tmp_path_factory: Any) -> Path:
     return folder / "flight"
 
 
-@pytest.fixture
-def launched(flight: Path) -> Iterator[subprocess.Popen[str]]:
-    """localizer.launch.py with the recording's parameters, in a process group of its own."""
-    command = ["ros2", "launch", "rs_localizer", "localizer.launch.py"]
+@contextmanager
+def launching(file: str, *words: str) -> Iterator[subprocess.Popen[str]]:
+    """A launch file, in a process group of its own."""
     process = subprocess.Popen(
-        [*command, f"params_file:={flight / 'parameters.yaml'}", "use_sim_time:=true"],
+        ["ros2", "launch", "rs_localizer", file, *words],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip
     try:
@@ -63,6 +64,40 @@ def launched(flight: Path) -> Iterator[subprocess.Popen[str]]:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGINT)
         process.communicate(timeout=30.0)
+
+
+@pytest.fixture
+def launched(flight: Path) -> Iterator[subprocess.Popen[str]]:
+    """localizer.launch.py with the recording's parameters."""
+    parameters = f"params_file:={flight / 'parameters.yaml'}"
+    with launching("localizer.launch.py", parameters, "use_sim_time:=true") as process:
+        yield process
+
+
+# Beside the localizer, what each starts by these arguments.
+NODES = {
+    "localizer.launch.py": (),
+    "features.launch.py": ("/feature_detector",),
+    "markers.launch.py": ("/marker_detector",),
+    "rig.launch.py": ("/front/marker_detector", "/rear/marker_detector"),
+}
+
+
+@pytest.mark.parametrize("file", LAUNCHES)
+def test_each_launch_file_starts_its_nodes(file: str, tmp_path: Path) -> None:
+    words = ["readout_time:=0.02"]
+    if file in ("markers.launch.py", "rig.launch.py"):
+        made = ros2(
+            "run", "rs_localizer", "rs_localizer", "markers", "make", str(tmp_path / "wall")
+        )
+        assert made.returncode == 0, made.stderr
+        words.append(f"marker_map:={tmp_path / 'wall.yaml'}")
+    if file == "rig.launch.py":
+        words.append("cameras:=front, rear")
+    with launching(file, *words) as process:
+        for node in ("/rs_localizer", *NODES[file]):
+            until("active", "lifecycle", "get", node)
+        assert process.poll() is None
 
 
 @pytest.mark.parametrize("file", LAUNCHES)
