@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -77,6 +78,9 @@ def changed(kind: str, world: Array, rng: np.random.Generator) -> Array:
         part = far < np.quantile(far, rng.uniform(0.1, 0.35))
         turn = so3.exp(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
         found[part] = (world[part] - centre) @ turn.T + centre + rng.normal(0.0, 2.0, 3)
+    elif kind == "repeated":  # as of windows: matches with their neighbours, a period away
+        other = rng.random(len(world)) < rng.uniform(0.2, 0.7)
+        found[other] += rng.uniform(0.5, 1.5) * np.eye(3)[rng.integers(2)]
     elif kind == "stale":
         gone = rng.random(len(world)) < rng.uniform(0.2, 0.7)
         found[gone] += rng.normal(0.0, 0.5, (gone.sum(), 3))
@@ -94,10 +98,10 @@ def squares(world: Array, rng: np.random.Generator) -> Array:
                            for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])  # fmt: skip
 
 
-def sequence(number: int) -> list[Row]:
+def sequence(number: int, kinds: Sequence[str] = KINDS) -> list[Row]:
     """The frames of one sequence that have a pose."""
-    kind = KINDS[number % len(KINDS)]
-    matcher = MATCHERS[(number // len(KINDS)) % len(MATCHERS)]
+    kind = kinds[number % len(kinds)]
+    matcher = MATCHERS[(number // len(kinds)) % len(MATCHERS)]
     rng = np.random.default_rng([7, number])
     motion = ConstantVelocity(rng.normal(0, 0.6, 3), rng.normal(0, 0.5, 3), 3.0)
     world = room(motion.state(0, np.linspace(0.0, 2.0, 9)).positions, rng, count=4000)
@@ -215,7 +219,7 @@ def report(rows: list[Row]) -> None:
     for limit in (0.5, 0.9):
         right = [p > limit for p, row in zip(said, rows, strict=True) if row.kind == "right"]
         print(f"above {limit}: {sum(right)} of {len(right)} frames in right maps")
-        for kind in dict.fromkeys(KINDS[3:]):
+        for kind in dict.fromkeys(row.kind for row in rows if row.kind != "right"):
             print(f"  {kind}: {_detected(rows, said, kind, limit)}")
 
 
@@ -237,10 +241,11 @@ def main() -> None:
     parser.add_argument("--sequences", type=int, default=240)
     parser.add_argument("--first", type=int, default=480, help="below 480 are those of the fit")
     parser.add_argument("--fit", action="store_true", help="print new weights, of the first ones")
+    parser.add_argument("--kinds", nargs="+", default=KINDS, help="also: repeated")
     chosen = parser.parse_args()
     first = 0 if chosen.fit else chosen.first
     numbers = range(first, first + chosen.sequences)
-    rows = [row for number in tqdm(numbers, disable=None) for row in sequence(number)]
+    rows = [row for number in tqdm(numbers, disable=None) for row in sequence(number, chosen.kinds)]
     if chosen.fit:
         fit(rows)
     report(rows)
