@@ -165,7 +165,7 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
             time.sleep(1.0)
             if sents[0][0] > 0.0:
                 memory.append([_memory(pid) for _, pid in nodes])
-                used.append([time.monotonic(), *(_cpu_time(pid) for _, pid in nodes)])
+                used.append([time.monotonic(), *(cpu_time(pid) for _, pid in nodes)])
         spent = np.subtract(used[-1], used[0])
         time.sleep(_REST_TIME)
         for ear in ears:
@@ -195,7 +195,7 @@ def _memory(pid: int) -> float:
     return float("nan")
 
 
-def _cpu_time(pid: int) -> float:
+def cpu_time(pid: int) -> float:
     """Seconds of all cores that a process has used."""
     values = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK")
