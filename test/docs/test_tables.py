@@ -1,8 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of README and docs that repeat the code say what the code says."""
+"""Tables and pages of README and docs that repeat the code say what the code says."""
 
 import re
+import runpy
 from collections.abc import Iterator
 from typing import Any
 
@@ -129,3 +130,13 @@ def test_every_state_is_explained():
 def test_commands_are_all_told_of():
     told = "\n".join(line for page in pages.NAMES for line in pages.shell(page))
     assert {name for name in COMMANDS if f"rs_localizer {name}" not in told} <= {"demo"}
+
+
+def test_the_page_of_the_reasons_is_up_to_date():
+    # `python docs/make_reasons.py` writes it.
+    made = runpy.run_path(str(pages.ROOT / "docs/make_reasons.py"))
+    assert pages.text("docs/reasons.md") == made["reasons_page"]()
+
+
+def test_the_reference_shows_all_public_names():
+    assert ".. automodule:: rs_localizer\n   :members:\n" in pages.text("docs/api.md")

@@ -4,9 +4,11 @@
 
 import contextlib
 import importlib
+import os
 import resource
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -198,3 +200,35 @@ def test_every_folder_with_kernels_counts():
         if "import kernel" in path.read_text() or "import inlined" in path.read_text()
     }
     assert using == set(jit.PARTS)
+
+
+DAY = 86400.0
+
+
+def folder(cache: Path, name: str, days: float, inside: str = "rs_localizer.core.so3") -> Path:
+    """A folder of kernels that was used some days ago."""
+    made = cache / name
+    (made / inside).mkdir(parents=True)
+    (made / inside / "hat-1.py311.nbi").write_bytes(b"")
+    os.utime(made, times=(time.time() - days * DAY,) * 2)
+    return made
+
+
+def test_what_nobody_used_for_a_month_is_removed(tmp_path):
+    """What may be in use, or is somebody else's, stays."""
+    jit._is_ours.cache_clear()
+    old = folder(tmp_path, "0123456789abcdef", 31)
+    staying = [
+        folder(tmp_path, "1" * 16, 29),  # another version, still in use
+        folder(tmp_path, "another_package_of_numba", 100),
+        folder(tmp_path, "2" * 16, 100, inside="somebody.elses"),
+    ]
+    (tmp_path / "3333333333333333").write_text("a file")
+    empty = tmp_path / ("4" * 16)  # of anybody
+    empty.mkdir()
+    os.utime(empty, times=(time.time() - 100 * DAY,) * 2)
+    staying.append(empty)
+    compiler._remove_old(tmp_path)
+    assert not old.exists()
+    assert all(path.is_dir() for path in staying)
+    assert (tmp_path / "3333333333333333").is_file()
