@@ -178,10 +178,10 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
                 refused=ear.counts["Frames refused"],
                 latencies=(ear.arrived - sent)[np.isfinite(ear.arrived)],
                 memory=of_node,
-                cpu=float(cpu_time / spent[0]) if spent[0] > 0.0 else float("nan"),
+                cpu=float(used_by_it / spent[0]) if spent[0] > 0.0 else float("nan"),
                 imu=ear.imu,
             )
-            for ear, sent, of_node, cpu_time in zip(
+            for ear, sent, of_node, used_by_it in zip(
                 ears, sents, np.array(memory).T, spent[1:], strict=True
             )
         ]

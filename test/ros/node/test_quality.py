@@ -96,3 +96,21 @@ def test_publishers_that_cannot_be_heard_are_named(peer, monkeypatch):
     inputs.close()
     driver.destroy_node()
     context.try_shutdown()
+
+
+def test_two_publishers_of_frames_are_named(peer):
+    said: list[str] = []
+    topics = {"frames": Topic(PointCloud2, print, single=True), "info": Topic(CameraInfo, print)}
+    inputs = Inputs(peer.node, topics, Refusals(said.append))
+    context = Context()
+    context.init(args=[])
+    driver = Node("driver", context=context)
+    for name, topic in topics.items():
+        peer.node.create_publisher(topic.type, name, 1)
+        driver.create_publisher(topic.type, name, 1)
+    assert peer.spin_until(lambda: said)
+    names = " and ".join(sorted(("/driver", f"/{peer.node.get_name()}")))
+    assert said == [f"two_publishers: {names} publish on /frames: their frames come in turns"]
+    inputs.close()
+    driver.destroy_node()
+    context.try_shutdown()
