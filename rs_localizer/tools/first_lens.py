@@ -194,9 +194,12 @@ def _fisheye(size: tuple[int, int], images: list[Observed], K: Array) -> tuple[f
         return total
 
     numbers = np.r_[K[0, 0], K[1, 1], K[0, 2], K[1, 2], np.zeros(4)]
-    first = [(image, _pose(_equidistant(size, numbers), image)) for image in images]
-    posed = [image for image, pose in first if pose is not None]
-    poses = [pose for _, pose in first if pose is not None]
+    begin, posed, poses = _equidistant(size, numbers), [], []
+    for image in images:
+        pose = _pose(begin, image)
+        if pose is not None and _linear(begin, image, *pose) is not None:
+            posed.append(image)
+            poses.append(pose)
     if len(posed) < max(_LEAST_IMAGES, len(images) // 2):
         raise ValueError("no poses by this focal length")
     least, damping = cost(numbers, poses), 1e-3

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
+from rs_localizer.tools import first_lens as first_lens_module
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import Observed
 from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
@@ -128,3 +129,25 @@ def test_the_distortion_model_is_that_of_the_lens(model, deep):
     assert found.distortion_model == model
     corner = np.array([[0.8, 0.6]]) if model == "equidistant" else np.array([[0.5, 0.4]])
     np.testing.assert_allclose(found.distort(corner)[0], camera.distort(corner)[0], atol=1.0)
+
+
+def test_images_by_whose_first_pose_points_are_behind_the_camera_are_left_out(monkeypatch):
+    """Among those of a fisheye; the others find the lens."""
+    rng, board = np.random.default_rng(3), projector.board(8, 6, 0.05, 0.0)
+    lens = replace(CAMERA, D=np.array([0.02, -0.01, 0.003, 0.0]), distortion_model="equidistant")
+    images = []
+    for k in range(8):
+        turn = Rotation.from_rotvec(rng.normal(0.0, 0.4, 3))
+        pixels = lens.project(turn.apply(board - board.mean(axis=0)) + np.array([0.0, 0.0, 0.5]))
+        images.append(Observed(10**9 + 10**8 * k, board - board.mean(axis=0), pixels))
+    pose = first_lens_module._pose
+    monkeypatch.setattr(
+        first_lens_module,
+        "_pose",
+        lambda camera, image: (
+            (np.eye(3), np.array([0.0, 0.0, -1.0])) if image is images[2] else pose(camera, image)
+        ),
+    )
+    error, found = first_lens_module._fisheye(lens.size, images, lens.K)
+    assert error < 1.0
+    np.testing.assert_allclose(found.K, lens.K, rtol=1e-3)
