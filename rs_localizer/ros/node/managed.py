@@ -96,9 +96,13 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
         self.worker: Worker[State, Result] | None = None
         # From activating to deactivating.
         self._inputs: Inputs | None = None
-        config = parameters.declare(self, kind)
-        if self.checked_at_start:
-            self.check(config)
+        try:
+            config = parameters.declare(self, kind)
+            if self.checked_at_start:
+                self.check(config)
+        except ValueError:
+            super().destroy_node()  # of Kilted on, the context would end what was never made
+            raise
         for text in parameters.unknown_names(self, kind):
             self.warn(f"a parameter is ignored: {text}")
         parameters.on_change(
