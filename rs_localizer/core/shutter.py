@@ -26,16 +26,11 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import add_block
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import (
-    ANGULAR,
-    ANGULAR_ACCELERATION,
-    LINEAR,
-    LINEAR_ACCELERATION,
-    MOVE,
     PARAMETERS,
-    TURN,
 )
 
 Numbers = tuple[Array, Array, Array, Array, Array, Array]
@@ -121,26 +116,29 @@ def carried(motion: Numbers, readouts: float, fading: float) -> tuple[Numbers, A
     back = so3.exp(-angle)  # then_from_now
     turned = so3.right_jacobian_of(angle)
     velocity = back @ (linear + faster * acceleration)
-    transport = np.zeros((PARAMETERS, PARAMETERS))
-    transport[TURN, TURN] = back
-    transport[TURN, ANGULAR] = readouts * turned
-    transport[TURN, ANGULAR_ACCELERATION] = farther * turned
-    transport[MOVE, MOVE] = back
-    transport[MOVE, TURN] = -(back @ so3.hat_of(way))
-    transport[MOVE, LINEAR] = readouts * back
-    transport[MOVE, LINEAR_ACCELERATION] = farther * back
-    transport[LINEAR, LINEAR] = back
-    transport[LINEAR, LINEAR_ACCELERATION] = faster * back
-    transport[LINEAR_ACCELERATION, LINEAR_ACCELERATION] = left * back
-    across = so3.hat_of(velocity) @ turned
-    transport[LINEAR, ANGULAR] = readouts * across
-    transport[LINEAR, ANGULAR_ACCELERATION] = farther * across
     # Without acceleration the body rate stays what it is, however far the camera turns.
     mean = farther / readouts if readouts != 0.0 else 0.0
-    transport[ANGULAR, ANGULAR_ACCELERATION] = (faster - mean) * turned
-    transport[ANGULAR, ANGULAR] = np.eye(3)
-    transport[ANGULAR, ANGULAR_ACCELERATION] += mean * np.eye(3)
-    transport[ANGULAR_ACCELERATION, ANGULAR_ACCELERATION] = left * np.eye(3)
+    across, unit = so3.hat_of(velocity) @ turned, np.eye(3)
+    transport = np.zeros((PARAMETERS, PARAMETERS))
+    for row, column, factor, block in (
+        (0, 0, 1.0, back),
+        (0, 6, readouts, turned),
+        (0, 12, farther, turned),
+        (3, 3, 1.0, back),
+        (3, 0, -1.0, back @ so3.hat_of(way)),
+        (3, 9, readouts, back),
+        (3, 15, farther, back),
+        (9, 9, 1.0, back),
+        (9, 15, faster, back),
+        (15, 15, left, back),
+        (9, 6, readouts, across),
+        (9, 12, farther, across),
+        (6, 12, faster - mean, turned),
+        (6, 6, 1.0, unit),
+        (6, 12, mean, unit),
+        (12, 12, left, unit),
+    ):
+        add_block(transport, row, column, factor, block)
     later = (
         back @ rotation, back @ (translation - way), turned @ (angular + faster * change), velocity,
         left * change, left * (back @ acceleration),

@@ -50,7 +50,7 @@ from rs_localizer.estimation.refine import TINY, apply_step, inverted, refine, s
 
 # Logarithm of the odds of rest against each typical speed before any frame: errors of maps that no
 # polynomial of the image follows look like motion, and a hundred to one is what surveyed tags ask
-# for (benchmarks.honesty tags).
+# for.
 REST_ODDS = math.log(100.0)
 # Logarithm of the odds of a typical speed beside a better one, beyond which no faster one is tried.
 FAR_LESS_PROBABLE = 9.0

@@ -15,11 +15,12 @@ import numpy as np
 from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import add_block
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.shake import MIDDLE_RATES, MIDDLE_VALUES
 from rs_localizer.core.shutter import Motion, Numbers, carried, motion_of, numbers_of
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import ANGULAR, PARAMETERS, TURN
+from rs_localizer.core.state import ANGULAR, PARAMETERS
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.refine import inverted
 
@@ -110,7 +111,7 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
 
 @kernel
 def _unshaken(motion: Numbers, shake: Array, joint: Array) -> tuple[Numbers, Array, Array, Array]:
-    values, slopes = MIDDLE_VALUES, MIDDLE_RATES
+    values, slopes, unit = MIDDLE_VALUES, MIDDLE_RATES, np.eye(3)
     rotation, translation, angular, linear, change, acceleration = motion
     turn, rate, swing = np.zeros(3), np.zeros(3), np.zeros((PARAMETERS, PARAMETERS))
     for k in range(len(shake)):
@@ -119,16 +120,16 @@ def _unshaken(motion: Numbers, shake: Array, joint: Array) -> tuple[Numbers, Arr
             turn[axis] += values[k] * shake[k, axis]
             rate[axis] += slopes[k] * shake[k, axis]
             square += shake[k, axis] * shake[k, axis] / 3.0
-        swing[TURN, TURN] += values[k] * values[k] * square * np.eye(3)
-        swing[ANGULAR, ANGULAR] += slopes[k] * slopes[k] * square * np.eye(3)
+        add_block(swing, 0, 0, values[k] * values[k] * square, unit)
+        add_block(swing, 6, 6, slopes[k] * slopes[k] * square, unit)
     # Derivatives of the motion without its shaking by motion and coefficients.
     jacobian = np.zeros((PARAMETERS, len(joint)))
     for i in range(PARAMETERS):
         jacobian[i, i] = 1.0
     for k in range((len(joint) - PARAMETERS) // 3):
         place = PARAMETERS + 3 * k
-        jacobian[TURN, place : place + 3] = -values[k] * np.eye(3)
-        jacobian[ANGULAR, place : place + 3] = -slopes[k] * np.eye(3)
+        add_block(jacobian, 0, place, -values[k], unit)
+        add_block(jacobian, 6, place, -slopes[k], unit)
     # As if turned back in its own axes: exp(-[-turn]x) R.
     turned = so3.exp(turn)
     beside = (

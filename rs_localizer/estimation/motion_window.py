@@ -271,9 +271,15 @@ def _predicted(
     )  # fmt: skip
     later, transport = carried(numbers, seconds, FADING)
     predicted = np.empty(STATE_SIZE)
-    predicted[:9] = later[0].copy().reshape(9)
-    predicted[9:12], predicted[12:15], predicted[15:18] = later[1], later[2], later[3]
-    predicted[18:21], predicted[21:24] = later[4], later[5]
+    for i in range(3):
+        for j in range(3):
+            predicted[3 * i + j] = later[0][i, j]
+        predicted[9 + i], predicted[12 + i], predicted[15 + i] = (
+            later[1][i],
+            later[2][i],
+            later[3][i],
+        )
+        predicted[18 + i], predicted[21 + i] = later[4][i], later[5][i]
     spread = transport @ covariance @ transport.T + _noise(seconds, deviations)
     for i in range(6):
         for j in range(6):
