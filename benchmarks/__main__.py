@@ -54,7 +54,8 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   mutants                          planted bugs, and whether tests catch them
   mapping                          refined maps and surveyed markers
   fuzzing                          wrong input for everything that reads
-  load, .changes, .robot           live nodes under load, set anew, and on a robot
+  load, load.changes               live nodes under load, and set anew
+  load.robot                       a live node on a robot: occlusions, odometry at 200 Hz
   simulation                       bags as of simulate, of more sensors
   start                            memory and time of a start of the node
 """
