@@ -29,7 +29,7 @@ from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
-from rs_localizer.core.state import PARAMETERS
+from rs_localizer.core.state import ANGULAR, PARAMETERS, TURN
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.experience import Experience, covering
@@ -280,13 +280,18 @@ class Tracker:
         except ValueError:  # rounding errors are all that is left of the covariance
             return None
 
-    def at(self, time_ns: int) -> Estimate | None:
+    def at(self, time_ns: int, imu: ImuSamples | None = None) -> Estimate | None:
         """The motion at a time, in ns as :meth:`localize` takes it.
 
         Within the rows of one of the last frames it is that frame's, between frames what those
         before and after tell, after them predicted, and as sure as such predictions deserved of
         late. None before the last frames, more than ``max_prediction`` after them, and where the
         orientation is too uncertain. Points are those of the frame that is nearest.
+
+        Args:
+            time_ns: when.
+            imu: samples from before the last frame with a pose until now: after it, the camera
+                turns as they say.
         """
         track = self._track
         if track is None or track.window is None:
@@ -301,7 +306,9 @@ class Tracker:
         assert isinstance(nearest, Estimate)
         seconds = 1e-9 * (time_ns - nearest_ns)
         if abs(seconds) <= 0.5 * nearest.span:
-            there = replace(Estimate.at_time(nearest, seconds), time_ns=time_ns)
+            there = Estimate.at_time(nearest, seconds)
+        elif (turned := self._turned(time_ns, imu)) is not None:
+            there = turned
         else:
             motion = window.at(time_ns)
             if motion is None:
@@ -309,9 +316,36 @@ class Tracker:
             there = predicted_estimate(nearest, motion, swing)
             if (ahead := 1e-9 * (time_ns - track.time_ns)) > 0.0:
                 there = self._errors.widened(there, ahead)
+        there = replace(there, time_ns=time_ns)
         if isinstance(there, RigEstimate):
             there = replace(there, time=there.time + seconds)
         return there if self.localizer.accepted(there) else None
+
+    def _turned(self, time_ns: int, samples: ImuSamples | None) -> Estimate | None:
+        """The motion after the last frame, turning as a gyroscope says; None where it does not."""
+        track = self._track
+        if track is None or self._aid is None or not samples:
+            return None
+        span, last_ns = track.estimate.span, self._aid.last_ns(samples)
+        half_ns, seen_ns = round(0.5e9 * span), min(time_ns, last_ns)
+        # As if a frame had its last row there.
+        middle_ns = min(time_ns, last_ns - half_ns)
+        before = self._before(middle_ns)
+        if before is None or not track.time_ns < middle_ns or time_ns > last_ns + half_ns:
+            return None
+        from rs_localizer.inertial.aiding import changed
+
+        known = self._aid.ahead(samples, middle_ns, before)
+        if known is None:
+            return None
+        there = known.of(track.estimate).at_time(1e-9 * (seen_ns - middle_ns))
+        if (unseen := 1e-9 * (time_ns - seen_ns)) > 0.0:
+            there, variance = there.at_time(unseen), changed(samples, unseen)
+            added = acceleration_covariance(self._beside_gyro(track), unseen, span)
+            added[ANGULAR, ANGULAR] += span**2 * variance * np.eye(3)
+            added[TURN, TURN] += unseen**2 * variance * np.eye(3)
+            there = replace(there, joint_covariance=there.joint_covariance + added)
+        return there
 
     def flush(self) -> list[Estimate | Failure]:
         """The results that ``output_lag`` still holds back, at the end of a recording."""
@@ -529,6 +563,11 @@ class Tracker:
             return alone
         return window if window.surprise < _MOST_INNOVATION else alone  # NaN is neither
 
+    def _beside_gyro(self, track: _Track) -> Acceleration:
+        """Accelerations beside the turn that a gyroscope knows."""
+        linear = math.sqrt(track.linear_scale) * self._without_gyro.linear
+        return replace(self._without_gyro, linear=max(linear, _LEAST_ACCELERATION))
+
     def _before(self, time_ns: int) -> Before | None:
         """What the last frame says of the motion beside what a gyroscope sees."""
         track = self._track
@@ -539,9 +578,7 @@ class Tracker:
         readout_time = self.localizer.camera.readout_time
         motion, covariance, added, _ = unshaken(track.estimate)
         dt = 1e-9 * (time_ns - track.time_ns)
-        linear = math.sqrt(track.linear_scale) * self._without_gyro.linear
-        expected = replace(self._without_gyro, linear=max(linear, _LEAST_ACCELERATION))
-        added += acceleration_covariance(expected, dt, readout_time)
+        added += acceleration_covariance(self._beside_gyro(track), dt, readout_time)
         return Before(
             track.time_ns,
             motion,

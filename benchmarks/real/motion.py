@@ -27,6 +27,8 @@ from benchmarks.real.recordings import Frame, Recording
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.io.trajectories import read_tum, split_at_gaps
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
@@ -37,6 +39,9 @@ _INSIDE = 12.592  # 95 % quantile of chi-squared with six degrees of freedom
 _RATE = 30.0  # Hz
 AHEAD = (0.01, 0.03, 0.1)  # s after the middle of an image, for which the tracker is asked
 _EVERY = 0.001  # s, within rows and between images
+# Of a gyroscope: rad/s/sqrt(Hz); rad/s; s; ns from a reading to who asks for it.
+_GYROSCOPE_NOISE, _BIAS, _EARLY = math.radians(0.01), math.radians(0.5), 0.004
+_LATENCY_NS = 4_000_000
 _ROOM, _POINTS = 3.0, 20_000  # m about a trajectory
 _BAND, _TONES, _SHORT_SPACING = (4.0, 40.0), 24, 0.002  # Hz of shaking; s
 _SPACING = 0.005  # s, of the samples of a trajectory
@@ -184,16 +189,39 @@ def judge(recording: Recording, motion: Motion) -> dict[str, Row]:
     return rows
 
 
-def at_any_time(recording: Recording, motion: Motion) -> dict[str, Row]:
+def gyroscope(motion: Motion, rate: float, seed: int = 0) -> ImuSamples:
+    """What a gyroscope beside the camera shows: with noise and a bias, stamps 4 ms early."""
+    rng, times = np.random.default_rng(seed), np.arange(motion.start, motion.end, 1.0 / rate)
+    noise = _GYROSCOPE_NOISE * math.sqrt(rate) * rng.normal(size=(len(times), 3))
+    rates = np.array([motion.twist(time)[0] for time in times])
+    stamps = np.rint(1e9 * (times - _EARLY)).astype(np.int64) + 10**12
+    return ImuSamples(stamps, rates + _BIAS * rng.normal(size=3) + noise)
+
+
+def _until(samples: ImuSamples | None, time_ns: int) -> ImuSamples | None:
+    """The samples that have come until then."""
+    if samples is None:
+        return None
+    end = int(samples.times_ns.searchsorted(time_ns - _LATENCY_NS - round(1e9 * _EARLY)))
+    begin = max(end - 300, 0)
+    return ImuSamples(samples.times_ns[begin:end], samples.angular_velocity[begin:end])
+
+
+def at_any_time(
+    recording: Recording, motion: Motion, samples: ImuSamples | None = None
+) -> dict[str, Row]:
     """``Tracker.at`` within rows, between images and ahead; beside poses held, and moved on as the
-    last image moved.
+    last image moved. A gyroscope's samples come some milliseconds late.
     """
-    camera, tracker = recording.camera, Tracker(Localizer(recording.camera))
+    inertial = InertialSettings(_GYROSCOPE_NOISE, _GYROSCOPE_NOISE, estimate_time_offset=True)
+    camera = recording.camera
+    tracker = Tracker(Localizer(camera), None if samples is None else inertial)
     found: dict[str, list[tuple[int, Estimate]]] = {}
     before: Estimate | None = None
     half = round(0.5e9 * camera.readout_time)
     for each in recording.frames:
-        one = tracker.localize(each.middle_ns, each.points, each.pixels)
+        imu = _until(samples, each.middle_ns + half + 5 * _LATENCY_NS)
+        one = tracker.localize(each.middle_ns, each.points, each.pixels, imu=imu)
         if not one:
             continue
         asked = [("within rows", half * k // 8) for k in range(-8, 9)]
@@ -202,7 +230,7 @@ def at_any_time(recording: Recording, motion: Motion) -> dict[str, Row]:
             asked += [("between images", later) for later in gap]
         asked += [(f"{1e3 * ahead:.0f} ms ahead", round(1e9 * ahead)) for ahead in AHEAD]
         for name, later in asked:
-            there = tracker.at(each.middle_ns + later)
+            there = tracker.at(each.middle_ns + later, _until(samples, each.middle_ns + later))
             others = {"": there}
             if later > half:
                 others |= {", held": one, ", same velocity": one.at_time(1e-9 * later)}
@@ -278,6 +306,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--readout-time", type=float, default=0.016, help="s")
     parser.add_argument("--points", type=int, default=150, help="of each image")
     parser.add_argument("--noise", type=float, default=0.5, help="px")
+    parser.add_argument("--gyroscope", type=float, default=0.0, help="Hz of one for any time")
     parser.add_argument("--out", type=Path, default=Path("real"), help="table")
     args = parser.parse_args(argv)
     read = read_aria if args.folder.is_dir() else read_trajectory
@@ -287,7 +316,8 @@ def main(argv: Sequence[str]) -> None:
     motion = replace(motion, end=min(motion.end, motion.start + args.seconds))
     camera = TrueCamera(readout_time=args.readout_time)
     recording = simulated(args.folder.name, motion, points, camera, args.points, args.noise)
-    rows = judge(recording, motion) | at_any_time(recording, motion)
+    samples = gyroscope(motion, args.gyroscope) if args.gyroscope > 0.0 else None
+    rows = judge(recording, motion) | at_any_time(recording, motion, samples)
     table = text(rows)
     print(table)
     args.out.mkdir(parents=True, exist_ok=True)

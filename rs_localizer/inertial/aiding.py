@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,6 +40,8 @@ _MOST_SURPRISE = 38.0
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
 # Deviations of an offset that was found at once, as the filter takes them.
 _WIDER = 3.0
+# s: over which rates have changed as they will.
+_LATELY = 0.1
 # An offset is hardly known whose deviation is this part of what it is at first.
 _HARDLY = 0.25
 
@@ -71,6 +74,18 @@ class GyroPrediction:
     @property
     def turn(self) -> GyroRotation:
         return self.within.known
+
+    def of(self, last: Estimate) -> Estimate:
+        """The estimate that it makes of the last frame's."""
+        assert self.predicted is not None
+        motion, turn = self.predicted.motion, self.turn
+        numbers = {each.name: getattr(motion, each.name) for each in fields(Motion)}
+        numbers["angular_velocity"] = motion.angular_velocity + turn.rate
+        numbers["angular_acceleration"] = motion.angular_acceleration + turn.change
+        return replace(
+            last, **numbers, joint_covariance=self.predicted.covariance, shake=np.zeros((0, 3)),
+            turn=turn,
+        )  # fmt: skip
 
 
 class GyroscopeAid:
@@ -171,6 +186,24 @@ class GyroscopeAid:
         better = _better(found[0], alone[0])
         self._contradicted(middle_ns, None if better else alone[0])
         return found if better else alone
+
+    def last_ns(self, samples: ImuSamples) -> int:
+        """The last moment that samples cover, by the camera's clock."""
+        return int(samples.times_ns[-1]) + round(1e9 * self.filter.errors.time_offset) - 1
+
+    def ahead(self, samples: ImuSamples, middle_ns: int, last: Before) -> GyroPrediction | None:
+        """What is known of a moment after the last frame, as if it were a frame's.
+
+        None unless the last frame agreed with the gyroscope, and samples cover this one.
+        """
+        if self._state is not Alone.NONE:
+            return None
+        errors = self.filter.errors
+        turn = turning.turn_within(samples, middle_ns, self._readout_time, errors)
+        between = turning.turn_between(samples, last.middle_ns, middle_ns, errors)
+        if turn is None or between is None:
+            return None
+        return self._predicted(last, between, turn, middle_ns)
 
     def _foreseen(
         self, samples: ImuSamples | None, middle_ns: int, before: Callable[[], Before | None]
@@ -277,6 +310,18 @@ class GyroscopeAid:
         """Compare a gyroscope that was dropped with what the camera sees without it."""
         if alone and self._watch.dropped is not Alone.NONE:
             self._watch.judge(False, _oriented(middle_ns, alone))
+
+
+def changed(samples: ImuSamples, seconds: float) -> float:
+    """Mean squared change of each axis' turn rate (rad/s)^2 in so many s, of late."""
+    times = 1e-9 * (samples.times_ns - samples.times_ns[-1])
+    late = times >= times[0] + seconds
+    late &= times >= -_LATELY
+    if not late.any():
+        return math.inf
+    rates = samples.angular_velocity
+    before = [np.interp(times[late] - seconds, times, rates[:, axis]) for axis in range(3)]
+    return float(np.mean((rates[late] - np.transpose(before)) ** 2))
 
 
 def _better(found: Estimate | Failure, alone: Estimate | Failure) -> bool:

@@ -23,7 +23,7 @@ from numba.core.registry import cpu_target
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd import compiler
-from rs_localizer.core.simd.jit import NotCompiled, at_once, cache_directory, digest
+from rs_localizer.core.simd.jit import NotCompiled, at_once, cache_directory, digest, make_folder
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.localizer import Localizer
@@ -98,8 +98,7 @@ def note_whole(solver: str) -> None:
         OSError: when that cannot be written.
     """
     note = _note(solver)
-    for path in (*reversed(note.parent.parents), note.parent):
-        path.mkdir(0o700, exist_ok=True)
+    make_folder(note.parent)
     note.touch()
 
 

@@ -600,8 +600,14 @@ class FrameLocalizer:
         None before the last frames, more than ``max_prediction`` after them, and where frames do
         not know how the camera moves (:attr:`predicts`).
         """
-        found = self._tracker.at(stamp_ns) if self.predicts else None
-        if found is None or self._newest is None:
+        if not self.predicts or self._newest is None:
+            return None
+        newest_ns, samples = self._tracker.newest_ns, None
+        if newest_ns is not None and stamp_ns > newest_ns:
+            known = self._tracker, self._config, stamp_ns, self.camera_frame, self.transforms
+            samples = self.imu.ahead(*known)
+        found = self._tracker.at(stamp_ns, samples)
+        if found is None:
             return None
         cloud, deviation = self._newest
         cloud = replace(cloud, stamp_ns=stamp_ns)

@@ -156,6 +156,34 @@ class ImuInput:
         missing_ns = self._buffer.lag(end_ns + _AROUND_NS)
         return 0 < missing_ns <= round((patience + _BUNDLE) * 1e9)
 
+    def ahead(
+        self,
+        tracker: Tracker,
+        config: NodeConfig,
+        time_ns: int,
+        camera_frame: str,
+        transforms: Transforms,
+    ) -> ImuSamples | None:
+        """The readings that tell how the camera has turned since its last frame, until this time.
+
+        None where there are none, or the frame was the last one so long ago that none counts.
+        """
+        if not self._wanted(config) or tracker.inertial is None:
+            return None
+        start_ns, _ = _exposure(config, time_ns - round(1e9 * config.max_prediction), tracker)
+        readings = self._buffer.between(
+            start_ns, start_ns, start_ns - _BEFORE_NS, time_ns + _AROUND_NS
+        )
+        if isinstance(readings, Lacking):
+            return None
+        times_ns = readings.stamps_ns + round(1e9 * config.imu.time_offset)
+        try:
+            return in_camera_axes(
+                readings, times_ns, transforms, (camera_frame, self.frame), time_ns
+            )
+        except TransformError:
+            return None
+
     def track(
         self,
         tracker: Tracker,

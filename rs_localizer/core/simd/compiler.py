@@ -25,7 +25,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection, wait
 from operator import attrgetter
 from pathlib import Path
@@ -256,15 +256,22 @@ def _kept(request: Request) -> bool:
     kernel = attrgetter(request.name)(importlib.import_module(request.module))
     holds = functools.partial(kernel._cache.holds, request.arguments, cpu_target.target_context)
     try:
-        kernel._cache._impl.locator.ensure_cache_path()
-        lock = Path(kernel._cache.cache_path).parent / "rs_localizer.lock"
-        with lock.open("a") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            if not holds():
-                kernel.compile(request.arguments)
-            return bool(holds())
+        if not holds():
+            kernel.compile(request.arguments)
+        return bool(holds())
     except Exception:  # whoever asks compiles it itself, and says what is wrong
         return False
+
+
+@contextlib.contextmanager
+def alone() -> Iterator[None]:
+    """Within ``with``, this process is the only one that compiles into the cache."""
+    from rs_localizer.core.simd import jit
+
+    jit.make_folder(jit.cache_directory())
+    with (jit.cache_directory() / "rs_localizer.lock").open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def _called(request: Request) -> bool:

@@ -72,6 +72,7 @@ class _Thread(threading.local):
     asks = False  # whether the cache has a kernel
     # What is called whenever it has kept a kernel, if it compiles what it needs by itself.
     kept: Callable[[], None] | None = None
+    compiles = False  # at present
 
 
 _thread = _Thread()
@@ -108,6 +109,12 @@ def cache_directory() -> Path:
         except RuntimeError:  # a user without a home, as in some containers
             chosen = "/nonexistent"
     return Path(chosen) if config.CACHE_DIR else Path(chosen) / "rs_localizer"
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder, and those above it, into which nobody else writes."""
+    for path in (*reversed(folder.parents), folder):
+        path.mkdir(0o700, exist_ok=True)
 
 
 def digest(part: str, package: Path = _PACKAGE) -> str:
@@ -178,8 +185,15 @@ def is_global(function: Any) -> bool:
 
 def _obtained(compiled: Any, compile_or_load: Callable[..., Any], signature: Any) -> Any:
     """The entry point of a kernel: from the cache, where a process of its own compiles to."""
-    if _thread.kept is not None:
+    if _thread.compiles:
         return compile_or_load(signature)
+    if _thread.kept is not None:
+        with compiler.alone():
+            _thread.compiles = True
+            try:
+                return compile_or_load(signature)
+            finally:
+                _thread.compiles = False
     loaded = compiled.overloads.get(tuple(signature))
     if loaded is not None:
         return loaded.entry_point
@@ -217,8 +231,7 @@ class _Locator:
         return cls(function, file)
 
     def ensure_cache_path(self) -> None:
-        for path in (*reversed(self._directory.parents), self._directory):
-            path.mkdir(0o700, exist_ok=True)
+        make_folder(self._directory)
 
     def get_cache_path(self) -> str:
         return str(self._directory)
