@@ -21,15 +21,14 @@ _REASONS_INTRODUCTION = """\
 
 ## Why a frame has no pose
 
-The same in the library (`Failure.reason`), in `replay`, in the log and in `/diagnostics`.
-What to look at is in italics; *settings*:
-{settings}
+`Failure.reason` of the library; in `replay`, the log and `/diagnostics`. In italics: what to check.
+*Settings*: {settings}.
 
 """
 _IMU_INTRODUCTION = """
 ## Why the IMU is not used for an image
 
-The camera continues alone, and the image still has its pose: [imu.md](imu.md).
+The image still has its pose, by the camera alone: [imu.md](imu.md).
 
 """
 _BY_HAND = "\n<!-- From here on written by hand"

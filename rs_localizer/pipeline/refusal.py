@@ -60,109 +60,79 @@ class Meaning(NamedTuple):
     look_at: str
 
 
-SETTINGS = "is readout_time in seconds, scan_direction right, are the pixels raw (not rectified)?"
+SETTINGS = "readout_time (in s), scan_direction, raw pixels (not rectified)"
 
 REASONS: dict[str, Meaning] = {
-    Reason.TOO_FEW_POINTS: Meaning(
-        "fewer usable points than min_inliers", "show three markers, or a larger part of the map"
-    ),
+    Reason.TOO_FEW_POINTS: Meaning("fewer points than min_inliers", "show more of the map"),
     Reason.TOO_FEW_INLIERS: Meaning(
         "no motion fits min_inliers points",
-        f"do map and calibration belong to these images; {SETTINGS}",
+        f"check map, calibration, {SETTINGS}",
     ),
     Reason.NO_HYPOTHESIS: Meaning(
-        "no sample of points gave a pose", "are all points the same, or on one line?"
+        "no sample of points gave a pose", "are all points alike, or on a line?"
     ),
     Reason.BEHIND_CAMERA: Meaning(
-        "most points would lie behind the camera", "is the map mirrored, or another one?"
+        "most points lie behind the camera", "is the map mirrored, or another one?"
     ),
     Reason.RESIDUAL: Meaning(
-        "inlier residuals are as large as inlier_threshold allows", f"calibration, map; {SETTINGS}"
+        "inlier residuals reach inlier_threshold", f"check calibration, map, {SETTINGS}"
     ),
     Reason.DEGENERATE: Meaning(
-        "the points do not determine the motion, e.g. a frontoparallel plane",
-        "look from an angle, show other depths, leave tracking and velocity_prior on",
+        "the points, as of a frontal plane, leave the motion open",
+        "look from an angle, show depth, keep tracking on",
     ),
-    Reason.IMPLAUSIBLE: Meaning(
-        "the motion exceeds what a camera can do", f"mostly chance matches; {SETTINGS}"
-    ),
+    Reason.IMPLAUSIBLE: Meaning("no camera moves like this", f"chance matches? check {SETTINGS}"),
     Reason.MIRRORED: Meaning(
-        "planar pose ambiguity: two mirrored poses fit equally well",
-        "come nearer, look from an angle, use markers on several walls",
+        "planar ambiguity: two poses fit equally well",
+        "come nearer, look from an angle",
     ),
     Reason.MODEL_ERROR: Meaning(
-        "errors that no motion explains, of rows or smooth over the image",
-        f"vibration (stiffer mounting, IMU), calibration, map; {SETTINGS}",
+        "residuals depend on row or place in the image",
+        f"vibration (IMU)? check calibration, map, {SETTINGS}",
     ),
     Reason.UNCERTAIN: Meaning(
-        "orientation uncertainty exceeds max_orientation_deviation",
-        "come nearer, show more of the map, leave tracking on, or raise the limit",
+        "orientation deviation above max_orientation_deviation",
+        "come nearer, show more of the map",
     ),
-    Reason.SCAN_AXIS: Meaning(
-        "scan_direction names the wrong axis: columns, or rows",
-        "set the direction that the message names (drivers may rotate images)",
-    ),
-    Reason.AWAITS_FRAMES: Meaning(
-        "output_lag holds results back until later frames have come", "nothing is wrong"
-    ),
+    Reason.SCAN_AXIS: Meaning("scan_direction names the wrong axis", "set that of the message"),
+    Reason.AWAITS_FRAMES: Meaning("output_lag waits for later frames", "nothing is wrong"),
     Reason.NO_CAMERA_INFO: Meaning(
-        "no usable camera_info came before it", "is it recorded, is its topic the right one?"
+        "no usable camera_info yet", "is it recorded, is its topic right?"
     ),
     Reason.BAD_CAMERA_INFO: Meaning(
-        "a camera_info cannot be used", "calibrate; uncalibrated drivers publish zeros"
+        "camera_info cannot be used", "calibrate; uncalibrated drivers send zeros"
     ),
     Reason.BAD_CLOUD: Meaning(
-        "a cloud of correspondences cannot be read", "its fields: x y z u v, FLOAT32 or FLOAT64"
+        "correspondences cannot be read", "fields x y z u v, FLOAT32 or FLOAT64"
     ),
-    Reason.BAD_KEYPOINTS: Meaning(
-        "a cloud of keypoints cannot be read", "its fields: u v and id and/or descriptor"
-    ),
-    Reason.EMPTY_CLOUD: Meaning(
-        "a cloud holds no point", "does the camera see anything of the map?"
-    ),
-    Reason.BAD_MAP: Meaning(
-        "a map on map_points cannot be used", "its fields: x y z and id and/or descriptor"
-    ),
-    Reason.BAD_IMU: Meaning(
-        "a message on imu cannot be used", "its units: rad/s and m/s^2; what its driver fills in"
-    ),
+    Reason.BAD_KEYPOINTS: Meaning("keypoints cannot be read", "fields u v, and id or descriptor"),
+    Reason.EMPTY_CLOUD: Meaning("the cloud has no point", "does the camera see the map?"),
+    Reason.BAD_MAP: Meaning("map_points cannot be used", "fields x y z, and id or descriptor"),
+    Reason.BAD_IMU: Meaning("imu cannot be used", "rad/s and m/s^2, filled in by its driver?"),
     Reason.BAD_DETECTIONS: Meaning(
-        "detections cannot be used, or have another order of corners",
+        "detections cannot be used, or their order of corners",
         "apriltag's order: lower left, lower right, upper right, upper left",
     ),
     Reason.NO_MAP: Meaning(
-        "keypoints came before a map, or detections without marker_map",
-        "map_file or map_points; marker_map for detections",
+        "keypoints without a map, detections without marker_map",
+        "map_file, map_points or marker_map",
     ),
     Reason.NO_MATCHES: Meaning(
-        "no keypoint matches a landmark, or no tag is in marker_map",
-        "are descriptors, or ids, of one kind?",
+        "no keypoint or tag matches the map", "are descriptors, or ids, of one kind?"
     ),
     Reason.BAD_IMAGE: Meaning(
-        "an image cannot be read", "its encoding: mono, color, Bayer, YUV, JPEG, PNG"
+        "the image cannot be read", "encodings: mono, color, Bayer, YUV, JPEG, PNG"
     ),
-    Reason.NO_TIME: Meaning(
-        "OpenCV gives no presentation time for an image of a video",
-        "--rate, or another container; the image is left out",
-    ),
-    Reason.INTERNAL_ERROR: Meaning(
-        "a fault of this program, which continues with the next frame", "please report the message"
-    ),
-    Reason.REPEATED_STAMP: Meaning(
-        "a frame with this stamp has come already",
-        "two publishers on this topic, or a driver that stamps anew?",
-    ),
-    Reason.LATE_FRAME: Meaning(
-        "a newer frame came before it; from half a second on, tracking restarts",
-        "nothing, if it is rare; else, do two senders use this topic?",
-    ),
+    Reason.NO_TIME: Meaning("a video's image has no time", "give --rate"),
+    Reason.INTERNAL_ERROR: Meaning("a fault of this program", "please report the message"),
+    Reason.REPEATED_STAMP: Meaning("this stamp came before", "two publishers?"),
+    Reason.LATE_FRAME: Meaning("a newer frame came before", "nothing, if rare; two publishers?"),
     Reason.COMPILING: Meaning(
-        "kernels of this frame are being compiled (first start)",
-        "it ends within minutes; `rs_localizer warm` beforehand",
+        "kernels are being compiled", "wait minutes; `rs_localizer warm` avoids it"
     ),
     Reason.NO_TRANSFORM: Meaning(
-        "TF has no transform from the camera to base_frame",
-        "record /tf and /tf_static, run a robot_state_publisher",
+        "TF lacks camera to base_frame",
+        "record /tf_static; robot_state_publisher",
     ),
 }
 """By the reason as it is counted, logged and published."""
@@ -170,49 +140,40 @@ REASONS: dict[str, Meaning] = {
 IMU_REASONS: dict[str, Meaning] = {
     ImuReason.NEVER: Meaning("no message has come on imu", "is its topic remapped, does it run?"),
     ImuReason.LATE: Meaning(
-        "IMU messages arrive later than imu.wait or use another clock",
-        "a larger imu.wait, imu.time_offset, its driver",
+        "messages come after imu.wait, or by another clock",
+        "imu.wait, imu.time_offset",
     ),
     ImuReason.STOPPED: Meaning(
-        "the last message is older than the image by half a second or more",
-        "does it still run, by the camera's clock?",
+        "the last message is half a second old",
+        "does it run, by this clock?",
     ),
     ImuReason.BEGINS_LATER: Meaning(
-        "the first remembered message is younger than the image",
-        "nothing, at the beginning; else, is there one clock?",
+        "the first message is younger than the image", "later: one clock?"
     ),
-    ImuReason.GAP: Meaning(
-        "messages of the exposure are lost", "a reliable publisher, a machine with less to do"
-    ),
-    ImuReason.TOO_SLOW: Meaning(
-        "messages arrive too rarely to resolve vibration", "a rate of 100 Hz, better 200 Hz"
-    ),
-    ImuReason.SATURATED: Meaning(
-        "the camera turns faster than the gyroscope can measure", "a larger range of the gyroscope"
-    ),
+    ImuReason.GAP: Meaning("messages of the exposure are lost", "publish reliably"),
+    ImuReason.TOO_SLOW: Meaning("messages are too rare to resolve vibration", "200 Hz"),
+    ImuReason.SATURATED: Meaning("faster than the gyroscope measures", "a larger range"),
     ImuReason.NO_TRANSFORM: Meaning(
-        "TF has no transform from the IMU to the camera",
-        "publish it on /tf_static; ROS needs tf2_ros for it",
+        "TF lacks IMU to camera",
+        "publish it on /tf_static; install tf2_ros",
     ),
     ImuReason.NO_READOUT_TIME: Meaning(
-        "readout_time is 0: unknown which message belongs to which row",
-        "set readout_time; rs_localizer calibrate finds it",
+        "readout_time is 0: messages have no row", "rs_localizer calibrate finds it"
     ),
     ImuReason.NOT_TRACKING: Meaning("the solver is for global shutters", "another solver"),
     ImuReason.DOUBTED: Meaning(
-        "this image fits better without the gyroscope, or its stamps have stepped",
-        "nothing, if rare; imu.gyroscope_noise, imu.time_offset",
+        "the image fits better without the gyroscope",
+        "if often: imu.gyroscope_noise, imu.time_offset",
     ),
     ImuReason.DISAGREES: Meaning(
-        "the gyroscope's rates disagree with the camera's motion",
-        "one body? imu.time_offset, its frame_id and units",
+        "the gyroscope's rates are not the camera's", "one body? imu.time_offset, frame_id, units"
     ),
     ImuReason.TURNED: Meaning(
-        "the gyroscope's axes disagree with TF", "the transform between the two frame_ids"
+        "the gyroscope's axes disagree with TF", "the transform of the frame_ids"
     ),
     ImuReason.COMPILING: Meaning(
-        "kernels for an IMU are being compiled (first start)",
-        "it ends within minutes; `rs_localizer warm` beforehand",
+        "kernels for an IMU are being compiled",
+        "wait minutes; `rs_localizer warm` avoids it",
     ),
 }
 """Why an image was localized by the camera alone."""
