@@ -1,13 +1,11 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a map of markers can be true: by itself, and by what images show of it."""
+"""Checks of a map of markers: by itself, and by what images show of it."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import cv2
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
@@ -65,7 +63,13 @@ def still_fit(camera: Camera, points: Array, pixels: Array) -> Predict | None:
     return (lambda some: camera.project(some @ rotation.T + translation)) if solved else None
 
 
-def rms(errors: Array) -> float:
+def still_residual(camera: Camera, points: Array, pixels: Array) -> float:
+    """Error of the best still pose of points (n,3) at pixels (n,2), px rms; NaN: there is none."""
+    predict = still_fit(camera, points, pixels)
+    return np.nan if predict is None else _rms(predict(points) - pixels)
+
+
+def _rms(errors: Array) -> float:
     """Root mean square of the lengths of errors (n,2)."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
@@ -78,15 +82,10 @@ _STILL = 0.5  # px rms: what a still camera leaves at most
 # Without the marker the others fit to this share of what they fit to with it, and it is off by this
 # multiple of how well they fit.
 _BETTER, _CLEARLY = 0.6, 4.0
-# Another reading leaves this share of what is told, in this share of the images.
-_MUCH_BETTER, _MOSTLY = 0.4, 0.8
-_TURNED = ("", "a quarter", "half", "three quarters")  # of a whole turn
-_SCALES = np.exp(np.linspace(-0.8, 0.8, 17))  # 0.45 to 2.2
-_LENS, _SIZE = "lens", "size"
 
 
 class MapCheck:
-    """Which marker is not where the map has it, or whether all are another way round or size.
+    """Residual of each marker in a pose by the others: which is not where the map has it.
 
     In every image the pose is estimated from all markers but one, which is looked for where that
     pose puts it: what a rolling shutter does changes from image to image and spares no marker.
@@ -100,7 +99,6 @@ class MapCheck:
         self._markers, self._fit, self._images = marker_map.markers, fit, 0
         # By marker: px rms of the others, and of all; px and m that it is off.
         self._views: dict[int, list[tuple[float, ...]]] = {}
-        self._votes: dict[str, list[float]] = {}  # scales, by another reading
 
     def add(self, camera: Camera, detections: Detections) -> None:
         """Take in what an image shows."""
@@ -112,11 +110,9 @@ class MapCheck:
             return
         rows = np.array(list(whole.values()))
         points, pixels = detections.points[rows], detections.pixels[rows]  # (m,4,3) and (m,4,2)
-        told = _still_rms(camera, points, pixels)
-        if told > _STILL and self._images <= _ALL_UNTIL:
-            self._read(camera, points, pixels, told)
-        fit = still_fit if told < _STILL else self._fit
-        together = fit(camera, points.reshape(-1, 3), pixels.reshape(-1, 2))
+        every = points.reshape(-1, 3), pixels.reshape(-1, 2)
+        fit = still_fit if still_residual(camera, *every) < _STILL else self._fit
+        together = fit(camera, *every)
         for k, marker in enumerate(whole):
             others = np.delete(points, k, 0).reshape(-1, 3), np.delete(pixels, k, 0).reshape(-1, 2)
             alone = fit(camera, *others)
@@ -125,38 +121,13 @@ class MapCheck:
             off = float(np.linalg.norm((alone(points[k]) - pixels[k]).mean(axis=0)))
             side = np.linalg.norm(pixels[k] - np.roll(pixels[k], 1, axis=0), axis=1).max()
             view = (
-                rms(alone(others[0]) - others[1]),
-                rms(together(points.reshape(-1, 3)) - pixels.reshape(-1, 2)),
+                _rms(alone(others[0]) - others[1]),
+                _rms(together(every[0]) - every[1]),
                 off,
                 off / side * self._markers[marker].size,
             )
             if np.isfinite(view).all():
                 self._views.setdefault(marker, []).append(view)
-
-    def _read(self, camera: Camera, points: Array, pixels: Array, told: float) -> None:
-        """Vote for what leaves much less than what is told."""
-        middles = points.mean(axis=1, keepdims=True)
-
-        def of_size(scale: float) -> float:
-            return _still_rms(camera, middles + scale * (points - middles), pixels)
-
-        def of_lens(scale: float) -> float:
-            matrix = camera.K * [[scale, 1.0, 1.0], [1.0, scale, 1.0], [1.0, 1.0, 1.0]]
-            return _still_rms(replace(camera, K=matrix), points, pixels)
-
-        def of_image(scale: float) -> float:
-            return _still_rms(
-                replace(camera, K=camera.K * [[scale], [scale], [1.0]]), points, pixels
-            )
-
-        found = {
-            text: (_still_rms(camera, np.roll(points, turns, axis=1), pixels), float(turns))
-            for turns, text in enumerate(_TURNED) if turns
-        }  # fmt: skip
-        found[_SIZE], found[_LENS] = _least(of_size), min(_least(of_lens), _least(of_image))
-        best = min(found, key=lambda name: found[name][0])
-        if found[best][0] < _MUCH_BETTER * told:
-            self._votes.setdefault(best, []).append(found[best][1])
 
     def misplaced(self) -> str | None:
         """Which marker is off and by how much; None when none stands out."""
@@ -175,43 +146,3 @@ class MapCheck:
             f"fit to {fit:.2f} px without it, it is off by {off:.1f} px, {100 * metres:.1f} cm or "
             "more"
         )
-
-    def other_reading(self) -> str | None:
-        """What all markers say; None where the map is the best reading."""
-        counted = min(self._images, _ALL_UNTIL)
-        if counted < _LEAST_MARKERS or not self._votes:
-            return None
-        name, scales = max(self._votes.items(), key=lambda item: len(item[1]))
-        if len(scales) < _MOSTLY * counted:
-            return None
-        scale = float(np.median(scales))
-        if name == _LENS:
-            return (
-                f"the focal length that fits is {scale:.2f} of what is told: is K that of a binned "
-                "image, or of another resolution?"
-            )
-        if name == _SIZE:
-            why = "measured with the white rim" if scale < 1.0 else "is it the side of the pattern"
-            return (
-                f"each marker alone says {scale:.2f} of its size in the map: {why}? It is the side "
-                "of the black square"
-            )
-        drawn = any("apriltag" in marker.family.kind for marker in self._markers)
-        why = "OpenCV draws AprilTags so" if drawn and name == _TURNED[2] else "do they hang so?"
-        return f"all {len(self._markers)} markers fit turned by {name}: {why}"
-
-
-def _still_rms(camera: Camera, points: Array, pixels: Array) -> float:
-    """What a still camera leaves (px) of markers (m,4,3) at pixels (m,4,2); inf: no pose."""
-    points, pixels = points.reshape(-1, 3), pixels.reshape(-1, 2)
-    predict = still_fit(camera, points, pixels)
-    left = np.inf if predict is None else rms(predict(points) - pixels)
-    return float(left) if np.isfinite(left) else np.inf
-
-
-def _least(left: Callable[[float], float]) -> tuple[float, float]:
-    """What the best scale leaves, and that scale."""
-    best = int(np.argmin([left(float(scale)) for scale in _SCALES]))
-    around = _SCALES[max(best - 1, 0)], _SCALES[min(best + 1, len(_SCALES) - 1)]
-    fine = minimize_scalar(left, bounds=around, method="bounded", options={"xatol": 1e-3})
-    return float(fine.fun), float(fine.x)

@@ -28,7 +28,7 @@ from rs_localizer.io.recording import (
 )
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.detection import recognized
-from rs_localizer.markers.map_check import MapCheck, Predict, rms, still_fit
+from rs_localizer.markers.map_check import MapCheck, Predict, still_residual
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
@@ -199,9 +199,7 @@ class _MarkerTally:
     def recorded(self) -> Extraction:
         known = [value for value in self._residuals if np.isfinite(value)]
         faults = [] if (fault := self._check.misplaced()) is None else [fault]
-        if (reading := self._check.other_reading()) is not None:
-            faults = [reading]
-        elif known and (least := float(np.percentile(known, _STILL_PERCENT))) > _MOST_STILL:
+        if known and (least := float(np.percentile(known, _STILL_PERCENT))) > _MOST_STILL:
             faults.append(
                 f"even the stillest images leave {least:.1f} px rms: the calibration can hardly be "
                 "of this camera in this mode, or the map (sizes, positions) is wrong"
@@ -299,8 +297,7 @@ def static_residual(camera: Camera, detected: Detected) -> float:
     detections = detected.detections
     if len(detections.ids) < _LEAST_CORNERS:
         return np.nan
-    predict = still_fit(camera, detections.points, detections.pixels)
-    return np.nan if predict is None else rms(predict(detections.points) - detections.pixels)
+    return still_residual(camera, detections.points, detections.pixels)
 
 
 def record_features(

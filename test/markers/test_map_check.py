@@ -92,40 +92,6 @@ def test_a_shaking_rolling_shutter_hides_no_marker():
     assert said(0.0, spin=4.0, fit=_RollingFit(), images=12) is None
 
 
-def read(turns=0, size=1.0, lens=1.0, family_="tag36h11", spin=0.0) -> str | None:
-    """What is said of six markers in a corner that are otherwise than their map has them."""
-    rng, told = np.random.default_rng(4), MarkerMap(wall(family_, (3, 2), 0.07, 0.03))
-    corners = told.points.reshape(-1, 4, 3).copy()
-    corners[..., 2] += 0.5 * np.abs(corners[..., 0])
-    true = np.roll(corners, turns, axis=1)
-    middles = true.mean(axis=1, keepdims=True)
-    true = (middles + size * (true - middles)).reshape(-1, 3)
-    matrix = K * [[lens], [lens], [1.0]]
-    check = MapCheck(told)
-    for _ in range(5):
-        turn = Rotation.from_euler("yxz", rng.uniform(-25.0, 25.0, 3), degrees=True).as_matrix()
-        motion = Motion(
-            turn @ np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]),
-            np.radians(spin) * rng.normal(size=3), np.zeros(3),
-        )  # fmt: skip
-        pixels, _ = project_rolling(CAMERA, motion.at_rows, true)
-        pixels += rng.normal(0.0, 0.1, pixels.shape)
-        found = np.arange(24), corners.reshape(-1, 3), pixels, np.ones(24)
-        check.add(Camera(640, 480, matrix), Detections(*found, (), (), (), ()))
-    return check.other_reading()
-
-
-@pytest.mark.parametrize("spin", [0.0, 2.0])
-def test_all_markers_are_read_otherwise(spin):
-    assert read(2, spin=spin) == "all 6 markers fit turned by half: OpenCV draws AprilTags so"
-    assert "turned by a quarter: do they" in read(1, family_="4x4_50", spin=spin)
-    assert read(size=0.8, spin=spin).startswith(
-        "each marker alone says 0.80 of its size in the map: measured with the white rim?"
-    )
-    assert "focal length that fits is 2.0" in read(lens=0.5, spin=spin)
-    assert read(spin=spin) is None
-
-
 def test_with_two_markers_nobody_knows_which_is_off():
     assert said([0.01, 0.0, 0.0], marker=0, corners=12) is not None
     assert said([0.01, 0.0, 0.0], marker=0, corners=8) is None
