@@ -206,8 +206,6 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
         if args.rate is not None:
             raise UsageError("--rate is for videos and folders; a bag has its own times")
         with open_bag(path) as bag:
-            if bag.fault is not None:
-                print(f"warning: {bag.fault}")
             yield _of_bag(bag, camera, remapped(args), calibrated)
         return
     if args.remaps:

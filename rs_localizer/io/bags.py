@@ -20,8 +20,6 @@ from typing import Any, Self
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
-    MessageDefinition,
-    MessageDefinitionFormat,
     Qos,
     QosDurability,
     QosHistory,
@@ -112,26 +110,8 @@ def _bound_decompression() -> None:
     }
 
 
-def _read_other_definitions() -> None:
-    """Have rosbags take ROS 1's definitions in an MCAP, and pass over those that are not of ROS."""
-    mcap = vars(importlib.import_module("rosbags.rosbag2.storage_mcap"))
-    own = mcap["get_msgdef"]
-
-    def get_msgdef(schema: Any) -> MessageDefinition:
-        if schema is not None and schema.encoding == "ros1msg":
-            return MessageDefinition(MessageDefinitionFormat.MSG, schema.data)
-        try:
-            found: MessageDefinition = own(schema)
-            return found
-        except KeyError:  # of JSON, Protobuf ...
-            return MessageDefinition(MessageDefinitionFormat.NONE, "")
-
-    mcap["get_msgdef"] = get_msgdef
-
-
 with contextlib.suppress(KeyError, AttributeError):  # of versions that are made otherwise
     _bound_decompression()
-    _read_other_definitions()
 
 
 def _zstd() -> Any:
@@ -162,30 +142,13 @@ def make_message(type_name: str, **fields: Any) -> Any:
     return typestore().types[type_name](**fields)
 
 
-_ROS1 = "ros1"
-_ENCODINGS = ("cdr", _ROS1, "")
-
-
-def _encoding(connection: Any) -> str:
-    return str(getattr(connection.ext, "serialization_format", _ROS1))
-
-
 class BagReader:
     """An open recording (see :func:`open_bag`)."""
 
-    def __init__(self, path: Path, reader: AnyReader, fault: str | None = None) -> None:
-        self.path = path
-        self.fault = fault  # what is to be said of the file: that it was cut off
-        self._reader = reader
-        self._connections = [c for c in reader.connections if _encoding(c) in _ENCODINGS]
-        others = {_encoding(c) for c in reader.connections} - set(_ENCODINGS)
-        if others and not self._connections:
-            raise BagError(
-                f"{path} has no messages of ROS: they are {', '.join(sorted(others))}, as of "
-                f"{reader.connections[0].msgtype}; record or convert them as ROS 2 messages (cdr)"
-            )
+    def __init__(self, path: Path, reader: AnyReader) -> None:
+        self.path, self._reader = path, reader
         kinds: dict[str, set[str]] = {}
-        for connection in self._connections:
+        for connection in reader.connections:
             kinds.setdefault(connection.topic, set()).add(normalize_msgtype(connection.msgtype))
         self.topics: dict[str, str] = {
             name: next(iter(types)) if len(types) == 1 else "several types"
@@ -209,20 +172,20 @@ class BagReader:
                 f"{self.path} has no topic {', '.join(missing)}; it has "
                 f"{', '.join(sorted(self.topics))}"
             )
-        wanted = [c for c in self._connections if c.topic in topics]
+        wanted = [c for c in self._reader.connections if c.topic in topics]
         if not wanted:
             return
         with _explained(self.path):
-            self._check_types({c.msgtype for c in wanted if _encoding(c) != _ROS1})
+            if self._reader.is2:
+                self._check_types({c.msgtype for c in wanted})
             for connection, stamp_ns, data in self._reader.messages(connections=wanted):
                 if data[: len(ZSTD)] == ZSTD and self._reader.is2:  # of a file without metadata
                     data = _unpacked(_zstd().ZstdDecompressor(), data)
                 kind = normalize_msgtype(connection.msgtype)
-                if _encoding(connection) == _ROS1:
-                    old = self._reader.typestore.deserialize_ros1(data, kind)
-                    yield connection.topic, stamp_ns, _as_ros2(old, kind)
-                else:
-                    yield connection.topic, stamp_ns, self._reader.deserialize(data, kind)
+                message = self._reader.deserialize(data, kind)
+                if not self._reader.is2:
+                    message = _as_ros2(message, kind)
+                yield connection.topic, stamp_ns, message
 
     def _check_types(self, names: Collection[str]) -> None:
         """Refuse types that a recording describes otherwise than ROS: fields would be missed."""
@@ -245,8 +208,8 @@ def open_bag(path: Path | str) -> Iterator[BagReader]:
     with contextlib.ExitStack() as stack:
         with _explained(path):
             opened = stack.enter_context(storage(path, _listed(path), _unpack_file))
-            reader = stack.enter_context(AnyReader(opened.paths, default_typestore=typestore()))
-            bag = BagReader(path, reader, opened.fault)
+            reader = stack.enter_context(AnyReader(opened, default_typestore=typestore()))
+            bag = BagReader(path, reader)
             if bag.count(bag.topics) == 0:
                 raise BagError(f"{path} is an empty recording: it holds no message")
         yield bag
