@@ -183,7 +183,7 @@ def _calibrated(
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
     print("\n".join(verdict.table(found, args.rate)))
-    image_input.tell_telemetry(args, verdict.readout_time(found), found.fit.camera, lens=False)
+    image_input.tell_telemetry(args, verdict.readout_time(found))
     if intrinsics:
         print("\n".join(verdict.of_lens(found)))
     if source.imu is not None:

@@ -41,8 +41,7 @@ if WORKING:
         with_telemetry,
     )
 
-# Readout times and focal lengths that differ by less are called the same: what a file says counts
-# rows its own way, and is of no single camera.
+# Readout times that differ by less are called the same: what a file says counts rows its own way.
 _SAME = 0.05
 
 
@@ -106,22 +105,19 @@ def _can_read() -> bool:
     return all(importlib.util.find_spec(name) is not None for name in ("telemetry_parser", "av"))
 
 
-def tell_telemetry(
-    args: ImageOptions, used: float | None = None, measured: Camera | None = None, lens: bool = True
-) -> None:
+def tell_telemetry(args: ImageOptions, used: float | None = None) -> None:
     """Say what a video knows of its camera, and what is not used of it.
 
     Args:
         args: of the video.
         used: the readout time that was measured, s; None: that of the settings is used.
-        measured: the camera, if it was measured.
-        lens: whether a lens profile takes the place of a calibration.
     """
-    path, settings = args.recording, None if measured else build(shutter_values(args))
+    path = args.recording
+    settings = None if used is not None else build(shutter_values(args))
     is_rig = settings is not None and bool(settings.of_cameras)
     if path.suffix == ".insv" and importlib.util.find_spec("av") is not None:
         names = LENSES[: count_lenses(path)]
-        if len(names) > 1 and measured is None and not is_rig:
+        if len(names) > 1 and used is None and not is_rig:
             print(f"note: of {', '.join(names)} the first one is used; calibrate --rig takes all")
     if not _has_telemetry(path):
         return
@@ -144,17 +140,6 @@ def tell_telemetry(
         how, ours = ("measured", used) if settings is None else ("given", settings.readout_time)
         if ours is not None and abs(ours / telemetry.readout_time - 1.0) > _SAME:
             said[-1] += f" (not used: {1e3 * ours:.2f} ms was {how})"
-    profile = telemetry.profile
-    if telemetry.lens:
-        said.append(telemetry.lens)
-    if telemetry.lens and profile is not None:
-        said[-1] += ", used" if lens and args.calibration is None else ", not used"
-        focal = measured.K[0, 0] * profile.width / measured.width if measured else profile.K[0, 0]
-        if abs(focal / profile.K[0, 0] - 1.0) > _SAME:
-            said[-1] += (
-                f" (its focal length is {profile.K[0, 0]:.0f} px, {focal:.0f} px was measured: of "
-                "another mode?)"
-            )
     print(f"{telemetry.camera}: {', '.join(said)}")
 
 
@@ -210,11 +195,8 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
         return
     if args.remaps:
         raise UsageError("-r names topics of a bag")
-    lens, telemetry = args.lens, None
-    if lens is None and calibrated:
-        telemetry = telemetry_of(path)
-        if camera is None and telemetry is not None:
-            camera = telemetry.profile
+    lens = args.lens
+    telemetry = telemetry_of(path) if lens is None and calibrated else None
     if camera is None and calibrated:
         file = "FILE of calibrate --rig" if lens is not None else ""
         raise UsageError(f"a video or folder has no camera_info: give --camera {file}".rstrip())

@@ -53,12 +53,11 @@ class _Program(NamedTuple):
     readout_ms: str = ""  # for all rows
 
 
-_GYROFLOW = _Program(
-    ("fisheye_params.camera_matrix",), ("fisheye_params.distortion_coeffs",), ("calib_dimension",),
-    default="opencv_fisheye", readout_ms="frame_readout_time",
-)  # fmt: skip
 _PROGRAMS = (
-    _GYROFLOW,
+    _Program(  # Gyroflow
+        ("fisheye_params.camera_matrix",), ("fisheye_params.distortion_coeffs",),
+        ("calib_dimension",), default="opencv_fisheye", readout_ms="frame_readout_time",
+    ),
     _Program(("cameraIntrinsics",), ("distCoeffs",), model=("lensmodel",)),  # PhotonVision
     _Program(("projection_parameters",), ("distortion_parameters",)),  # VINS, camodocal
     # ORB-SLAM
@@ -249,15 +248,6 @@ def lens_camera(lens: dict[str, Any]) -> Camera:
     if (camera := _of_program(lens, _PROGRAMS[-1])) is None:
         raise KeyError("camera_matrix")
     return camera
-
-
-def gyroflow_camera(tree: dict[str, Any]) -> Camera | None:
-    """The camera of a lens profile of Gyroflow; None: it is none.
-
-    Raises:
-        ValueError, KeyError, TypeError: when something is missing or impossible.
-    """
-    return _of_program(tree, _GYROFLOW)
 
 
 def _numbers(item: Any) -> bool:

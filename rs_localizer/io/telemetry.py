@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gyroscope, accelerometer, readout time and lens inside videos, by telemetry-parser.
+"""Gyroscope, accelerometer and readout time inside videos, by telemetry-parser.
 
 GoPro, DJI, Insta360, Sony, Canon and others write them; the library (extra ``video``) knows their
 formats and turns all to one orientation. Its axes in those of the camera are gyroflow's
@@ -22,8 +22,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
-from rs_localizer.io.camera_files import gyroflow_camera
 from rs_localizer.io.limited import LimitedError, run_limited
 
 # Optical axes (x right, y down, z forward) from telemetry-parser's.
@@ -44,8 +42,6 @@ _KEPT = 0.9  # least share of readings that can be used
 _READOUT_NAMES = ("0x53524f54", "FrameReadoutTime", "frame_readout_time", "rolling_shutter_time")
 _STABILIZED, _STABILIZER = "0x45495345", "0x45495341"  # GoPro: EISE, whether, and EISA, how
 _OFF = ("", "N", "N/A", "OFF")
-_MEI = "insta360"
-_ANGLES = 200  # of a lens, to fit another model to: more change nothing
 
 
 class TelemetryError(ValueError):
@@ -62,8 +58,6 @@ class Telemetry:
     forces: Array  # (n,3) m/s^2, specific force in these axes; NaN where it is not measured
     readout_time: float | None  # s
     stabilizer: str = ""  # what has changed the images; empty: nothing that is known
-    lens: str = ""  # what its profile says
-    profile: Camera | None = None  # its lens, where the maker's profile is of a model of ours
 
     @property
     def rate(self) -> float:
@@ -127,7 +121,7 @@ def interpreted(found: dict[str, Any]) -> Telemetry | None:
     times, rates = _plausible(times, rates)
     if len(times) < 2:
         return None
-    values, profile = said["values"], said["profile"]
+    values = said["values"]
     readout = next((_number(values[name]) for name in _READOUT_NAMES if name in values), np.nan)
     stabilizer = str(values.get(_STABILIZER, "")).strip()
     if values.get(_STABILIZED) == "N" or stabilizer.upper() in _OFF:
@@ -139,8 +133,6 @@ def interpreted(found: dict[str, Any]) -> Telemetry | None:
         _spread(found["accelerometer"][:, 1:], times) @ CAMERA_FROM_SENSOR.T,
         1e-3 * readout if 0.0 < readout < _LONGEST_READOUT else None,
         stabilizer,
-        _lens(profile),
-        _profile(profile),
     )
 
 
@@ -180,57 +172,6 @@ def _number(value: Any) -> float:
         return float(value)
     except (TypeError, ValueError):
         return np.nan
-
-
-def _lens(profile: dict[str, Any]) -> str:
-    """What a lens profile says; each needs a calibration of its own."""
-    fisheye = profile.get("fisheye_params")
-    if not isinstance(fisheye, dict) or "camera_matrix" not in fisheye:
-        return ""
-    model = profile.get("distortion_model") or "opencv_fisheye"
-    fx = _number(next(iter(np.ravel(np.array(fisheye["camera_matrix"], object))), None))
-    return f"lens profile by {profile.get('calibrated_by') or 'its maker'} ({model}, {fx:.0f} px)"
-
-
-def _profile(profile: dict[str, Any]) -> Camera | None:
-    """The camera of a lens profile in gyroflow's format, as far as its model is one of ours."""
-    try:
-        if profile.get("distortion_model") == _MEI:
-            size, lens = profile["calib_dimension"], profile["fisheye_params"]
-            names = ("camera_matrix", "distortion_coeffs")
-            K, D = (np.array(lens[name], float) for name in names)
-            fitted = _equidistant(K, D, 0.5 * min(size["w"], size["h"]))
-            lens = {name: part.tolist() for name, part in zip(names, fitted, strict=True)}
-            profile = profile | {"fisheye_params": lens, "distortion_model": "opencv_fisheye"}
-        return gyroflow_camera(profile)
-    except (KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError):
-        return None
-
-
-def _equidistant(K: Array, D: Array, radius: float) -> tuple[Array, Array]:
-    """The equidistant lens nearest to one of Mei and Rives, over the image circle.
-
-    Mei and Rives, "Single view point omnidirectional camera calibration from planar grids" (ICRA
-    2007): a bearing on the unit sphere, seen from ``xi`` behind its centre, then a polynomial. The
-    two differ by some hundredths of a pixel; what decentres (p1, p2) is left out, a pixel at the
-    rim where they are 1e-4. ``D``: k1, k2, k3, p1, p2, xi; ``radius`` of the circle, px.
-    """
-    k1, k2, k3, _, _, xi = D
-    angles = np.linspace(0.0, np.pi, _ANGLES, endpoint=False)[1:]
-    with np.errstate(all="ignore"):
-        m = np.sin(angles) / (np.cos(angles) + xi)
-        radii = m * (1.0 + k1 * m**2 + k2 * m**4 + k3 * m**6)
-        grows = np.diff(radii, prepend=0.0) > 0.0
-    # As far as radii grow, and the image reaches.
-    inside = np.logical_and.accumulate(grows & (np.cos(angles) > -xi) & (K[0, 0] * radii < radius))
-    angles, radii = angles[inside], radii[inside]
-    powers = angles[:, None] ** np.arange(1, 10, 2)
-    focal, *rest = np.linalg.lstsq(powers, radii, rcond=None)[0]
-    if not focal > 0.0:
-        raise ValueError("the lens has no image")
-    scaled = K.copy()
-    scaled[[0, 1], [0, 1]] *= focal
-    return scaled, np.array(rest) / focal
 
 
 def _spread(forces: Array, times: Array) -> Array:

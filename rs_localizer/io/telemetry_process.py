@@ -13,25 +13,22 @@ from typing import Any
 
 import numpy as np
 
-_TURNS, _LENS = "Quaternion", "Lens"
-
 
 def extract(parser: Any) -> dict[str, Any]:
     """Arrays of a ``telemetry_parser.Parser``: readings, orientations, and what else is said.
 
     Returns:
         ``gyroscope`` and ``accelerometer`` (n,4) ms and three numbers, ``turns`` (k,5) ms and
-        x y z w, and ``said``, JSON of the camera's ``name``, of ``values`` by their names and of
-        the lens ``profile``.
+        x y z w, and ``said``, JSON of the camera's ``name`` and of ``values`` by their names.
     """
     samples, tags = parser.normalized_imu(), parser.telemetry(False)
     groups = [group for group in tags if isinstance(group, dict)]
-    rows = [row for group in groups for row in _data(group, _TURNS, list)]
+    parts = [part for group in groups if isinstance(part := group.get("Quaternion"), dict)]
+    rows = [row for part in parts if isinstance(data := part.get("Data"), list) for row in data]
     turns = [[row["t"], *(row["v"][axis] for axis in "xyzw")] for row in rows]
     said = {
         "name": " ".join(dict.fromkeys(f"{parser.camera} {parser.model or ''}".split())),
         "values": _values(groups),
-        "profile": next((lens for group in groups if (lens := _data(group, _LENS, dict))), {}),
     }
     return {
         "gyroscope": _readings(samples, "gyro"),
@@ -39,12 +36,6 @@ def extract(parser: Any) -> dict[str, Any]:
         "turns": np.array(turns, float).reshape(-1, 5),
         "said": json.dumps(said, default=str),
     }
-
-
-def _data(group: dict[str, Any], name: str, kind: type) -> Any:
-    part = group.get(name)
-    data = part.get("Data") if isinstance(part, dict) else None
-    return data if isinstance(data, kind) else kind()
 
 
 def _readings(samples: list[dict[str, Any]], name: str) -> Any:

@@ -18,13 +18,11 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("telemetry_parser", reason="needs telemetry-parser (rs_localizer[video])")
 
-import telemetry_parser
 from recorded import field, insta360
 
 from rs_localizer.cli import image_input
 from rs_localizer.cli.main import main, parse
 from rs_localizer.cli.map import build_command
-from rs_localizer.core.camera import Camera
 from rs_localizer.io import telemetry as files
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
@@ -95,20 +93,10 @@ def test_a_small_file_gets_little_memory(tmp_path):
         read_telemetry(path)
 
 
-PROFILE = {  # as telemetry-parser makes them of DJI's files; there they name no model
-    "calibrated_by": "DJI",
-    "calib_dimension": {"w": 160, "h": 120},
-    "fisheye_params": {
-        "camera_matrix": [[70.0, 0.0, 80.0], [0.0, 70.0, 60.0], [0.0, 0.0, 1.0]],
-        "distortion_coeffs": [0.1, -0.02, 0.01, 0.001],
-    },
-}
-
-
 def readings(**changes: Any) -> dict[str, Any]:
     """Of a hundred readings, as the process leaves them."""
     gyroscope = np.column_stack([5.0 * np.arange(100), np.full((100, 3), 10.0)])
-    said = {"name": "X", "values": changes.pop("values", {}), "profile": changes.pop("profile", {})}
+    said = {"name": "X", "values": changes.pop("values", {})}
     arrays = {"gyroscope": gyroscope, "accelerometer": np.zeros((0, 4)), "turns": np.zeros((0, 5))}
     return arrays | {"said": json.dumps(said)} | changes
 
@@ -125,19 +113,8 @@ def test_numbers_that_no_gyroscope_gives():
         interpreted(readings(gyroscope=some + 1e5))
 
 
-@pytest.mark.parametrize(
-    "profile",
-    [
-        {"fisheye_params": 3}, {"fisheye_params": {"camera_matrix": "x"}},
-        {"fisheye_params": {"camera_matrix": [[1e400]]}}, {"distortion_model": "insta360"},
-        {"distortion_model": "insta360", "calib_dimension": {"w": 0, "h": 0},
-         "fisheye_params": {"camera_matrix": np.eye(3).tolist(), "distortion_coeffs": [0.0] * 6}},
-        PROFILE | {"calib_dimension": None}, PROFILE | {"distortion_model": 7},
-    ],
-)  # fmt: skip
-def test_profiles_of_other_types(profile):
-    found = interpreted(readings(profile=profile, values={"frame_readout_time": "soon"}))
-    assert (found.profile, found.readout_time) == (None, None)
+def test_a_readout_time_of_another_type():
+    assert interpreted(readings(values={"frame_readout_time": "soon"})).readout_time is None
 
 
 def dji(tags: list[Any], samples: Any = list) -> Telemetry | None:
@@ -146,20 +123,6 @@ def dji(tags: list[Any], samples: Any = list) -> Telemetry | None:
         camera="DJI", model="Action 4", normalized_imu=samples, telemetry=lambda readable: tags
     )
     return interpreted(extract(parser))
-
-
-@pytest.mark.parametrize(("model", "known"), [({}, True), ({"distortion_model": "gopro"}, False)])
-def test_lens_profiles(log, model, known):
-    samples = telemetry_parser.Parser(str(log)).normalized_imu
-    found = dji([{"Lens": {"Data": PROFILE | model}}], samples)
-    name = model.get("distortion_model", "opencv_fisheye")
-    assert found.lens == f"lens profile by DJI ({name}, 70 px)"
-    assert (found.profile is not None) == known
-    if known:
-        points = np.array([[[0.5, -0.3, 1.0], [-2.0, 1.0, 1.5]]])
-        K, D = map(np.array, PROFILE["fisheye_params"].values())
-        pixels, _ = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, D)
-        np.testing.assert_allclose(found.profile.project(points[0]), pixels[0], atol=1e-9)
 
 
 def test_orientations_take_the_place_of_a_gyroscope():
@@ -174,7 +137,7 @@ def test_orientations_take_the_place_of_a_gyroscope():
         {"t": 1e3 * t, "v": dict(zip("xyzw", turn.as_quat(), strict=True))}
         for t, turn in zip(times, turns, strict=True)
     ]
-    lens = {"Data": PROFILE | {"frame_readout_time": 9.0}}
+    lens = {"Data": {"frame_readout_time": 9.0}}
     found = dji(
         [{"Quaternion": {"Data": rows[:20]}, "Lens": lens}, {"Quaternion": {"Data": rows[19:]}}]
     )
@@ -183,24 +146,15 @@ def test_orientations_take_the_place_of_a_gyroscope():
     np.testing.assert_allclose(found.rates[20:], np.tile([0.3, 0.0, 0.0], (19, 1)), atol=1e-9)
     assert np.isnan(found.forces).all()
     assert found.readout_time == pytest.approx(0.009)
-    assert found.profile is not None
-
-
-# As a GO 3 has them: xi, fx, fy, cx, cy, three angles, three of a place, k1, k2, k3, p1, p2, size.
-MEI = {"xi": 2.0, "f": 2870.0, "centre": (1280.0, 1290.0), "k": (0.05, -0.1, 0.1), "size": 2560}
 
 
 def test_a_file_of_insta360(tmp_path):
-    """Its trailer, written by hand as telemetry-parser's source describes it; the lens is that of
-    Mei and Rives, here by its own formula.
-    """
-    size, (cx, cy) = MEI["size"], MEI["centre"]
-    numbers = [1, MEI["xi"], MEI["f"], MEI["f"], cx, cy, 0, 0, 0, 0, 0, 0, *MEI["k"], 0, 0, size,
-               size, 4, 0]  # fmt: skip
+    """Its trailer, written by hand as telemetry-parser's source describes it."""
+    size = 2560
     pair = field(1, size) + field(2, size)
     about = field(2, "Insta360 GO 3") + field(19, pair) + field(24, 1000) + field(25, 18.5)
     about += field(27, pair + field(3, size) + field(4, size))
-    about += field(54, "_".join(map(str, numbers)))
+    about += field(54, "1_2_2870_2870_1280_1290_0_0_0_0_0_0_0.05_-0.1_0.1_0_0_2560_2560_4_0")
     readings = b"".join(
         struct.pack("<Q6d", 1000 + 5 * k, 1.0, 0.0, 0.0, 0.5, 0.0, 0.1) for k in range(400)
     )
@@ -214,19 +168,6 @@ def test_a_file_of_insta360(tmp_path):
     # The library has x up, as in test_readings_are_in_the_axes_of_the_camera.
     np.testing.assert_allclose(found.rates[0], [0.0, -0.5, -0.1], atol=1e-9)
     np.testing.assert_allclose(found.forces[0], [0.0, -9.80665, 0.0], atol=1e-3)
-    assert found.profile.distortion_model == "equidistant"
-    slope, around = np.meshgrid(np.linspace(0.0, 1.4, 30), np.linspace(0.0, 6.0, 7))
-    bearings = np.stack(
-        [np.sin(slope) * np.cos(around), np.sin(slope) * np.sin(around), np.cos(slope)], axis=-1
-    ).reshape(-1, 3)
-    m = bearings[:, :2] / (bearings[:, 2:] + MEI["xi"])
-    square = np.sum(m**2, axis=1, keepdims=True)
-    grown = 1.0 + sum(k * square ** (j + 1) for j, k in enumerate(MEI["k"]))
-    pixels = MEI["f"] * m * grown + [cx, cy]
-    inside = np.linalg.norm(pixels - [cx, cy], axis=1) < size / 2
-    assert inside.sum() > 150
-    seen = found.profile.project(bearings)
-    np.testing.assert_allclose(seen[inside], pixels[inside], atol=0.1)
 
 
 def box(kind: str, *parts: bytes) -> bytes:
@@ -373,44 +314,17 @@ def test_where_the_gyroscope_says_nothing(video, telemetry, capsys, changes, wor
     assert not (out / "parameters.yaml").exists() or "--rate" in words
 
 
-def test_a_lens_profile_takes_the_place_of_a_calibration_and_what_is_given_goes_before(
-    video, telemetry, capsys
-):
-    lens = Camera(160, 120, [[140.0, 0, 80], [0, 140, 60], [0, 0, 1]], np.zeros(4), "equidistant")
-    telemetry(lens="lens profile by DJI (opencv_fisheye, 140 px)", profile=lens)
-    out = video.parent / "seen"
-    words = ["detect", str(video), "--features", "orb", "--out", str(out)]
-    assert main(words) == 0
-    assert "lens profile by DJI (opencv_fisheye, 140 px), used\n" in capsys.readouterr().out
-    with open_bag(out) as bag:
-        info = next(message for _, _, message in bag.messages(["/camera_info"]))
-    assert (info.distortion_model, info.k[0]) == ("equidistant", 140.0)
-    detect(video, "-p", "readout_time:=0.03")
-    said = capsys.readouterr().out
-    assert "140 px), not used\n" in said
-    assert "readout time 20.50 ms (not used: 30.00 ms was given)" in said
+def test_what_is_given_goes_before_what_a_video_says(video, telemetry, capsys):
+    telemetry()
+    out = detect(video, "-p", "readout_time:=0.03")
+    assert "readout time 20.50 ms (not used: 30.00 ms was given)" in capsys.readouterr().out
     assert load_params_file(out / "parameters.yaml")["readout_time"] == 0.03
-    with open_bag(out) as bag:
-        assert next(m for _, _, m in bag.messages(["/camera_info"])).k[0] == 150.0
 
 
 def test_maps_take_the_readout_time_of_a_video(video, telemetry):
     telemetry()
     given = parse("map build", build_command, [str(video), "--out", "map"])[0]
     assert build_command.shutter_of(given)[0] == pytest.approx(0.0205)
-
-
-@pytest.mark.parametrize(("focal", "doubted"), [(280.0, False), (300.0, True)])
-def test_a_focal_length_that_disagrees_is_named(video, telemetry, capsys, focal, doubted):
-    """Of another resolution of the same shape: half of the measured one is to be compared."""
-    lens = Camera(160, 120, [[140.0, 0, 80], [0, 140, 60], [0, 0, 1]], np.zeros(4), "equidistant")
-    telemetry(lens="lens profile", profile=lens)
-    measured = Camera(320, 240, [[focal, 0, 160], [0, focal, 120], [0, 0, 1]])
-    args = SimpleNamespace(recording=video, calibration=None)
-    image_input.tell_telemetry(args, 0.0205, measured, lens=False)
-    said = capsys.readouterr().out
-    assert "lens profile, not used" in said
-    assert ("(its focal length is 140 px, 150 px was measured" in said) == doubted
 
 
 def test_a_slower_accelerometer_is_read_at_the_times_of_the_gyroscope():

@@ -102,7 +102,7 @@ def run(args: Options) -> None:
     if not args.recording.exists():
         raise ValueError(f"{args.recording} does not exist")
     markers = None if args.markers is None else read_checked_map(args.markers)
-    tell_telemetry(args, lens=False)
+    tell_telemetry(args)
     shutter, frame = shutter_of(args), MAP_FRAME if markers is None else markers.map_frame
     with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
