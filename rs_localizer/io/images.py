@@ -71,8 +71,7 @@ _MOST_PIXELS = 150_000_000
 _STILL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 # JPEG's markers of frames, by which the size is given.
 _FRAME_HEADERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
-ALONE = {0x01, *range(0xD0, 0xD8)}
-"""Markers of JPEG that stand alone; all others are followed by their length."""
+_ALONE = {0x01, *range(0xD0, 0xD8)}  # all other markers of JPEG are followed by their length
 # Of pixels with 16 bits: so many tell the range, and these percentiles of them bound it.
 _LOOKED_AT, _RANGE = 100_000, (0.1, 99.9)
 _LEVELS = 64  # of eight bits, that an image needs
@@ -212,7 +211,7 @@ def _claimed_size(data: bytes, name: str) -> tuple[int, int] | None:
             height, width = struct.unpack_from(">HH", data, position + 5)
             return width, height
         # Markers may be filled up with more of 0xFF.
-        position += 1 if marker == 0xFF else 2 if marker in ALONE else 2 + length
+        position += 1 if marker == 0xFF else 2 if marker in _ALONE else 2 + length
     return None
 
 

@@ -4,7 +4,6 @@
 
 import contextlib
 import itertools
-import mmap
 import os
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -15,14 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.io.images import ALONE, decode
-from rs_localizer.io.messages import MessageError
-
 Image = NDArray[np.uint8]
 
 _JPEG_START = b"\xff\xd8"
-_START, _END, _SCAN = 0xD8, 0xD9, 0xDA
-# For videos that are not JPEG already; artefacts stay below the noise of a corner.
+# Artefacts stay below the noise of a corner.
 _QUALITY = 95
 
 
@@ -41,10 +36,9 @@ class VideoImage(NamedTuple):
 class Video:
     """The images of a video, in the order of presentation; to be iterated over once.
 
-    A plain stream of JPEG images (``.mjpeg``) keeps its bytes and has no times. Anything else is
-    read by PyAV, where it is installed, and compressed anew: it has one clock for all streams of
-    a file, decodes what OpenCV may have no decoder for (AV1), and says where it stops. OpenCV
-    counts from the first image on.
+    They are read by PyAV, where it is installed, and compressed anew: it has one clock for all
+    streams of a file, decodes what OpenCV may have no decoder for (AV1), and says where it stops.
+    OpenCV counts from the first image on. A plain stream of JPEG images (``.mjpeg``) has no times.
 
     Args:
         path: of the video.
@@ -65,17 +59,15 @@ class Video:
 
     def __iter__(self) -> Iterator[VideoImage]:
         with self.path.open("rb") as file:
-            is_stream = file.read(2) == _JPEG_START
-        if is_stream and self._lens is None:
-            images = _from_stream(self.path)
-        elif self._lens is not None or find_spec("av") is not None:
+            timed = file.read(len(_JPEG_START)) != _JPEG_START
+        if self._lens is not None or find_spec("av") is not None:
             images = self._by_pyav()
         else:
             images = self._by_opencv()
         for image in images:
             self.read += 1
             self.until = max(self.until, image.seconds or 0.0)
-            yield image
+            yield image if timed else image._replace(seconds=None)
         if not self.read:
             raise VideoError(
                 f"{self.path} holds no image that can be read (pip install av, of the extra video "
@@ -198,13 +190,6 @@ def _lenses(container: Any) -> list[Any]:
     return [stream for stream in streams if (stream.width, stream.height) == size]
 
 
-def _from_stream(path: Path) -> Iterator[VideoImage]:
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        for jpeg in split_jpegs(data):
-            with contextlib.suppress(MessageError):
-                yield VideoImage(jpeg, decode(jpeg, "jpeg"), None)
-
-
 def has_times(path: Path | str) -> bool:
     """True for a video with presentation times; a single image needs none.
 
@@ -219,50 +204,3 @@ def _compressed(color: Any, seconds: float | None) -> VideoImage:
     _, jpeg = cv2.imencode(".jpg", color, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     grey = color if color.ndim == 2 else cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)
     return VideoImage(jpeg.tobytes(), np.asarray(grey, np.uint8), seconds)
-
-
-def split_jpegs(data: bytes | mmap.mmap) -> Iterator[bytes]:
-    """The whole images of a stream of JPEGs; one that breaks off is left out.
-
-    Segments are walked by their lengths: an embedded thumbnail has a start and an end of its own.
-    """
-    start = data.find(_JPEG_START)
-    while start >= 0:
-        is_whole, end = _walk_jpeg(data, start)
-        if is_whole:
-            yield data[start:end]
-        start = data.find(_JPEG_START, max(start + 2, end))
-
-
-def _walk_jpeg(data: bytes | mmap.mmap, start: int) -> tuple[bool, int]:
-    """Whether the image that starts here has an end, and where that is, or where it breaks off."""
-    at = start + 2
-    while at + 1 < len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker == _END:
-            return True, at + 2
-        if marker == _START:  # the next one
-            break
-        if marker == 0xFF:  # padding
-            at += 1
-        elif marker in ALONE:
-            at += 2
-        elif at + 4 > len(data):
-            break
-        else:
-            end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-            if end > len(data):
-                break
-            at = _scan_end(data, end) if marker == _SCAN else end
-    return False, at
-
-
-def _scan_end(data: bytes | mmap.mmap, at: int) -> int:
-    """The next marker after compressed data, in which 0xFF is followed by 0 or a restart."""
-    while True:
-        at = data.find(b"\xff", at)
-        if at < 0 or at + 1 >= len(data):
-            return len(data)
-        if data[at + 1] != 0 and not 0xD0 <= data[at + 1] < 0xD8:
-            return at
-        at += 2

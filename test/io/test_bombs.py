@@ -21,7 +21,7 @@ from rs_localizer.io.camera_files import CalibrationError, read_calibration
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum
-from rs_localizer.io.video import Video, VideoError, split_jpegs
+from rs_localizer.io.video import Video, VideoError
 
 COLMAP = Path(__file__).parent / "maps" / "colmap"
 IMU = "sensor_msgs/msg/Imu"
@@ -35,17 +35,11 @@ def in_time() -> Iterator[None]:
     assert time.process_time() - started < 20.0
 
 
-def test_a_stream_of_starts_is_walked_once():
-    scan = b"\xff\xd8\xff\xda\x00\x02" + bytes(10)
-    assert list(split_jpegs(scan * 40_000)) == []
-    assert list(split_jpegs(b"\xff\xd8\xff\xe1\xff\xff" * 100_000)) == []
-
-
 def test_a_stream_of_images_that_claim_too_much(tmp_path):
     size = b"\x00\x11\x08" + struct.pack(">HH", 65000, 65000) + b"\x03" + bytes(9)
     image = b"\xff\xd8\xff\xc0" + size + b"\xff\xda\x00\x02" + bytes(20) + b"\xff\xd9"
     (tmp_path / "a.mjpeg").write_bytes(image * 3)
-    with pytest.raises(VideoError, match="holds no image"):
+    with pytest.raises(VideoError, match=r"no (image|stream of images) that can be"):
         list(Video(tmp_path / "a.mjpeg"))
 
 
