@@ -80,7 +80,6 @@ class ImuState:
     frames: int  # since its first reading
     used: int  # of them
     share: float  # of the last of them
-    unused: Unused | None  # of the last frame; None: it was used
     mostly: Unused | None  # most frequent of the last frames; None: it was used in all
     reasons: dict[str, int]  # of the others, how many for which
     rate: float  # Hz; NaN: unknown
@@ -107,7 +106,6 @@ class ImuInput:
         self._with_force = 0  # how many
         self._gravity: float | None = None
         self._frames = self._used = 0
-        self._unused: Unused | None = None
         self._reasons: Counter[str] = Counter()
         self._in_a_row: deque[ImuReason] = deque(maxlen=_LONG)
         self._reported: ImuReason | None = None
@@ -139,7 +137,6 @@ class ImuInput:
             self._frames,
             self._used,
             recently.count(None) / len(recently),
-            self._unused,
             next((u for u in reversed(recently) if u is not None and u.reason == usual), None),
             dict(self._reasons),
             self._buffer.rate(),
@@ -280,7 +277,6 @@ class ImuInput:
         self._frames += 1
         self._used += unused is None
         self._recently.append(unused)
-        self._unused = unused
         self._status = None if tracker is None else tracker.inertial
         self._given_offset = config.imu.time_offset
         if unused is None:

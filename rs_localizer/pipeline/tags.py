@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.detections import TagDetections, read_detections
 from rs_localizer.markers.boards import flat_misfit
-from rs_localizer.markers.detection import Detections
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse
@@ -118,24 +117,19 @@ class Tags:
         np.fill_diagonal(apart, np.inf)
         return np.array(np.unravel_index(np.argmin(apart), apart.shape))
 
-    def _detections(self, detections: TagDetections, corners: Array) -> Detections:
-        rows = (detections.ids[:, None] + np.arange(4)).ravel()
-        return Detections(
-            rows, self._points[rows], corners.reshape(-1, 2), np.ones(len(rows)), (), (), (), ()
-        )
-
     def _correspondences(self, detections: TagDetections) -> Correspondences:
         sides = np.linalg.norm(np.roll(detections.corners, -1, axis=1) - detections.corners, axis=2)
         scores = np.repeat(sides.min(axis=1), 4)
-        found = self._detections(detections, detections.corners)
+        ids = (detections.ids[:, None] + np.arange(4)).ravel()
+        points, pixels = self._points[ids], detections.corners.reshape(-1, 2)
         names = [(name, "<f8") for name in "xyz"]
         fields = [*names, ("u", "<f4"), ("v", "<f4"), ("score", "<f4"), ("id", "<u4")]
         table = np.empty(len(scores), fields)
-        columns = [*found.points.T, *found.pixels.T, scores, found.ids]
+        columns = [*points.T, *pixels.T, scores, ids]
         for (name, _), column in zip(fields, columns, strict=True):
             table[name] = column
         return Correspondences(
-            detections.stamp_ns, self._map.map_frame, found.points, found.pixels, scores, 0, table
+            detections.stamp_ns, self._map.map_frame, points, pixels, scores, 0, table
         )
 
 

@@ -161,7 +161,6 @@ def test_it_makes_poses_better(flight):
     both, alone = fly(flight), fly(flight, lambda message, time: ())
     both.assert_none_is_lost_or_wrong(count(flight))
     assert both.state.share == 1.0
-    assert both.state.unused is None
     assert both.state.rate == pytest.approx(400.0)
     assert alone.state is None  # whoever has no IMU hears nothing of it
     assert np.median(both.errors()[0]) < 0.75 * np.median(alone.errors()[0])
@@ -198,7 +197,6 @@ def test_the_camera_goes_on_alone(flight, fault):
     assert flown.state.reasons[reason] > 0
     lasts = fault not in ("is cut", "begins late")
     assert flown.notices[reason] == lasts  # told once, not at every frame
-    assert (flown.state.unused is not None) == lasts
 
 
 def test_a_wrong_mounting_is_noticed_and_told_with_its_angle(flight):
@@ -209,8 +207,8 @@ def test_a_wrong_mounting_is_noticed_and_told_with_its_angle(flight):
     rotation.x, rotation.y, rotation.z, rotation.w = wrong.as_quat().tolist()
     flown = fly(flight, mounting=upside_down)
     flown.assert_none_is_lost_or_wrong(count(flight))
-    assert flown.state.unused.reason == ImuReason.TURNED
-    angle = re.search(r"by (\d+) degrees", str(flown.state.unused))
+    assert flown.state.mostly.reason == ImuReason.TURNED
+    angle = re.search(r"by (\d+) degrees", str(flown.state.mostly))
     assert 175 <= int(angle[1]) <= 180
 
 
@@ -228,7 +226,7 @@ def test_without_a_readout_time_or_for_a_global_shutter_it_is_not_used_and_that_
         (NodeConfig(readout_time=READOUT_TIME, solver="p3p"), ImuReason.NOT_TRACKING),
     ):
         flown = fly(flight, config=config, most=8)
-        assert flown.state.unused.reason == reason
+        assert flown.state.mostly.reason == reason
         assert flown.notices[reason] == 1
 
 

@@ -15,7 +15,6 @@ from typing import Any, ClassVar, Generic, TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
 from sensor_msgs.msg import CompressedImage, PointCloud2
@@ -27,7 +26,7 @@ from rs_localizer.io import topics
 from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make, make_header
 from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
-from rs_localizer.ros.node.conversion import create_output, make_message
+from rs_localizer.ros.node.conversion import create_output, make_message, steady_timer
 from rs_localizer.ros.node.health import (
     Health,
     Level,
@@ -149,9 +148,7 @@ class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
 
     def begin(self, config: Settings) -> None:
         assert self._outputs is not None
-        self._timer = self.create_timer(
-            _LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        self._timer = steady_timer(self, _LOOK_PERIOD, self._look)
         self.get_logger().info(
             f"active with {self._description}; subscribed to images while somebody subscribes to "
             f"{' or '.join(self._outputs.topics)}"

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Collection
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.serialization import deserialize_message
 from rclpy.timer import Timer
@@ -40,7 +39,13 @@ from rs_localizer.ros.localizer.health import (
     tell,
 )
 from rs_localizer.ros.localizer.transforms import Broadcaster
-from rs_localizer.ros.node.conversion import create_output, installed, make_message, message_class
+from rs_localizer.ros.node.conversion import (
+    create_output,
+    installed,
+    make_message,
+    message_class,
+    steady_timer,
+)
 from rs_localizer.ros.node.health import Health
 from rs_localizer.ros.node.inputs import FAST_DATA, LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.managed import ManagedNode
@@ -373,8 +378,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized]):
             self.destroy_timer(self._ticks)
             self._ticks = None
         if rate > 0.0:
-            clock = Clock(clock_type=ClockType.STEADY_TIME)
-            self._ticks = self.create_timer(1.0 / rate, self._tick, clock=clock)
+            self._ticks = steady_timer(self, 1.0 / rate, self._tick)
 
     def _tick(self) -> None:
         if self.worker is not None:

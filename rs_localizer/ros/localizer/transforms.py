@@ -17,7 +17,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.subscription import Subscription
@@ -36,7 +36,7 @@ from rs_localizer.io.transforms import (
 )
 from rs_localizer.pipeline.map_to_odom import Holding, MapToOdom
 from rs_localizer.pipeline.published import Broadcast, broadcast, check_time
-from rs_localizer.ros.node.conversion import make_message
+from rs_localizer.ros.node.conversion import make_message, steady_timer
 from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import WINDOW
@@ -276,8 +276,7 @@ class Broadcaster:
         self._stop_timer()
         self._config = config
         if config.publish_tf == PublishTf.MAP_TO_ODOM and config.tf_rate > 0.0:
-            clock = Clock(clock_type=ClockType.STEADY_TIME)
-            self._timer = self._node.create_timer(1.0 / config.tf_rate, self._tick, clock=clock)
+            self._timer = steady_timer(self._node, 1.0 / config.tf_rate, self._tick)
 
     def _stop_timer(self) -> None:
         if self._timer is not None:

@@ -1,16 +1,20 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""rclpy messages, made by type name or copied from those of a recording, and their publishers."""
+"""rclpy messages, made by type name or copied from a recording's, their publishers, timers."""
 
 import array
 import importlib
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
 import numpy as np
+from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.timer import Timer
 
 
 @cache
@@ -73,6 +77,11 @@ def create_output(node: LifecycleNode, kind: type, topic: str) -> Any:
         QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE),
         qos_overriding_options=QoSOverridingOptions.with_default_policies(),
     )
+
+
+def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
+    """A timer (s) that goes on whatever ROS time does."""
+    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def _full_name(kind: str) -> str:

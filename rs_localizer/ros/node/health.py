@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from rs_localizer.io.topics import DIAGNOSTICS
+from rs_localizer.ros.node.conversion import steady_timer
 from rs_localizer.ros.node.statistics import WINDOW, Event, Summary
 
 SOME = 0.05
@@ -155,9 +155,7 @@ class Diagnostics:
         # As diagnostic_updater in C++: with the namespace and without the first slash.
         self._name = f"{node.get_fully_qualified_name().lstrip('/')}: {task}"
         self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, 1)
-        self._timer = node.create_timer(
-            _PERIOD, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        self._timer = steady_timer(node, _PERIOD, self._tick)
 
     def publish(self) -> Health:
         """Publish the health now."""

@@ -11,7 +11,6 @@ from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import CallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -28,7 +27,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from rs_localizer.core.reasons import Notice
-from rs_localizer.ros.node.conversion import type_name
+from rs_localizer.ros.node.conversion import steady_timer, type_name
 from rs_localizer.ros.node.refusals import Refusals, describe
 
 # A context that is shut down by others wakes nobody: it is looked at this often, in ns.
@@ -233,9 +232,7 @@ class Inputs:
             self._destroy()
             raise
         self._intake = self._take_all()
-        self._timer = node.create_timer(
-            _LOOK_PERIOD, self._follow_publishers, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        self._timer = steady_timer(node, _LOOK_PERIOD, self._follow_publishers)
 
     @property
     def topics(self) -> list[str]:
