@@ -21,12 +21,15 @@ import numba
 import numpy as np
 from numba.core.registry import cpu_target
 
+from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd import compiler
 from rs_localizer.core.simd.jit import NotCompiled, at_once, cache_directory, digest, make_folder
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 from rs_localizer.tracking import Tracker
 
 _LAST = "markers"  # last folder with kernels of frames
@@ -45,7 +48,7 @@ _MADV_DONTNEED = 4  # Linux, <bits/mman-linux.h>
 def plain_frames(
     localizer: Localizer, inertial: InertialSettings | None = None, patient: bool = True
 ) -> None:
-    """Call what frames of a moving camera before a scene that is no plane need.
+    """Call what frames of a moving camera before a scene that is no plane need, up to messages.
 
     Args:
         localizer: of the settings; its camera may be another.
@@ -62,7 +65,7 @@ def plain_frames(
     try:
         tracker = Tracker(Localizer(_timed(camera), localizer.config), inertial)
     except ValueError:  # a global shutter
-        Localizer(camera, localizer.config).localize(points, pixels, scores)
+        _publish(Localizer(camera, localizer.config).localize(points, pixels, scores))
         return
     # Rolls by a frame's period, and by its rows.
     centre, row_times = 0.5 * np.array(camera.size), camera.row_time(pixels) * _READOUT_TIME
@@ -77,9 +80,16 @@ def plain_frames(
         samples = None if inertial is None else ImuSamples(times, rates)
         with contextlib.nullcontext() if patient or k == 0 else at_once():
             try:
-                tracker.localize(time_ns, points, each, scores, imu=samples)
+                _publish(tracker.localize(time_ns, points, each, scores, imu=samples))
             except NotCompiled:
                 return
+
+
+def _publish(result: Estimate | Failure) -> None:
+    """Call what messages of a frame need."""
+    if result:
+        so3.quaternion(pose_at(result, 0.5).rotation.copy())
+        twist_at(result, 0.5, 1.0)
 
 
 def _timed(camera: Camera) -> Camera:

@@ -15,7 +15,6 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_localizer import matching
 from rs_localizer.config import CameraSettings, Imu, ImuUse, MatchBy, NodeConfig, PoseTime
@@ -23,7 +22,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice, Reason
-from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
+from rs_localizer.core.rig import Rig, RigEstimate
 from rs_localizer.core.simd.jit import NotCompiled
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
@@ -36,20 +35,27 @@ from rs_localizer.io.clouds import (
     thinned,
 )
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.io.outputs import CameraShare, Localized
+from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, MAP_POINTS
 from rs_localizer.io.transforms import Transform, TransformError, Transforms, TransformTree
 from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline.cloud_checks import oddities
 from rs_localizer.pipeline.compiling import note_whole, plain_frames
 from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
 from rs_localizer.pipeline.imu import ImuInput, inertial_settings
 from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.pipeline.landmarks import Landmarks, read_landmarks
-from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, published_moment, twist_at
+from rs_localizer.pipeline.pose_at_time import middle_row_ns, published_moment
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch, Watched
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
-from rs_localizer.pipeline.rig_frames import FrameAssembler, Image
+from rs_localizer.pipeline.rig_frames import (
+    FrameAssembler,
+    Image,
+    joined,
+    matches_of,
+    share_of,
+)
 from rs_localizer.pipeline.rig_watch import RigWatch
 from rs_localizer.pipeline.stream import Stream
 from rs_localizer.solvers.table import find_solver
@@ -61,71 +67,12 @@ if TYPE_CHECKING:
 
 # From this chance on of a wrong pose or map, it is more probable than not.
 _DOUBTFUL = 0.5
-# Coordinates in single precision shall tell millimetres, in m: they do as far as 8 km.
-_FINE = 0.00097
-# Trackers of features may find a point somewhat outside, in px.
-_SLACK = 1.0
-
-
-def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[Notice, str]:
-    """What is odd, a sentence each.
-
-    Args:
-        cloud: of one image.
-        camera: that ``camera_info`` describes.
-        camera_frame: its optical frame.
-    """
-    notices: dict[Notice, str] = {}
-    if cloud.frame == camera_frame:
-        notices[Notice.MAP_IS_CAMERA] = (
-            f"the points are given in {cloud.frame!r}, which is the camera's own frame: "
-            "header.frame_id of the cloud (or map) must name the frame of x, y, z"
-        )
-    if len(cloud.points) > 0 and cloud.table.dtype["x"].itemsize <= 4:
-        largest = np.abs(cloud.points).max()
-        step = float(np.spacing(np.float32(largest)))
-        if step >= _FINE:
-            notices[Notice.COARSE_COORDINATES] = (
-                f"coordinates of {largest:.0f} m in FLOAT32 are known to {1e3 * step:.0f} mm "
-                "only: send them as FLOAT64, or from an origin nearby"
-            )
-    width, height = camera.size
-    limit = np.array(camera.size) - 0.5 + _SLACK
-    outside = np.any((cloud.pixels < -0.5 - _SLACK) | (cloud.pixels > limit), axis=1)
-    if np.any(outside):
-        u, v = cloud.pixels[outside][0]
-        notices[Notice.PIXELS_OUTSIDE] = (
-            f"{outside.sum()} of {len(outside)} pixels lie outside the {width} x {height} of "
-            f"camera_info, as ({u:.0f}, {v:.0f}): are both of the same camera and resolution?"
-        )
-    return notices
-
-
-def lens_is_off(pixels: float) -> str:
-    """What to say of a lens or a map that is off by so much, root mean square."""
-    return (
-        f"residuals vary smoothly over the image ({pixels:.1f} px rms): recalibrate the lens, or "
-        "survey the map again; until then poses allow for it"
-    )
-
 
 ANY_CALIBRATION = Calibration(
     "camera", 640, 480, (500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0), (), "plumb_bob",
     (1, 1), None,
 )  # fmt: skip
 """Stands in until the first camera_info: kernels are compiled and settings checked before it."""
-# Something to publish before there is anything.
-_STILL = Estimate(
-    rotation=np.eye(3),
-    translation=np.zeros(3),
-    angular_velocity=np.zeros(3),
-    linear_velocity=np.zeros(3),
-    inliers=np.zeros(0, dtype=np.bool_),
-    residuals=np.zeros(0),
-    joint_covariance=np.zeros((18, 18)),
-    global_shutter_inliers=0,
-    iterations=0,
-)
 
 
 # Settings that change what is made of an estimate, or which points come to it, and not how it is
@@ -332,8 +279,6 @@ class FrameLocalizer:
 
         ``patient``: what joins frames, too; else it is loaded if it is there, and ordered if not.
         """
-        so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
-        twist_at(_STILL, 0.5, 1.0)
         if not self._alone:
             matching.warm_up()
         plain_frames(self._tracker.localizer, patient=patient)
@@ -453,9 +398,7 @@ class FrameLocalizer:
         """What is published of a frame that has waited."""
         if not found:
             return Refusal(found.reason, found.detail)
-        cloud, deviation = self._waiting[found.time_ns]
-        published = self._published(cloud, found, deviation)
-        return self.mounted(published) if published else published
+        return self._published(*self._waiting[found.time_ns], found)
 
     def localize_keypoints(self, message: Any) -> Localized | Refusal:
         """Localize one sensor_msgs/PointCloud2 of keypoints; never raises for bad ones.
@@ -570,17 +513,17 @@ class FrameLocalizer:
         if result and not self.readout_watch.wrong_axis:
             self._stream.pace(time_ns, result, config)
             self._pose_prior.judge(result)
+            if self.predicts:
+                without = replace(cloud, table=cloud.table[:0], dropped=0)
+                self._newest = without, context.readout_time_deviation
         if self._tracker.output_lag > 0:
             self._waiting[time_ns] = cloud, context.readout_time_deviation
             while len(self._waiting) > self._tracker.output_lag + 1:
                 del self._waiting[next(iter(self._waiting))]
-        published = self._published(cloud, result, context.readout_time_deviation)
-        if published and self.predicts:
-            rows = cloud.table[:0]
-            self._newest = replace(cloud, table=rows, dropped=0), context.readout_time_deviation
+        published = self._published(cloud, context.readout_time_deviation, result)
         if adopted is not config:  # from the next frame on
             self._use(adopted)
-        return self.mounted(published) if published else published
+        return published
 
     @property
     def _context(self) -> FrameContext:
@@ -613,12 +556,12 @@ class FrameLocalizer:
         cloud = replace(cloud, stamp_ns=stamp_ns)
         if self.readout_watch.wrong_axis:
             return None
-        return self.mounted(self._made(cloud, found, deviation, (stamp_ns, 0.0)))
+        return self.mounted(self._made(cloud, found, (stamp_ns, 0.0), deviation))
 
     def _published(
-        self, cloud: Correspondences, result: Estimate | Failure, deviation: float
+        self, cloud: Correspondences, deviation: float, result: Estimate | Failure
     ) -> Localized | Refusal:
-        """A result at the published moment, unless the watch over the shutter denies it.
+        """A result of the body at the published moment; a refusal where the shutter is another.
 
         ``deviation``: s, of the readout time.
         """
@@ -633,27 +576,30 @@ class FrameLocalizer:
         if result.left_out:
             self._notice(Notice.DOUBTFUL, result.left_out)
         if (off := self._tracker.smooth_error) > 0.0 and not watch.axis.doubtful:
-            self._notice(Notice.LENS, lens_is_off(off))
-        return self._made(cloud, result, deviation)
+            self._notice(
+                Notice.LENS,
+                f"residuals vary smoothly over the image ({off:.1f} px rms): recalibrate the lens, "
+                "or survey the map again; until then poses allow for it",
+            )
+        moment = published_moment(self._config, self._camera, cloud.stamp_ns)
+        return self.mounted(self._made(cloud, result, moment, deviation))
 
     def _made(
         self,
         cloud: Correspondences,
         estimate: Estimate,
-        deviation: float,
-        moment: tuple[int, float] | None = None,
+        moment: tuple[int, float],
+        deviation: float = 0.0,
     ) -> Localized:
-        """What is published of an estimate; ``moment``: as of :func:`.of_camera`."""
-        watch = self.readout_watch
+        """Pose and twist of an estimate at a moment, as of :func:`.of_camera`."""
+        watch, first = self.readout_watch, next(iter(self._cameras.values()))
         readout = ReadoutKnown(
             deviation,
-            self._camera.first_row_time,
+            first.first_row_time,
             watch.may_be_reversed,
             watch.surely_global,
             watch.axis.other,
         )
-        if moment is None:
-            moment = published_moment(self._config, self._camera, cloud.stamp_ns)
         return of_camera(cloud, estimate, self._config, self.camera_frame, moment, readout)
 
     def _checked(self, cloud: Correspondences, name: str = "") -> Correspondences:
@@ -690,7 +636,7 @@ class FrameLocalizer:
         # Seconds since the first image: nothing is lost of stamps since 1970.
         origin_ns = images[0].start_ns
         starts = {image.camera: 1e-9 * (image.start_ns - origin_ns) for image in images}
-        matches = {image.camera: _matches(image.cloud, images) for image in images}
+        matches = {image.camera: matches_of(image.cloud, images) for image in images}
         context = FrameContext(error_modes=self._landmarks.error_modes)
         result = self._tracker.localize(origin_ns, matches, stamps=starts, context=context)
         self.rig_watch.judge(bool(result))
@@ -728,10 +674,8 @@ class FrameLocalizer:
         time_ns = origin_ns + round(1e9 * result.time)
         stamp_ns = time_ns if config.pose_time == PoseTime.MID_FRAME else first.stamp_ns
         moment = stamp_ns, (stamp_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
-        dropped = sum(image.cloud.dropped for image in images)
-        cloud = replace(first, table=_table(config.cameras, images), dropped=dropped)
-        made = of_camera(cloud, result, config, self.camera_frame, moment, ReadoutKnown())
-        return replace(made, cameras=tuple(_share(image, result) for image in images))
+        made = self._made(joined(config.cameras, images), result, moment)
+        return replace(made, cameras=tuple(share_of(image, result) for image in images))
 
     def mounted(self, localized: Localized) -> Localized | Refusal:
         """The result of ``base_frame``, from that of the camera."""
@@ -742,39 +686,3 @@ def _shutters(config: NodeConfig) -> Mapping[str, CameraSettings]:
     """Readout time, direction and stamp offset of each camera."""
     own = CameraSettings(config.readout_time, config.scan_direction, config.stamp_offset)
     return config.of_cameras or {"": own}
-
-
-def _matches(cloud: Correspondences, images: Sequence[Image]) -> tuple[Array, ...]:
-    """Points and pixels of an image; with scores, where all images have them."""
-    if any(image.cloud.scores is None for image in images):
-        return cloud.points, cloud.pixels
-    assert cloud.scores is not None
-    return cloud.points, cloud.pixels, cloud.scores
-
-
-def _table(names: Sequence[str], images: Sequence[Image]) -> NDArray[Any]:
-    """The rows of all images, of the fields that all have, and which of the cameras it was."""
-    types = [image.cloud.table.dtype for image in images]
-    fields = [name for name in types[0].names or () if all(name in (t.names or ()) for t in types)]
-    kinds: list[tuple[str, Any]] = [
-        (name, np.result_type(*(t[name].newbyteorder("<") for t in types))) for name in fields
-    ]
-    rows = np.empty(sum(len(image.cloud.table) for image in images), [*kinds, ("camera", "u1")])
-    first = 0
-    for image in images:
-        last = first + len(image.cloud.table)
-        for name in fields:
-            rows[name][first:last] = image.cloud.table[name]
-        rows["camera"][first:last] = names.index(image.camera)
-        first = last
-    return rows
-
-
-def _share(image: Image, result: RigEstimate) -> CameraShare:
-    name = image.camera
-    assert isinstance(result.inliers, ByCamera)  # as all of a rig
-    assert isinstance(result.residuals, ByCamera)
-    inliers = result.inliers[name]
-    kept = np.asarray(result.residuals[name][inliers])
-    rms = float(np.sqrt(kept @ kept / max(len(kept), 1)))
-    return CameraShare(name, len(inliers), len(kept), rms, image.start_ns)

@@ -12,10 +12,17 @@ ahead of the others, or has gone back alone. When all clocks go back, a recordin
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Notice
+from rs_localizer.core.rig import ByCamera, RigEstimate
 from rs_localizer.io.clouds import Correspondences
+from rs_localizer.io.outputs import CameraShare
 from rs_localizer.pipeline.refusal import Notify
 
 # Frames in a row without a camera after which it is not awaited: it may have lost one or two.
@@ -130,3 +137,46 @@ class FrameAssembler:
 
     def _leave_out(self, name: str, why: str) -> None:
         self._notice(Notice.NO_IMAGES, f"{name} is left out: {why}")
+
+
+def matches_of(cloud: Correspondences, images: Sequence[Image]) -> tuple[Array, ...]:
+    """Points and pixels of an image; with scores, where all images have them."""
+    if any(image.cloud.scores is None for image in images):
+        return cloud.points, cloud.pixels
+    assert cloud.scores is not None
+    return cloud.points, cloud.pixels, cloud.scores
+
+
+def joined(names: Sequence[str], images: Sequence[Image]) -> Correspondences:
+    """Correspondences of all images with the stamp of the first; ``names``: of all cameras."""
+    dropped = sum(image.cloud.dropped for image in images)
+    return replace(images[0].cloud, table=_table(names, images), dropped=dropped)
+
+
+def _table(names: Sequence[str], images: Sequence[Image]) -> NDArray[Any]:
+    """The rows of all images, of the fields that all have, and which of the cameras it was."""
+    types = [image.cloud.table.dtype for image in images]
+    fields = [name for name in types[0].names or () if all(name in (t.names or ()) for t in types)]
+    kinds: list[tuple[str, Any]] = [
+        (name, np.result_type(*(t[name].newbyteorder("<") for t in types))) for name in fields
+    ]
+    rows = np.empty(sum(len(image.cloud.table) for image in images), [*kinds, ("camera", "u1")])
+    first = 0
+    for image in images:
+        last = first + len(image.cloud.table)
+        for name in fields:
+            rows[name][first:last] = image.cloud.table[name]
+        rows["camera"][first:last] = names.index(image.camera)
+        first = last
+    return rows
+
+
+def share_of(image: Image, result: RigEstimate) -> CameraShare:
+    """Contribution of one camera to an estimate."""
+    name = image.camera
+    assert isinstance(result.inliers, ByCamera)  # as all of a rig
+    assert isinstance(result.residuals, ByCamera)
+    inliers = result.inliers[name]
+    kept = np.asarray(result.residuals[name][inliers])
+    rms = float(np.sqrt(kept @ kept / max(len(kept), 1)))
+    return CameraShare(name, len(inliers), len(kept), rms, image.start_ns)

@@ -7,7 +7,7 @@ import pytest
 
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.io.clouds import Correspondences
-from rs_localizer.pipeline.frames import oddities
+from rs_localizer.pipeline.cloud_checks import oddities
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, K)

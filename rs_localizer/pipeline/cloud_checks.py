@@ -1,0 +1,48 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Oddities of correspondences that a reader of clouds cannot see, and that refuse no frame."""
+
+import numpy as np
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Notice
+from rs_localizer.io.clouds import Correspondences
+
+# Coordinates in single precision shall tell millimetres, in m: they do as far as 8 km.
+_FINE = 0.00097
+# Trackers of features may find a point somewhat outside, in px.
+_SLACK = 1.0
+
+
+def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[Notice, str]:
+    """Sentences that say what is odd.
+
+    Args:
+        cloud: of one image.
+        camera: that ``camera_info`` describes.
+        camera_frame: its optical frame.
+    """
+    notices: dict[Notice, str] = {}
+    if cloud.frame == camera_frame:
+        notices[Notice.MAP_IS_CAMERA] = (
+            f"the points are given in {cloud.frame!r}, which is the camera's own frame: "
+            "header.frame_id of the cloud (or map) must name the frame of x, y, z"
+        )
+    if len(cloud.points) > 0 and cloud.table.dtype["x"].itemsize <= 4:
+        largest = np.abs(cloud.points).max()
+        step = float(np.spacing(np.float32(largest)))
+        if step >= _FINE:
+            notices[Notice.COARSE_COORDINATES] = (
+                f"coordinates of {largest:.0f} m in FLOAT32 are known to {1e3 * step:.0f} mm "
+                "only: send them as FLOAT64, or from an origin nearby"
+            )
+    width, height = camera.size
+    limit = np.array(camera.size) - 0.5 + _SLACK
+    outside = np.any((cloud.pixels < -0.5 - _SLACK) | (cloud.pixels > limit), axis=1)
+    if np.any(outside):
+        u, v = cloud.pixels[outside][0]
+        notices[Notice.PIXELS_OUTSIDE] = (
+            f"{outside.sum()} of {len(outside)} pixels lie outside the {width} x {height} of "
+            f"camera_info, as ({u:.0f}, {v:.0f}): are both of the same camera and resolution?"
+        )
+    return notices
