@@ -1,3 +1,3 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a message to what is published of it: what the live nodes and the offline commands share."""
+"""The way from a message to what is published, shared by live nodes and offline commands."""

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is compiled when: what a plain frame needs before it, the rest beside the frames.
+"""Order of compiling: what a plain frame needs before it, the rest beside the frames.
 
 Whoever calls a kernel that is not in the cache waits for the process that compiles it
 (:mod:`rs_localizer.core.simd`); a node's frames do not wait but are refused. So this asks for
@@ -97,7 +97,7 @@ def _timed(camera: Camera) -> Camera:
 
 
 def is_whole(solver: str) -> bool:
-    """Whether the rest of the kernels of a solver's frames has been compiled, by a note of it."""
+    """True if a note says that the rest of a solver's kernels has been compiled."""
     return _note(solver).is_file()
 
 

@@ -167,7 +167,7 @@ class FrameLocalizer:
 
     @property
     def _alone(self) -> bool:
-        """Whether there is one camera, without a name."""
+        """True for one camera, without a name."""
         return not self._config.of_cameras
 
     def _use(self, config: NodeConfig) -> None:
@@ -209,7 +209,7 @@ class FrameLocalizer:
 
     @property
     def rig(self) -> Rig:
-        """Of several cameras, as far as they are known."""
+        """The rig of several cameras, as far as they are known."""
         return self._rig(self._cameras)
 
     @property
@@ -219,12 +219,12 @@ class FrameLocalizer:
         return camera
 
     def _middle_row_ns(self, stamp_ns: int) -> int:
-        """When the middle row of the image with this stamp was exposed."""
+        """Time at which the middle row of the image with this stamp was exposed."""
         return middle_row_ns(self._config, self._camera, stamp_ns)
 
     @property
     def calibration(self) -> Calibration | None:
-        """What the last usable camera_info of the first camera said."""
+        """The last usable calibration of the first camera."""
         return self.calibrations.get(self._config.cameras[0])
 
     @property
@@ -328,7 +328,7 @@ class FrameLocalizer:
             )
 
     def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
-        """Whether readings of the frame with this stamp may yet come within so many s."""
+        """True if readings of the frame with this stamp may yet come within so many s."""
         if not self._alone:
             return False  # a rig has none
         time_ns = self._middle_row_ns(stamp_ns)
@@ -395,7 +395,7 @@ class FrameLocalizer:
         return self._late(tracker.delayed)
 
     def _late(self, found: Estimate | Failure) -> Localized | Refusal:
-        """What is published of a frame that has waited."""
+        """The result of a frame that has waited."""
         if not found:
             return Refusal(found.reason, found.detail)
         return self._published(*self._waiting[found.time_ns], found)
@@ -468,7 +468,7 @@ class FrameLocalizer:
     def _read(
         self, name: str, kind: str, message: Any, camera: Camera
     ) -> Correspondences | Refusal:
-        """What a camera saw of the map."""
+        """Correspondences of one camera's message."""
         read: Callable[[Any], Any]
         read = read_correspondences if kind == CORRESPONDENCES else read_keypoints
         found: Correspondences | Keypoints | Refusal
@@ -534,7 +534,7 @@ class FrameLocalizer:
 
     @property
     def predicts(self) -> bool:
-        """Whether frames are tracked, so that :meth:`at` knows the motion between them."""
+        """True if frames are tracked, so that :meth:`at` knows the motion between them."""
         return self._alone and self._tracker.remembers_motion
 
     def at(self, stamp_ns: int) -> Localized | Refusal | None:

@@ -44,7 +44,7 @@ class GivenPose:
 
     @property
     def lasts(self) -> bool:
-        """Whether it is of a filter, which says more and more."""
+        """True for a filter's pose: others will follow."""
         return bool(self.body)
 
 
@@ -94,7 +94,7 @@ class PosePrior:
         config: NodeConfig,
         transforms: Transforms,
     ) -> Prior | None:
-        """What it says of the camera's motion at a time; None: nothing."""
+        """Prior of the camera's motion at a time; None: nothing was given."""
         self._expected = None
         given = self._given
         if given is None:

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the frames get of an IMU: the readings of their exposure, in the camera's axes.
+"""IMU readings for frames: those of their exposure, in the camera's axes.
 
 Node and replay share it. Readings may be added from any thread; all else belongs to the one that
 localizes. What a frame gets depends on stamps alone, not on when a reading came, so that a
@@ -75,7 +75,7 @@ class Unused:
 
 @dataclass(frozen=True, slots=True)
 class ImuState:
-    """How it stands with the IMU, for people."""
+    """State of the IMU, for people."""
 
     frames: int  # since its first reading
     used: int  # of them
@@ -121,7 +121,7 @@ class ImuInput:
 
     @property
     def frame(self) -> str:
-        """Of the readings' axes; empty as long as none has come."""
+        """Frame of the readings' axes; empty as long as none has come."""
         return self._buffer.frame
 
     @property
@@ -146,7 +146,7 @@ class ImuInput:
         )
 
     def awaits(self, tracker: Tracker, config: NodeConfig, time_ns: int, patience: float) -> bool:
-        """Whether readings of this exposure are missing that may come within so many seconds."""
+        """True if readings of this exposure are missing that may come within so many seconds."""
         if not self._wanted(config) or tracker.inertial is None:
             return False
         _, end_ns = _exposure(config, time_ns, tracker)
@@ -231,7 +231,7 @@ class ImuInput:
     def _compare_gravity(
         self, config: NodeConfig, samples: ImuSamples, result: Estimate | Failure
     ) -> None:
-        """How far the accelerometer's gravity is from gravity_in_map, if that is used."""
+        """Compare the accelerometer's gravity with gravity_in_map, if that is used."""
         if not config.imu.gravity:
             self._gravity, self._with_force = None, 0
             return
@@ -291,7 +291,7 @@ class ImuInput:
 
 
 def inertial_settings(config: NodeConfig) -> InertialSettings | None:
-    """What the tracker is told of the IMU; None: there is none to be used."""
+    """Settings of the IMU for the tracker; None: there is none to be used."""
     if config.imu.use == ImuUse.NONE:
         return None
     return InertialSettings(

@@ -41,7 +41,7 @@ Of a rig an image may complete no frame, or several; each is worked on when it i
 
 
 class Role(Enum):
-    """What becomes of the messages of an input."""
+    """Use of the messages of an input."""
 
     FRAMES = auto()  # each is localized, unless a newer one comes first
     STATE = auto()  # the latest one says how frames are localized
@@ -170,7 +170,7 @@ def input_named(name: str) -> Input:
 
 
 def said(name: str) -> str:
-    """What a user is told that is missing."""
+    """Words for a user whom an input lacks."""
     camera, _, own = name.rpartition("/")
     return f"{INPUTS[own].said} of {camera}" if camera else INPUTS[own].said
 

@@ -48,7 +48,7 @@ class Landmarks:
         self.lacking = False
 
     def how(self, keypoints: Keypoints, settings: Matching) -> MatchBy | Refusal:
-        """By what they can be matched."""
+        """Means by which keypoints can be matched."""
         if self._matcher is None:
             self.lacking = True
             return Refusal(
@@ -109,7 +109,7 @@ def read_landmarks(file: str, frame: str) -> Map:
 
 
 def oddities_of_map(landmarks: Map, previous: Map | None) -> dict[Notice, str]:
-    """What is worth telling of a map that takes the place of another, or of none."""
+    """Sentences on a map that takes the place of another, or of none."""
     notices: dict[Notice, str] = {}
     if landmarks.dropped:
         notices[Notice.MAP_INCOMPLETE] = (

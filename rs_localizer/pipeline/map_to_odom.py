@@ -49,7 +49,7 @@ def corrected(map_from_body: Transform, odom_from_body: Transform, *, two_d: boo
 
 @dataclass(frozen=True, slots=True)
 class Holding:
-    """How the correction stands at a moment."""
+    """Age and deviations of the correction at a moment."""
 
     seconds: float  # since the frame that it is of
     position: float  # m, standard deviation of the body's place in the map
@@ -64,7 +64,7 @@ class Holding:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Correction:
-    """What one frame made of odometry."""
+    """The correction that one frame made."""
 
     stamp_ns: int
     map_from_odom: Transform
@@ -168,7 +168,7 @@ class MapToOdom:
 
 
 def _offsets(older: _Correction, newer: _Correction) -> Array:
-    """How far (m, rad) the older one has the body from where the newer one has it."""
+    """Distances (m, rad) of the body by the older one from where the newer one has it."""
     expected = older.map_from_odom @ newer.odom_from_body
     found = newer.map_from_odom @ newer.odom_from_body
     turn = so3.log(np.ascontiguousarray(expected.rotation.T @ found.rotation))

@@ -112,7 +112,7 @@ def backwards(twist: Twist) -> Twist:
 
 
 def middle_row_ns(config: NodeConfig, camera: Camera, stamp_ns: int) -> int:
-    """When the middle row of the image with this stamp was exposed."""
+    """Time at which the middle row of the image with this stamp was exposed."""
     delay = config.stamp_offset - config.readout_time * camera.first_row_time
     return stamp_ns + round(delay * 1e9)
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From an estimate to what is published of it: the moment, the velocities, and the body.
+"""The way from an estimate to what is published: the moment, the velocities, and the body.
 
 With ``R = map_from_camera`` and ``p`` the camera's position, the camera's velocities ``v, w`` in
 its own axes, and the mounting ``camera_from_base`` with rotation ``C`` and translation ``r`` (where
@@ -45,7 +45,7 @@ _LINEAR, _ANGULAR = slice(0, 3), slice(3, 6)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mounting:
-    """How the base hangs on the camera at one moment."""
+    """Mounting of the base on the camera at one moment."""
 
     camera_from_base: Transform
     linear: Array  # (3,) m/s, of the base's origin with respect to the camera, in camera axes
@@ -143,7 +143,7 @@ def about_angles(pose: Pose) -> Pose:
 
 @dataclass(frozen=True, slots=True)
 class ReadoutKnown:
-    """How well the readout time is known; by default, as it is set."""
+    """Knowledge of the readout time; by default, as it is set."""
 
     deviation: float = 0.0  # s
     first_row_time: float = 0.0  # from the middle row, in readout times

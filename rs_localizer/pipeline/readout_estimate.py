@@ -89,7 +89,7 @@ class MeasuredReadout:
     misfit: float = 1.0  # squared errors, in variances of their noise
 
     def contradicts(self, readout_time: float) -> bool:
-        """Whether this readout time (s, of the assumed direction) must be wrong."""
+        """True if this readout time (s, of the assumed direction) must be wrong."""
         off = abs(self.readout_time - readout_time)
         largest = max(abs(self.readout_time), readout_time)
         deviations = float(stdtrit(self._freedom, 1.0 - _CHANCE))
@@ -204,7 +204,7 @@ class ReadoutEstimate:
 
     @property
     def _determined(self) -> bool:
-        """Whether the motion is more than its noise."""
+        """True if the motion is more than its noise."""
         return bool(self._sums[1] > max(self._noise, 1.0))
 
     @property
@@ -233,7 +233,7 @@ class ReadoutEstimate:
 
     @property
     def measured(self) -> MeasuredReadout | None:
-        """What the frames show; None as long as the motion determines nothing."""
+        """The readout time by the frames; None as long as the motion determines nothing."""
         if not self._determined:
             return None
         b, a = self._sums

@@ -67,7 +67,7 @@ class Watched:
     camera: Camera
 
     def tell(self, estimate: ReadoutEstimate) -> MeasuredReadout | None:
-        """What the readout time is with this frame, which has a pose."""
+        """The readout time with this frame, which has a pose."""
         assert self.result
         seen = self.cloud.points, self.cloud.pixels
         estimate.add(self.time_ns, self.camera, self.result, *seen)
@@ -107,7 +107,7 @@ class ScanAxis:
 
     @property
     def doubtful(self) -> bool:
-        """Whether frames fit the other axis better: errors of map and lens may do it, too."""
+        """True while frames fit the other axis better: errors of map and lens may do it, too."""
         return self._odds > _DOUBT and not self._contradicted
 
     @property
@@ -116,7 +116,7 @@ class ScanAxis:
 
     @property
     def wrong(self) -> bool:
-        """Whether it must be the other axis: its motions also agree from frame to frame."""
+        """True if it must be the other axis: its motions also agree from frame to frame."""
         agrees = self.direction is not None or self._moves > _AGREES
         return agrees and self._odds > self._enough
 
@@ -231,7 +231,7 @@ class ReadoutWatch:
 
     @property
     def wrong_axis(self) -> str:
-        """Why no pose may be published: the shutter moves along the other axis; empty: it may."""
+        """Reason to publish no pose, as the shutter moves along the other axis; empty: none."""
         if self.axis.wrong and self.axis.direction is None:
             return "the image fits a shutter along the other axis better than scan_direction"
         return self.fault if self.axis.wrong else ""
@@ -283,7 +283,7 @@ class ReadoutWatch:
         return self._adopt(config, measured, direction) if estimates else config
 
     def _judge(self, config: NodeConfig, measured: MeasuredReadout) -> None:
-        """Whether the setting is contradicted, and by what."""
+        """Judge whether the setting is contradicted, and by what."""
         usual, found = config.readout_time, measured.readout_time
         of_global, of_reversed = (measured.odds(value, usual) for value in (0.0, -usual))
         doubt = max(of_global, of_reversed)
@@ -347,7 +347,7 @@ class ReadoutWatch:
 
 
 def _verdict(config: NodeConfig, measured: MeasuredReadout, at_rest: bool) -> tuple[str, str]:
-    """What is wrong about the readout time that is set, and the sentence that says so; or nothing.
+    """The fault of the readout time that is set, and a sentence that says it; or nothing.
 
     ``at_rest``: all rows are certainly exposed at once, whatever errors of the map look like.
     """

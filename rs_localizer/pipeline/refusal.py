@@ -44,7 +44,7 @@ def unheard(notice: Notice | ImuReason, text: str) -> None:
 
 
 def read_or_refuse(read: Callable[[Any], Read], message: Any, reason: Reason) -> Read | Refusal:
-    """What is read of a message; refused for this reason if it cannot be, or as empty."""
+    """Content of a message; refused for this reason if it cannot be read, or as empty."""
     try:
         return read(message)
     except EmptyCloudError as error:

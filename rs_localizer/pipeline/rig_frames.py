@@ -33,7 +33,7 @@ _LONGEST_STEP = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Image:
-    """What one of the cameras saw."""
+    """Points that one of the cameras saw."""
 
     camera: str
     start_ns: int  # exposure of the first row
@@ -78,18 +78,18 @@ class FrameAssembler:
         return frames
 
     def flush(self) -> list[list[Image]]:
-        """What is left when no more images will come."""
+        """Frames that are left when no more images will come."""
         return [self._complete()] if self._waiting else []
 
     def _belongs(self, image: Image) -> bool:
-        """Whether an image is of the frame that waits."""
+        """True if an image is of the frame that waits."""
         return image.camera not in self._waiting and all(
             abs(image.middle_ns - other.middle_ns) <= self._window_ns
             for other in self._waiting.values()
         )
 
     def _is_usable(self, image: Image) -> bool:
-        """Whether an image can be of the frame that waits, or of the next one."""
+        """True if an image can be of the frame that waits, or of the next one."""
         name, time_ns = image.camera, image.middle_ns
         before = self._stamps.get(name)
         if before is not None and time_ns < before:

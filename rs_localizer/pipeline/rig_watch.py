@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the cameras of a rig are mounted, and their clocks set, as they are said to be.
+"""Watch over a rig: its cameras are mounted, and their clocks set, as they are said to be.
 
 Each camera is tracked alone, so that it does not matter what the others do to the pose of the rig.
 With the pose of a camera as it sees it and as the first camera, the reference, predicts it by the
@@ -70,7 +70,7 @@ class _Sight(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class _Fit:
-    """What one camera lacks: translation and turn in its axes, offset; and their covariance."""
+    """Error of one camera: translation and turn in its axes, offset; and their covariance."""
 
     covariance: Array  # (7,7)
     mean: Array = field(default_factory=lambda: np.zeros(7))
@@ -110,13 +110,13 @@ class _Fit:
 
     @property
     def off(self) -> bool:
-        """Whether the extrinsics are certainly others."""
+        """True if the extrinsics are certainly others."""
         mean, covariance = self.of_extrinsics
         score = float(mean @ np.linalg.solve(covariance, mean))
         return self.count >= _ENOUGH and score > _SURELY_SIX
 
     def described(self) -> str:
-        """How much the extrinsics are off."""
+        """Sizes of the extrinsics' errors."""
         mean, covariance = self.of_extrinsics
         texts = []
         for part, scale, unit in ((slice(3, 6), 180.0 / math.pi, "deg"), (slice(3), 1e3, "mm")):
@@ -227,7 +227,7 @@ class RigWatch:
             )  # fmt: skip
 
     def _conclude(self, name: str, fit: _Fit) -> None:
-        """What a difference more says, and what of it is applied."""
+        """Draw conclusions from one difference more."""
         reference = self._names[0]
         offset, deviation = float(fit.mean[6]), fit.offset_deviation
         self.values = self.values | {

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the stamps and poses of successive frames show that no single frame does."""
+"""Oddities that stamps and poses of successive frames show, and no single frame does."""
 
 from collections import deque
 from collections.abc import Callable

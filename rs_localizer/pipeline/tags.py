@@ -89,7 +89,7 @@ class Tags:
         return rows
 
     def _other_order(self, detections: TagDetections) -> str | None:
-        """What is wrong with the order of the corners, if another one fits the map."""
+        """The fault of the order of the corners, if another one fits the map."""
         self._images += 1
         if len(detections.ids) < 2 or (self._agreed >= _AGREED and self._images % _ONE_IN):
             return None

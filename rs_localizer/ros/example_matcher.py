@@ -59,7 +59,7 @@ class ExampleMatcher(Node):
         )
 
     def _schedule(self) -> Any:
-        """When each message is due (ns), its topic and the message, for ever."""
+        """Times (ns) at which messages are due, their topics and the messages, for ever."""
         stamps = [stamp_ns(message) for _, message in self._messages]
         length = stamps[-1] - stamps[0] + _PERIOD_NS
         start = self.get_clock().now().nanoseconds + 10**9 - stamps[0]

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch files share: every setting is an argument, and a wrong one ends the launch."""
+"""Parts of the launch files: every setting is an argument, and a wrong one ends the launch."""
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress

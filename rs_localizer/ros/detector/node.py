@@ -46,7 +46,7 @@ Picture = NDArray[np.uint8]  # (h,w,3) blue, green, red
 
 
 def judge(summary: Summary, silence: Mapping[str, Silence], oddities: Mapping[str, str]) -> Health:
-    """Of an active node that somebody listens to: ``waiting for images`` or ``detecting``."""
+    """Diagnosis of an active node with listeners: ``waiting for images`` or ``detecting``."""
     causes = [f"{item.topic}: {item.cause}" for item in silence.values() if item.cause]
     if causes or not silence:
         message = "; ".join([f"{State.WAITING} images", *causes])
@@ -71,7 +71,7 @@ Settings = TypeVar("Settings", DetectorConfig, FeatureConfig)
 
 @dataclass(slots=True)
 class Work:
-    """What the worker alone touches."""
+    """State that the worker alone touches."""
 
     finder: Any
 
@@ -103,7 +103,7 @@ class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
     # -- what a node looks for ---------------------------------------------------------------
 
     def make_finder(self, config: Settings) -> Any:
-        """What looks at images, the class that works offline, too.
+        """The finder that looks at images, of the class that works offline, too.
 
         Raises:
             ValueError: for settings that cannot be used.
@@ -119,7 +119,7 @@ class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
         raise NotImplementedError
 
     def describe(self, finder: Any) -> str:
-        """What the node is active with, for the log."""
+        """Words for the log on what the node looks for."""
         raise NotImplementedError
 
     # -- as every managed node ---------------------------------------------------------------
@@ -252,11 +252,11 @@ class ImageOutputs(Generic[Result]):
 
     @property
     def wanted(self) -> bool:
-        """Whether somebody listens."""
+        """True while somebody listens."""
         return not self._closed and any(p.get_subscription_count() for p in self._publishers)
 
     def publish(self, result: Result) -> None:
-        """What is wanted of an image."""
+        """Publish what is wanted of an image."""
         with self._lock:
             if self._closed:
                 return

@@ -116,7 +116,7 @@ class LiveNode:
 
     @property
     def pid(self) -> int:
-        """Of the node's process."""
+        """Number of the node's process."""
         assert self._process is not None
         return self._process.pid
 
@@ -155,7 +155,7 @@ class LiveNode:
         to_cloud.publish(copy_message(cloud, "sensor_msgs/msg/PointCloud2"))
 
     def localize(self, info: Any, cloud: Any) -> PoseStamped | None:
-        """What the node answers to a frame; None: it has refused it.
+        """The node's answer to a frame; None: it has refused it.
 
         Raises:
             LiveError: as :meth:`wait`.

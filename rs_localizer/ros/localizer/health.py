@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the numbers mean for a user: a level, one sentence, and the numbers by readable names."""
+"""Diagnosis of the localizer: a level, one sentence, and the numbers by readable names."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -59,7 +59,7 @@ _MOST_TILT = math.radians(10.0)
 
 
 def imu_oddity(state: ImuState | None) -> dict[str, str]:
-    """Why the camera goes on alone, and what to look at; what contradicts gravity."""
+    """Reasons of a camera that goes on alone, and what to look at; what contradicts gravity."""
     if state is None:
         return {}
     oddities = {}
@@ -115,7 +115,7 @@ _LONG_WORK = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """What the node knows of itself."""
+    """The node's knowledge of itself."""
 
     life_cycle: str  # label of the state
     changing: bool  # new settings compile kernels
@@ -184,7 +184,7 @@ def _judge(condition: Condition, summary: Summary) -> Health:
 
 
 def _silent_frames(condition: Condition) -> Health | None:
-    """What to say where no frames come; None where they do."""
+    """Diagnosis where no frames come; None where they do."""
     silences = _of_frames(condition.silence)
     if not silences or any(item.heard and not item.cause for item in silences):
         return None

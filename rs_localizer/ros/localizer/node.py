@@ -103,7 +103,7 @@ class Feed:
 
     @property
     def changing(self) -> bool:
-        """Whether kernels of new settings are being loaded or compiled."""
+        """True while kernels of new settings are being loaded or compiled."""
         return self._wanted is not None
 
     def take_config(self, config: NodeConfig) -> None:
@@ -142,7 +142,7 @@ class Feed:
         return Topic(installed(*item.types), take, single=True)
 
     def _take_pose(self, message: Any) -> None:
-        """What others know of the pose."""
+        """Use a pose that others know."""
         try:
             given = read_given_pose(message)
         except MessageError as error:

@@ -144,7 +144,7 @@ class Tf:
         return read_transform(self._ask(target, source, stamp_ns).transform)
 
     def moves(self, target: str, source: str) -> bool:
-        """Whether a part of the transform comes with a time.
+        """True if a part of the transform comes with a time.
 
         Raises:
             TransformError: when it is not known at all.
@@ -186,7 +186,7 @@ class Tf:
 
 
 class _WithoutExecutor:
-    """What the TransformListener takes for its node: its messages are left to an Intake.
+    """A node for the TransformListener, whose messages are left to an Intake.
 
     A robot sends some hundred messages a second on /tf, and the executor takes 0.4 ms for each.
     """
@@ -300,7 +300,7 @@ class Broadcaster:
 
     @property
     def holding(self) -> Holding | None:
-        """How the correction of odometry stands; None: none is sent."""
+        """Age and deviations of the correction of odometry; None: none is sent."""
         return self._holding
 
     def close(self) -> None:

@@ -1,3 +1,3 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What every node of this package needs."""
+"""Parts that every node of this package needs."""

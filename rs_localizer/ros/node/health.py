@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What every node says of itself: a level, a state, one sentence, and numbers by readable names."""
+"""Diagnosis of a node: a level, a state, one sentence, and numbers by readable names."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,7 @@ SOME = 0.05
 
 
 class State(StrEnum):
-    """Of nodes: THE list; docs/reasons.md says what each means and what to do."""
+    """THE list of states of nodes; docs/reasons.md says what each means and what to do."""
 
     COMPILING = "compiling"
     LOADING = "loading"
@@ -45,7 +45,7 @@ _PREPARING = {
 
 
 class Level(IntEnum):
-    """As in diagnostic_msgs/DiagnosticStatus."""
+    """Levels of diagnostic_msgs/DiagnosticStatus."""
 
     OK = 0
     WARN = 1
@@ -69,7 +69,7 @@ class Health:
 
 
 def out_of_service(life_cycle: str) -> Health | None:
-    """What to say of a node that is not active, by the label of its state; None if it is."""
+    """Diagnosis of a node that is not active, by the label of its state; None if it is."""
     if life_cycle in _PREPARING:
         state, what = _PREPARING[life_cycle]
         return Health(Level.WARN, state, f"the node is being configured: kernels are {what}")
@@ -81,12 +81,12 @@ def out_of_service(life_cycle: str) -> Health | None:
 
 
 def one_line(oddities: Mapping[str, str]) -> str:
-    """What is odd, in one line."""
+    """Oddities in one line."""
     return "; ".join(f"{name}: {text}" for name, text in oddities.items())
 
 
 def hindrance(summary: Summary, what: str) -> str:
-    """Why some of the last messages have no result; empty where nearly all have one."""
+    """Reason for which some of the last messages have no result; empty where nearly all have."""
     lately, lost = summary.lately, summary.recently_missing
     came = lately.get(Event.RECEIVED, 0)
     for event, text in ((Event.REFUSED, "were refused"), (Event.REPLACED, "came too fast")):

@@ -120,7 +120,7 @@ def policies(profile: QoSProfile) -> Policies:
 
 
 def offered(node: Node, topic: str) -> list[Policies]:
-    """By the publishers of a topic (full name)."""
+    """Policies of the publishers of a topic (full name)."""
     return [policies(info.qos_profile) for info in node.get_publishers_info_by_topic(topic)]
 
 
@@ -130,7 +130,7 @@ def node_of(publisher: Any) -> str:
 
 
 def best(wished: Policies, offers: Sequence[Policies]) -> Policies:
-    """What is wished, and where that is ``BEST_AVAILABLE``, the most that all of them offer.
+    """Policies that are wished; for ``BEST_AVAILABLE`` the most that all publishers offer.
 
     A subscription that asks for more than a publisher offers hears nothing; one that asks for less
     loses what is large (of reliable clouds of 2 MB a best-effort subscription of Fast DDS heard 3
@@ -197,7 +197,7 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """Whether messages come on a topic, and why not."""
+    """Silence of a topic, and its cause."""
 
     topic: str  # full name
     seconds: float  # since the last message, or since the subscription was made
@@ -240,7 +240,7 @@ class Inputs:
         return [subscription.topic_name for subscription in self._subscriptions.values()]
 
     def silence(self) -> dict[str, Silence]:
-        """How it stands with each topic, by the name that the node gave it."""
+        """Silences of the topics, by the names that the node gave them."""
         return {name: self._silence(name) for name in self._subscriptions}
 
     def close(self) -> None:
@@ -324,7 +324,7 @@ class Inputs:
         return Silence(topic, seconds, heard is not None, cause, mismatch, reliable)
 
     def _cause(self, subscription: Subscription) -> tuple[str, bool]:
-        """Why nothing is heard, and whether that is because of the QoS or the type."""
+        """The cause that nothing is heard, and whether it is the QoS or the type."""
         wanted = type_name(subscription.msg_type)
         unfit = []
         publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)

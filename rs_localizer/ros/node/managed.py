@@ -120,7 +120,7 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
     # -- what a node does --------------------------------------------------------------------
 
     def kernels(self) -> Callable[[], None]:
-        """What calls the kernels of the present settings, to be called in another thread."""
+        """A function that calls the kernels of the present settings, for another thread."""
         raise NotImplementedError
 
     def check(self, config: Config) -> None:
@@ -165,7 +165,7 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
 
     @property
     def silence(self) -> dict[str, Silence]:
-        """How it stands with each topic that is listened to."""
+        """Silences of the topics that are listened to, by name."""
         return {} if self._inputs is None else self._inputs.silence()
 
     def employ(self, state: State, publish: Callable[[Result], None]) -> Worker[State, Result]:

@@ -48,7 +48,7 @@ def declare(node: Node, kind: type[Config]) -> Config:
 
 
 def _of_camera_file(node: Node, kind: Kind) -> dict[str, Any]:
-    """What ``camera_file`` says; a parameters file that holds the defaults does not change it."""
+    """Values of ``camera_file``; a parameters file that holds the defaults does not change them."""
     given, known = node._parameter_overrides, settings(kind)
     if kind is not NodeConfig or "camera_file" not in given or not given["camera_file"].value:
         return {}
@@ -61,7 +61,7 @@ def _of_camera_file(node: Node, kind: Kind) -> dict[str, Any]:
 
 
 def _of_cameras(node: Node, kind: Kind) -> dict[str, Setting]:
-    """Of the cameras of a rig, which the parameters so far name."""
+    """Settings of the cameras of a rig, which the parameters so far name."""
     if kind is not NodeConfig:
         return {}
     return camera_settings({name: node.get_parameter(name).value for name in settings(kind)})
@@ -85,7 +85,7 @@ def _declare(node: Node, names: Mapping[str, Setting], own: Mapping[str, Any]) -
 
 
 def unknown_names(node: Node, kind: Kind) -> list[str]:
-    """What to say of each parameter that the node was started with and does not have.
+    """Sentences on parameters that the node was started with and does not have.
 
     No reason to refuse the start: a params file for ``/**`` speaks to several nodes.
     """
@@ -175,7 +175,7 @@ def _descriptor(setting: Setting) -> ParameterDescriptor:
 
 
 def _constraints(setting: Setting) -> list[str]:
-    """What ranges cannot say."""
+    """Constraints that ranges cannot say."""
     constraints = [f"one of {', '.join(setting.choices)}"] if setting.choices else []
     return constraints + (
         ["can be changed while the node is unconfigured"] if setting.fixed else []

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What was refused: counted by reason, and logged without flooding the log."""
+"""Refusals: counted by reason, and logged without flooding the log."""
 
 import re
 import threading
@@ -61,14 +61,14 @@ class Refusals:
             self._log(line)
 
     def recent(self, reasons: Collection[str], seconds: float) -> dict[str, str]:
-        """Of these, what has been noticed in the last seconds, and its latest detail."""
+        """Reasons of these that were noticed in the last seconds, with their latest details."""
         with self._lock:
             since = self._clock() - seconds
             latest = {reason: self._latest.get(reason) for reason in reasons}
             return {k: item[1] for k, item in latest.items() if item and item[0] >= since}
 
     def _line(self, reason: str, detail: str) -> str | None:
-        """What to log of it; None if it has been said."""
+        """A line for the log; None if it has been said."""
         now = self._clock()
         kinds = self._logged.setdefault(reason, {})
         kind = re.sub(r"\d+", "0", detail)

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What became of the frames: totals since the start, and how things are now."""
+"""Statistics of frames: totals since the start, and of the last seconds."""
 
 import threading
 import time
@@ -23,7 +23,7 @@ _MOST_LOOSE = 0.1  # share of intervals that may be further off
 
 
 def missing(stamps_ns: Sequence[int]) -> int:
-    """How many frames are missing between these; 0 where the stamps are not those of a steady rate.
+    """Number of frames missing between these; 0 where the stamps are not of a steady rate.
 
     Args:
         stamps_ns: in the order of arrival.
@@ -60,7 +60,7 @@ Percentiles = tuple[float, float]  # s, the median and the 95th
 
 
 class Event(StrEnum):
-    """What becomes of a frame."""
+    """Fate of a frame."""
 
     RECEIVED = "received"
     ANSWERED = "answered"
@@ -71,7 +71,7 @@ class Event(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What is told of a frame that was answered."""
+    """Words on a frame that was answered."""
 
     state: str
     text: str  # one sentence
@@ -80,7 +80,7 @@ class Told:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """How things are now."""
+    """State of the frames now."""
 
     total: Mapping[Event, int]  # frames since the start
     lately: Mapping[Event, int]  # in the window
@@ -163,7 +163,7 @@ class Statistics(Generic[Result]):
             self._last = kept
 
     def summary(self) -> Summary:
-        """How things are now."""
+        """The state of the frames now."""
         with self._lock:
             now, started = self._clock(), self._started
             recent = [item for item in self._events if item[0] >= now - WINDOW]

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What RViz and Foxglove show beside the messages of a frame: the map, and the camera in it."""
+"""Views for RViz and Foxglove beside the messages of a frame: the map, and the camera in it."""
 
 import math
 from typing import TYPE_CHECKING

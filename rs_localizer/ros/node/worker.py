@@ -35,7 +35,7 @@ _MOST_LATE = 100
 
 @dataclass(frozen=True, slots=True)
 class Need(Generic[State]):
-    """What a frame waits for before it is processed."""
+    """Condition that a frame waits for before it is processed."""
 
     missing: Callable[[State, Any], bool]  # whether something is, and may still come
     patience: float  # s for which it waits
@@ -179,7 +179,7 @@ class Worker(Generic[State, Result]):
                 self._begin(self._early.popleft())
 
     def _is_ready(self) -> bool:
-        """Whether there is a frame that need not wait."""
+        """True if there is a frame that need not wait."""
         if not self._early:
             return False
         arrival = self._early[0]
@@ -208,7 +208,7 @@ class Worker(Generic[State, Result]):
         self._statistics.ended()
 
     def _results(self, arrival: _Arrival[State, Result]) -> Iterator[Any]:
-        """What comes of a frame."""
+        """Results of a frame."""
         result = self._attempt(lambda: arrival.process(self._state, arrival.message))
         several = result if isinstance(result, Iterator) else iter([result])
         while (each := self._attempt(lambda: next(several, None))) is not None:
@@ -226,7 +226,7 @@ class Worker(Generic[State, Result]):
             self._finish(item.arrival, result)
 
     def _attempt(self, function: Callable[[], Any]) -> Any:
-        """What it returns; if it fails, or waits for a compiler, a refusal."""
+        """The function's value; if it fails, or waits for a compiler, a refusal."""
         try:
             with at_once():
                 return function()
