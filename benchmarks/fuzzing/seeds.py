@@ -79,18 +79,7 @@ _PHOTONVISION = b"""{"resolution": {"width": 640.0, "height": 480.0}, "cameraInt
 _GYROFLOW = b"""{"calib_dimension": {"w": 640, "h": 480}, "fisheye_params": {"camera_matrix":
 [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], "distortion_coeffs": [0.1, 0, 0, 0]},
 "distortion_model": "opencv_fisheye", "frame_readout_time": 9.6}"""
-_ORB_SLAM = b"""%YAML:1.0
-Camera.type: "PinHole"
-Camera1.fx: 500.0
-Camera1.cx: 319.5
-Camera1.cy: 239.5
-Camera1.k1: 0.1
-Camera.width: 640
-Camera.height: 480
-"""
-CALIBRATIONS = (
-    *(_ROS, _OPENCV, _XML, _KALIBR, _COLMAP, _JSON, _PHOTONVISION, _GYROFLOW, _ORB_SLAM),
-)
+CALIBRATIONS = (_ROS, _OPENCV, _XML, _KALIBR, _COLMAP, _JSON, _PHOTONVISION, _GYROFLOW)
 """Of every program whose files are read."""
 
 _COUNT = 5

@@ -31,7 +31,7 @@ _ORDER = {
 _RATIONAL = len(_ORDER["rational_polynomial"])
 # What programs call the models.
 _MODELS = {
-    "fisheye": "equidistant", "opencv_fisheye": "equidistant", "kannalabrandt8": "equidistant",
+    "fisheye": "equidistant", "opencv_fisheye": "equidistant",
     "radtan": "plumb_bob", "pinhole": "plumb_bob", "none": "plumb_bob",
     "opencv_standard": "plumb_bob", "lensmodel_opencv": "plumb_bob",
     "double_sphere": str(DistortionModel.DOUBLE_SPHERE),
@@ -41,8 +41,7 @@ _MODELS = {
 class _Program(NamedTuple):
     """Places of a lens in a program's files: dotted paths in the tree, the first that is there.
 
-    ``K`` is a matrix, or a mapping of ``fx fy cx cy``; ``D`` a list, or a mapping of ``k1 k2 p1 p2
-    k3 ...``; an empty path is the tree itself.
+    ``K`` is a matrix and ``D`` a list, or each a mapping with ``data``; an empty path is the tree.
     """
 
     K: tuple[str, ...]
@@ -59,20 +58,17 @@ _PROGRAMS = (
         ("calib_dimension",), default="opencv_fisheye", readout_ms="frame_readout_time",
     ),
     _Program(("cameraIntrinsics",), ("distCoeffs",), model=("lensmodel",)),  # PhotonVision
-    _Program(("projection_parameters",), ("distortion_parameters",)),  # VINS, camodocal
-    # ORB-SLAM
-    _Program(("Camera1", "Camera"), ("Camera1", "Camera"), ("Camera",), ("Camera.type",)),
     _Program(  # ROS' camera_calibration, OpenCV, and whatever has the usual names
-        ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "mtx", ""),
+        ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "mtx"),
         ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs",
-         "dist_coeff", "distortion", "dist", "D", ""),
+         "dist_coeff", "distortion", "dist", "D"),
     ),
 )  # fmt: skip
 _WIDTH = ("image_width", "image_Width", "width", "w")
 _HEIGHT = ("image_height", "image_Height", "height", "h")
 CALIBRATION_KINDS = (
     "calibration file of ROS' camera_calibration, OpenCV (YAML, XML), Kalibr (camchain), COLMAP "
-    "(cameras.txt), PhotonVision, Gyroflow, VINS, ORB-SLAM, or JSON with K, D, width and height"
+    "(cameras.txt), PhotonVision, Gyroflow, or JSON with K, D, width and height"
 )
 # Who writes FILE#cam1 means a camera in a file; a name of a file may hold the sign, too.
 _CHOICE = re.compile(r"(.+)#([^/#]+)")
@@ -134,7 +130,7 @@ def _camera(text: str, chosen: str | None) -> Camera:
     if _is_kalibr(tree):
         return kalibr_camera(tree)
     for program in _PROGRAMS:
-        if (camera := _of_program(_nested(tree), program)) is not None:
+        if (camera := _of_program(tree, program)) is not None:
             return camera
     found = ", ".join(sorted(map(str, tree))[:8]) or "nothing"
     raise ValueError(f"expected a {CALIBRATION_KINDS}; found {found}")
@@ -203,19 +199,9 @@ def _at(tree: dict[str, Any], paths: tuple[str, ...]) -> Iterator[Any]:
             yield item
 
 
-def _nested(tree: dict[str, Any]) -> dict[str, Any]:
-    """The tree with a mapping for names before a dot, as ORB-SLAM's ``Camera1.fx``."""
-    nested = dict(tree)
-    for name, value in tree.items():
-        first, dot, rest = str(name).partition(".")
-        if dot and isinstance(nested.setdefault(first, {}), dict):
-            nested[first] = nested[first] | {rest: value}
-    return nested
-
-
 def _of_program(tree: dict[str, Any], program: _Program) -> Camera | None:
     """The camera of a program's file; None: it is of another."""
-    lens = next((item for item in _at(tree, program.K) if _numbers(item) or "fx" in item), None)
+    lens = next((item for item in _at(tree, program.K) if _numbers(item)), None)
     if lens is None:
         return None
     size = next((both for item in _at(tree, program.size) if (both := _size(item))), None)
@@ -224,19 +210,17 @@ def _of_program(tree: dict[str, Any], program: _Program) -> Camera | None:
     said = next((item for item in _at(tree, program.model) if item), program.default)
     name = "fisheye" if tree.get("fisheye_model") else str(said).lower()  # of OpenCV's example
     model = _MODELS.get(name, name)
-    coefficients = (_distortion(item, model) for item in _at(tree, program.D))
-    D = next((found for found in coefficients if found is not None), None)
-    if D is None and _numbers(lens):  # which writers have before the coefficients
+    D = next((_values(item) for item in _at(tree, program.D) if _numbers(item)), None)
+    if D is None:  # which writers have behind the matrix
         raise ValueError(
             "it has a camera matrix and no distortion coefficients: is it cut off? A lens "
             "without distortion says so: distortion_coefficients: {data: []}"
         )
-    D = np.zeros(0) if D is None else D
     # Without a name, OpenCV's own model: its first coefficients mean the same in all lengths.
     if name in ("", "pinhole") or name.startswith("lensmodel_opencv"):
         model = "rational_polynomial" if len(D) >= _RATIONAL else "plumb_bob"
     seconds = 1e-3 * float(tree.get(program.readout_ms) or 0.0) * (size[1] - 1) / size[1]
-    return Camera(*size, _matrix(lens), D, model, readout_time=max(seconds, 0.0))
+    return Camera(*size, _values(lens).reshape(3, 3), D, model, readout_time=max(seconds, 0.0))
 
 
 def lens_camera(lens: dict[str, Any]) -> Camera:
@@ -259,13 +243,6 @@ def _values(item: Any) -> Array:
     return np.array(item["data"] if isinstance(item, dict) else item, np.float64).ravel()
 
 
-def _matrix(item: Any) -> Array:
-    if _numbers(item):
-        return _values(item).reshape(3, 3)
-    fx, cx, cy = (float(item[name]) for name in ("fx", "cx", "cy"))
-    return pinhole_matrix(fx, float(item.get("fy", fx)), cx, cy)
-
-
 def _size(item: Any) -> tuple[int, int] | None:
     """Width and height of a pair or a mapping; None: it says neither."""
     if _numbers(item):
@@ -276,19 +253,6 @@ def _size(item: Any) -> tuple[int, int] | None:
     if None in sides and sides != [None, None]:
         raise KeyError((_WIDTH, _HEIGHT)[sides.index(None)][0])
     return None if None in sides else (int(sides[0]), int(sides[1]))
-
-
-def _distortion(item: Any, model: str) -> Array | None:
-    """Coefficients of a list, or by their names; None: it has none of them."""
-    if _numbers(item):
-        return _values(item)
-    names = _ORDER["equidistant" if model == "equidistant" else "rational_polynomial"]
-    present = [name in item for name in names]
-    if not any(present):
-        return None
-    last = len(names) - present[::-1].index(True)
-    count = 4 if last <= 4 else 5 if last == 5 else _RATIONAL
-    return np.array([float(item.get(name, 0.0)) for name in names[:count]])
 
 
 # Parameters of COLMAP's models behind its size; f stands for both focal lengths.

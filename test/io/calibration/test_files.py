@@ -23,28 +23,6 @@ PHOTONVISION = """{"resolution": {"width": 640.0, "height": 480.0}, "cameraIntri
 GYROFLOW = """{"calib_dimension": {"w": 640, "h": 480}, "orig_dimension": {"w": 64, "h": 48},
  "fisheye_params": {"camera_matrix": [[500, 0, 320.5], [0, 510, 240.5], [0, 0, 1]],
  "distortion_coeffs": [0.1, 0.2, 0.3, 0.4]}, "frame_readout_time": 9.6}"""
-VINS = """%YAML:1.0
----
-model_type: PINHOLE
-image_width: 640
-image_height: 480
-distortion_parameters: {k1: 1.0, k2: 2.0, p1: 3.0, p2: 4.0}
-projection_parameters: {fx: 500.0, fy: 510.0, cx: 320.5, cy: 240.5}
-"""
-ORB_SLAM = """%YAML:1.0
-Camera.type: "KannalaBrandt8"
-Camera1.fx: 500.0
-Camera1.fy: 510.0
-Camera1.cx: 320.5
-Camera1.cy: 240.5
-Camera1.k1: 0.1
-Camera1.k2: 0.2
-Camera1.k3: 0.3
-Camera1.k4: 0.4
-Camera.width: 640
-Camera.height: 480
-"""
-
 
 KALIBR = """
 cam0:
@@ -71,10 +49,6 @@ FIVE = [0.1, -0.2, 1e-3, 2e-3, 0.3]
         (ROS, "rational_polynomial", [1, 2, 3, 4, 5, 6, 7, 8]),
         (PHOTONVISION, "rational_polynomial", [1, 2, 3, 4, 0, 0, 0, 0]),
         (GYROFLOW, "equidistant", [0.1, 0.2, 0.3, 0.4]),
-        (VINS, "plumb_bob", [1, 2, 3, 4]),
-        (ORB_SLAM, "equidistant", [0.1, 0.2, 0.3, 0.4]),
-        (ORB_SLAM.replace("KannalaBrandt8", "PinHole").replace(".k4: 0.4", ".p1: 0.4"),
-         "plumb_bob", [0.1, 0.2, 0.4, 0, 0.3]),
         (COLMAP.format("SIMPLE_RADIAL_FISHEYE", "500 321 241 .1"), "equidistant", [0.1, 0, 0, 0]),
         # COLMAP's first pixel has its corner at 0, 0; its order has the tangential ones third.
         (COLMAP.format("OPENCV", "500 510 321 241 .1 .2 .3 .4"), "plumb_bob",
@@ -87,8 +61,6 @@ FIVE = [0.1, -0.2, 1e-3, 2e-3, 0.3]
         (JSON % '"width": 640, "height": 480', "plumb_bob", [0.1, 0.2, 0, 0]),
         (JSON % '"image_size": [640, 480], "distortion_model": "fisheye"', "equidistant",
          [0.1, 0.2, 0, 0]),
-        ('{"w": 640, "h": 480, "fx": 500, "fy": 510, "cx": 320.5, "cy": 240.5, "k1": 0.1, "p1": 1}',
-         "plumb_bob", [0.1, 0, 1, 0]),
     ],
 )  # fmt: skip
 def test_other_programs(tmp_path, text, model, D):
@@ -141,8 +113,6 @@ def test_one_of_several_cameras(tmp_path):
         ("width: 3\nname: x", r"not a usable calibration: .* found name, width"),
         (ROS.replace("image_width", "breite"), r"not a usable calibration: no 'image_width'"),
         (ROS.replace("rational_polynomial", "fov"), r"distortion_model must be .* got 'fov'"),
-        (VINS.replace("PINHOLE", "MEI").replace("fx", "gamma1"), "or JSON with K, D, width and"),
-        (VINS.replace("PINHOLE", "SCARAMUZZA"), r"distortion_model must be .* got 'scaramuzza'"),
         (ROS[: ROS.index("distortion_model")], r"no distortion coefficients: is it cut off"),
         (KALIBR.replace("pinhole", "omni"), r"must be pinhole, eucm or ds, found 'omni'"),
         (COLMAP.format("FOV", "500 510 321 241 1"), r"model must be one of .* found FOV"),
