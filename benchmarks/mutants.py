@@ -44,8 +44,8 @@ MUTANTS = [Mutant(*row) for row in (
      "np.arange(len(forces)) / (len(times) - 1)", "test/io/test_telemetry.py"),
     ("core/camera.py", "offset if sign > 0 else offset + extent - 1",
      "offset if sign > 0 else offset + extent", _CAMERA),
-    ("offline/table.py", '"vz"), twist.linear', '"vz"), twist.angular',
-     "test/offline/test_table.py -k what_the_messages_say"),
+    ("offline/frame_table.py", '"vz"), twist.linear', '"vz"), twist.angular',
+     "test/offline/test_frame_table.py -k what_the_messages_say"),
     # And more of their kind.
     ("pipeline/pose_at_time.py", "pose.rotation @ twist.linear, ", "twist.linear, ", _POSE),
     ("pipeline/pose_at_time.py", "[acceleration.linear, acceleration.angular]",
@@ -109,8 +109,8 @@ MUTANTS = [Mutant(*row) for row in (
     ("io/outputs.py", "make_vector(make, twist.linear), make_vector(make, twist.angular)",
      "make_vector(make, twist.angular), make_vector(make, twist.linear)", _OUT),
     ("io/telemetry.py", "times[0] + span * np", "span * np", "test/io/test_telemetry.py"),
-    ("offline/table.py", '"wx", "wy", "wz"), twist', '"wy", "wx", "wz"), twist',
-     "test/offline/test_table.py -k what_the_messages_say"),
+    ("offline/frame_table.py", '"wx", "wy", "wz"), twist', '"wy", "wx", "wz"), twist',
+     "test/offline/test_frame_table.py -k what_the_messages_say"),
     # Of kernels.
     ("core/so3.py", "matrix[0, 1] = c * x * y - s * z", "matrix[0, 1] = c * x * y + s * z", _SO3),
     ("core/so3.py", "q[1] = matrix[0, 2] - matrix[2, 0]", "q[1] = matrix[2, 0] - matrix[0, 2]",

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         write_camchain,
     )
     from rs_localizer.localizer import Localizer
-    from rs_localizer.offline.table import localize_recording
+    from rs_localizer.offline.frame_table import localize_recording
     from rs_localizer.solvers.minimal import solve_minimal
     from rs_localizer.tracking import Tracker
 
@@ -74,7 +74,7 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
         "io.camera_files": ("read_calibration",),
         "io.rigs": ("RigParts", "read_camchain", "write_camchain"),
         "localizer": ("Localizer",),
-        "offline.table": ("localize_recording",),
+        "offline.frame_table": ("localize_recording",),
         "solvers.minimal": ("solve_minimal",),
         "tracking": ("Tracker",),
     }

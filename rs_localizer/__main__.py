@@ -38,7 +38,7 @@ def run() -> int:
                 from rs_localizer import cli
 
                 cli.WORKING = not _asks_for_help(sys.argv)
-                from rs_localizer.cli.main import main
+                from rs_localizer.cli.commands import main
 
             code = main(importing=importing)
         except KeyboardInterrupt:  # before a command runs

@@ -73,7 +73,7 @@ _LOOKS = 2
 _STILL_TRACKED = 0.7
 
 
-class _Given(NamedTuple):
+class _Inputs(NamedTuple):
     """What :meth:`Localizer.find` is given."""
 
     exposure: Exposure
@@ -240,7 +240,7 @@ class Localizer:
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
         sights = self._sights(points, pixels, scores, stamps)
-        given = _Given(*sights, prior, expected_share, turn, error_modes)
+        given = _Inputs(*sights, prior, expected_share, turn, error_modes)
         if turn is not None and not given.exposure.alone:
             raise ValueError("a known turn is that of a camera alone, not of a rig")
         if turn is not None:
@@ -279,7 +279,7 @@ class Localizer:
             )
         return checked_of_rig(self.rig, points, stamps)
 
-    def _found(self, given: _Given) -> Estimate | Failure:
+    def _found(self, given: _Inputs) -> Estimate | Failure:
         exposure, counts, points, pixels, scores, prior, expected_share, turn, modes = given
         terms, assumed = self._assume(exposure.span)
         if prior is not None or turn is not None:

@@ -58,8 +58,8 @@ from rs_localizer.solvers.table import find_solver
 
 if TYPE_CHECKING:  # without a gyroscope nobody needs them
     from rs_localizer.inertial.aiding import Before, Found, GyroPrediction, GyroscopeAid
+    from rs_localizer.inertial.gyroscope_noise import InertialSettings
     from rs_localizer.inertial.samples import ImuSamples
-    from rs_localizer.inertial.settings import InertialSettings
     from rs_localizer.inertial.status import InertialStatus
 
 

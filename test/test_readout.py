@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.readout import (
     COMMON,
     StampAt,

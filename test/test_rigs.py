@@ -20,7 +20,7 @@ from benchmarks.independent.rigs import Mounted, Scene, middle_of, views
 from benchmarks.independent.rotations import exponential, logarithm
 from rs_localizer.config import CalibrationErrors
 from rs_localizer.core.types import Estimate
-from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.gyroscope_noise import InertialSettings
 
 UPRIGHT, TURNED = np.eye(3), np.diag([-1.0, -1.0, 1.0])
 ASKEW = exponential(np.array([0.2, -2.5, 0.4]))

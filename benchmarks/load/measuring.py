@@ -29,7 +29,7 @@ from benchmarks.load.camera import Camera
 from benchmarks.load.frames import READOUT_TIME, Frames
 from rs_localizer.core.arrays import Array
 from rs_localizer.io import topics
-from rs_localizer.ros.node.inputs import Intake, NotByExecutor
+from rs_localizer.ros.node.subscriptions import Intake, NotByExecutor
 from rs_localizer.settings import NODE_NAME
 
 _NODE = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"

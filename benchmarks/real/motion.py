@@ -27,8 +27,8 @@ from benchmarks.real.recordings import Frame, Recording
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
+from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.io.trajectories import read_tum, split_at_gaps
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker

@@ -47,7 +47,7 @@ if WORKING:
         transform_between,
     )
     from rs_localizer.offline.replay import find_topics, has_frames
-    from rs_localizer.pipeline.images import FrameDetector
+    from rs_localizer.pipeline.marker_detector import FrameDetector
     from rs_localizer.settings import write_camera_file
     from rs_localizer.tools import verdict
     from rs_localizer.tools.adjust.lens import LensErrors

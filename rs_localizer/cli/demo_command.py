@@ -67,7 +67,7 @@ class Options:
     quick: bool = option("a few frames of each recording only", default=False)
 
 
-class Frame(NamedTuple):
+class FrameMessages(NamedTuple):
     """Messages of a frame."""
 
     stamp_ns: int
@@ -106,40 +106,42 @@ def run(options: Options) -> None:
     print(f"done in {time.monotonic() - started:.0f} s\n{_AFTERWARDS}", end="")
 
 
-def read_frames(path: Path, most: int | None = None) -> list[Frame]:
+def read_frames(path: Path, most: int | None = None) -> list[FrameMessages]:
     """The frames, or the first ones, of a recording of correspondences.
 
     Raises:
         BagError: when it cannot be read.
     """
-    frames, info = list[Frame](), None
+    frames, info = list[FrameMessages](), None
     with open_bag(path) as bag:
         for topic, _, message in bag.messages({CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC}):
             if topic == CAMERA_INFO_TOPIC:
                 info = message
             else:
-                frames.append(Frame(stamp_ns(message), info, message))
+                frames.append(FrameMessages(stamp_ns(message), info, message))
     return frames[:most]
 
 
-def _fly(camera: Camera, motion: RecordedMotion, most: int | None) -> list[Frame]:
+def _fly(camera: Camera, motion: RecordedMotion, most: int | None) -> list[FrameMessages]:
     start_ns = motion.intervals_ns[0][0] + round(_FLIGHT_START * 1e9)
     first, last = np.searchsorted(
         stamps := frame_stamps(motion, camera, _SEEN.rate),
         [start_ns, start_ns + round(_FLIGHT_DURATION * 1e9)],
     )
     path = motion.state(start_ns, np.linspace(0.0, _FLIGHT_DURATION, 200)).positions
-    scene, frames = room(path, np.random.default_rng(0)), list[Frame]()
+    scene, frames = room(path, np.random.default_rng(0)), list[FrameMessages]()
     stamps = stamps[first:last][:most]
     with stage("Simulating a flight along a hand's motion", len(stamps)) as step:
         for seen in simulate_frames(camera, motion, scene, _SEEN, stamps_ns=stamps):
             cloud = make_correspondences(seen.stamp_ns, seen.points, seen.pixels, seen.ids)
-            frames.append(Frame(seen.stamp_ns, make_camera_info(camera, seen.stamp_ns), cloud))
+            frames.append(
+                FrameMessages(seen.stamp_ns, make_camera_info(camera, seen.stamp_ns), cloud)
+            )
             step(1)
     return frames
 
 
-def _true(camera: Camera, motion: TrueMotion, frames: Sequence[Frame]) -> Motions:
+def _true(camera: Camera, motion: TrueMotion, frames: Sequence[FrameMessages]) -> Motions:
     """The camera at the middle rows."""
     stamps = np.array([middle_stamp(camera, frame.stamp_ns) for frame in frames], np.int64)
     state = motion.state(int(stamps[0]), 1e-9 * (stamps - stamps[0]))
@@ -151,7 +153,7 @@ def _true(camera: Camera, motion: TrueMotion, frames: Sequence[Frame]) -> Motion
 
 
 def _localized(
-    title: str, frames: Sequence[Frame], readout_time: float, true: Motions | None
+    title: str, frames: Sequence[FrameMessages], readout_time: float, true: Motions | None
 ) -> Answers:
     """The frames by all methods, as a node localizes them, and a table of what came of it."""
     answers, rows = dict[str, dict[int, Localized]](), dict[str, np.ndarray]()
@@ -192,12 +194,12 @@ def _settings(solver: str, readout_time: float) -> dict[str, Any]:
 def _cube(walls: cube_clip.Walls, most: int | None, out: Path) -> None:
     """Walls of markers, filmed and detected, and the cube there by the poses of both methods."""
     stamps, camera = walls.stamps(most), cube_clip.CAMERA
-    images, frames = [], list[Frame]()
+    images, frames = [], list[FrameMessages]()
     with stage("Rendering walls of markers", len(stamps)) as step:
         for stamp, (image, seen) in zip(stamps, walls.film(stamps), strict=True):
             images.append(image)
             cloud = make_correspondences(stamp, seen.points, seen.pixels, seen.ids)
-            frames.append(Frame(stamp, make_camera_info(camera, stamp), cloud))
+            frames.append(FrameMessages(stamp, make_camera_info(camera, stamp), cloud))
             step(1)
     true = _true(camera, walls.motion, frames)
     answers = _localized("Walls of markers", frames, camera.readout_time, true)
@@ -220,7 +222,10 @@ def _cube(walls: cube_clip.Walls, most: int | None, out: Path) -> None:
 
 
 def _live(
-    frames: Sequence[Frame], answers: Mapping[int, Localized], readout_time: float, log: Path
+    frames: Sequence[FrameMessages],
+    answers: Mapping[int, Localized],
+    readout_time: float,
+    log: Path,
 ) -> None:
     """The flight once more through a live node, which says the same."""
     try:

@@ -42,8 +42,8 @@ if WORKING:
     from rs_localizer.offline.detect import Extraction, record, record_features
     from rs_localizer.offline.fleet import Figures
     from rs_localizer.offline.image_sources import Carried, Shot
-    from rs_localizer.pipeline.images import FrameDetector
     from rs_localizer.pipeline.keypoints import FrameExtractor
+    from rs_localizer.pipeline.marker_detector import FrameDetector
 
     Shots = Iterable[Shot | Carried]
 

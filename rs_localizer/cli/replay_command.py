@@ -39,7 +39,7 @@ if WORKING:
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
     from rs_localizer.io.topics import IMU
     from rs_localizer.markers.map_files import is_marker_file
-    from rs_localizer.offline import fleet, table
+    from rs_localizer.offline import fleet, frame_table
     from rs_localizer.offline.fleet import Figures, Outcome, Task
     from rs_localizer.offline.image_sources import holds_images, image_topics
     from rs_localizer.offline.replay import (
@@ -118,7 +118,7 @@ def _check_place(options: Options) -> None:
     file = options.parquet
     if file is None:
         return
-    table.schema()  # what is not installed is said now
+    frame_table.schema()  # what is not installed is said now
     check_writable(file)
     if not file.is_file():
         return  # nothing is there, or what takes all that comes, such as /dev/stdout
@@ -234,7 +234,7 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
         localizer.warm_up()
         tally = Tally(bag.count([topics.frames]), notices)
         if options.parquet is not None:
-            tally.table = table.FrameTable(recording, localizer, options.smooth)
+            tally.table = frame_table.FrameTable(recording, localizer, options.smooth)
         earlier = replaced(options, f"{RESULT}/metadata.yaml", out, _remove_results)
         with atomic_directory(out, earlier) as built:
             built.mkdir()
@@ -251,7 +251,7 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
 
 
 def _write_table(tables: list[Table], file: Path) -> None:
-    rows = table.write_parquet(tables, file)
+    rows = frame_table.write_parquet(tables, file)
     print(f"written to {file}: {rows} rows, one a frame")
 
 
@@ -460,7 +460,9 @@ def _replay_all(options: Options) -> None:
     print(f"written to {out / fleet.SUMMARY}")
     done = [task for task in tasks if outcomes[task.folder].figures is not None]
     if options.parquet is not None:
-        _write_table([table.read_parquet(task.folder / TABLE) for task in done], options.parquet)
+        _write_table(
+            [frame_table.read_parquet(task.folder / TABLE) for task in done], options.parquet
+        )
     if failed := len(tasks) - len(done):
         raise ValueError(
             f"{failed} of {len(tasks)} recordings failed; {out / fleet.SUMMARY} says why"

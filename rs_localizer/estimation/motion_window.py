@@ -79,7 +79,7 @@ class Gaussian(NamedTuple):
     shifts: Array  # (18,m) by one deviation of each error of calibration and map
 
 
-class Sample(NamedTuple):
+class MotionSample(NamedTuple):
     """What the points of one frame say of its motion."""
 
     time_ns: int
@@ -117,7 +117,7 @@ class MotionWindow:
     start: Gaussian
     configured: Array
     deviations: Array
-    samples: tuple[Sample, ...] = ()
+    samples: tuple[MotionSample, ...] = ()
     solved: _Solved | None = None
     readout_share: float = 0.0
 
@@ -182,7 +182,7 @@ class MotionWindow:
             return self.before(len(times) - 1 - times.index(time_ns))
         row = int(np.searchsorted(times, time_ns)) - 1
         neighbour = self.samples[row]
-        silent = Sample(
+        silent = MotionSample(
             time_ns, neighbour.state, np.zeros((PARAMETERS,) * 2), np.zeros(PARAMETERS),
             np.zeros_like(neighbour.pulls),
         )  # fmt: skip
@@ -190,7 +190,7 @@ class MotionWindow:
         solved = _solved(self.start, samples, self.deviations, self.readout_share)
         return replace(self, samples=samples, solved=solved).before(len(self.samples) - row)
 
-    def joined(self, sample: Sample) -> MotionWindow:
+    def joined(self, sample: MotionSample) -> MotionWindow:
         """With one more frame, and with what it tells of the accelerations."""
         start, samples = self.start, (*self.samples, sample)
         if len(samples) >= LENGTH:
@@ -241,7 +241,7 @@ def _moved(motion: Gaussian, time_ns: int, deviations: Array, readout_share: flo
 
 
 def _solved(
-    start: Gaussian, samples: tuple[Sample, ...], deviations: Array, readout_share: float
+    start: Gaussian, samples: tuple[MotionSample, ...], deviations: Array, readout_share: float
 ) -> _Solved:
     times = np.array([1e-9 * (sample.time_ns - start.time_ns) for sample in samples])
     width = max(start.shifts.shape[1], *(sample.pulls.shape[1] for sample in samples))
@@ -444,7 +444,7 @@ def motion_of(gaussian: Gaussian, span: float) -> tuple[Motion, Array]:
 
 def sample_of(
     estimate: Estimate, time_ns: int, known: PriorTerms, configured: PriorTerms
-) -> Sample:
+) -> MotionSample:
     """What the points of an estimate say beside what was known of its motion before.
 
     Args:
@@ -458,7 +458,7 @@ def sample_of(
     told: Array = _told_by_points(covariance, information)
     # As far as the settings' prior lets errors move the motion, the points have pulled it.
     pulls = (told + configured.informations[0]) @ estimate.calibration_shifts
-    return Sample(
+    return MotionSample(
         time_ns, _state(motion, units), told / np.outer(units, units), slope / units,
         pulls / units[:, None],
     )  # fmt: skip
@@ -518,7 +518,7 @@ def warm_up() -> None:
     still = np.concatenate([np.eye(3).ravel(), np.zeros(STATE_SIZE - 9)])
     unit = np.eye(PARAMETERS)
     start = Gaussian(0, still, unit, np.zeros((PARAMETERS, 1)))
-    sample = Sample(10**7, still, unit, np.zeros(PARAMETERS), np.zeros((PARAMETERS, 1)))
+    sample = MotionSample(10**7, still, unit, np.zeros(PARAMETERS), np.zeros((PARAMETERS, 1)))
     window = MotionWindow.begin(start, Acceleration(1.0, 1.0)).joined(sample)
     window.before(1)
     window.after(2 * 10**7)

@@ -22,10 +22,10 @@ from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.inertial import turning
 from rs_localizer.inertial.filter import RATE, GyroscopeFilter, Predicted
 from rs_localizer.inertial.gravity import gravity_seen
+from rs_localizer.inertial.gyroscope_noise import OFFSET_DEVIATION, InertialSettings
 from rs_localizer.inertial.offset_search import OffsetSearch, Orientation
 from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.settings import OFFSET_DEVIATION, InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.inertial.turning import TurnBetween, TurnWithin
 from rs_localizer.inertial.watch import GyroscopeWatch

@@ -26,7 +26,7 @@ from rs_localizer.core.state import (
     PARAMETERS,
 )
 from rs_localizer.inertial import turning
-from rs_localizer.inertial.settings import (
+from rs_localizer.inertial.gyroscope_noise import (
     BIAS_DEVIATION,
     JITTER,
     OFFSET_DEVIATION,

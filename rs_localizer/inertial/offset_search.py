@@ -28,8 +28,8 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import PARAMETERS
+from rs_localizer.inertial.gyroscope_noise import BIAS_DEVIATION, OFFSET_DEVIATION, SCALE_DEVIATION
 from rs_localizer.inertial.row_offset_likelihood import RowOffsetLikelihood
-from rs_localizer.inertial.settings import BIAS_DEVIATION, OFFSET_DEVIATION, SCALE_DEVIATION
 
 _EACH = 60  # offsets on either side of the middle one
 # s from one to the next: of frames whose rows count (a vibration of 120 Hz has 16 steps in a

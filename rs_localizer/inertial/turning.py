@@ -30,8 +30,8 @@ from rs_localizer.core.gyro_rotation import GyroRotation, turn_of
 from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import coefficients, log
+from rs_localizer.inertial.gyroscope_noise import JITTER, SCALE_DEVIATION
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.settings import JITTER, SCALE_DEVIATION
 
 # End of the spectrum, as a part of the sample rate, and noise beside it (variance).
 _BAND, _NOISE = 0.4, 1e-5

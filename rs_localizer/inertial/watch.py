@@ -18,9 +18,9 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.inertial.filter import GyroscopeFilter
+from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.offset_search import BY_TURNS, OffsetSearch, Orientation
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.inertial.turning import turn_between
 

@@ -27,7 +27,7 @@ TYPES = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pose:
+class BodyPose:
     """Pose of the body in the map."""
 
     position: Array  # (3,) m
@@ -63,7 +63,7 @@ class Localized:
     stamp_ns: int  # for which pose and twist are valid
     map_frame: str
     body_frame: str
-    pose: Pose
+    pose: BodyPose
     twist: Twist | None  # None: the readout time is unknown, or the solver sees no motion
     inliers: NDArray[Any]  # (k,) structured: the input rows that were kept, and their residual
     dropped: int  # input rows with NaN or infinity

@@ -119,7 +119,7 @@ def make_transform(
 
 
 @dataclass(slots=True)
-class _Track:
+class _Links:
     """A frame in its parent over time: for ever, or samples in the order of time."""
 
     stamps: list[int] = field(default_factory=list)  # ns; none: the only link holds for ever
@@ -162,7 +162,7 @@ class TransformTree:
     """
 
     def __init__(self) -> None:
-        self._tracks: dict[str, _Track] = {}  # by child
+        self._tracks: dict[str, _Links] = {}  # by child
         self._parents: set[str] = set()
 
     def add(self, message: Any, *, static: bool) -> None:
@@ -178,11 +178,11 @@ class TransformTree:
                 continue
             self._parents.add(parent)
             if static:
-                self._tracks[child] = _Track(links=[(parent, link)])
+                self._tracks[child] = _Links(links=[(parent, link)])
                 continue
             track = self._tracks.get(child)
             if track is None or not track.stamps:  # the first, or one that was static
-                track = self._tracks[child] = _Track()
+                track = self._tracks[child] = _Links()
             track.add(stamp_of(stamped), parent, link)
 
     def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:

@@ -27,7 +27,7 @@ from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.io.clouds import Correspondences, Keypoints
 from rs_localizer.io.maps.landmarks import Descriptors, Ids, Map
 from rs_localizer.matching.kernels import (
-    Best,
+    BestFound,
     Near,
     in_view,
     move,
@@ -86,7 +86,7 @@ class Index:
         result, count = Nearest.none(len(queries)), len(visible.landmarks)
         owners = np.full(count, -1, np.int64)
         near = Near(pixels, visible.landmarks, visible.pixels, visible.gate)
-        best = Best(result.distances, result.landmarks, np.full(count, np.inf), owners)
+        best = BestFound(result.distances, result.landmarks, np.full(count, np.inf), owners)
         self._search_within(self._packed(queries), self._rows, near, best)
         return result, owners
 
@@ -176,14 +176,14 @@ _BORDER_PIXELS = 33
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class SearchView:
     """What the image may show."""
 
     landmarks: IntArray  # (v,)
     gate: float  # px around the prediction
 
 
-def find_view(camera: Camera, prior: Prior, points: Array, least_gate: float) -> View:
+def find_view(camera: Camera, prior: Prior, points: Array, least_gate: float) -> SearchView:
     """The landmarks that some row may see, and how far from the prediction.
 
     Args:
@@ -202,12 +202,12 @@ def find_view(camera: Camera, prior: Prior, points: Array, least_gate: float) ->
     in_view(points, state_in(prior.motion, np.zeros(3)), low - slack, high + slack, depths)
     near = np.flatnonzero(depths)
     if len(near) == 0:
-        return View(near, float(least_gate))
+        return SearchView(near, float(least_gate))
     deviation = focal * _bearing_deviation(prior.covariance, float(np.median(depths[near])))
-    return View(near, float(min(max(least_gate, _DEVIATIONS * deviation), widest)))
+    return SearchView(near, float(min(max(least_gate, _DEVIATIONS * deviation), widest)))
 
 
-def search_cost(camera: Camera, view: View, queries: int, candidate_cost: float) -> float:
+def search_cost(camera: Camera, view: SearchView, queries: int, candidate_cost: float) -> float:
     """What it takes to project the view and to search near the predictions, in ns.
 
     Args:
@@ -224,7 +224,7 @@ def search_cost(camera: Camera, view: View, queries: int, candidate_cost: float)
     return len(view.landmarks) * (projection + search)
 
 
-def predict(camera: Camera, prior: Prior, points: Array, view: View) -> Visible:
+def predict(camera: Camera, prior: Prior, points: Array, view: SearchView) -> Visible:
     """Where the image should show the landmarks of a view: each at the time of its own row."""
     assert prior.motion is not None
     near, gate = view.landmarks, view.gate

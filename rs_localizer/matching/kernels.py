@@ -97,7 +97,7 @@ class Near(NamedTuple):
     gate: float  # px between the two
 
 
-class Best(NamedTuple):
+class BestFound(NamedTuple):
     """What a search fills in."""
 
     distances: Array  # (q,2)
@@ -107,7 +107,7 @@ class Best(NamedTuple):
 
 
 @inlined
-def _enter(best: Best, near: Near, q: int, k: int, distance: float) -> None:
+def _enter(best: BestFound, near: Near, q: int, k: int, distance: float) -> None:
     _insert(distance, near.landmarks[k], best.distances[q], best.indices[q])
     if distance < best.rivals[k]:
         best.rivals[k], best.owners[k] = distance, q
@@ -121,7 +121,7 @@ def _is_near(near: Near, q: int, k: int) -> bool:
 
 
 @kernel
-def nearest_binary_within(queries: Any, rows: Any, near: Near, best: Best) -> None:
+def nearest_binary_within(queries: Any, rows: Any, near: Near, best: BestFound) -> None:
     """Among the landmarks of rows (n,w) that are predicted near the keypoint."""
     lines = near.predicted[:, 1].copy()
     for q in range(len(queries)):
@@ -137,7 +137,7 @@ def nearest_binary_within(queries: Any, rows: Any, near: Near, best: Best) -> No
 
 
 @kernel
-def nearest_real_within(queries: Any, rows: Any, near: Near, best: Best) -> None:
+def nearest_real_within(queries: Any, rows: Any, near: Near, best: BestFound) -> None:
     """As :func:`nearest_binary_within`, by the Euclidean distance of rows of numbers."""
     lines = near.predicted[:, 1].copy()
     for q in range(len(queries)):

@@ -31,8 +31,8 @@ from rs_localizer.markers.detection import recognized
 from rs_localizer.markers.map_check import MapCheck, Predict, still_residual
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
-from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
+from rs_localizer.pipeline.marker_detector import Detected, FrameDetector, correspondences
 from rs_localizer.pipeline.refusal import Refusal
 
 # Fewer corners than this say nothing about how well a pose fits.

@@ -33,10 +33,10 @@ from rs_localizer.io.trajectories import (
 )
 from rs_localizer.io.transforms import TransformError, make_transform
 from rs_localizer.offline.fleet import Figures
+from rs_localizer.offline.frame_table import FrameTable
 from rs_localizer.offline.replay import TF_TYPE
-from rs_localizer.offline.table import FrameTable
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.imu import ImuState
+from rs_localizer.pipeline.imu_readings import ImuState
 from rs_localizer.pipeline.published import broadcast
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.settings import NODE_NAME

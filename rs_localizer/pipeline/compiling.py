@@ -26,8 +26,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd import compiler
 from rs_localizer.core.simd.jit import NotCompiled, at_once, cache_directory, digest, make_folder
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 from rs_localizer.tracking import Tracker

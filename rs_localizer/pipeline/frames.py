@@ -42,16 +42,16 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.cloud_checks import oddities
 from rs_localizer.pipeline.compiling import note_whole, plain_frames
 from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
-from rs_localizer.pipeline.imu import ImuInput, inertial_settings
+from rs_localizer.pipeline.imu_readings import ImuInput, inertial_settings
 from rs_localizer.pipeline.inputs import INPUTS
-from rs_localizer.pipeline.landmarks import Landmarks, read_landmarks
+from rs_localizer.pipeline.keypoint_map import Landmarks, read_landmarks
 from rs_localizer.pipeline.pose_at_time import middle_row_ns, published_moment
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch, Watched
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
 from rs_localizer.pipeline.rig_frames import (
+    CameraImage,
     FrameAssembler,
-    Image,
     joined,
     matches_of,
     share_of,
@@ -450,7 +450,7 @@ class FrameLocalizer:
         watch, frame = self.rig_watch, self.camera_frame
         start_ns = cloud.stamp_ns + round(own.stamp_offset * 1e9)
         middle_ns = start_ns - round(camera.first_row_time * own.readout_time * 1e9)
-        image = Image(name, start_ns, middle_ns, cloud)
+        image = CameraImage(name, start_ns, middle_ns, cloud)
         for images in self._assembler.add(image):
             yield self._localize_frame(images)
         fixed = {
@@ -616,7 +616,7 @@ class FrameLocalizer:
             )
         return thinned(cloud, most, camera.size)
 
-    def _localize_frame(self, images: Sequence[Image]) -> Localized | Refusal:
+    def _localize_frame(self, images: Sequence[CameraImage]) -> Localized | Refusal:
         reference = images[0].cloud
         others = {image.cloud.frame for image in images} - {reference.frame}
         if others:
@@ -646,7 +646,7 @@ class FrameLocalizer:
         self._landmarks.lacking = False  # who sends correspondences needs none
         return self.mounted(self._localized(images, result, origin_ns))
 
-    def _mount(self, images: Sequence[Image]) -> Refusal | None:
+    def _mount(self, images: Sequence[CameraImage]) -> Refusal | None:
         """Look up where cameras are that move; why one of this frame is not known."""
         frame, stamp_ns = self.camera_frame, images[0].cloud.stamp_ns or None
         mounts, refusal = dict(self._mounts), None
@@ -668,7 +668,9 @@ class FrameLocalizer:
                 self._tracker.mount(self.rig)
         return refusal
 
-    def _localized(self, images: Sequence[Image], result: RigEstimate, origin_ns: int) -> Localized:
+    def _localized(
+        self, images: Sequence[CameraImage], result: RigEstimate, origin_ns: int
+    ) -> Localized:
         """Pose and twist of the rig's axes at the published moment."""
         config, first = self._config, images[0].cloud
         time_ns = origin_ns + round(1e9 * result.time)

@@ -16,7 +16,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.outputs import Localized, Pose
+from rs_localizer.io.outputs import BodyPose, Localized
 from rs_localizer.io.transforms import Transform
 
 # Of odometry that nobody has seen drift yet: m/s and rad/s, of wheels on carpet.
@@ -176,7 +176,7 @@ def _offsets(older: _Correction, newer: _Correction) -> Array:
     return np.array([np.linalg.norm(off), np.linalg.norm(turn)])
 
 
-def _variances(pose: Pose, *, two_d: bool) -> tuple[float, float]:
+def _variances(pose: BodyPose, *, two_d: bool) -> tuple[float, float]:
     """Traces of a covariance; of a correction in the plane, of what it has."""
     own = pose.covariance.diagonal()
     return (own[:2].sum(), own[5]) if two_d else (own[:3].sum(), own[3:].sum())

@@ -41,15 +41,15 @@ from rs_localizer.core.moment_kernels import pose_of, twist_of
 from rs_localizer.core.shutter import Numbers, numbers_of
 from rs_localizer.core.state import MOTION_PARAMETERS
 from rs_localizer.core.types import Estimate, beyond_rows
-from rs_localizer.io.outputs import Pose, Twist
+from rs_localizer.io.outputs import BodyPose, Twist
 
 
-def pose_at(estimate: Estimate, tau: float) -> Pose:
+def pose_at(estimate: Estimate, tau: float) -> BodyPose:
     """Pose of the camera in the map at row time ``tau``."""
     position, rotation, covariance = pose_of(
         *_numbers(estimate, tau), beyond_rows(estimate, tau)[0]
     )
-    return Pose(position=position, rotation=rotation, covariance=covariance)
+    return BodyPose(position=position, rotation=rotation, covariance=covariance)
 
 
 def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
@@ -71,8 +71,8 @@ def _numbers(estimate: Estimate, tau: float) -> tuple[Numbers, Array, Array, Tur
 
 
 def with_timing(
-    pose: Pose, twist: Twist, deviation: float, delay: float, acceleration: Acceleration
-) -> tuple[Pose, Twist]:
+    pose: BodyPose, twist: Twist, deviation: float, delay: float, acceleration: Acceleration
+) -> tuple[BodyPose, Twist]:
     """The covariances with what is not known of the readout time.
 
     Args:
@@ -92,7 +92,7 @@ def with_timing(
     )
 
 
-def either(pose: Pose, other: Pose) -> Pose:
+def either(pose: BodyPose, other: BodyPose) -> BodyPose:
     """A pose with room for another that it may be as well."""
     displacement = other.position - pose.position
     turn = so3.log(np.ascontiguousarray(other.rotation @ pose.rotation.T))

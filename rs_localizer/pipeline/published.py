@@ -26,7 +26,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences, select_inliers
-from rs_localizer.io.outputs import Localized, Pose, Twist
+from rs_localizer.io.outputs import BodyPose, Localized, Twist
 from rs_localizer.io.transforms import NotYetError, Transform, TransformError, Transforms
 from rs_localizer.pipeline.map_to_odom import corrected
 from rs_localizer.pipeline.pose_at_time import (
@@ -81,12 +81,12 @@ def find_mounting(
     )
 
 
-def base_pose(camera: Pose, mounting: Mounting) -> Pose:
+def base_pose(camera: BodyPose, mounting: Mounting) -> BodyPose:
     """Pose of the base in the map, from that of the camera."""
     lever = camera.rotation @ mounting.camera_from_base.translation
     jacobian = np.eye(6)
     jacobian[_LINEAR, _ANGULAR] = -so3.hat(lever)
-    return Pose(
+    return BodyPose(
         position=camera.position + lever,
         rotation=camera.rotation @ mounting.camera_from_base.rotation,
         covariance=_propagate(jacobian, camera.covariance),
@@ -117,7 +117,7 @@ def _propagate(jacobian: Array, covariance: Array) -> Array:
 _LEAST_COSINE = 0.02
 
 
-def about_angles(pose: Pose) -> Pose:
+def about_angles(pose: BodyPose) -> BodyPose:
     """The pose with the covariance of x, y, z, roll, pitch and yaw.
 
     REP-103 means small rotations about the fixed axes of the map; an extended Kalman filter whose

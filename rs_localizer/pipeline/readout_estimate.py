@@ -112,7 +112,7 @@ class MeasuredReadout:
         return self.deviation / max(abs(self.readout_time), 1e-12)
 
 
-class View(NamedTuple):
+class ImageMotion(NamedTuple):
     """One frame by its image alone."""
 
     rotation: Array  # (3,3) map_from_camera
@@ -139,7 +139,7 @@ class ReadoutEstimate:
 
     def reset(self) -> None:
         """Forget all frames."""
-        self._views: deque[tuple[int, View]] = deque(maxlen=3)
+        self._views: deque[tuple[int, ImageMotion]] = deque(maxlen=3)
         self._before: Equation | None = None
         self._means = np.zeros((2, _SIDE))  # of x and y
         self._sums, self._last = np.zeros(2), np.zeros(2)  # of (b, a), and of the last few
@@ -245,7 +245,7 @@ class ReadoutEstimate:
         return MeasuredReadout(value, deviation, self._triples, telling, self._usual / _SIDE)
 
 
-def view(camera: Camera, estimate: Estimate, points: Array, pixels: Array) -> View | None:
+def view(camera: Camera, estimate: Estimate, points: Array, pixels: Array) -> ImageMotion | None:
     """A frame by its image alone: one Gauss-Newton step of constant velocities on its inliers.
 
     None where they are too few.
@@ -275,7 +275,7 @@ def view(camera: Camera, estimate: Estimate, points: Array, pixels: Array) -> Vi
     covariance: Array = variance * held
     covariance[VELOCITIES, VELOCITIES] = free[VELOCITIES, VELOCITIES]
     back = estimate.rotation.T
-    return View(
+    return ImageMotion(
         back @ so3.exp(step[:3]),
         estimate.position + back @ step[3:6],
         np.concatenate([steady.angular_velocity, steady.linear_velocity]) + step[6:],
@@ -288,7 +288,9 @@ def _exposure(camera: Camera) -> Exposure:
     return Rig.of(camera).exposure().ahead()
 
 
-def equation(before: View, now: View, after: View, first: float, second: float) -> Equation:
+def equation(
+    before: ImageMotion, now: ImageMotion, after: ImageMotion, first: float, second: float
+) -> Equation:
     """The equation of three views; ``first``, ``second``: s from one to the next."""
     span = first + second
     # Integral of the parabola through three values (Simpson's rule for unlike intervals).

@@ -32,7 +32,7 @@ _LONGEST_STEP = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Image:
+class CameraImage:
     """Points that one of the cameras saw."""
 
     camera: str
@@ -57,13 +57,13 @@ class FrameAssembler:
 
     def reset(self) -> None:
         """Forget all images so far."""
-        self._waiting: dict[str, Image] = {}
+        self._waiting: dict[str, CameraImage] = {}
         self._last_ns: int | None = None  # middle of the latest image of the last frame
         self._stamps: dict[str, int] = {}  # the last of each camera
         self._missed = dict.fromkeys(self._names, 0)  # frames in a row
         self._gone_back: set[str] = set()
 
-    def add(self, image: Image) -> list[list[Image]]:
+    def add(self, image: CameraImage) -> list[list[CameraImage]]:
         """The frames that are complete with this image: none, one or two."""
         if not self._is_usable(image):
             return []
@@ -77,18 +77,18 @@ class FrameAssembler:
             frames.append(self._complete())
         return frames
 
-    def flush(self) -> list[list[Image]]:
+    def flush(self) -> list[list[CameraImage]]:
         """Frames that are left when no more images will come."""
         return [self._complete()] if self._waiting else []
 
-    def _belongs(self, image: Image) -> bool:
+    def _belongs(self, image: CameraImage) -> bool:
         """True if an image is of the frame that waits."""
         return image.camera not in self._waiting and all(
             abs(image.middle_ns - other.middle_ns) <= self._window_ns
             for other in self._waiting.values()
         )
 
-    def _is_usable(self, image: Image) -> bool:
+    def _is_usable(self, image: CameraImage) -> bool:
         """True if an image can be of the frame that waits, or of the next one."""
         name, time_ns = image.camera, image.middle_ns
         before = self._stamps.get(name)
@@ -122,7 +122,7 @@ class FrameAssembler:
     def _is_ahead(self, time_ns: int) -> bool:
         return self._last_ns is not None and time_ns - self._last_ns > _LONGEST_STEP * 1e9
 
-    def _complete(self) -> list[Image]:
+    def _complete(self) -> list[CameraImage]:
         """The frame that waits, in the order of the names."""
         frame = [self._waiting[name] for name in self._names if name in self._waiting]
         self._waiting = {}
@@ -139,7 +139,7 @@ class FrameAssembler:
         self._notice(Notice.NO_IMAGES, f"{name} is left out: {why}")
 
 
-def matches_of(cloud: Correspondences, images: Sequence[Image]) -> tuple[Array, ...]:
+def matches_of(cloud: Correspondences, images: Sequence[CameraImage]) -> tuple[Array, ...]:
     """Points and pixels of an image; with scores, where all images have them."""
     if any(image.cloud.scores is None for image in images):
         return cloud.points, cloud.pixels
@@ -147,13 +147,13 @@ def matches_of(cloud: Correspondences, images: Sequence[Image]) -> tuple[Array, 
     return cloud.points, cloud.pixels, cloud.scores
 
 
-def joined(names: Sequence[str], images: Sequence[Image]) -> Correspondences:
+def joined(names: Sequence[str], images: Sequence[CameraImage]) -> Correspondences:
     """Correspondences of all images with the stamp of the first; ``names``: of all cameras."""
     dropped = sum(image.cloud.dropped for image in images)
     return replace(images[0].cloud, table=_table(names, images), dropped=dropped)
 
 
-def _table(names: Sequence[str], images: Sequence[Image]) -> NDArray[Any]:
+def _table(names: Sequence[str], images: Sequence[CameraImage]) -> NDArray[Any]:
     """The rows of all images, of the fields that all have, and which of the cameras it was."""
     types = [image.cloud.table.dtype for image in images]
     fields = [name for name in types[0].names or () if all(name in (t.names or ()) for t in types)]
@@ -171,7 +171,7 @@ def _table(names: Sequence[str], images: Sequence[Image]) -> NDArray[Any]:
     return rows
 
 
-def share_of(image: Image, result: RigEstimate) -> CameraShare:
+def share_of(image: CameraImage, result: RigEstimate) -> CameraShare:
     """Contribution of one camera to an estimate."""
     name = image.camera
     assert isinstance(result.inliers, ByCamera)  # as all of a rig

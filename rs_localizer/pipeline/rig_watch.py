@@ -39,7 +39,7 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 from rs_localizer.pipeline.published import Mounting, base_pose
 from rs_localizer.pipeline.refusal import Notify
-from rs_localizer.pipeline.rig_frames import Image
+from rs_localizer.pipeline.rig_frames import CameraImage
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Tracker
 
@@ -163,7 +163,7 @@ class RigWatch:
         """Take note of whether a frame of all was localized."""
         self._refused = not localized
 
-    def add(self, image: Image, camera: Camera, mounts: Mapping[str, Transform]) -> None:
+    def add(self, image: CameraImage, camera: Camera, mounts: Mapping[str, Transform]) -> None:
         """Take an image, and where the cameras are in the rig."""
         name, reference = image.camera, self._names[0]
         self._frames += name == reference

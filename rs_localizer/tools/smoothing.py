@@ -24,7 +24,7 @@ from rs_localizer.core.rig import Rig
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 from rs_localizer.core.types import Estimate
-from rs_localizer.inertial.settings import SCALE_DEVIATION
+from rs_localizer.inertial.gyroscope_noise import SCALE_DEVIATION
 from rs_localizer.inertial.turning import MOST_ROUGH
 from rs_localizer.tools.adjust.fit import Fit, cheaper, solve
 from rs_localizer.tools.adjust.motion import acceleration_rows

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.simulation.__main__ import record
 from rs_localizer import data
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.camera_files import read_calibration
 from rs_localizer.io.trajectories import read_tum

@@ -16,7 +16,7 @@ import pytest
 from recorded import add_telemetry, write_mp4
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.cli.marker_map import find_map
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import read_calibration, write_calibration

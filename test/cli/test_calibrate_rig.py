@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.simulation.__main__ import record
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.rigs import RigParts, read_camchain, write_camchain
 from rs_localizer.settings import build, load_params_file

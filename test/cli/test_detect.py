@@ -13,7 +13,7 @@ import pytest
 from recorded import imu, tf, write_mp4
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
@@ -25,8 +25,8 @@ from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.offline import detect as detecting
-from rs_localizer.pipeline.images import FrameDetector, correspondences
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
+from rs_localizer.pipeline.marker_detector import FrameDetector, correspondences
 from rs_localizer.settings import build, load_params_file
 
 K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.io.trajectories import Trajectory, Twists, read_motions, write_tum, write_twists
 
 STAMPS = 1_500_000_000_000_000_000 + np.arange(40, dtype=np.int64) * 33_333_333

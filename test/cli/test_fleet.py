@@ -21,7 +21,7 @@ from types import SimpleNamespace
 import pytest
 
 from rs_localizer.cli import replay_command
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.offline import fleet
 from rs_localizer.offline.fleet import Outcome, Task, perform, perform_all, tasks_of
 

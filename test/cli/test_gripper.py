@@ -14,11 +14,11 @@ from recorded import add_telemetry, write_mp4
 
 from benchmarks.room_mapping import Piece, Room
 from rs_localizer import data
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.map_files import write_marker_map
-from rs_localizer.offline.table import read_parquet
+from rs_localizer.offline.frame_table import read_parquet
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.simulation.settings import ImageSettings
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.io.maps.files import read_map_file, write_npz
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.markers.map_files import read_any, read_marker_map, write_marker_map

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import write_calibration
 from rs_localizer.tools.simulation.walls import collage

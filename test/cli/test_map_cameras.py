@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from benchmarks.simulation.__main__ import record
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_files import write_calibration

@@ -13,7 +13,7 @@ import pytest
 from recorded import CAMERA, READOUT_TIME, SHUTTER, flight, write_ros1
 
 from rs_localizer.cli import replay_command
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.cli.replay_command import print_summary
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES, Localized

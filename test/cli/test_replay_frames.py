@@ -10,7 +10,7 @@ import pytest
 from recorded import CAMERA, SHUTTER, flight, tf, write_ros1
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.trajectories import read_tum, read_twists

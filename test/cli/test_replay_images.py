@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from recorded import write_mp4
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_files import write_calibration
 from rs_localizer.io.camera_info import read_camera_info

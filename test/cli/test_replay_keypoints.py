@@ -9,7 +9,7 @@ from recorded import SHUTTER
 
 from benchmarks.simulation.__main__ import record
 from benchmarks.simulation.keypoints import keypoint_rows, map_rows, random_descriptors
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map

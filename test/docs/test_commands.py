@@ -12,7 +12,7 @@ import pages
 import pytest
 
 from benchmarks.__main__ import EXPERIMENTS
-from rs_localizer.cli.main import COMMANDS, parse
+from rs_localizer.cli.commands import COMMANDS, parse
 from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.io.topics import GIVEN_POSES
 from rs_localizer.pipeline.inputs import INPUTS

@@ -10,15 +10,15 @@ from typing import Any
 import pages
 import pytest
 
-from rs_localizer.cli.main import COMMANDS
+from rs_localizer.cli.commands import COMMANDS
 from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.topics import LIVE
-from rs_localizer.offline.table import COLUMNS
+from rs_localizer.offline.frame_table import COLUMNS
 from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.ros.localizer.node import Feed
-from rs_localizer.ros.node.health import State
+from rs_localizer.ros.node.diagnostics import State
 from rs_localizer.settings import Kind, settings
 from rs_localizer.solvers.table import SOLVERS, find_solver
 

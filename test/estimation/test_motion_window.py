@@ -13,8 +13,8 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.motion_window import (
     LENGTH,
     Gaussian,
+    MotionSample,
     MotionWindow,
-    Sample,
     sample_of,
 )
 from rs_localizer.estimation.prior import Prior, motion_terms, with_motion
@@ -76,7 +76,7 @@ def samples_of(path, rng, first=0):
         seen[12:] = 0.0
         time_ns = round(1e9 * PERIOD * (first + k + 1))
         found.append(
-            Sample(time_ns, apply_step(STILL, seen), SEEN, np.zeros(18), np.zeros((18, 0)))
+            MotionSample(time_ns, apply_step(STILL, seen), SEEN, np.zeros(18), np.zeros((18, 0)))
         )
     return found
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 pytest.importorskip("pyarrow", exc_type=ImportError)
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.clouds import read_correspondences

@@ -7,8 +7,8 @@ import pytest
 
 from rs_localizer.core.shutter import Motion
 from rs_localizer.inertial.filter import GyroscopeFilter, Predicted
+from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.turning import turn_between, turn_within
 
 STILL = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))

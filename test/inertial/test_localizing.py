@@ -9,7 +9,7 @@ import pytest
 
 from rs_localizer.core.so3 import log
 from rs_localizer.core.types import Estimate
-from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.status import Alone
 from rs_localizer.inertial.turning import GyroscopeErrors, turn_between, turn_within
 from rs_localizer.localizer import Localizer

@@ -13,7 +13,7 @@ from benchmarks.independent.cameras import Camera
 from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, rest, shaken_hand
 from benchmarks.independent.scenes import Rich
-from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tracking import Tracker

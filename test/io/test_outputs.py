@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.io.bags import make_message, typestore
-from rs_localizer.io.outputs import TYPES, Localized, Pose, Twist, messages
+from rs_localizer.io.outputs import TYPES, BodyPose, Localized, Twist, messages
 
 
 @pytest.fixture
 def frame() -> Localized:
     rng = np.random.default_rng(1)
     rows = np.zeros(3, [(name, "<f4") for name in ("x", "y", "z", "u", "v", "residual")])
-    pose = Pose(rng.normal(size=3), so3.exp(rng.normal(size=3)), rng.normal(size=(6, 6)))
+    pose = BodyPose(rng.normal(size=3), so3.exp(rng.normal(size=3)), rng.normal(size=(6, 6)))
     twist = Twist(rng.normal(size=3), rng.normal(size=3), rng.normal(size=(6, 6)))
     # The stamp is half a readout before one of 0.
     return Localized(1_999_999_999, -1, "hall", "left_eye", pose, twist, rows, 0, None)

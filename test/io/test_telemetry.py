@@ -21,7 +21,7 @@ pytest.importorskip("telemetry_parser", reason="needs telemetry-parser (rs_local
 from recorded import field, insta360
 
 from rs_localizer.cli import image_input
-from rs_localizer.cli.main import main, parse
+from rs_localizer.cli.commands import main, parse
 from rs_localizer.cli.map import build_command
 from rs_localizer.io import telemetry as files
 from rs_localizer.io.bags import open_bag

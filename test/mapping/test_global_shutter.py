@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scenes import READOUT, camera, hand, walk
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.io.maps.colmap import ModelImage, Points, read_model, write_model
 from rs_localizer.tools.mapping.gauge import through
 

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from benchmarks.frames.judged import of_pose, of_twist
 from benchmarks.simulation.__main__ import record
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.io.bags import open_bag

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import rs_localizer.pipeline.landmarks
+import rs_localizer.pipeline.keypoint_map
 from benchmarks.simulation.keypoints import keypoint_rows, map_rows, random_descriptors
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
@@ -141,7 +141,7 @@ def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
             asked.append(arguments[3] is not None)
             return super().match(*arguments)
 
-    monkeypatch.setattr(rs_localizer.pipeline.landmarks, "Matcher", Asked)
+    monkeypatch.setattr(rs_localizer.pipeline.keypoint_map, "Matcher", Asked)
     node = localizer(make_camera_info)
     node.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames[:3]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.io.outputs import Localized, Pose
+from rs_localizer.io.outputs import BodyPose, Localized
 from rs_localizer.io.transforms import Transform
 from rs_localizer.pipeline.map_to_odom import MapToOdom, corrected
 
@@ -19,7 +19,7 @@ def place(x: float, y: float, yaw: float, z: float = 0.0) -> Transform:
 
 def found(stamp_ns: int, at: Transform, deviation: float = 0.01) -> Localized:
     """A frame that has found the body there."""
-    pose = Pose(at.translation, at.rotation, deviation**2 * np.eye(6))
+    pose = BodyPose(at.translation, at.rotation, deviation**2 * np.eye(6))
     return Localized(
         input_stamp_ns=stamp_ns, stamp_ns=stamp_ns, map_frame="map", body_frame="base_link",
         pose=pose, twist=None, inliers=np.zeros(0), dropped=0, estimate=None,

@@ -4,7 +4,7 @@
 
 import pytest
 
-from rs_localizer.pipeline.rig_frames import FrameAssembler, Image
+from rs_localizer.pipeline.rig_frames import CameraImage, FrameAssembler
 
 
 class Watched:
@@ -20,7 +20,7 @@ class Watched:
         frames = []
         for text in times:
             name = {"f": "front", "r": "rear"}[text[0]]
-            image = Image(name, 0, round(1e6 * float(text[1:])), None)
+            image = CameraImage(name, 0, round(1e6 * float(text[1:])), None)
             frames += self.pair.add(image)
         return [" ".join(f"{i.camera[0]}{i.middle_ns / 1e6:g}" for i in frame) for frame in frames]
 

@@ -9,14 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import NodeConfig
-from rs_localizer.io.outputs import Localized, Pose
+from rs_localizer.io.outputs import BodyPose, Localized
 from rs_localizer.io.transforms import TransformTree
 from rs_localizer.pipeline.published import about_angles, of_body
 
 
-def pose(roll: float, pitch: float, yaw: float, root: Any) -> Pose:
+def pose(roll: float, pitch: float, yaw: float, root: Any) -> BodyPose:
     rotation = Rotation.from_euler("xyz", [roll, pitch, yaw], degrees=True).as_matrix()
-    return Pose(np.array([1.0, 2.0, 3.0]), rotation, root @ root.T)
+    return BodyPose(np.array([1.0, 2.0, 3.0]), rotation, root @ root.T)
 
 
 @pytest.mark.parametrize(

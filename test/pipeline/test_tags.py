@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import rs_localizer.tools.simulation.walls
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.camera_info import read_camera_info

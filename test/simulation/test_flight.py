@@ -4,7 +4,7 @@
 
 import numpy as np
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.io.trajectories import read_motions
 from rs_localizer.tools.errors import errors_of
 from rs_localizer.tools.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC

@@ -8,9 +8,9 @@ import pytest
 from rs_localizer.core import so3
 from rs_localizer.pipeline.readout_estimate import (
     Equation,
+    ImageMotion,
     MeasuredReadout,
     ReadoutEstimate,
-    View,
     equation,
 )
 
@@ -65,7 +65,9 @@ def test_the_equation_of_three_views_holds_for_a_steady_turn():
         path = np.array([so3.exp(turn * t) @ travel for t in fine])
         motion = readout * np.concatenate([turn, travel])
         way = np.mean(0.5 * (path[1:] + path[:-1]), axis=0) * time
-        views.append(View(start @ so3.exp(turn * time), start @ way, motion, covariance(rng, 12)))
+        views.append(
+            ImageMotion(start @ so3.exp(turn * time), start @ way, motion, covariance(rng, 12))
+        )
     of = equation(*views, times[1] - times[0], times[2] - times[1])
     np.testing.assert_allclose(of.y, readout * of.x, atol=1e-6)
     spans = np.array([-1.0, 0.0, 1.0]) / (times[2] - times[0])

@@ -10,8 +10,8 @@ from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
-from rs_localizer.ros.detector.node import ImageNode, Picture
-from rs_localizer.ros.node.health import State
+from rs_localizer.ros.detector.image_node import ImageNode, Picture
+from rs_localizer.ros.node.diagnostics import State
 from rs_localizer.ros.node.statistics import Told
 from rs_localizer.settings import FEATURES_NAME
 

@@ -12,9 +12,9 @@ from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import CORRESPONDENCES
 from rs_localizer.markers.overlay import draw_detections
-from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.ros.detector.node import ImageNode, Picture
-from rs_localizer.ros.node.health import State
+from rs_localizer.pipeline.marker_detector import Detected, FrameDetector, correspondences
+from rs_localizer.ros.detector.image_node import ImageNode, Picture
+from rs_localizer.ros.node.diagnostics import State
 from rs_localizer.ros.node.statistics import Told
 from rs_localizer.ros.node.views import MapView
 from rs_localizer.settings import DETECTOR_NAME

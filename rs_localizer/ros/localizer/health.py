@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rs_localizer.io.outputs import Localized
-from rs_localizer.pipeline.imu import ImuState
+from rs_localizer.pipeline.imu_readings import ImuState
 from rs_localizer.pipeline.inputs import Role, input_named, said
 from rs_localizer.pipeline.map_to_odom import Holding
 from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.pipeline.refusal import IMU_REASONS
-from rs_localizer.ros.node.health import (
+from rs_localizer.ros.node.diagnostics import (
     Health,
     Level,
     State,
@@ -23,8 +23,8 @@ from rs_localizer.ros.node.health import (
     one_line,
     out_of_service,
 )
-from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.statistics import Summary, Told
+from rs_localizer.ros.node.subscriptions import Silence
 
 
 def tell(frame: Localized) -> tuple[int, Told]:

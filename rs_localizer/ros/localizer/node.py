@@ -28,7 +28,7 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.given_pose import read_given_pose
 from rs_localizer.pipeline.inputs import Input, Results, Role, inputs_of
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.ros.localizer import transforms
+from rs_localizer.ros.localizer import tf
 from rs_localizer.ros.localizer.health import (
     Condition,
     diagnose,
@@ -38,7 +38,7 @@ from rs_localizer.ros.localizer.health import (
     readout_values,
     tell,
 )
-from rs_localizer.ros.localizer.transforms import Broadcaster
+from rs_localizer.ros.localizer.tf import Broadcaster
 from rs_localizer.ros.node.conversion import (
     create_output,
     installed,
@@ -46,11 +46,11 @@ from rs_localizer.ros.node.conversion import (
     message_class,
     steady_timer,
 )
-from rs_localizer.ros.node.health import Health
-from rs_localizer.ros.node.inputs import FAST_DATA, LATCHED, SENSOR_DATA, Topic
+from rs_localizer.ros.node.diagnostics import Health
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import WINDOW
+from rs_localizer.ros.node.subscriptions import FAST_DATA, LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.views import MapView, camera_marker
 from rs_localizer.ros.node.worker import Need, Worker, in_thread
 from rs_localizer.settings import NODE_NAME
@@ -283,7 +283,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized]):
 
     def check(self, config: NodeConfig) -> None:
         FrameLocalizer(config)
-        transforms.check(config)
+        tf.check(config)
 
     def open(self, config: NodeConfig) -> None:
         frames = FrameLocalizer(config, self.refusals.notice, self._broadcaster.tf)

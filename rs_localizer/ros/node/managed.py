@@ -30,10 +30,10 @@ from rclpy.task import Future
 from rs_localizer.core.simd import compiler
 from rs_localizer.process.stopping import StopRequest
 from rs_localizer.ros.node import parameters
-from rs_localizer.ros.node.health import Diagnostics, Health
-from rs_localizer.ros.node.inputs import Inputs, Silence, Topic
+from rs_localizer.ros.node.diagnostics import Diagnostics, Health
 from rs_localizer.ros.node.refusals import Refusals, describe
 from rs_localizer.ros.node.statistics import Statistics, Told
+from rs_localizer.ros.node.subscriptions import Inputs, Silence, Topic
 from rs_localizer.ros.node.worker import State, Worker, in_thread, wait_for_workers
 from rs_localizer.settings import Config
 

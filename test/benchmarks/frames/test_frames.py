@@ -23,7 +23,7 @@ from benchmarks.frames.judged import (
 )
 from benchmarks.independent.rotations import logarithm
 from benchmarks.independent.scenes import Rich, SmallPlane
-from rs_localizer.io.outputs import Pose, Twist
+from rs_localizer.io.outputs import BodyPose, Twist
 
 CONDITION = Condition("hand", "some", HAND, Rich(40), 1.0)
 
@@ -51,7 +51,7 @@ def published(rng: np.random.Generator, wider: float) -> tuple[float, float]:
         rng.normal(size=3), rng.normal(size=3), rng.normal(size=3),
     )  # fmt: skip
     way, turn = np.split(spread @ rng.normal(size=6), 2)
-    pose = Pose(
+    pose = BodyPose(
         position - way,
         # In the fixed axes of the map, as REP-103's covariances.
         Rotation.from_rotvec(-turn).as_matrix() @ rotation,

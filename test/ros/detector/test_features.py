@@ -12,7 +12,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image, PointCloud2
 
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.recording import make_camera_info

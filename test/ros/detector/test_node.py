@@ -14,7 +14,7 @@ from rs_localizer.config import DetectorConfig
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.pipeline.images import FrameDetector, correspondences
+from rs_localizer.pipeline.marker_detector import FrameDetector, correspondences
 from rs_localizer.ros.node.conversion import make_message
 
 from .talk import Talk

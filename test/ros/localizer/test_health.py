@@ -16,10 +16,10 @@ from rs_localizer.ros.localizer.health import (
     diagnose,
     tell,
 )
-from rs_localizer.ros.node.health import Level
-from rs_localizer.ros.node.inputs import Silence
+from rs_localizer.ros.node.diagnostics import Level
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
+from rs_localizer.ros.node.subscriptions import Silence
 
 COMES = Silence("/camera_info", 0.1, heard=True, cause="", mismatch=False)
 FRAMES = replace(COMES, topic="/correspondences")

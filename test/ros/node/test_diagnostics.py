@@ -10,7 +10,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 
-from rs_localizer.ros.node.health import Diagnostics, Health, Level, State
+from rs_localizer.ros.node.diagnostics import Diagnostics, Health, Level, State
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import missing
 

@@ -10,10 +10,10 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
-from rs_localizer.ros.node import inputs as inputs_module
-from rs_localizer.ros.node.inputs import LATCHED as LATCHED_DATA
-from rs_localizer.ros.node.inputs import Inputs, Topic, best
+from rs_localizer.ros.node import subscriptions as inputs_module
 from rs_localizer.ros.node.refusals import Refusals
+from rs_localizer.ros.node.subscriptions import LATCHED as LATCHED_DATA
+from rs_localizer.ros.node.subscriptions import Inputs, Topic, best
 
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 VOLATILE, LATCHED = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL

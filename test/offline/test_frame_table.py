@@ -16,11 +16,11 @@ pytest.importorskip(  # of today, which NumPy 1.26 cannot import
 )
 
 import rs_localizer as rsl
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.offline.table import COLUMNS, read_parquet, schema
+from rs_localizer.offline.frame_table import COLUMNS, read_parquet, schema
 
 SETTINGS = {"readout_time": 0.03}
 SHUTTER = ["-p", "readout_time:=0.03"]
@@ -87,7 +87,7 @@ def test_rows_say_what_the_messages_say(flights: list[Path], tmp_path: Path) -> 
 _ALONE = """
 import pickle, sys
 import rs_localizer as rsl
-from rs_localizer.offline.table import write_parquet
+from rs_localizer.offline.frame_table import write_parquet
 function, places, settings, file = pickle.load(sys.stdin.buffer)
 write_parquet((function(place, None, settings) for place in places), file)
 """

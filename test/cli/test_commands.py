@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 import rs_localizer
-from rs_localizer.cli.main import COMMANDS, main, parse
+from rs_localizer.cli.commands import COMMANDS, main, parse
 from rs_localizer.cli.options import UsageError
 from rs_localizer.core.simd.jit import cache_directory
 from rs_localizer.io.atomic_files import atomic_files
@@ -75,7 +75,7 @@ def test_help_waits_for_nothing_that_only_work_needs():
 import sys
 from rs_localizer import cli
 cli.WORKING = False
-from rs_localizer.cli.main import main
+from rs_localizer.cli.commands import main
 for words in {[name.split() for name in COMMANDS]}:
     assert main([*words, "--help"]) == 0, words
     assert {{"numba", "scipy", "matplotlib", "pyarrow"}}.isdisjoint(sys.modules), words
@@ -234,7 +234,7 @@ def test_who_stops_reading_is_not_told_of_it():
     """As with ``| head -1``: more is written than the pipe holds."""
     code = (
         "import sys; from dataclasses import dataclass\n"
-        "from types import SimpleNamespace as N; import rs_localizer.cli.main as c\n"
+        "from types import SimpleNamespace as N; import rs_localizer.cli.commands as c\n"
         "def run(_):\n"
         "    for _ in range(100_000): print('a line of a long table')\n"
         "Options = dataclass(type('O', (), {}))\n"

@@ -27,7 +27,7 @@ from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make, make_header
 from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
 from rs_localizer.ros.node.conversion import create_output, make_message, steady_timer
-from rs_localizer.ros.node.health import (
+from rs_localizer.ros.node.diagnostics import (
     Health,
     Level,
     State,
@@ -36,9 +36,9 @@ from rs_localizer.ros.node.health import (
     one_line,
     out_of_service,
 )
-from rs_localizer.ros.node.inputs import Silence, Topic
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.statistics import WINDOW, Summary, Told
+from rs_localizer.ros.node.subscriptions import Silence, Topic
 from rs_localizer.ros.node.worker import Worker
 
 Result = TypeVar("Result")

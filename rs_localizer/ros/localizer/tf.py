@@ -37,9 +37,9 @@ from rs_localizer.io.transforms import (
 from rs_localizer.pipeline.map_to_odom import Holding, MapToOdom
 from rs_localizer.pipeline.published import Broadcast, broadcast, check_time
 from rs_localizer.ros.node.conversion import make_message, steady_timer
-from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import WINDOW
+from rs_localizer.ros.node.subscriptions import Intake, NotByExecutor
 
 # For how long tf2's buffer remembers, in ns: its default.
 _MEMORY = 10_000_000_000

@@ -14,8 +14,8 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.time import Time
 
 from rs_localizer.config import NodeConfig
-from rs_localizer.io.outputs import Localized, Pose
-from rs_localizer.ros.localizer.transforms import Broadcaster, check
+from rs_localizer.io.outputs import BodyPose, Localized
+from rs_localizer.ros.localizer.tf import Broadcaster, check
 
 from .robot import tf2_ros
 
@@ -77,7 +77,7 @@ def made(peer, robot) -> Iterator[Callable[..., Any]]:
 
 
 def frame(stamp_ns: int, x: float = 0.0) -> Localized:
-    pose = Pose(np.array([x, 0.0, 0.0]), np.eye(3), np.eye(6))
+    pose = BodyPose(np.array([x, 0.0, 0.0]), np.eye(3), np.eye(6))
     return Localized(
         input_stamp_ns=stamp_ns, stamp_ns=stamp_ns, map_frame="map", body_frame="base_link",
         pose=pose, twist=None, inliers=np.zeros(0), dropped=0, estimate=None,

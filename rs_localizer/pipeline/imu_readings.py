@@ -20,8 +20,8 @@ from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.simd.jit import NotCompiled
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.inertial.buffer import LONGEST_PERIOD_NS, Lack, Lacking, ReadingBuffer, Readings
+from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.transforms import TransformError, Transforms

@@ -27,7 +27,7 @@ from rs_localizer.io.trajectories import read_motions
 from rs_localizer.io.transforms import Transform, TransformError, TransformTree, make_transform
 from rs_localizer.offline.replay import imu_first
 from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
-from rs_localizer.pipeline.imu import in_camera_axes
+from rs_localizer.pipeline.imu_readings import in_camera_axes
 
 READOUT_TIME = 0.03
 CONFIG = NodeConfig(readout_time=READOUT_TIME)
