@@ -108,7 +108,7 @@ def _other_frames(estimate: Trajectory, truth: Trajectory) -> str:
 
 
 def _coverage(path: Path, posed: int, met: int, true: int) -> str:
-    """How much of what the truth knows has been localized."""
+    """Share of what the truth knows that has been localized, as a sentence."""
     try:
         with open_bag(path) as bag:
             topics = (CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC)

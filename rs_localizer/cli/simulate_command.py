@@ -148,7 +148,7 @@ def motion_of(args: Options) -> TrueMotion:
 
 
 def stamps_of(args: Options, camera: Camera, motion: TrueMotion) -> list[int]:
-    """When the frames begin, ns; ValueError when there are none."""
+    """Times at which the frames begin, ns; ValueError when there are none."""
     start_ns = motion.intervals_ns[0][0] + round(args.start * 1e9)
     end_ns = math.inf if args.duration is None else start_ns + round(args.duration * 1e9)
     every = frame_stamps(motion, camera, _POINTS.rate)

@@ -92,7 +92,7 @@ def check_writable(place: Path) -> None:
 
 
 def remove_unfinished() -> None:
-    """What a process that ends in the middle of its work removes."""
+    """Removal of what a process leaves that ends in the middle of its work."""
     for path in tuple(_unfinished):
         shutil.rmtree(path, ignore_errors=True)
 

@@ -156,7 +156,7 @@ class BagReader:
         }
 
     def count(self, topics: Collection[str]) -> int:
-        """How many messages the recording holds on these topics."""
+        """Number of messages that the recording holds on these topics."""
         counts = self._reader.topics
         return sum(counts[topic].msgcount for topic in topics if topic in counts)
 

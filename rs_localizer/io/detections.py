@@ -80,7 +80,7 @@ def read_detections(message: Any) -> TagDetections:
 
 
 def _family(name: str) -> str:
-    """As apriltag calls it: ``tag36h11``."""
+    """Name of a family as apriltag has it: ``tag36h11``."""
     return re.sub(r"^(?:tag_?)?(?=\d\dh\d)", "tag", name)
 
 

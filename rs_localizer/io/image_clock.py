@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""When the images of a file were taken: what is known of it, and what is assumed."""
+"""Times at which the images of a file were taken, as far as they are known, else assumed."""
 
 from dataclasses import dataclass
 

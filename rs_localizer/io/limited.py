@@ -36,7 +36,7 @@ class LimitedError(ValueError):
 def run_limited(
     script: Path, task: dict[str, Any], memory: int, seconds: int
 ) -> dict[str, NDArray[Any]]:
-    """What ``python SCRIPT TASK.json OUT.npz`` leaves: arrays of numbers or of text by name.
+    """Arrays of numbers or of text, by name, that ``python SCRIPT TASK.json OUT.npz`` leaves.
 
     Args:
         script: run by its path.

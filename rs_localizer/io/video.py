@@ -155,7 +155,7 @@ _UNCOUNTED, _NEAR, _UNTIMED = 1, 3.0, 2.0
 
 
 def count_lenses(path: Path) -> int:
-    """How many cameras filmed into one file: its streams of one size, as in Insta360's .insv.
+    """Number of cameras that filmed into one file: its streams of one size, as in .insv.
 
     Raises:
         VideoError: when it cannot be read.

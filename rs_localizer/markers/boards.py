@@ -159,7 +159,7 @@ class BoardSizes:
 def find_charuco(
     image: Gray, board: Charuco, ids: NDArray[np.int64], quads: Array
 ) -> tuple[NDArray[np.int64], Array]:
-    """Which inner corners of a ChArUco board are seen, and where.
+    """Inner corners of a ChArUco board that are seen, and their pixels.
 
     Args:
         image: gray.
@@ -199,7 +199,7 @@ _LEAST_MARKERS = 3
 
 
 def flat_misfit(points: Array, pixels: Array) -> float:
-    """How far markers of one plane are from where a homography has them, in their sides.
+    """Distance of markers of one plane from where a homography has them, in their sides.
 
     No calibration is needed. NaN: the points are not of one plane; infinite: corners go the other
     way round, as of a mirrored map.
@@ -226,7 +226,7 @@ def flat_misfit(points: Array, pixels: Array) -> float:
 
 
 def charuco_fault(board: Charuco, ids: NDArray[np.int64], quads: Array) -> str | None:
-    """What the board is instead, where its markers (m,) do not lie as it says: (m,4,2) px.
+    """Layout of the board that fits instead, where its markers (m,) are elsewhere: (m,4,2) px.
 
     The other layout or exchanged sizes put each marker one square or more beside its place.
     """
@@ -332,7 +332,7 @@ def ordered(
 
 
 def _starts_black(grid: Array, image: Gray) -> bool:
-    """Whether the first square between the corners, as the one diagonally before it, is black."""
+    """True if the first square between the corners, as the one diagonally before it, is black."""
     first = grid[0:2, 0:2].mean(axis=(0, 1))
     second = grid[0:2, 1:3].mean(axis=(0, 1))
     (x, y), (u, v) = np.rint(first).astype(int), np.rint(second).astype(int)

@@ -48,7 +48,7 @@ class MarkerQuads:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """What one image shows of the map."""
+    """Corners of the map that one image shows."""
 
     ids: IntArray  # (n,) rows of MarkerMap.points
     points: Array  # (n,3) m, map frame
@@ -226,7 +226,7 @@ def _finders(marker_map: MarkerMap) -> list[tuple[MarkerFinder, MarkerFinder]]:
 
 
 def _different(ids: IntArray, quads: Array, exact: NDArray[np.bool_]) -> IntArray:
-    """Which quadrilaterals to keep when OpenCV (4.6) gives one marker twice."""
+    """Rows of quadrilaterals to keep when OpenCV (4.6) gives one marker twice."""
     keep: list[int] = []
     for m in range(len(ids)):
         if keep and ids[keep[-1]] == ids[m]:

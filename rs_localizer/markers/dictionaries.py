@@ -117,7 +117,7 @@ def _bits(family: Family, id_: int) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=32)
 def _turns(family: Family) -> int:
-    """By how many quarters, anticlockwise, OpenCV's pattern has to be turned to be upright."""
+    """Quarters, anticlockwise, by which OpenCV's pattern has to be turned to be upright."""
     bits = _bits(family, 0)
     for turns in range(4):
         if int("".join(map(str, np.rot90(bits, turns).ravel())), 2) == family.first:

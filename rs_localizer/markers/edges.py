@@ -21,7 +21,7 @@ from rs_localizer.core.simd.jit import inlined, kernel
 _STEP, _MOST_STEPS = 0.5, 7
 _LEAST_RISE = 10.0  # gray levels from black to white
 SEEN, VARIANCE, BLACK, WHITE, CUT = range(5)
-"""What :func:`edge_points` tells of the rises: how many, and of those the means of the variance
+"""Numbers of the rises by :func:`edge_points`: how many, and of those the means of the variance
 (px^2), of the levels at foot and top, and the share that goes on beyond its profile."""
 
 
@@ -313,7 +313,7 @@ def _fit_twice(s: Array, e: Array, parabola: bool, c: Array) -> bool:
 
 @inlined
 def _corner(q: Array, at: int, before: Array, after: Array) -> tuple[float, float]:
-    """Where the tangents of two sides meet, taken at the sides' ends in this corner."""
+    """Meeting point of the tangents of two sides, taken at the sides' ends in this corner."""
     p, r = (at + 3) % 4, (at + 1) % 4
     # The side that ends here, at s = 1.
     ux, uy = q[at, 0] - q[p, 0], q[at, 1] - q[p, 1]

@@ -19,7 +19,7 @@ _OTHER_UNIT, _LARGEST, _LARGEST_SQUARE = 20.0, 5.0, 2.0
 
 
 def other_units(marker_map: MarkerMap) -> Iterator[str]:
-    """What speaks for sizes that are not in metres."""
+    """Signs of sizes that are not in metres, as sentences."""
     for board in marker_map.boards:
         large = board.spacing if isinstance(board, CircleGrid) else board.square
         if large > _LARGEST_SQUARE:
@@ -49,7 +49,7 @@ def whole_markers(detections: Detections, end: int) -> dict[int, IntArray]:
 Predict = Callable[[Array], Array]
 """Pixels (n,2) of points (n,3) of the map."""
 Fit = Callable[[Camera, Array, Array], Predict | None]
-"""What predicts, fitted to a camera's points (n,3) and pixels (n,2); None: nothing fits."""
+"""Fit to a camera's points (n,3) and pixels (n,2): what predicts; None: nothing fits."""
 
 
 def still_fit(camera: Camera, points: Array, pixels: Array) -> Predict | None:
@@ -130,7 +130,7 @@ class MapCheck:
                 self._views.setdefault(marker, []).append(view)
 
     def misplaced(self) -> str | None:
-        """Which marker is off and by how much; None when none stands out."""
+        """Name of the marker that is off, and by how much; None when none stands out."""
         views = {
             marker: np.median(some, axis=0)
             for marker, some in self._views.items() if len(some) >= _LEAST_IMAGES

@@ -33,10 +33,10 @@ from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation, rot
 from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid, Marker
 
 USUAL_FAMILY = FAMILIES["apriltag_36h11"]
-"""Of files of other programs that do not say it."""
+"""Family of files of other programs that do not say it."""
 OWN, WPILIB, BUNDLES, _KALIBR = "rs_localizer", "wpilib", "apriltag_ros", "kalibr"
 FORMATS = (OWN, WPILIB, BUNDLES)
-"""What is written; Kalibr's targets are read, too."""
+"""Formats that are written; Kalibr's targets are read, too."""
 _KEYS = {
     OWN: ("markers", "boards", "map_frame"), WPILIB: ("tags",),
     BUNDLES: ("tag_bundles", "standalone_tags"), _KALIBR: ("target_type",),
@@ -56,14 +56,14 @@ _CHESSBOARD, _CIRCLES, _ASYMMETRIC, _CHARUCO = _BOARDS = (
 
 @dataclass(frozen=True, slots=True)
 class Unsaid:
-    """What a file does not say of its markers."""
+    """Properties of markers that a file does not say."""
 
     family: Family | None = None  # None: as the file says, or the usual one
     size: float | None = None  # m
 
 
 def is_marker_file(path: Path) -> bool:
-    """Whether a file is one of markers, by its name."""
+    """True for a file of markers, by its name."""
     return path.suffix.lower() in SUFFIXES
 
 
@@ -264,7 +264,7 @@ def write_any(path: Path, marker_map: MarkerMap, name: str) -> None:
 
 
 def _field(marker_map: MarkerMap) -> dict[str, Any]:
-    """Of WPILib; as large as its tags need, from the origin on."""
+    """A field of WPILib; as large as its tags need, from the origin on."""
     sizes = sorted(marker.size for marker in marker_map.markers)
     if sizes[-1] > sizes[0] * (1.0 + _SAME_SIZE):
         raise MarkerMapError(
@@ -398,7 +398,7 @@ class _Entry:
         return number
 
     def numbers(self, names: Iterable[str]) -> list[float]:
-        """What is missing is 0."""
+        """Numbers by their names; a missing one is 0."""
         return [float(self.take(name, _NUMBER, 0.0)) for name in names]
 
     def below(self, name: str) -> _Entry:

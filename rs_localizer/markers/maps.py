@@ -74,7 +74,7 @@ class MarkerMap:
 
     @property
     def settings(self) -> dict[str, float]:
-        """What the localizer is to be told: ``map_deviation`` (m), rms over the boards.
+        """Settings that the localizer is to be told: ``map_deviation`` (m), rms over the boards.
 
         Markers are exact: what their places are worth is their survey's to say.
         """

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a print is in the map."""
+"""Poses of prints in the map."""
 
 from dataclasses import dataclass, field
 
@@ -17,7 +17,7 @@ _LENGTH_TOLERANCE = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Where a print is: map_from_print.
+    """Pose of a print: map_from_print.
 
     Raises:
         ValueError: for a mirrored or no rotation, or values that are not finite.

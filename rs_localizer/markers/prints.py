@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What can be printed and seen: single markers, and boards of squares or circles, in the map frame.
+"""Prints that can be seen: single markers, and boards of squares or circles, in the map frame.
 
 The frame of a print has its origin in the middle (of the black square of a marker, of the whole
 pattern of squares of a board), x to the right, y up, and z out of the paper toward the viewer.
@@ -104,7 +104,7 @@ class _Board:
 
     @property
     def points_deviation(self) -> float:
-        """By how much (m, rms of one standard deviation) points are off: as given, or paper's."""
+        """Deviation of the points (m, rms of one standard deviation): as given, or paper's."""
         if self.deviation is not None:
             return self.deviation
         apart = self.points - self.points.mean(axis=0)
@@ -116,7 +116,7 @@ class _Board:
         return replace(self, shape=shape, deviation=deviation)
 
     def _check(self, least: tuple[int, int], wanted: str, *lengths: str) -> None:
-        """What every board is checked for, and the ``lengths`` by their names."""
+        """Check what every board is checked for, and the ``lengths`` by their names."""
         if self.columns < least[0] or self.rows < least[1]:
             raise ValueError(f"{wanted}, got {self.columns}x{self.rows}")
         if max(self.columns, self.rows) > _MOST_SQUARES:

@@ -76,7 +76,7 @@ class Extraction:
 
 @dataclass(frozen=True, slots=True)
 class DetectionOptions:
-    """How images are recorded."""
+    """Options of how images are recorded."""
 
     with_images: bool = False  # write these, too, as far as they are compressed
     scan_direction: str = ScanDirection.TOP_TO_BOTTOM  # for the check of the markers' places
@@ -284,7 +284,7 @@ def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
 
 
 def _write(bag: BagWriter, shot: Shot, topic: str, message: Any, options: DetectionOptions) -> None:
-    """What the image shows, its camera, and the image itself."""
+    """Write the points of an image, its camera, and the image itself."""
     own = f"/{options.camera}" if options.camera else ""
     bag.write(own + CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
     bag.write(own + topic, message, shot.recorded_ns)

@@ -180,7 +180,7 @@ def perform(task: Task) -> Outcome:
 
 
 def _unfinished(task: Task) -> str:
-    """How the names of folders begin in which this task is worked on."""
+    """Beginning of the names of folders in which this task is worked on."""
     return f".unfinished-{task.identity[:16]}-"
 
 

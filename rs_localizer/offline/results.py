@@ -171,7 +171,7 @@ class Tally:
 
     @property
     def localized(self) -> int:
-        """How many frames have a pose."""
+        """Number of frames with a pose."""
         return len(self._stamps_ns)
 
     def column(self, name: str) -> Array:

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What every program begins with: signals, threads, arguments, and what is not installed."""
+"""Beginning of every program: signals, threads, arguments, and what is not installed."""
 
 import os
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What to say of a package that is not installed: one sentence with the command that brings it."""
+"""Sentence on a package that is not installed, with the command that brings it."""
 
 # By the name that is imported: Ubuntu's package, and pip's where Ubuntu 24.04 has none.
 _UBUNTU = {

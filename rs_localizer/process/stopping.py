@@ -158,7 +158,7 @@ def _is_fragile(frame: FrameType | None) -> bool:
 
 
 def _is_handled(error: BaseException | None) -> bool:
-    """Whether a KeyboardInterrupt is what somebody cleans up after."""
+    """True if a KeyboardInterrupt is what somebody cleans up after."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None

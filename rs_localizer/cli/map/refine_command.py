@@ -109,7 +109,7 @@ def _recorded(
 
 
 def _deviations(args: Options, landmarks: Map, map_deviation: float) -> Array | None:
-    """How well each landmark is known, m; None: not at all."""
+    """Standard deviation of each landmark as it is known, m; None: not at all."""
     every = map_deviation if map_deviation > 0.0 else np.inf
     if not args.hold:
         return np.full(len(landmarks), every) if map_deviation > 0.0 else None
@@ -202,7 +202,7 @@ def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
 
 
 def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:
-    """When images were taken, ns, by their names: times in ns, or numbers at a rate.
+    """Times of images, ns, by their names: times in ns, or numbers at a rate.
 
     Raises:
         UsageError: for names that are neither.

@@ -59,12 +59,12 @@ def _pose(image: Any) -> Any:
 
 
 def _called(member: Any) -> Any:
-    """What is a property in some versions and a method in others."""
+    """Value of what is a property in some versions and a method in others."""
     return member() if callable(member) else member
 
 
 def _camera(number: int, camera: Any) -> str:
-    """As a line of ``cameras.txt``."""
+    """Line of ``cameras.txt``."""
     values = " ".join(repr(float(value)) for value in camera.params)
     return f"{number} {camera.model.name} {camera.width} {camera.height} {values}"
 
@@ -105,7 +105,7 @@ def describe(found: dict[str, Any], database: str) -> dict[str, Any]:
 
 
 def _numeric(descriptors: Any) -> bool:
-    """Whether they are compared as numbers; COLMAP keeps SIFT as bytes, but numbers they are."""
+    """True if they are compared as numbers; COLMAP keeps SIFT as bytes, but numbers they are."""
     return bool(descriptors.dtype.kind == "f" or descriptors.shape[1] == _SIFT_WIDTH)
 
 

@@ -68,7 +68,7 @@ class Map:
         return len(self.points)
 
     def equals(self, other: Map) -> bool:
-        """Whether both are the same to the last bit, in the same frame."""
+        """True if both are the same to the last bit, in the same frame."""
         return (
             self.frame == other.frame
             and np.array_equal(self.points, other.points)
