@@ -141,18 +141,28 @@ def _pose(camera: Camera, image: Observed) -> tuple[Array, Array] | None:
     rays = camera.rays(image.pixels)
     if not np.isfinite(rays).all():
         return None
-    solved, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None)
-    if not solved:
-        return None
-    # In pixels, not in rays: far from the middle they are not the same.
-    pose = np.array(cv2.Rodrigues(turn)[0], np.float64), np.array(place, np.float64).ravel()
+    # Before several walls the first method may end behind the camera.
+    for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_SQPNP):
+        solved, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None, flags=method)
+        if solved:
+            rotation = np.array(cv2.Rodrigues(turn)[0], np.float64)
+            pose = _refined(camera, image, rotation, np.array(place, np.float64).ravel())
+            if pose is not None:
+                return pose
+    return None
+
+
+def _refined(
+    camera: Camera, image: Observed, rotation: Array, place: Array
+) -> tuple[Array, Array] | None:
+    """A pose in pixels, not in rays: far from the middle they are not the same."""
     for _ in range(_POSE_STEPS):
-        linear = _linear(camera, image, *pose)
+        linear = _linear(camera, image, rotation, place)
         if linear is None:
             return None
         errors, by_pose, _ = linear
-        pose = _moved(*pose, np.linalg.lstsq(by_pose, -errors, rcond=None)[0])
-    return pose
+        rotation, place = _moved(rotation, place, np.linalg.lstsq(by_pose, -errors, rcond=None)[0])
+    return rotation, place
 
 
 def _moved(rotation: Array, place: Array, step: Any) -> tuple[Array, Array]:

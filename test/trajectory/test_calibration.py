@@ -131,6 +131,32 @@ def test_the_distortion_model_is_that_of_the_lens(model, deep):
     np.testing.assert_allclose(found.distort(corner)[0], camera.distort(corner)[0], atol=1.0)
 
 
+def test_an_image_before_two_walls_has_a_pose():
+    """Of these 300 ``cv2.solvePnP`` alone finds six behind the camera."""
+    rng, middle = np.random.default_rng(0), np.array([319.5, 239.5])
+    camera = Camera(640, 480, [[500.0, 0.0, middle[0]], [0.0, 500.0, middle[1]], [0.0, 0.0, 1.0]])
+    x, z = (axis.ravel() for axis in np.mgrid[-1.2:1.3:0.2, -0.8:0.9:0.2])
+    walls = np.concatenate([np.c_[x, 0.0 * x, z], np.c_[0.0 * x + 1.3, x - 1.3, z]])
+    for _ in range(300):
+        eye = rng.uniform([-0.8, -2.2, -0.5], [0.8, -1.0, 0.5])
+        forward = walls[rng.integers(len(walls))] - eye
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        axes = np.array([right, np.cross(forward, right), forward])
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        turned = Rotation.from_rotvec(rng.normal(0.0, 0.3, 3)).as_matrix() @ axes
+        local = (walls - eye) @ turned.T
+        with np.errstate(divide="ignore"):
+            pixels = 500.0 * local[:, :2] / local[:, 2:] + middle
+        inside = (local[:, 2] > 0.2) & ((pixels > 0) & (pixels < [640, 480])).all(axis=1)
+        if inside.sum() < 20:
+            continue
+        pixels = pixels[inside]
+        pixels += np.outer((pixels[:, 1] - 240.0) / 480.0, rng.normal(0.0, 12.0, 2))  # the shutter
+        pixels += rng.normal(0.0, 0.3, pixels.shape)
+        error = first_lens_module.reprojection_error(camera, Observed(0, walls[inside], pixels))
+        assert error < 20.0
+
+
 def test_images_by_whose_first_pose_points_are_behind_the_camera_are_left_out(monkeypatch):
     """Among those of a fisheye; the others find the lens."""
     rng, board = np.random.default_rng(3), projector.board(8, 6, 0.05, 0.0)
