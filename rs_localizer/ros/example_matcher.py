@@ -76,15 +76,19 @@ class ExampleMatcher(Node):
             self._next = next(self._due)
 
     def _tell(self, message: PoseStamped | TwistStamped) -> None:
+        say = self.get_logger().info  # which throttles each line of code on its own
         if isinstance(message, PoseStamped):
             p, q = message.pose.position, message.pose.orientation
-            numbers = [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
-            text = "pose x y z (m), qx qy qz qw"
+            values = _text(p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+            say(f"pose x y z (m), qx qy qz qw: {values}", throttle_duration_sec=0.5)
         else:
             w, v = message.twist.angular, message.twist.linear
-            numbers, text = [w.x, w.y, w.z, v.x, v.y, v.z], "twist wx wy wz (rad/s), vx vy vz (m/s)"
-        values = " ".join(f"{number:+.3f}" for number in numbers)
-        self.get_logger().info(f"{text}: {values}", throttle_duration_sec=0.5)
+            values = _text(w.x, w.y, w.z, v.x, v.y, v.z)
+            say(f"twist wx wy wz (rad/s), vx vy vz (m/s): {values}", throttle_duration_sec=0.5)
+
+
+def _text(*numbers: float) -> str:
+    return " ".join(f"{number:+.3f}" for number in numbers)
 
 
 def run(args: list[str] | None = None) -> None:
