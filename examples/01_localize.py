@@ -18,7 +18,7 @@ if result:  # a Failure is false, and str() of it says why
     deviations = np.sqrt(np.diag(result.covariance))
     print("inliers", result.inliers.sum(), "of", len(points))
     print("position (m)", state.position.round(4), "+-", deviations[3:6].round(4))
-    print("turn rate (rad/s)", state.angular_velocity.round(3), "true", moving.turn)
+    print("angular velocity (rad/s)", state.angular_velocity.round(3), "true", moving.turn)
     print("velocity (m/s)", state.linear_velocity_in_map.round(3), "true", moving.velocity)
     print("pose at the first row", *result.at(-0.5))
 else:

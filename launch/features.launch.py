@@ -3,7 +3,7 @@
 """From a camera to poses in a map of landmarks: camera driver, feature detector, localizer.
 
 ros2 launch rs_localizer features.launch.py camera:=v4l2_camera map_file:=$PWD/map.npz \
-    features:=sift readout_time:=0.02 calibration:=file://$PWD/camera.yaml
+    features:=sift camera_file:=$PWD/camera.yaml
 """
 
 from rs_localizer.config import FeatureConfig

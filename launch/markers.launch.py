@@ -3,7 +3,7 @@
 """From a camera to poses by markers or a board: camera driver, marker detector, localizer.
 
 ros2 launch rs_localizer markers.launch.py camera:=v4l2_camera marker_map:=$PWD/wall.yaml \
-    readout_time:=0.02 calibration:=file://$PWD/camera.yaml
+    camera_file:=$PWD/camera.yaml
 """
 
 from rs_localizer.config import DetectorConfig

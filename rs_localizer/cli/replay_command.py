@@ -89,7 +89,7 @@ class Options(ImageOptions, FleetOptions):
         default=False,
     )
     pose_rate: float | None = option(
-        "poses of the motion, as the frames until then tell it, or with --smooth all "
+        "poses of the motion, by the frames until then, or with --smooth by all "
         "(default: one for each image)", "HZ",
         limits=(0.0, math.inf), above=True,
     )  # fmt: skip
@@ -394,7 +394,7 @@ def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:
             ("samples of the smoothed motion", smoothed["samples"]),
             (f"  bridged, listed in {BRIDGED}", len(tally.bridged)),
             ("  left out, not determined", smoothed["undetermined"]),
-            ("  shaken faster than it follows, left as they were", smoothed["shaken"]),
+            ("  vibrating, left as they were", smoothed["shaken"]),
         ]
     for name, text in rows:
         print(f"{name:40} {text!s:>8}")

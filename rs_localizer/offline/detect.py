@@ -275,8 +275,8 @@ def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
     """Relation of two sizes of images, in words."""
     if size == calibrated[::-1]:
         return (
-            ": they are turned by a quarter; calibrate with images as they are recorded (the scan "
-            "direction turns with them)"
+            ": they are rotated by a quarter turn; calibrate with images as they are recorded (the "
+            "scan direction rotates with them)"
         )
     if abs(size[0] * calibrated[1] - size[1] * calibrated[0]) <= max(calibrated):
         return ": another resolution of the same shape; calibrate in the mode that is used"

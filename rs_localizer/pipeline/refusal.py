@@ -78,7 +78,7 @@ REASONS: dict[str, Meaning] = {
         "inlier residuals reach inlier_threshold", f"check calibration, map, {SETTINGS}"
     ),
     Reason.DEGENERATE: Meaning(
-        "the points, as of a frontal plane, leave the motion open",
+        "the points, such as a frontal plane, do not determine the motion",
         "look from an angle, show depth, keep tracking on",
     ),
     Reason.IMPLAUSIBLE: Meaning("no camera moves like this", f"chance matches? check {SETTINGS}"),
@@ -131,7 +131,7 @@ REASONS: dict[str, Meaning] = {
         "kernels are being compiled", "wait minutes; `rs_localizer warm` avoids it"
     ),
     Reason.NO_TRANSFORM: Meaning(
-        "TF lacks camera to base_frame",
+        "TF has no transform from camera to base_frame",
         "record /tf_static; robot_state_publisher",
     ),
 }
@@ -154,7 +154,7 @@ IMU_REASONS: dict[str, Meaning] = {
     ImuReason.TOO_SLOW: Meaning("messages are too rare to resolve vibration", "200 Hz"),
     ImuReason.SATURATED: Meaning("faster than the gyroscope measures", "a larger range"),
     ImuReason.NO_TRANSFORM: Meaning(
-        "TF lacks IMU to camera",
+        "TF has no transform from IMU to camera",
         "publish it on /tf_static; install tf2_ros",
     ),
     ImuReason.NO_READOUT_TIME: Meaning(

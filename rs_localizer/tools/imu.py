@@ -70,12 +70,12 @@ def first_mount(samples: GyroSamples, spline: Spline, given: Array | None = None
     best = max(matches, key=lambda match: match.explained)
     if not best.explained > _LEAST_EXPLAINED:
         raise NoMount(
-            f"the IMU's turn rates are not the camera's: within {1e3 * _MOST_DELAY:.0f} ms of each "
-            f"other's stamps {max(best.explained, 0.0):.0%} of them agree"
+            f"the IMU's angular rates are not the camera's: within {1e3 * _MOST_DELAY:.0f} ms of "
+            f"each other's stamps {max(best.explained, 0.0):.0%} of them agree"
         )
     if not 1.0 / _MOST_SCALE < best.scale < _MOST_SCALE:
         raise NoMount(
-            f"the IMU's turn rates are {best.scale:.3g} times the camera's: are they in rad/s?"
+            f"the IMU's angular rates are {best.scale:.3g} times the camera's: are they in rad/s?"
         )
     return best.mount
 

@@ -25,7 +25,7 @@ def test_one_image(capsys):
     found = dict(re.findall(r"^([\w ]+ \(.*?\)) \[(.*?)\]", said, re.MULTILINE))
     values = {name: np.array(text.split(), float) for name, text in found.items()}
     assert np.linalg.norm(values["position (m)"]) < 0.02
-    assert np.linalg.norm(values["turn rate (rad/s)"] - [0.4, 1.0, -0.3]) < 0.3
+    assert np.linalg.norm(values["angular velocity (rad/s)"] - [0.4, 1.0, -0.3]) < 0.3
 
 
 def test_a_video(capsys):

@@ -62,7 +62,7 @@ def run(options: Options) -> info_command.Figures:
         by = alignment(any_map, *wishes)
         turn = np.degrees(Rotation.from_matrix(by.rotation).magnitude())
         shift = ", ".join(f"{value:.4f}" for value in by.translation)
-        print(f"scaled by {by.scale:.6g}, turned by {turn:.3f} deg, shifted by ({shift}) m")
+        print(f"scaled by {by.scale:.6g}, rotated by {turn:.3f} deg, shifted by ({shift}) m")
         any_map = moved(any_map, by)
     figures = info_command.describe(options.file, any_map, kind)
 

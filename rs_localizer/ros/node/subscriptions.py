@@ -263,7 +263,7 @@ class Inputs:
             publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)
             if self._topics[name].single and len(publishers) > 1:
                 names = " and ".join(sorted(map(node_of, publishers)))
-                text = f"{names} publish on {subscription.topic_name}: their frames come in turns"
+                text = f"{names} publish on {subscription.topic_name}: their frames alternate"
                 self._refusals.notice(Notice.TWO_PUBLISHERS, text)
             offers = [policies(each.qos_profile) for each in publishers]
             present = policies(subscription.qos_profile)

@@ -184,7 +184,7 @@ def _nothing(output: dict[str, Any], keyframes: int) -> str:
         f"no two of the {keyframes} keyframes determine a structure "
         f"({output['features'] / keyframes:.0f} features each, {output['pairs']} pairs of them "
         "agree): the images need texture that does not repeat, overlap, and a camera that moves "
-        "sideways and does not only turn"
+        "sideways, not one that only rotates"
     )
 
 

@@ -110,7 +110,7 @@ def test_two_publishers_of_frames_are_named(peer):
         driver.create_publisher(topic.type, name, 1)
     assert peer.spin_until(lambda: said)
     names = " and ".join(sorted(("/driver", f"/{peer.node.get_name()}")))
-    assert said == [f"two_publishers: {names} publish on /frames: their frames come in turns"]
+    assert said == [f"two_publishers: {names} publish on /frames: their frames alternate"]
     inputs.close()
     driver.destroy_node()
     context.try_shutdown()
