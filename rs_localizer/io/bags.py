@@ -6,7 +6,6 @@ Messages come out as rosbags' plain objects with the attribute names of ROS 2, w
 recording was; the readers of this package take them and rclpy's messages alike.
 """
 
-import bz2
 import contextlib
 import importlib
 import shutil
@@ -14,10 +13,8 @@ import sqlite3
 from collections.abc import Collection, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Self
 
-from lz4.frame import LZ4FrameDecompressor
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
     Qos,
@@ -47,80 +44,18 @@ _LATCHED = Qos(
     _NO_LIMIT, _NO_LIMIT, QosLiveliness.AUTOMATIC, _NO_LIMIT, False,
 )  # fmt: skip
 
-# Of a chunk or a message, unpacked: a hundred raw images of a megapixel are fewer.
-_MOST_UNPACKED = 2**28
-# A packed file may stand for so many times its size: raw images of a dark room.
-_BEST_PACKING = 1000
-
 
 class BagError(ValueError):
     """A recording that cannot be read or written; the message names the path and the fault."""
 
 
-def _unpacked(decompressor: Any, data: bytes) -> bytes:
-    raw: bytes = decompressor.decompress(data, _MOST_UNPACKED)
-    if not decompressor.eof:
-        raise BagError(f"{len(data)} packed bytes are cut off or stand for over {len(raw)}")
-    return raw
-
-
-class _BoundedZstd:
-    """Functions that rosbags takes of its module zstd, which unpacks without a limit."""
-
-    def __init__(self, module: Any) -> None:
-        self._module = module
-        self.compress = module.compress
-        self.ZstdDecompressor = module.ZstdDecompressor
-
-    def decompress(self, data: bytes) -> bytes:
-        return _unpacked(self._module.ZstdDecompressor(), data)
-
-    @contextlib.contextmanager
-    def open(self, file: Any, mode: str) -> Iterator[Any]:
-        remaining = _BEST_PACKING * max(Path(file.name).stat().st_size, 1000)
-
-        def read(size: int) -> bytes:
-            nonlocal remaining
-            data: bytes = opened.read(size)
-            remaining -= len(data)
-            if remaining < 0:
-                raise BagError(f"{file.name} unpacks to over {_BEST_PACKING} times its size")
-            return data
-
-        with self._module.open(file, mode) as opened:
-            yield SimpleNamespace(read=read)
-
-
-def _bound_decompression() -> None:
-    """Have rosbags unpack no more than :data:`_MOST_UNPACKED` at once; it has no such option."""
-    ros1, ros2, mcap = (
-        vars(importlib.import_module(f"rosbags.{name}"))
-        for name in ("rosbag1.reader", "rosbag2.reader", "rosbag2.storage_mcap")
-    )
-    bounded = _BoundedZstd(ros2["zstd"])
-    ros2["zstd"] = bounded
-
-    ros1["decompressors"] |= {
-        "bz2": lambda data: _unpacked(bz2.BZ2Decompressor(), data),
-        "lz4": lambda data: _unpacked(LZ4FrameDecompressor(), data),
-    }
-    mcap["DECOMPRESSORS"] |= {
-        "zstd": lambda data, _: bounded.decompress(data),
-        "lz4": lambda data, _: _unpacked(LZ4FrameDecompressor(), data),
-    }
-
-
-with contextlib.suppress(KeyError, AttributeError):  # of versions that are made otherwise
-    _bound_decompression()
-
-
 def _zstd() -> Any:
-    """The module, with limits, that rosbags unpacks with."""
+    """The module that rosbags unpacks with: of Python from 3.14 on, else of a package."""
     return vars(importlib.import_module("rosbags.rosbag2.reader"))["zstd"]
 
 
 def _unpack_file(packed: Path, out: Path) -> None:
-    """Write what a file of Zstandard holds, within limits."""
+    """Write what a file of Zstandard holds."""
     with packed.open("rb") as data, _zstd().open(data, "rb") as file, out.open("wb") as target:
         shutil.copyfileobj(file, target)
 
@@ -180,7 +115,7 @@ class BagReader:
                 self._check_types({c.msgtype for c in wanted})
             for connection, stamp_ns, data in self._reader.messages(connections=wanted):
                 if data[: len(ZSTD)] == ZSTD and self._reader.is2:  # of a file without metadata
-                    data = _unpacked(_zstd().ZstdDecompressor(), data)
+                    data = _zstd().decompress(data)
                 kind = normalize_msgtype(connection.msgtype)
                 message = self._reader.deserialize(data, kind)
                 if not self._reader.is2:

@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from rs_localizer.io import bags
 from rs_localizer.io.bags import BagError, BagWriter, make_message, open_bag
 from rs_localizer.io.camera_files import CalibrationError, read_calibration
 from rs_localizer.io.maps.files import read_map_file
@@ -89,32 +88,6 @@ def test_recordings_with_types_of_their_own(tmp_path):
         pytest.raises(BagError, match="describes sensor_msgs/msg/Imu otherwise than ROS 2"),
     ):
         list(bag.messages(["/imu"]))
-
-
-@pytest.mark.parametrize(
-    ("mode", "storage"),
-    [("FILE", "SQLITE3"), ("MESSAGE", "SQLITE3"), ("STORAGE", "MCAP"), ("MESSAGE", "MCAP")],
-)
-def test_packed_recordings(tmp_path, mode, storage, monkeypatch):
-    monkeypatch.setattr(bags, "_MOST_UNPACKED", 1_000_000)
-    monkeypatch.setattr(bags, "_BEST_PACKING", 50)
-    text = "std_msgs/msg/String"
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for length in (1000, 3_000_000):
-        writer = Writer(tmp_path / f"bag{length}", version=9, storage_plugin=StoragePlugin[storage])
-        writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
-        with writer:
-            connection = writer.add_connection("/a", text, typestore=store)
-            message = make_message(text, data="a" * length)
-            writer.write(connection, 1, store.serialize_cdr(message, text))
-    with open_bag(tmp_path / "bag1000") as bag:
-        assert [len(message.data) for _, _, message in bag.messages(["/a"])] == [1000]
-
-    with (
-        pytest.raises(BagError, match=r"stand for over|times its size"),
-        open_bag(tmp_path / "bag3000000") as bag,
-    ):
-        list(bag.messages(["/a"]))
 
 
 def test_metadata_that_merges_for_ever(tmp_path):
