@@ -15,15 +15,12 @@ from rs_localizer.io.recording import CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IM
 
 if WORKING:
     import numpy as np
-    from scipy.spatial.transform import Rotation
 
     from rs_localizer.io.trajectories import Trajectory, read_motions
     from rs_localizer.offline.fleet import Figures
     from rs_localizer.tools import errors
 
 _TOPICS = ("pose", "twist", "truth_pose", "truth_twist")
-# Deg: less is an error, not another frame. And what is left once a rotation explains the rest.
-_ANOTHER_FRAME, _EXPLAINED = 10.0, 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +55,6 @@ def run(options: Options) -> Figures:
     print(f"{count} of {len(estimate.poses)} poses compared")
     rows, true_rows = errors.associate(estimate.poses.stamps_ns, truth.poses.stamps_ns)
     print(_coverage(options.truth, len(rows), len(np.unique(true_rows)), len(truth.poses)))
-    if text := _other_frames(estimate.poses.part(rows), truth.poses.part(true_rows)):
-        print(f"warning: {text}")
     of = {f"{kind} ({errors.UNITS[kind]})": each.values for kind, each in found.items()}
     print(f"\n{errors.table(of)}")
     figures: Figures = {"poses": count}
@@ -74,37 +69,6 @@ def run(options: Options) -> Figures:
     if options.plot is not None:
         write_all({options.plot: lambda part: errors.draw({"estimate": found}, part)})
     return figures
-
-
-def _other_frames(estimate: Trajectory, truth: Trajectory) -> str:
-    """Warning of orientations of the same times that all differ by one rotation, or ''."""
-    before = np.median(errors.angles(estimate.quaternions, truth.quaternions))
-    shifted = truth.quaternions[:, [1, 2, 3, 0]]
-    after = np.median(errors.angles(estimate.quaternions, shifted))
-    if len(truth) < 2 or before <= _ANOTHER_FRAME:
-        return ""
-    if after < _EXPLAINED * before:
-        return (
-            f"are quaternions of TRUTH given w first? Read so, orientations differ by {after:.3f} "
-            f"deg and not {before:.3f} (TUM's lines are t x y z qx qy qz qw)"
-        )
-    estimated, true = (Rotation.from_quat(each.quaternions) for each in (estimate, truth))
-    for whose, between in (
-        ("body (base_frame, optical axes)", true.inv() * estimated),
-        ("map", estimated * true.inv()),
-    ):
-        turn = between.mean()
-        after = np.degrees(np.median((turn.inv() * between).magnitude()))
-        if after < _EXPLAINED * before:
-            axis = turn.as_rotvec() / turn.magnitude()
-            x, y, z, w = turn.as_quat(canonical=True)
-            return (
-                f"the poses are given in different frames of the {whose}: a turn of "
-                f"{np.degrees(turn.magnitude()):.2f} deg about ({axis[0]:.3f}, {axis[1]:.3f}, "
-                f"{axis[2]:.3f}) (quaternion x y z w {x:.4f} {y:.4f} {z:.4f} {w:.4f}) explains all "
-                f"but {after:.3f} deg of {before:.3f} deg"
-            )
-    return ""
 
 
 def _coverage(path: Path, posed: int, met: int, true: int) -> str:

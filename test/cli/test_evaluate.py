@@ -59,7 +59,6 @@ def test_table(files, capsys):
     assert picture.is_file()
     text = capsys.readouterr().out
     assert "40 of 40 poses compared" in text
-    assert "different frames" not in text
     found = rows(text)
     for name, error in {
         "position (m)": 0.1,
@@ -110,28 +109,3 @@ def test_clocks_that_differ_are_mended(files, tmp_path, capsys):
     assert all(key.isidentifier() for key in told)
     assert evaluate(files, "--offset", "soon", estimate="late.txt") == 2
     assert "--offset: must be a number, got 'soon'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("whose", ["body", "map"])
-def test_frames_that_differ_are_named_with_their_turn(files, capsys, whose):
-    """A camera's optical axes are no body's with x forward: 120 deg about (-1, 1, -1)."""
-    optical = Rotation.from_quat([-0.5, 0.5, -0.5, 0.5])
-    other = TURNS * optical if whose == "body" else optical * TURNS
-    write_tum(files / "other.txt", Trajectory(STAMPS, TRUTH.positions, other.as_quat()))
-    assert evaluate(files, estimate="other.txt") == 0
-    said = capsys.readouterr().out
-    assert f"warning: the poses are given in different frames of the {whose}" in said
-    assert "a turn of 120.00 deg about (-0.577, 0.577, -0.577)" in said
-    assert "explains all but 0.000 deg of 120.000 deg" in said
-
-
-def test_quaternions_with_w_first_are_named(files, capsys):
-    """Their norm is 1, too, and no turn of a frame explains them."""
-    first = TRUTH.quaternions[:, [3, 0, 1, 2]]
-    write_tum(files / "truth.txt", Trajectory(STAMPS, TRUTH.positions, first))
-    assert evaluate(files) == 0
-    said = capsys.readouterr().out
-    assert (
-        "warning: are quaternions of TRUTH given w first? Read so, orientations differ by 2.0"
-        in said
-    )
