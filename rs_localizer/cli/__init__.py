@@ -110,30 +110,11 @@ def read_counts(text: str, option: str) -> tuple[int, int]:
     return columns, rows
 
 
-_EVERY = 5.0  # s between lines of progress
-
-
 @contextmanager
 def stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
-    """A progress bar for a person who waits, a line every few seconds for a log; what counts."""
-    if sys.stderr.isatty():
-        with tqdm(total=total, desc=name) as bar:
-            yield bar.update
-        return
-    counts, ended, began = [0], threading.Event(), time.monotonic()
-
-    def tell() -> None:
-        while not ended.wait(_EVERY):
-            seconds = time.monotonic() - began
-            print(f"{name}: {sum(counts)} of {total}, {seconds:.0f} s", file=sys.stderr, flush=True)
-
-    teller = threading.Thread(target=tell, daemon=True)
-    teller.start()
-    try:
-        yield counts.append
-    finally:
-        ended.set()
-        teller.join()
+    """A progress bar for a person who waits, none in a log; what counts."""
+    with tqdm(total=total, desc=name, disable=None) as bar:
+        yield bar.update
 
 
 # s between two lines that say what is compiled, where no terminal shows it.

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``rs_localizer map build``: what it refuses, and that nothing is half-written."""
 
-import re
-
 import cv2
 import numpy as np
 import pytest
@@ -57,7 +55,5 @@ def test_what_makes_no_map_is_said_and_leaves_nothing(tmp_path, images, text, ca
     words = ["map", "build", str(tmp_path / "images"), *given, "-p", "readout_time:=0.03"]
     assert main([*words, "--out", str(tmp_path / "map")]) == 1
     assert not (tmp_path / "map").exists()
-    *progress, line = capsys.readouterr().err.strip().splitlines()
-    # Every five seconds, which a busy machine takes.
-    assert all(re.fullmatch(r"\w+: \d+ of \d+, \d+ s", text) for text in progress), progress
+    (line,) = capsys.readouterr().err.strip().splitlines()
     assert text in line
