@@ -134,7 +134,7 @@ def localized(room: Room, clouds: Sequence[Any], landmarks: Map, solver: str) ->
 def without_refinement(built: Built) -> Map:
     """The map as a global shutter makes it: COLMAP's, laid onto the refined one as a whole."""
     landmarks = built.landmarks
-    points = built.structure.points[built.kept]
+    points = built.structure.start.points[built.kept]
     laid = through(points, landmarks.points)(points)
     return Map(laid, landmarks.ids, landmarks.descriptors, landmarks.frame)
 

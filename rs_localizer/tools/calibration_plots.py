@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.tools.camera_calibration import CameraCalibration, likelihood
-from rs_localizer.tools.verdict import sense
 
 _BLUE, _ORANGE, _GREY = "#0b3c8c", "#f08a24", "#c9c9c9"
 _DPI = 130
@@ -28,7 +27,7 @@ def save_plots(camera: Camera, calibration: CameraCalibration, directory: Path) 
 
 def _likelihood(axes: Axes, camera: Camera, calibration: CameraCalibration) -> None:
     values, costs = likelihood(camera, calibration)
-    middle, along = calibration.readout_time, 1e3 * sense(calibration)
+    middle, along = calibration.readout_time, 1e3 * calibration.sense
     axes.plot(along * values, np.exp(-0.5 * costs), "o-", color=_BLUE, label="measured")
     fine = np.linspace(values[0], values[-1], 200)
     bound = np.exp(-0.5 * ((fine - middle) / calibration.formal_deviation) ** 2)
@@ -38,7 +37,7 @@ def _likelihood(axes: Axes, camera: Camera, calibration: CameraCalibration) -> N
 
 
 def _blocks(axes: Axes, calibration: CameraCalibration) -> None:
-    along = 1e3 * sense(calibration)
+    along = 1e3 * calibration.sense
     for block in calibration.blocks:
         axes.errorbar(
             0.5 * (block.start + block.end), along * block.readout_time,

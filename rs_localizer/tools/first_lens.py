@@ -14,8 +14,11 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.tools.adjust.fit import fit
 from rs_localizer.tools.adjust.lens import lens_prior, lens_values, project
 from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.adjust.spline import spline_through
+from rs_localizer.tools.adjust.variables import Freedom, Observations, start_state
 
 _MOST_IMAGES, _LEAST_IMAGES = 30, 4
 # Of the points that the fullest image shows.
@@ -66,9 +69,11 @@ _CANDIDATES = (
 _RICHER = 0.9
 _POSE_STEPS = 4  # of Gauss and Newton from a pose in rays: they double the digits
 _LEAST_POINTS = 8
-# Of Levenberg and Marquardt for a fisheye: steps at most, and by what part of the cost the last one
-# changed it.
-_LENS_STEPS, _SETTLED = 60, 1e-7
+# Images of their own, and a lens of which nothing is known.
+_ALONE = Freedom(
+    readout_time=False, lens=True, lens_deviations=(10.0, 10.0), angular_velocity=1.0,
+    linear_velocity=1.0,
+)  # fmt: skip
 _FLAT = 1e-6  # thickness of a plane by its size
 
 
@@ -153,38 +158,25 @@ def _pose(camera: Camera, image: Observed) -> tuple[Array, Array] | None:
 
 
 def _refined(
-    camera: Camera, image: Observed, rotation: Array, place: Array
+    camera: Camera, image: Observed, rotation: Array, centre: Array
 ) -> tuple[Array, Array] | None:
     """A pose in pixels, not in rays: far from the middle they are not the same."""
     for _ in range(_POSE_STEPS):
-        linear = _linear(camera, image, rotation, place)
-        if linear is None:
+        local = image.points @ rotation.T + centre
+        if not np.all(local[:, 2] > 0.0):
             return None
-        errors, by_pose, _ = linear
-        rotation, place = _moved(rotation, place, np.linalg.lstsq(by_pose, -errors, rcond=None)[0])
-    return rotation, place
-
-
-def _moved(rotation: Array, place: Array, step: Any) -> tuple[Array, Array]:
-    change: Array = so3.exp(np.ascontiguousarray(step[:3]))
-    return change @ rotation, change @ place + step[3:]
-
-
-def _linear(
-    camera: Camera, image: Observed, rotation: Array, place: Array
-) -> tuple[Array, Array, Array] | None:
-    """Errors (2n,) px of an image, by its pose (2n,6), and the rays (n,2); None: it looks away."""
-    local = image.points @ rotation.T + place
-    if not np.all(local[:, 2] > 0.0):
-        return None
-    rays = local[:, :2] / local[:, 2:]
-    pixels, by_ray = camera.distort(rays)
-    if not np.isfinite(pixels).all():
-        return None
-    along = -np.einsum("nij,nj->ni", by_ray, rays)[:, :, None]
-    by_point = np.concatenate([by_ray, along], 2) / local[:, 2, None, None]
-    by_pose = np.concatenate([-by_point @ so3.hat(local), by_point], 2).reshape(-1, 6)
-    return (pixels - image.pixels).ravel(), by_pose, rays
+        rays = local[:, :2] / local[:, 2:]
+        pixels, by_ray = camera.distort(rays)
+        if not np.isfinite(pixels).all():
+            return None
+        along = -np.einsum("nij,nj->ni", by_ray, rays)[:, :, None]
+        by_point = np.concatenate([by_ray, along], 2) / local[:, 2, None, None]
+        by_pose = np.concatenate([-by_point @ so3.hat(local), by_point], 2).reshape(-1, 6)
+        off = (image.pixels - pixels).ravel()
+        step = np.linalg.lstsq(by_pose, off, rcond=None)[0]
+        turned: Array = so3.exp(np.ascontiguousarray(step[:3]))
+        rotation, centre = turned @ rotation, turned @ centre + step[3:]
+    return rotation, centre
 
 
 def _fisheye(size: tuple[int, int], images: list[Observed], K: Array) -> tuple[float, Camera]:
@@ -195,55 +187,25 @@ def _fisheye(size: tuple[int, int], images: list[Observed], K: Array) -> tuple[f
     Raises:
         ValueError: when no such lens fits.
     """
-
-    def cost(numbers: Array, poses: list[tuple[Array, Array]]) -> float:
-        camera, total = _equidistant(size, numbers), 0.0
-        for image, pose in zip(posed, poses, strict=True):
-            part = _linear(camera, image, *pose)
-            total += np.inf if part is None else float(part[0] @ part[0])
-        return total
-
-    numbers = np.r_[K[0, 0], K[1, 1], K[0, 2], K[1, 2], np.zeros(4)]
-    begin, posed, poses = _equidistant(size, numbers), [], []
-    for image in images:
-        pose = _pose(begin, image)
-        if pose is not None and _linear(begin, image, *pose) is not None:
-            posed.append(image)
-            poses.append(pose)
-    if len(posed) < max(_LEAST_IMAGES, len(images) // 2):
+    lens = _equidistant(size, np.r_[K[0, 0], K[1, 1], K[0, 2], K[1, 2], np.zeros(4)])
+    found = [(image, pose) for image in images if (pose := _pose(lens, image)) is not None]
+    if len(found) < max(_LEAST_IMAGES, len(images) // 2):
         raise ValueError("no poses by this focal length")
-    least, damping = cost(numbers, poses), 1e-3
-    for _ in range(_LENS_STEPS):
-        camera, parts = _equidistant(size, numbers), []
-        of_lens, slope = np.zeros((8, 8)), np.zeros(8)
-        for image, pose in zip(posed, poses, strict=True):
-            linear = _linear(camera, image, *pose)
-            assert linear is not None
-            errors, by_pose, rays = linear
-            by_lens = _by_lens(camera, rays)
-            own = by_pose.T @ by_pose
-            own[np.diag_indices(6)] *= 1.0 + damping
-            mixed = np.linalg.solve(own, np.column_stack([by_pose.T @ by_lens, by_pose.T @ errors]))
-            parts.append(mixed)
-            of_lens += by_lens.T @ (by_lens - by_pose @ mixed[:, :8])
-            slope += by_lens.T @ (errors - by_pose @ mixed[:, 8])
-        of_lens[np.diag_indices(8)] *= 1.0 + damping
-        step = -np.linalg.solve(of_lens, slope)
-        moved = [
-            _moved(*pose, -mixed[:, 8] - mixed[:, :8] @ step)
-            for pose, mixed in zip(poses, parts, strict=True)
-        ]
-        left = cost(numbers + step, moved) if np.all(numbers[:2] + step[:2] > 0.0) else np.inf
-        if not left < least:
-            damping *= 10.0
-            if damping > 1e6:
-                break
-            continue
-        settled = least - left < _SETTLED * least
-        numbers, poses, least, damping = numbers + step, moved, left, max(0.1 * damping, 1e-9)
-        if settled:
-            break
-    return least * len(images) / len(posed), _equidistant(size, numbers)
+    counts, times = [len(image.points) for image, _ in found], np.arange(len(found), dtype=float)
+    seen = Observations(
+        times=np.repeat(times, counts), row_times=np.zeros(sum(counts)),
+        pixels=np.concatenate([image.pixels for image, _ in found]),
+        landmarks=np.concatenate([image.points for image, _ in found]),
+        points=np.arange(sum(counts)), frames=np.repeat(np.arange(len(found)), counts),
+        trusted=np.ones(sum(counts), np.bool_),
+    )  # fmt: skip
+    rotations = np.array([rotation.T for _, (rotation, _) in found])
+    centres = np.array([-rotation.T @ place for _, (rotation, place) in found])
+    # Each image is a motion of its own.
+    apart = [np.array([k]) for k in range(len(found))]
+    spline = spline_through(apart, times, rotations, centres, 0.1, 0.05)
+    fitted = fit(lens, seen, start_state(lens, seen, spline), _ALONE)
+    return float(np.sum(fitted.squared_errors)) * len(images) / len(found), fitted.camera
 
 
 def as_fisheye(lens: Camera, pixels: Array) -> Camera:

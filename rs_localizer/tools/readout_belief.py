@@ -171,6 +171,11 @@ class Evidence:
         return self.determined and self.near_zero and sure and self.own_stamps
 
     @property
+    def sense(self) -> float:
+        """The sign by which readout times of parts are those along the direction that is told."""
+        return 1.0 if self.global_shutter else math.copysign(1.0, self.readout_time)
+
+    @property
     def stabilised(self) -> bool:
         """Whether the parts disagree as those of a camera that turns its picture do."""
         least = max(_STABILISED * abs(self.readout_time), self.limit)
@@ -180,21 +185,19 @@ class Evidence:
         scatter = np.std(values, ddof=1) if len(values) > 1 else 0.0
         return bool((self.inflation > 1.0 and scatter > least) or by_halves)
 
-    def parts(self, sign: float) -> str:
-        """The values of the blocks, ms, along a direction."""
-        return ", ".join(f"{1e3 * sign * one.readout_time:.2f}" for one in self.blocks)
+    @property
+    def parts(self) -> str:
+        """The values of the blocks, ms, along the direction that is told."""
+        return ", ".join(f"{1e3 * self.sense * one.readout_time:.2f}" for one in self.blocks)
 
-    def disbelief(self, sign: float) -> str:
-        """One line with the figure when the readout time is not determined; or ''.
-
-        Args:
-            sign: of the value along the direction that was found.
-        """
-        value = f"{1e3 * sign * self.readout_time:.1f} +- {1e3 * self.deviation:.1f} ms"
-        why = self._why_not(sign)
+    @property
+    def disbelief(self) -> str:
+        """One line with the figure when the readout time is not determined; or ''."""
+        value = f"{1e3 * self.sense * self.readout_time:.1f} +- {1e3 * self.deviation:.1f} ms"
+        why = self._why_not()
         return f"not observable: {value}{why}" if why else ""
 
-    def _why_not(self, sign: float) -> str:
+    def _why_not(self) -> str:
         """What speaks against it, beginning with how that goes on from the value."""
         why = ""
         if self.jitter > _BESIDE:
@@ -205,7 +208,7 @@ class Evidence:
             )
         if self.stabilised:
             why += (
-                f"; parts of the recording disagree ({self.parts(sign)} ms): is "
+                f"; parts of the recording disagree ({self.parts} ms): is "
                 "image stabilisation on, or was the video processed?"
             )
         if why:

@@ -37,11 +37,6 @@ def readout_time(result: CameraCalibration) -> float:
     return 0.0 if result.global_shutter else abs(result.readout_time)
 
 
-def sense(result: CameraCalibration) -> float:
-    """The sign by which the readout times of parts are those along :func:`scan_direction`."""
-    return 1.0 if result.global_shutter else float(np.copysign(1.0, result.readout_time))
-
-
 def scan_direction(result: CameraCalibration) -> ScanDirection:
     """The direction that the sign of the readout time says."""
     given = ScanDirection(result.fit.camera.scan_direction)
@@ -61,7 +56,7 @@ def lens_refusal(result: CameraCalibration) -> str:
 
 def refusal(result: CameraCalibration) -> str:
     """One line with the figure when lens or readout time is not determined; or ''."""
-    return lens_refusal(result) or result.disbelief(sense(result))
+    return lens_refusal(result) or result.disbelief
 
 
 def shape_is_free(result: CameraCalibration) -> bool:
@@ -102,8 +97,7 @@ def remarks(result: CameraCalibration) -> list[str]:
         said.append(f"{result.stamps.missing} images are missing between the others")
     if result.inflation > 1.0:
         said.append(
-            f"parts of the recording differ ({result.parts(sense(result))} ms) by more than their "
-            "noise: the "
+            f"parts of the recording differ ({result.parts} ms) by more than their noise: the "
             f"deviation is {result.inflation:.1f} times that of the noise alone"
         )
     if result.held:
@@ -150,7 +144,7 @@ def table(found: CameraCalibration, rate: float | None) -> Iterator[str]:
         ("spacing of the knots", f"{1e3 * found.fit.state.spline.layout.spacing:.1f} ms"),
     ):
         yield f"{name:26} {text}"
-    along = 1e3 * sense(found)
+    along = 1e3 * found.sense
     for block in found.blocks:
         yield (
             f"  {block.start:6.1f} to {block.end:5.1f} s {'':5}"

@@ -67,3 +67,11 @@ def test_markers():
     assert [marker.size for marker in found] == pytest.approx([0.4, 0.4])
     assert np.linalg.norm(found[1].pose.position) == pytest.approx(4.0)
     np.testing.assert_allclose(found[0].deviations, known * [2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
+
+
+def test_ids_are_named_by_all_their_digits():
+    with pytest.raises(ValueError, match=r"no landmark 1234567$"):
+        alignment(room(), distance=(1234567.0, 3.0, 1.0))
+    one = float(room().ids[3])
+    with pytest.raises(ValueError, match=f"--distance: {one:.0f} and {one:.0f} are 0 m apart"):
+        alignment(room(), distance=(one, one, 1.0))

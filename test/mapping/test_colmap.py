@@ -15,6 +15,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import colmap_camera, colmap_parameters
 from rs_localizer.tools.mapping import MappingError, colmap
 from rs_localizer.tools.mapping.colmap import Effort, build_structure, image_name, pairs_of
+from rs_localizer.tools.mapping.shutter_fit import global_errors
 from rs_localizer.tools.simulation.walls import collage
 
 K = np.array([[260.0, 0.0, 161.0], [0.0, 255.0, 118.0], [0.0, 0.0, 1.0]])
@@ -53,9 +54,9 @@ def test_the_lens_is_the_same_for_colmap(model, D):
 
 def build(images: Path, folder: Path, count: int) -> colmap.Structure:
     folder.mkdir()
-    return build_structure(
-        images, np.arange(count), None, folder, Effort(), lambda *_: nullcontext(lambda count: None)
-    )
+    rows = np.arange(count)
+    silent = lambda *_: nullcontext(lambda count: None)  # noqa: E731
+    return build_structure(images, rows, rows, None, folder, Effort(), silent)
 
 
 def test_a_process_that_dies_is_named(tmp_path, monkeypatch):
@@ -110,18 +111,12 @@ def test_a_plane_and_a_box_are_mapped_without_a_calibration(tmp_path):
     assert structure.parts == (count,)
     assert structure.camera.K[0, 0] == pytest.approx(focal, rel=0.03)
     assert structure.error < 0.7
-    assert structure.descriptors.shape == (len(structure.points), 128)
+    assert structure.descriptors.shape == (len(structure.start.points), 128)
     # Positions have the true shape.
-    true, found = np.array(centres), structure.positions
+    true, found = np.array(centres), structure.start.positions
     steps = [np.linalg.norm(of - of[0], axis=1)[1:] for of in (true, found)]
     ratios = steps[1] / steps[0]
     assert np.ptp(ratios) < 0.05 * np.median(ratios)
     # Observations are where the points project to.
-    k = np.searchsorted(structure.views, structure.seen_views)
-    local = np.einsum(
-        "nji,nj->ni",
-        structure.rotations[k],
-        structure.points[structure.seen_points] - structure.positions[k],
-    )
-    errors = np.linalg.norm(structure.camera.project(local) - structure.pixels, axis=1)
+    errors = global_errors(structure.camera, structure.seen, structure.start)
     assert np.mean(errors) == pytest.approx(structure.error, rel=0.05)

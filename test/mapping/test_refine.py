@@ -23,8 +23,8 @@ from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.observations import MapObservations, RigCamera
 from rs_localizer.tools.mapping.refine import (
     MapFreedom,
-    Preparation,
     RefinedMap,
+    Refinement,
     refine,
 )
 
@@ -40,11 +40,8 @@ def errors(found: RefinedMap, truth: Walk) -> np.ndarray:
 def small_problem() -> tuple[Problem, State]:
     rng = np.random.default_rng(0)
     scene = walk(rng, np.array([0.0, 0.03, 0.06, 1.0, 2.0]), points=120, count=25)
-    prepared = Preparation([RigCamera(camera())], scene.seen, scene.start, MapFreedom())
-    seen = prepared.observations()
-    state = prepared.state(seen)
-    free = Freedom(lens=True, angular_velocity=2.0, linear_velocity=1.0)
-    return prepared.problem(seen, state, free), state
+    whole = Refinement([RigCamera(camera())], scene.seen, scene.start, MapFreedom())
+    return whole.problem(Freedom(lens=True, angular_velocity=2.0, linear_velocity=1.0)), whole.state
 
 
 def test_modes_are_the_errors_of_the_motion_that_move_landmarks_most():

@@ -11,8 +11,14 @@ import pytest
 from rs_localizer.features.extraction import Features
 from rs_localizer.io.images import Image
 from rs_localizer.tools.mapping import MappingError
-from rs_localizer.tools.mapping.build import check_views, choose_keyframes
-from rs_localizer.tools.mapping.views import Looker, View, blurred, sharpness
+from rs_localizer.tools.mapping.views import (
+    Looker,
+    View,
+    blurred,
+    check_views,
+    choose_keyframes,
+    sharpness,
+)
 from rs_localizer.tools.simulation.walls import collage
 
 PICTURE = collage(900, 700, np.random.default_rng(0))
@@ -28,8 +34,7 @@ def views_of(sharpnesses: list[float], rate: float = 15.0) -> list[View]:
 
 
 def chosen(views: list[View]) -> list[int]:
-    stamps = np.array([view.stamp_ns for view in views])
-    rows: list[int] = choose_keyframes(stamps, views).tolist()
+    rows: list[int] = choose_keyframes(views).tolist()
     return rows
 
 

@@ -12,12 +12,11 @@ from test_fit import READOUT, make_camera
 
 from rs_localizer.core import so3
 from rs_localizer.tools.adjust.gyro import Gyroscope
-from rs_localizer.tools.adjust.lens import lens_prior
 from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
-from rs_localizer.tools.adjust.priors import Floating, lens_term, mount_term
+from rs_localizer.tools.adjust.priors import Floating, block_rows
 from rs_localizer.tools.adjust.problem import Problem, View
 from rs_localizer.tools.adjust.spline import Layout, Spline
-from rs_localizer.tools.adjust.system import Factored, System
+from rs_localizer.tools.adjust.system import Factored, Quadratic, System
 from rs_localizer.tools.adjust.variables import (
     Accelerations,
     Extrinsics,
@@ -36,6 +35,7 @@ MOUNTED = Mounting(
 )
 FREEDOMS = {
     "board": Freedom(lens=True, landmarks=0.01, stamps=1e-3),
+    "paper": Freedom(lens=True, landmarks=0.01, paper=True),
     "mounted": Freedom(lens=True, mounting=MOUNTED, fading=0.1),
     "bodies": Freedom(readout_time=False, mounting=MOUNTED),
     "sizes": Freedom(sizes=0.1),
@@ -107,22 +107,35 @@ def test_a_gyroscope():
     are_derivatives(lambda one: gyro.terms(one, problem.at[0]["gyro"])[0], problem, state)
 
 
-def test_priors_of_lens_and_mount():
-    """The slope is half the derivative of the cost."""
-    problem, state = small("mounted")
-    prior = lens_prior(problem.camera, None)
-    extrinsics = state.extrinsics.moved(np.full(7, 1e-4))
-    off = replace(state, lens=state.lens + 0.01, extrinsics=extrinsics)
-    for name, term in (
-        ("lens", lambda one, at: lens_term(one.lens, prior, at)),
-        ("mount", lambda one, at: mount_term(one.extrinsics, MOUNTED, at)),
-    ):
-        known = term(off, problem.at[0][name])
-        for column, slope in zip(known.columns, known.slope, strict=True):
-            step = np.zeros(problem.groups.kept)
+@pytest.mark.parametrize(
+    ("of", "count"), [("board", 2), ("paper", 2), ("mounted", 2), ("bodies", 2), ("sizes", 1)]
+)
+def test_what_is_known_beforehand(of, count):
+    """Of lens, mount, landmarks, sizes: the slope is half the derivative of the cost."""
+    problem, state = small(of)
+    step = 1e-4 * np.ones(problem.groups.kept)
+    step[: problem.groups.motion] = 0.0
+    off = problem.moved(state, np.r_[step, np.zeros(problem.groups.blocks)])
+
+    def priors(one: State) -> list[Quadratic]:
+        return [term for term in problem.terms(one, 100.0) if isinstance(term, Quadratic)]
+
+    known = priors(off)
+    assert len(known) == count
+    for k, term in enumerate(known):
+        for column, slope in zip(term.columns, term.slope, strict=True):
+            step = np.zeros(problem.groups.kept + problem.groups.blocks)
             step[column] = 1e-6
-            costs = [term(problem.moved(off, s * step), problem.at[0][name]).cost for s in (1, -1)]
-            assert (costs[0] - costs[1]) / 4e-6 == pytest.approx(slope, rel=1e-3, abs=1e-4)
+            costs = [priors(problem.moved(off, s * step))[k].cost for s in (1, -1)]
+            assert (costs[0] - costs[1]) / 4e-6 == pytest.approx(slope, rel=1e-3, abs=1e-3)
+
+
+def test_what_is_known_of_blocks():
+    """Of the times of images, each by itself."""
+    problem, state = small()
+    first = problem.at[0]["delays"]
+    are_derivatives(lambda one: block_rows(one.delays[:, None], np.full(5, 0.5), first), problem,
+                    state)  # fmt: skip
 
 
 @pytest.mark.parametrize("of", list(FREEDOMS))

@@ -37,9 +37,8 @@ if WORKING:
     from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
     from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map
     from rs_localizer.tools.mapping.colmap import Effort, require
-    from rs_localizer.tools.mapping.look import Looked, look
     from rs_localizer.tools.mapping.report import advice, rows, written
-    from rs_localizer.tools.mapping.views import Looker
+    from rs_localizer.tools.mapping.views import Looked, Looker, look
 
 
 def shutter_of(args: Options) -> tuple[float | None, str | None]:

@@ -35,7 +35,7 @@ if WORKING:
     from rs_localizer.offline.recordings import read_recording
     from rs_localizer.offline.replay import find_topics
     from rs_localizer.settings import build
-    from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, Shutter, undo_shutter
+    from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, undo_shutter
     from rs_localizer.tools.mapping.observations import RecordedMap, RigCamera, from_recordings
     from rs_localizer.tools.mapping.refine import MapFreedom, RefinedMap, refine_rig
 
@@ -188,13 +188,11 @@ def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
     values = given_values(args)
     readout = build(values).readout_time or None
     direction = str(build(values).scan_direction)
-    known = Shutter(
-        readout, direction if readout or "scan_direction" in values else None, args.intrinsics
-    )
+    known = direction if readout or "scan_direction" in values else None
     earlier = replaced(replace(args, out=out), "images.txt")
     with atomic_directory(out, earlier) as built:
-        result = undo_shutter(camera, model, model.images, stamps, known, _step)
-        check_readout(result.refined.readout_check)
+        result = undo_shutter(camera, model, stamps, readout, known, args.intrinsics, _step)
+        check_readout(result.readout_check)
         built.mkdir()
         write_model(built, result.camera, result.images, result.points)
     _tell_model(result, len(model.images), len(model.points))

@@ -8,10 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.tools.adjust.lens import LensPrior
 from rs_localizer.tools.adjust.spline import Spline
 from rs_localizer.tools.adjust.system import Quadratic, Rows
-from rs_localizer.tools.adjust.variables import EXTRINSICS, Extrinsics, Mounting
 
 # The whole may float so far while it is adjusted, by its size: loose enough to cost nothing.
 _FLOAT = 1e-3
@@ -22,18 +20,6 @@ def known(offset: Array, information: Array, first: int) -> Quadratic:
     slope = information @ offset
     columns = np.arange(first, first + len(offset))
     return Quadratic(columns, information, slope, float(offset @ slope))
-
-
-def lens_term(values: Array, prior: LensPrior, first: int) -> Quadratic:
-    """Of the numbers of a lens."""
-    return known(values - prior.mean, prior.information, first)
-
-
-def mount_term(extrinsics: Extrinsics, mounting: Mounting, first: int) -> Quadratic:
-    """Of a camera's place and clock."""
-    information = np.diag(mounting.deviations**-2.0)
-    assert len(information) == EXTRINSICS
-    return known(extrinsics.beside(mounting.given), information, first)
 
 
 def block_rows(offsets: Array, deviations: Array, first: int) -> Rows:

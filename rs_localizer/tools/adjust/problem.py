@@ -16,7 +16,7 @@ from rs_localizer.tools.adjust.gyro import Gyroscope
 from rs_localizer.tools.adjust.keypoints import LIMIT, Curve, Keypoints, Sights
 from rs_localizer.tools.adjust.lens import lens_prior
 from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
-from rs_localizer.tools.adjust.priors import Floating, block_rows, known, lens_term, mount_term
+from rs_localizer.tools.adjust.priors import Floating, block_rows, known
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import (
     Factored,
@@ -34,7 +34,8 @@ MEDIAN = 2.0 * np.log(2.0)
 """Of a squared error in two dimensions, in variances."""
 _LOOSE_BODY = 100.0  # m, rad
 _STEPS, _MOST_DAMPINGS = 20, 6
-# A step that brings less than this, or than this part of the cost, is the last one.
+# A step that brings less than this, or than this part of the cost, is the last one; of a cost no
+# larger than keypoints can make it: what is given tightly, and in conflict, must not end it.
 _LEAST_GAIN, _LEAST_SHARE = 0.02, 1e-6
 _FIRST_DAMPING = 1e-8
 # The rounds end when the noise settles to this part of it.
@@ -176,9 +177,11 @@ class Problem:
         view, at, pieces = self.views[k], self.at[k], self.pieces[k]
         freedom = view.freedom
         if "lens" in at:
-            terms.append(lens_term(own.lens, self._lens_priors[k], at["lens"]))
-        if freedom.mounting is not None:
-            terms.append(mount_term(own.extrinsics, freedom.mounting, at["mount"]))
+            prior = self._lens_priors[k]
+            terms.append(known(own.lens - prior.mean, prior.information, at["lens"]))
+        if (mounting := freedom.mounting) is not None:
+            off = own.extrinsics.beside(mounting.given)
+            terms.append(known(off, np.diag(mounting.deviations**-2.0), at["mount"]))
         if "points" in at and self.deviations is None and not (k and self._one_map):
             if pieces.rigid:  # a body none of whose landmarks fits stays where it is
                 information = np.full(pieces.columns, _LOOSE_BODY**-2)
@@ -255,6 +258,7 @@ def minimise(problem: Problem, state: State, deviation: float, steps: int = _STE
     """The state of least cost near to this one, by Levenberg and Marquardt, after so many steps."""
     system = problem.system(state, deviation)
     damping = _FIRST_DAMPING
+    most = LIMIT**2 / 3.0 * sum(len(view.observations.points) for view in problem.views)
     for _ in range(steps):
         for _ in range(_MOST_DAMPINGS):
             cost = math.inf
@@ -271,7 +275,7 @@ def minimise(problem: Problem, state: State, deviation: float, steps: int = _STE
             return state
         gain = system.cost - cost
         state, system, damping = trial, following, 0.1 * damping
-        if gain < max(_LEAST_GAIN, _LEAST_SHARE * cost):
+        if gain < max(_LEAST_GAIN, _LEAST_SHARE * min(cost, most)):
             break
     return state
 

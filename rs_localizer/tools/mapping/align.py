@@ -45,7 +45,7 @@ def alignment(
 
     def place(number: float) -> Array:
         if number not in places:
-            raise ValueError(f"the map has no {what} {number:g}")
+            raise ValueError(f"the map has no {what} {number:.15g}")
         return np.asarray(places[int(number)])
 
     upward = np.array(up or (0.0, 0.0, 1.0))
@@ -58,7 +58,8 @@ def alignment(
         one, other, wanted = distance
         apart = float(np.linalg.norm(place(one) - place(other)))
         if not min(apart, wanted) > 0.0:
-            raise ValueError(f"--distance: {one:g} and {other:g} are {apart:g} m apart, no scale")
+            ids = f"{one:.15g} and {other:.15g}"
+            raise ValueError(f"--distance: {ids} are {apart:g} m apart, no scale")
         scale = wanted / apart
     zero = np.zeros(3) if origin is None else place(origin)
     return Similarity(scale, turn, -scale * turn @ zero)

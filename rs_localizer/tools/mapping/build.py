@@ -13,18 +13,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.anchors import (
@@ -41,29 +38,27 @@ from rs_localizer.tools.mapping.observations import (
     Start,
     adjusted_part,
 )
-from rs_localizer.tools.mapping.refine import DRIFT, RefinedMap, refine
+from rs_localizer.tools.mapping.refine import DRIFT, RefinedMap
 from rs_localizer.tools.mapping.shutter_fit import (
     LEAST_FIT,
     colmap_freedom,
-    fit_shutter,
     likely_axes,
+    refine_with_shutter,
 )
 from rs_localizer.tools.mapping.track_on_map import track_on_map
 from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, moves, triangulate
-from rs_localizer.tools.mapping.views import View, blurred
+from rs_localizer.tools.mapping.views import (
+    LEAST_VIEWS,
+    View,
+    blurred,
+    check_views,
+    choose_keyframes,
+)
 from rs_localizer.tools.readout_belief import ReadoutCheck, ShutterFit
 
 # Settings of the localizer are in metres: so far (m) is the median landmark taken to be from where
 # it is seen, until it is known how far it is.
 USUAL_DISTANCE = 2.5
-# A view with fewer features is blurred, dark, or of a blank wall.
-_FEW_FEATURES = 50
-_LEAST_VIEWS = 3
-# Pictures in which features move by less than this share of their size (median) show no depth.
-_LEAST_PARALLAX = 0.01
-# COLMAP gets all views of a short recording and so many a second of a long one: at a turn of 60
-# degrees a second, neighbours have three quarters of a picture of 60 degrees in common.
-_KEYFRAMES, _KEYFRAMES_PER_SECOND = 60, 4.0
 # Share of the keyframes that must hang together.
 _LEAST_PART = 0.5
 # Errors that landmarks share are told of so many modes. Of a walk of 12 s around a room they are
@@ -163,7 +158,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
     """
     check_views(inputs.views)
     unsharp = blurred(inputs.views)
-    keyframes = choose_keyframes(inputs.stamps_ns, inputs.views)
+    keyframes = choose_keyframes(inputs.views)
     structure = _structure(inputs, keyframes, work)
     camera = replace(
         structure.camera,
@@ -178,7 +173,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
     check_fit(refined.fit_share, estimated)
     motion = Motion(rows[used], refined.times, refined)
     seen = rows[shown.images], shown.landmarks, shown.pixels
-    triangulated = triangulate(refined.camera, motion.sights(*seen), len(structure.points))
+    triangulated = triangulate(refined.camera, motion.sights(*seen), len(structure.start.points))
     anchors = inputs.anchors.seen(inputs.views)
     held = triangulate(refined.camera, motion.sights(*anchors), inputs.anchors.count)
     place = placement(inputs.anchors, held, *refined.poses())
@@ -199,7 +194,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
         placement=place,
         keyframes=keyframes,
         blurred=unsharp,
-        structure=structure.moved(similarity),
+        structure=replace(structure, start=structure.start.moved(similarity)),
         kept=kept,
         shutter=shutter,
         readout_check=check,
@@ -210,77 +205,26 @@ def build_map(inputs: Given, work: Workshop) -> Built:
     )  # fmt: skip
 
 
-def check_views(views: Sequence[View]) -> None:
-    """Refuse, before minutes of work, views that will make no map.
-
-    Raises:
-        MappingError: saying what was found and what to film instead.
-    """
-    if len(views) < _LEAST_VIEWS:
-        raise MappingError(f"{len(views)} images make no map; at least {_LEAST_VIEWS} are needed")
-    check_features(views)
-    first, step = views[0], max(1, len(views) // 8)
-    moved = [_moved(first, view) for view in views[step::step]]
-    if all(share < _LEAST_PARALLAX for share in moved):
-        raise MappingError(
-            f"the camera hardly moves (features by {100.0 * max(moved):.1f} % of the picture's "
-            "size): walk sideways and around what is to be mapped"
-        )
-
-
-def check_features(views: Sequence[View]) -> None:
-    """Refuse views that show too little.
-
-    Raises:
-        MappingError: saying what was found.
-    """
-    features = float(np.median([len(view.features) for view in views]))
-    if features < _FEW_FEATURES:
-        raise MappingError(
-            f"the images show {features:.0f} features each (median), at least {_FEW_FEATURES} are "
-            "needed: are they blurred, dark, or of blank walls?"
-        )
-
-
-def _moved(one: View, other: View) -> float:
-    """How far features move (median), by the size of the picture; infinite: they are others."""
-    if min(len(one.features), len(other.features)) < _FEW_FEATURES:
-        return math.inf
-    matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)
-    matches = matcher.match(
-        one.features.descriptors.astype(np.float32), other.features.descriptors.astype(np.float32)
-    )
-    here = one.features.pixels[[match.queryIdx for match in matches]]
-    there = other.features.pixels[[match.trainIdx for match in matches]]
-    if len(matches) < _FEW_FEATURES:
-        return math.inf
-    size = np.ptp(np.vstack([here, there]), axis=0).max()
-    return float(np.median(np.linalg.norm(there - here, axis=1)) / size)
-
-
-def choose_keyframes(stamps_ns: IntArray, views: Sequence[View]) -> IntArray:
-    """Rows (k,) of the views that COLMAP gets: evenly spaced, the sharpest of each few."""
-    seconds = 1e-9 * float(stamps_ns[-1] - stamps_ns[0])
-    count = max(_KEYFRAMES, math.ceil(_KEYFRAMES_PER_SECOND * seconds))
-    slots = np.array_split(np.arange(len(views)), min(count, len(views)))
-    return np.array([max(slot, key=lambda row: views[row].sharpness) for slot in slots], np.int64)
-
-
 def _structure(inputs: Given, keyframes: IntArray, work: Workshop) -> Structure:
     """The first structure, of about the right size."""
     structure = build_structure(
-        inputs.views[0].image.parent, keyframes, inputs.camera, work.folder, work.effort, work.stage
-    )
+        inputs.views[0].image.parent, keyframes, inputs.stamps_ns, inputs.camera, work.folder,
+        work.effort, work.stage,
+    )  # fmt: skip
     total = len(keyframes)
-    if structure.parts[0] < max(_LEAST_VIEWS, _LEAST_PART * total):
+    if structure.parts[0] < max(LEAST_VIEWS, _LEAST_PART * total):
         listed = " and ".join(map(str, structure.parts))
         raise MappingError(
             f"reconstruction is disconnected (components of {listed} keyframes, of {total}): "
             "record what lies between them, slowly, without blank walls"
         )
-    places = structure.positions[np.searchsorted(structure.views, structure.seen_views)]
-    depths = np.linalg.norm(structure.points[structure.seen_points] - places, axis=1)
-    return structure.moved(scaled(USUAL_DISTANCE / float(np.median(depths))))
+    size = usual_size(structure.seen, structure.start)
+    return replace(structure, start=structure.start.moved(size))
+
+
+def usual_size(seen: MapObservations, start: Start) -> Similarity:
+    """Larger, as a room is: priors of motions are in metres."""
+    return scaled(USUAL_DISTANCE / float(np.median(np.linalg.norm(start.local(seen), axis=1))))
 
 
 def _refined(
@@ -296,22 +240,11 @@ def _refined(
             camera, observations, start, corners, places
         )
         freedom = replace(freedom, deviations=deviations)
-    directions = likely_axes(camera.size, inputs.scan_direction)
-    unknown, check = inputs.readout_time is None, None
-    with work.stage("refine", 3 * (1 + len(directions)) if unknown else 3) as step:
-
-        def done(_: str) -> None:
-            step(1)
-
-        if not unknown:
-            refined = refine(camera, observations, start, freedom, done=done)
-            check = refined.readout_check
-            if check is None or not check.differs:
-                return refined, None, check
-            # A map adjusted with the wrong one is bent to it, and fits it nearly as well.
-            directions = [ScanDirection(camera.scan_direction)]
-        fitted = fit_shutter(camera, observations, start, freedom, directions, done)
-        return *fitted, check
+    directions, given = likely_axes(camera.size, inputs.scan_direction), inputs.readout_time
+    with work.stage("refine", 3 if given is not None else 3 * (1 + len(directions))) as step:
+        return refine_with_shutter(
+            camera, observations, start, freedom, given, directions, lambda _: step(1)
+        )
 
 
 def _corners(inputs: Given, stamps_ns: IntArray) -> MapObservations:

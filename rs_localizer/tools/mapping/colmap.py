@@ -16,9 +16,9 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -26,15 +26,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.camera_files import colmap_camera, colmap_parameters
-from rs_localizer.io.maps.colmap import read_colmap
+from rs_localizer.io.camera_files import colmap_parameters
+from rs_localizer.io.maps.colmap import DATABASE, Model, read_model
 from rs_localizer.tools.mapping import MappingError
-from rs_localizer.tools.mapping.gauge import Similarity
+from rs_localizer.tools.mapping.observations import MapObservations, Start
 
-DATABASE, SPARSE = "database.db", "sparse"
-_ARRAYS, _TASK = "arrays.npz", "task.json"
+SPARSE, _TASK = "sparse", "task.json"
 _SCRIPT = Path(__file__).with_name("colmap_process.py")
 # So few images are matched each with each (COLMAP's exhaustive matching: 435 pairs take 20 s on
 # two cores); of more, each with so many that follow it, and with those 2^k later (its
@@ -51,25 +50,12 @@ class Structure:
     """Poses of views, points, and which views show them where."""
 
     views: IntArray  # (k,) rows of the views that have a pose
-    rotations: Array  # (k,3,3) world_from_camera
-    positions: Array  # (k,3) of the camera centres
-    points: Array  # (p,3)
+    seen: MapObservations  # by these views
+    start: Start  # points and poses
     descriptors: NDArray[np.float32]  # (p,128)
-    seen_points: IntArray  # (n,) rows of points
-    seen_views: IntArray  # (n,) rows of the views
-    pixels: Array  # (n,2) raw
     camera: Camera  # lens as given, or as COLMAP calibrated it; without a readout time
     parts: tuple[int, ...]  # views of each part that hangs together, the largest first: this one
     error: float  # px, mean reprojection error of COLMAP's model
-
-    def moved(self, similarity: Similarity) -> Structure:
-        """The same in another frame."""
-        return replace(
-            self,
-            rotations=similarity.rotation @ self.rotations,
-            positions=similarity(self.positions),
-            points=similarity(self.points),
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,14 +84,15 @@ def image_name(row: int) -> str:
 
 
 def build_structure(
-    images: Path, keyframes: IntArray, lens: Camera | None, folder: Path, effort: Effort,
-    stage: Stage,
+    images: Path, keyframes: IntArray, stamps_ns: IntArray, lens: Camera | None, folder: Path,
+    effort: Effort, stage: Stage,
 ) -> Structure:  # fmt: skip
     """Reconstruct the largest part of the keyframes that hangs together.
 
     Args:
         images: folder with the images of the keyframes, by :func:`image_name`.
         keyframes: (k,) rows of the views.
+        stamps_ns: of all views.
         lens: of all images, which is believed; None: COLMAP calibrates a simple radial camera.
         folder: for COLMAP's database and model; they stay.
         effort: threads and seed.
@@ -126,14 +113,48 @@ def build_structure(
         "threads": effort.threads,
     }
     (folder / _TASK).write_text(json.dumps(task), encoding="utf-8")
-    _run(folder / _TASK, stage)
+    said = _run(folder / _TASK, stage)
     (folder / _TASK).unlink()
-    with np.load(folder / _ARRAYS) as arrays:
-        output = dict(arrays)
-    (folder / _ARRAYS).unlink()
-    if not output["parts"].size:
-        raise MappingError(_nothing(output, len(keyframes)))
-    return _structure(output, folder, lens)
+    if not said["parts"]:
+        raise MappingError(_nothing(said, len(keyframes)))
+    model = read_model(folder / SPARSE, folder / DATABASE)
+    assert model.descriptors is not None
+    names = sorted(model.images)
+    views = np.array([int(Path(name).stem) for name in names])
+    return Structure(
+        views,
+        *observed(model, names, stamps_ns[views]),
+        descriptors=model.descriptors.astype(np.float32),
+        camera=lens or model.camera,
+        parts=tuple(said["parts"]),
+        error=said["error"],
+    )
+
+
+def observed(
+    model: Model, names: Sequence[str], stamps_ns: IntArray
+) -> tuple[MapObservations, Start]:
+    """What images of a model show of its points, by their names in the order of stamps (g,).
+
+    Raises:
+        MappingError: for keypoints of points that are not there.
+    """
+    images = [model.images[name] for name in names]
+    shown = [image.points >= 0 for image in images]
+    pairs = list(zip(images, shown, strict=True))
+    ids = np.concatenate([image.points[some] for image, some in pairs])
+    rows = np.minimum(np.searchsorted(model.ids, ids), len(model.ids) - 1)
+    if not len(ids) or np.any(model.ids[rows] != ids):
+        raise MappingError("the model's images list no keypoints of its points")
+    rotations = np.array([image.rotation.T for image in images])
+    translations = np.array([image.translation for image in images])
+    seen = MapObservations(
+        stamps_ns,
+        np.repeat(np.arange(len(images)), [np.count_nonzero(some) for some in shown]),
+        rows,
+        np.concatenate([image.pixels[some] for image, some in pairs]) - HALF,
+    )
+    return seen, Start(model.points, rotations, -np.einsum("gij,gj->gi", rotations, translations))
 
 
 def pairs_of(count: int) -> list[tuple[int, int]]:
@@ -146,11 +167,12 @@ def pairs_of(count: int) -> list[tuple[int, int]]:
     return sorted(pairs | {(i, j) for i in every for j in every if i < j})
 
 
-def _run(task: Path, stage: Stage) -> None:
-    """Do the task; a process that dies is named with the last that it said."""
+def _run(task: Path, stage: Stage) -> dict[str, Any]:
+    """The task's result; a process that dies is named with the last that it said."""
     command = [sys.executable, str(_SCRIPT), str(task)]
     # Else a script imports from its own folder first.
     environment = os.environ | {"PYTHONSAFEPATH": "1"}
+    result: dict[str, Any] = {}
     with TemporaryFile("w+", encoding="utf-8", errors="replace") as log, subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment
     ) as process, ExitStack() as stages:  # fmt: skip
@@ -164,6 +186,8 @@ def _run(task: Path, stage: Stage) -> None:
                         step = stages.enter_context(stage(name, int(total)))
                     case ["step", count]:
                         step(int(count))
+                    case ["result", *_]:
+                        result = json.loads(line.removeprefix("result"))
             process.wait()
         finally:
             process.kill()
@@ -171,6 +195,7 @@ def _run(task: Path, stage: Stage) -> None:
             log.seek(0)
             lines = [line for line in log.read().splitlines() if line.strip()]
             raise MappingError(_death(process.returncode, lines[-1] if lines else ""))
+    return result
 
 
 def _death(code: int, last: str) -> str:
@@ -185,25 +210,4 @@ def _nothing(output: dict[str, Any], keyframes: int) -> str:
         f"({output['features'] / keyframes:.0f} features each, {output['pairs']} pairs of them "
         "agree): the images need texture that does not repeat, overlap, and a camera that moves "
         "sideways, not one that only rotates"
-    )
-
-
-def _structure(output: dict[str, Any], folder: Path, lens: Camera | None) -> Structure:
-    described = read_colmap(folder / SPARSE, "map", folder / DATABASE)
-    assert described.ids is not None
-    assert described.descriptors is not None
-    order = np.argsort(described.ids)
-    rows = np.array([int(Path(name).stem) for name in output["names"].tolist()])
-    return Structure(
-        views=rows,
-        rotations=output["rotations"],
-        positions=output["positions"],
-        points=output["points"],
-        descriptors=described.descriptors[order].astype(np.float32),
-        seen_points=output["tracks"][:, 0],
-        seen_views=rows[output["tracks"][:, 1]],
-        pixels=output["pixels"] - HALF,
-        camera=lens or colmap_camera(str(output["camera"]), None),
-        parts=tuple(output["parts"].tolist()),
-        error=float(output["error"]),
     )

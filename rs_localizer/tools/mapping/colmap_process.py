@@ -3,8 +3,8 @@
 """COLMAP at work, in a process of its own: ``python colmap_process.py TASK.json``.
 
 OpenCV and pycolmap in one process abort on some machines ("free(): invalid pointer"), so this file
-imports nothing of this package and is run by its path; ``colmap.py`` reads what it leaves. On
-standard output it says ``stage NAME TOTAL`` and ``step COUNT`` as it goes.
+imports nothing of this package and is run by its path; it leaves a model and its database. On
+standard output it says ``stage NAME TOTAL`` and ``step COUNT`` as it goes, at last ``result JSON``.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 import pycolmap
 
-DATABASE, SPARSE, ARRAYS = "database.db", "sparse", "arrays.npz"
+DATABASE, SPARSE = "database.db", "sparse"
 # Errors of COLMAP's log that say what raised the exception anyway are left out.
 _ONLY_FATAL = 3
 # Images and pairs of images between two steps of the progress bar.
@@ -44,15 +43,15 @@ def main(task: dict[str, Any]) -> None:
     _extract(task, database)
     _match(task, database)
     ordered = _map(task, database, folder)
-    arrays = {"parts": [model.num_reg_images() for model in ordered]} | _statistics(database)
+    result = {"parts": [model.num_reg_images() for model in ordered]} | _statistics(database)
     if ordered:
         (folder / SPARSE).mkdir()
         ordered[0].write(folder / SPARSE)
-        arrays |= _arrays(ordered[0])
+        result["error"] = ordered[0].compute_mean_reprojection_error()
     with closing(sqlite3.connect(database)) as tables:
         # Readers of a database with a write-ahead log leave files beside it.
         tables.execute("PRAGMA journal_mode=DELETE")
-    np.savez(folder / ARRAYS, **arrays)
+    _say("result", json.dumps(result))
 
 
 def _say(*words: object) -> None:
@@ -115,35 +114,6 @@ def _map(task: dict[str, Any], database: Path, folder: Path) -> list[Any]:
             database, task["images"], parts, options, next_image_callback=lambda: _say("step", 1)
         )
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
-
-
-def _arrays(model: Any) -> dict[str, Any]:
-    """What the refinement needs of a model; images by their names."""
-    images = sorted(
-        (image for image in model.images.values() if image.has_pose), key=lambda one: str(one.name)
-    )
-    row = {image.image_id: k for k, image in enumerate(images)}
-    poses = [image.cam_from_world().inverse() for image in images]
-    ids = sorted(model.points3D)
-    tracks = [
-        (point, row[element.image_id], element.point2D_idx)
-        for point, key in enumerate(ids)
-        for element in model.points3D[key].track.elements
-    ]
-    pixels = [images[image].points2D[feature].xy for _, image, feature in tracks]
-    (camera,) = model.cameras.values()
-    return {
-        "names": [image.name for image in images],
-        "rotations": np.array([pose.rotation.matrix() for pose in poses]),
-        "positions": np.array([pose.translation for pose in poses]),
-        "ids": np.array(ids),
-        "points": np.array([model.points3D[key].xyz for key in ids]).reshape(-1, 3),
-        "tracks": np.array(tracks).reshape(-1, 3)[:, :2],
-        "pixels": np.array(pixels).reshape(-1, 2),
-        "camera": f"1 {camera.model.name} {camera.width} {camera.height} "
-        + " ".join(repr(float(value)) for value in camera.params),
-        "error": model.compute_mean_reprojection_error(),
-    }
 
 
 def _statistics(database: Path) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.maps.landmarks import Map, make_map
 from rs_localizer.tools.adjust.observe import Observed, localize_each
 from rs_localizer.tools.adjust.variables import Extrinsics, Mounting
+from rs_localizer.tools.mapping.gauge import Similarity
 from rs_localizer.tools.readout_belief import ReadoutCheck
 
 # A part of the map hangs together with another by at least so many landmarks.
@@ -142,6 +143,15 @@ class Start:
     points: Array  # (p,3) m, map frame
     rotations: Array  # (g,3,3) map_from_camera, of the middle row or of the whole image
     positions: Array  # (g,3) m, of the camera's centre in the map
+
+    def moved(self, by: Similarity) -> Start:
+        """The same in another frame."""
+        return Start(by(self.points), by.rotation @ self.rotations, by(self.positions))
+
+    def local(self, seen: MapObservations) -> Array:
+        """The landmarks of keypoints (n,3) in camera axes, as of a global shutter."""
+        away = self.points[seen.landmarks] - self.positions[seen.images]
+        return np.asarray(np.einsum("nji,nj->ni", self.rotations[seen.images], away))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

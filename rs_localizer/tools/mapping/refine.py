@@ -59,13 +59,13 @@ _LEAST_ANCHORS = 3
 _LEAST_STRETCH = 20
 
 
-class Preparation:
-    """The keypoints that count, and the first motion."""
+class Refinement:
+    """One map on its way: the keypoints that count, motion, landmarks, and what else is free."""
 
     def __init__(
         self, rig: Sequence[RigCamera], seen: MapObservations, start: Start, freedom: MapFreedom
     ) -> None:
-        self.rig, self.seen, self.start, self.freedom = rig, seen, start, freedom
+        self.rig, self.shown, self.given, self.wanted = rig, seen, start, freedom
         self.start_ns = int(seen.stamps_ns.min())
         delays = np.array([one.delay for one in rig])[seen.of_cameras]
         self.times = np.asarray(1e-9 * (seen.stamps_ns - self.start_ns) + delays, np.float64)
@@ -87,12 +87,26 @@ class Preparation:
                 f"{len(self.times)} images have {held} unknowns of motion, at most "
                 f"{_MOST_UNKNOWNS} can be refined at once: leave images out"
             )
+        self.seen = self._observations()
+        pairs = zip(rig, self.seen, strict=True)
+        self.state = rig_state(
+            self.spline, ((one.camera, own, one.extrinsics) for one, own in pairs)
+        )
+        self.freedom = Freedom(
+            readout_time=freedom.readout_time,
+            lens=freedom.lens,
+            lens_deviations=freedom.lens_deviations,
+            angular_acceleration=freedom.angular_acceleration,
+            linear_acceleration=freedom.linear_acceleration,
+            angular_velocity=ANGULAR_VELOCITY,
+            linear_velocity=LINEAR_VELOCITY,
+        )
 
     def _known(self) -> tuple[Array, bool]:
         """Deviations (p,) of the landmarks, m, and whether nothing holds the whole."""
-        given = self.freedom.deviations
+        given = self.wanted.deviations
         if given is None:
-            given = np.full(len(self.start.points), np.inf)
+            given = np.full(len(self.given.points), np.inf)
         anchors = np.count_nonzero(np.isfinite(given))
         if 0 < anchors < _LEAST_ANCHORS:
             raise ValueError(
@@ -103,31 +117,31 @@ class Preparation:
 
     def _usable(self) -> BoolArray:
         """Keypoints (n,) that say something of map or motion."""
-        shared = np.zeros(len(self.start.points), np.bool_)
-        found = shared_landmarks(self.seen)
+        shared = np.zeros(len(self.given.points), np.bool_)
+        found = shared_landmarks(self.shown)
         shared[: len(found)] = found
-        if self.freedom.deviations is not None:
-            shared |= np.isfinite(self.freedom.deviations)
-        used = shared[self.seen.landmarks]
-        counts = np.bincount(self.seen.images[used], minlength=len(self.times))
-        return used & (counts >= LEAST_KEYPOINTS)[self.seen.images]
+        if self.wanted.deviations is not None:
+            shared |= np.isfinite(self.wanted.deviations)
+        used = shared[self.shown.landmarks]
+        counts = np.bincount(self.shown.images[used], minlength=len(self.times))
+        return used & (counts >= LEAST_KEYPOINTS)[self.shown.images]
 
     def _spline(self) -> Spline:
         """Through the images with keypoints, of a rig's frames through those with most.
 
         Images that follow each other are one stretch.
         """
-        counts = np.bincount(self.seen.images[self.used], minlength=len(self.times))
-        frames = frame_numbers(self.times, self.seen.of_cameras)
+        counts = np.bincount(self.shown.images[self.used], minlength=len(self.times))
+        frames = frame_numbers(self.times, self.shown.of_cameras)
         order = np.lexsort((-counts, frames))
         firsts = np.unique(frames[order], return_index=True)[1]
         best = order[firsts]
         beyond = np.abs(self.times - self.times[best[frames]])[counts > 0].max()
         best = best[counts[best] > 0]
-        extrinsics = [self.rig[k].extrinsics for k in self.seen.of_cameras[best]]
-        rotations = self.start.rotations[best] @ np.array([one.axes for one in extrinsics])
+        extrinsics = [self.rig[k].extrinsics for k in self.shown.of_cameras[best]]
+        rotations = self.given.rotations[best] @ np.array([one.axes for one in extrinsics])
         centres = np.array([one.centre for one in extrinsics])
-        positions = self.start.positions[best] - np.einsum("gij,gj->gi", rotations, centres)
+        positions = self.given.positions[best] - np.einsum("gij,gj->gi", rotations, centres)
         longest = max(one.camera.readout_time for one in self.rig) + 2.0 * float(beyond)
         follow = following(self.times[best], rotations)
         return initial_trajectory(self.times[best], rotations, positions, longest, follow)
@@ -139,48 +153,182 @@ class Preparation:
 
     def _longest(self) -> int:
         """Images in the longest stretch."""
-        own = self.times[np.unique(self.seen.images[self.used])]
+        own = self.times[np.unique(self.shown.images[self.used])]
         return int(np.bincount(self.spline.layout.stretches(own)).max())
 
     def keypoints(self, camera: int) -> BoolArray:
         """Which (n,) are used of a camera."""
-        return np.asarray(self.used & (self.seen.of_cameras[self.seen.images] == camera), np.bool_)
+        return np.asarray(
+            self.used & (self.shown.of_cameras[self.shown.images] == camera), np.bool_
+        )
 
-    def observations(self) -> list[Observations]:
+    def _observations(self) -> list[Observations]:
         """Of each camera."""
         every = []
         for k, one in enumerate(self.rig):
             used = self.keypoints(k)
-            images, pixels = self.seen.images[used], self.seen.pixels[used]
+            images, pixels = self.shown.images[used], self.shown.pixels[used]
             every.append(
                 Observations(
                     times=self.times[images],
                     row_times=one.camera.row_time(pixels),
                     pixels=pixels,
-                    landmarks=self.start.points,
-                    points=self.seen.landmarks[used],
+                    landmarks=self.given.points,
+                    points=self.shown.landmarks[used],
                     frames=images,
                     trusted=np.ones(len(images), np.bool_),
                 )
             )
         return every
 
-    def state(self, seen: Sequence[Observations]) -> State:
-        """The first guess."""
-        pairs = zip(self.rig, seen, strict=True)
-        return rig_state(self.spline, ((one.camera, own, one.extrinsics) for one, own in pairs))
-
-    def problem(
-        self, seen: Sequence[Observations], start: State, freedom: Freedom, held: bool = False
-    ) -> Problem:
+    def problem(self, freedom: Freedom, held: bool = False) -> Problem:
         """Of map and motion; ``held``: the map is as it is, and nothing but the motion is free."""
         views = [
             View(one.camera, own, replace(freedom, mounting=None if held else one.mounting))
-            for one, own in zip(self.rig, seen, strict=True)
+            for one, own in zip(self.rig, self.seen, strict=True)
         ]
         if held:
-            return Problem(views, start)
-        return Problem(views, start, deviations=self.deviations, floating=self.floating)
+            return Problem(views, self.state)
+        return Problem(views, self.state, deviations=self.deviations, floating=self.floating)
+
+    def solved(self, done: Callable[[str], object]) -> RefinedMap:
+        # The motion that goes with the map as it is.
+        held = replace(self.freedom, readout_time=False, lens=False)
+        motion = self.problem(held, held=True)
+        self.state, before = settle(motion, self.state, motion.noise(self.state, np.inf))
+        done("motion")
+        problem = self.problem(self.freedom)
+        self.state, deviation = settle(problem, self.state, before)
+        done("map")
+        calmer = acceleration_prior(self.state, self.freedom)
+        if calmer is not None:
+            self.freedom, problem = calmer, self.problem(calmer)
+            self.state, deviation = settle(problem, self.state, deviation)
+            done("accelerations")
+        return self._result(problem, before, deviation)
+
+    def _of_all(self, name: str) -> NDArray[Any]:
+        """A field of the observations of all cameras, one after the other."""
+        return np.concatenate([getattr(own, name) for own in self.seen])
+
+    def _result(self, problem: Problem, before: float, deviation: float) -> RefinedMap:
+        state, count = self.state, len(self.state.landmarks)
+        squared = problem.errors(state)
+        inliers = squared < (LIMIT * deviation) ** 2
+        shown, frames = (self._of_all(name)[inliers] for name in ("points", "frames"))
+        sights = np.bincount(shown, minlength=count)
+        pairs = np.unique(np.column_stack([shown, frames]), axis=0)
+        images = np.bincount(pairs[:, 0], minlength=count)
+        used = self._freedoms(state.spline) + 3 * int(np.count_nonzero(images))
+        inflation = inflation_of(squared[inliers], deviation, used + problem.border)
+        inflation = self._cluster_robust(problem, deviation, inflation)
+        factored = Factored(problem.system(state, deviation))
+        modes = np.zeros((problem.groups.kept, 0))
+        if self.wanted.drifts:
+            modes = DRIFT * math.sqrt(inflation) * factored.modes(self.wanted.drifts)
+        points, covariances, shared, spline = _laid(problem, state, factored, images > 1)
+        covariances *= inflation
+        spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        refined = (images > 1) & (spread < _KNOWN * self.size)
+        if self.wanted.deviations is None and refined.any():
+            moved = np.linalg.norm(points - self.given.points, axis=1)
+            refined &= spread < _WORTH * np.median(moved[refined])
+        all_squared = np.full(len(self.used), np.inf)
+        ends = np.cumsum([len(own.points) for own in self.seen])[:-1]
+        for k, own in enumerate(np.split(squared, ends)):
+            all_squared[self.keypoints(k)] = own
+        found = RefinedMap(
+            points=np.where(refined[:, None], points, self.given.points),
+            covariances=np.where(refined[:, None, None], covariances, np.nan),
+            refined=refined,
+            sights=sights,
+            cameras=self._cameras(problem, deviation, inflation, inflation * shared),
+            deviation=deviation * math.sqrt(left_over(len(inliers), used)),
+            squared_errors=all_squared,
+            inliers=all_squared < (LIMIT * deviation) ** 2,
+            before=before,
+            after=deviation,
+            spline=spline,
+            start_ns=self.start_ns,
+            times=self.times,
+            tells_readout=self.tells_readout,
+            apart=self.wanted.apart,
+        )
+        return replace(found, drifts=self._drifts(found, problem, modes))
+
+    def _drifts(self, found: RefinedMap, problem: Problem, modes: Array) -> tuple[RefinedMap, ...]:
+        drifts, still = [], np.zeros(3 * len(self.state.landmarks))
+        for mode in modes.T:
+            state = problem.moved(self.state, np.concatenate([mode, still]))
+            cameras = tuple(
+                _as_in(one, moved)
+                for one, moved in zip(found.cameras, problem.states(state), strict=True)
+            )
+            drifts.append(replace(found, spline=state.spline, cameras=cameras))
+        return tuple(drifts)
+
+    def _cluster_robust(self, problem: Problem, deviation: float, independent: float) -> float:
+        """The covariances' inflation, with what errors of a second pull together."""
+        squared, every = problem.errors(self.state), problem.keypoint_rows(self.state, deviation)
+        rows = np.concatenate([np.dstack([of.values[..., -3:], of.errors]) for of in every])
+        inside = squared[squared < (LIMIT * deviation) ** 2]
+        held, own = self.deviations**-2.0, steepness(inside, deviation) ** 2
+        pull = pull_at_landmarks(rows, self._of_all("points"), self._of_all("times"), held)
+        own *= left_over(len(inside), self._freedoms(self.state.spline))
+        return Pull(own * pull.measured, pull.expected).inflation(independent)
+
+    def _freedoms(self, spline: Spline) -> int:
+        """How many numbers of the motion the images determine: a pose each, and an end.
+
+        Those of a global shutter say nothing of what lies between them.
+        """
+        images = sum(len(np.unique(own.frames)) for own in self.seen)
+        rolling = self.freedom.readout_time or any(
+            one.camera.readout_time > 0.0 for one in self.rig
+        )
+        ends = len(spline.layout.starts) if rolling else 0
+        return CONTROL * min(images + ends, len(spline.positions))
+
+    def _cameras(
+        self, problem: Problem, deviation: float, inflation: float, shared: Array
+    ) -> tuple[Adjusted, ...]:
+        """The cameras, with the covariance (s,s) of what all images share."""
+        asked, spread, found = self._asked(deviation, inflation), np.sqrt(np.diag(shared)), []
+        free = self.freedom.readout_time
+        for k, (one, wanted, state) in enumerate(
+            zip(self.rig, asked, problem.states(self.state), strict=True)
+        ):
+            own = np.zeros(EXTRINSICS)
+            if one.mounting is not None:
+                own = spread[problem.place("mount", k) :][:EXTRINSICS]
+            readout = float(spread[problem.place("readout", k)]) if free else math.nan
+            given = Adjusted(one.camera, 0.0, readout, wanted, state.extrinsics, own)
+            found.append(_as_in(given, state))
+        return tuple(found)
+
+    def _asked(self, deviation: float, inflation: float) -> list[ReadoutCheck | None]:
+        """Readout times that images ask for where others were given: a step from the minimum."""
+        known = [one.camera.readout_time > 0.0 for one in self.rig]
+        none: list[ReadoutCheck | None] = [None] * len(known)
+        if self.freedom.readout_time or not any(known) or not self.tells_readout:
+            return none
+        problem = self.problem(replace(self.freedom, readout_time=True))
+        try:
+            factored = Factored(problem.system(self.state, deviation))
+            step, variances = factored.step(), np.diag(factored.border_covariance())
+        except Undetermined:
+            return none
+        given = [float(one.readout_time) for one in problem.states(self.state)]
+        return [
+            ReadoutCheck(
+                given[k],
+                given[k] + float(step[problem.at[k]["readout"]]),
+                math.sqrt(inflation * variances[problem.place("readout", k)]),
+            )
+            if known[k]
+            else None
+            for k in range(len(known))
+        ]
 
 
 __all__ = ["MapFreedom", "MapObservations", "RefinedMap", "Start", "refine", "refine_rig"]
@@ -297,171 +445,11 @@ def refine_rig(
     """
     freedom = freedom or MapFreedom()
     check(seen, len(start.points), np.array([one.delay for one in rig]))
-    prepared = Preparation(rig, seen, start, freedom)
+    refinement = Refinement(rig, seen, start, freedom)
     try:
-        return _Refinement(prepared).solved(done)
+        return refinement.solved(done)
     except Undetermined as error:
         raise ValueError(f"the map cannot be refined: {error}") from error
-
-
-class _Refinement:
-    """One map on its way."""
-
-    def __init__(self, prepared: Preparation) -> None:
-        self.prepared, self.seen = prepared, prepared.observations()
-        self.state = prepared.state(self.seen)
-        given = prepared.freedom
-        self.freedom = Freedom(
-            readout_time=given.readout_time,
-            lens=given.lens,
-            lens_deviations=given.lens_deviations,
-            angular_acceleration=given.angular_acceleration,
-            linear_acceleration=given.linear_acceleration,
-            angular_velocity=ANGULAR_VELOCITY,
-            linear_velocity=LINEAR_VELOCITY,
-        )
-
-    def solved(self, done: Callable[[str], object]) -> RefinedMap:
-        # The motion that goes with the map as it is.
-        held = replace(self.freedom, readout_time=False, lens=False)
-        motion = self.prepared.problem(self.seen, self.state, held, held=True)
-        self.state, before = settle(motion, self.state, motion.noise(self.state, np.inf))
-        done("motion")
-        problem = self._problem(self.freedom)
-        self.state, deviation = settle(problem, self.state, before)
-        done("map")
-        calmer = acceleration_prior(self.state, self.freedom)
-        if calmer is not None:
-            self.freedom, problem = calmer, self._problem(calmer)
-            self.state, deviation = settle(problem, self.state, deviation)
-            done("accelerations")
-        return self._result(problem, before, deviation)
-
-    def _problem(self, freedom: Freedom) -> Problem:
-        return self.prepared.problem(self.seen, self.state, freedom)
-
-    def _of_all(self, name: str) -> NDArray[Any]:
-        """A field of the observations of all cameras, one after the other."""
-        return np.concatenate([getattr(own, name) for own in self.seen])
-
-    def _result(self, problem: Problem, before: float, deviation: float) -> RefinedMap:
-        state, prepared, count = self.state, self.prepared, len(self.state.landmarks)
-        squared = problem.errors(state)
-        inliers = squared < (LIMIT * deviation) ** 2
-        points, frames = (self._of_all(name)[inliers] for name in ("points", "frames"))
-        sights = np.bincount(points, minlength=count)
-        pairs = np.unique(np.column_stack([points, frames]), axis=0)
-        images = np.bincount(pairs[:, 0], minlength=count)
-        used = self._freedoms(state.spline) + 3 * int(np.count_nonzero(images))
-        inflation = inflation_of(squared[inliers], deviation, used + problem.border)
-        inflation = self._cluster_robust(problem, deviation, inflation)
-        factored = Factored(problem.system(state, deviation))
-        modes = np.zeros((problem.groups.kept, 0))
-        if prepared.freedom.drifts:
-            modes = DRIFT * math.sqrt(inflation) * factored.modes(prepared.freedom.drifts)
-        placed = apply_similarity(problem, state, factored, images > 1)
-        covariances = inflation * placed.covariances
-        spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
-        refined = (images > 1) & (spread < _KNOWN * prepared.size)
-        if prepared.freedom.deviations is None and refined.any():
-            moved = np.linalg.norm(placed.points - prepared.start.points, axis=1)
-            refined &= spread < _WORTH * np.median(moved[refined])
-        all_squared = np.full(len(prepared.used), np.inf)
-        ends = np.cumsum([len(own.points) for own in self.seen])[:-1]
-        for k, own in enumerate(np.split(squared, ends)):
-            all_squared[prepared.keypoints(k)] = own
-        found = RefinedMap(
-            points=np.where(refined[:, None], placed.points, prepared.start.points),
-            covariances=np.where(refined[:, None, None], covariances, np.nan),
-            refined=refined,
-            sights=sights,
-            cameras=self._cameras(problem, deviation, inflation, inflation * placed.shared),
-            deviation=deviation * math.sqrt(left_over(len(inliers), used)),
-            squared_errors=all_squared,
-            inliers=all_squared < (LIMIT * deviation) ** 2,
-            before=before,
-            after=deviation,
-            spline=placed.spline,
-            start_ns=prepared.start_ns,
-            times=prepared.times,
-            tells_readout=prepared.tells_readout,
-            apart=prepared.freedom.apart,
-        )
-        return replace(found, drifts=self._drifts(found, problem, modes))
-
-    def _drifts(self, found: RefinedMap, problem: Problem, modes: Array) -> tuple[RefinedMap, ...]:
-        drifts, still = [], np.zeros(3 * len(self.state.landmarks))
-        for mode in modes.T:
-            state = problem.moved(self.state, np.concatenate([mode, still]))
-            cameras = tuple(
-                _as_in(one, moved)
-                for one, moved in zip(found.cameras, problem.states(state), strict=True)
-            )
-            drifts.append(replace(found, spline=state.spline, cameras=cameras))
-        return tuple(drifts)
-
-    def _cluster_robust(self, problem: Problem, deviation: float, independent: float) -> float:
-        """The covariances' inflation, with what errors of a second pull together."""
-        squared, every = problem.errors(self.state), problem.keypoint_rows(self.state, deviation)
-        rows = np.concatenate([np.dstack([of.values[..., -3:], of.errors]) for of in every])
-        inside = squared[squared < (LIMIT * deviation) ** 2]
-        held, own = self.prepared.deviations**-2.0, steepness(inside, deviation) ** 2
-        pull = pull_at_landmarks(rows, self._of_all("points"), self._of_all("times"), held)
-        own *= left_over(len(inside), self._freedoms(self.state.spline))
-        return Pull(own * pull.measured, pull.expected).inflation(independent)
-
-    def _freedoms(self, spline: Spline) -> int:
-        """How many numbers of the motion the images determine: a pose each, and an end.
-
-        Those of a global shutter say nothing of what lies between them.
-        """
-        images = sum(len(np.unique(own.frames)) for own in self.seen)
-        rolling = self.freedom.readout_time or any(
-            one.camera.readout_time > 0.0 for one in self.prepared.rig
-        )
-        ends = len(spline.layout.starts) if rolling else 0
-        return CONTROL * min(images + ends, len(spline.positions))
-
-    def _cameras(
-        self, problem: Problem, deviation: float, inflation: float, shared: Array
-    ) -> tuple[Adjusted, ...]:
-        """The cameras, with the covariance (s,s) of what all images share."""
-        asked, spread, found = self._asked(deviation, inflation), np.sqrt(np.diag(shared)), []
-        free = self.freedom.readout_time
-        for k, (one, wanted, state) in enumerate(
-            zip(self.prepared.rig, asked, problem.states(self.state), strict=True)
-        ):
-            own = np.zeros(EXTRINSICS)
-            if one.mounting is not None:
-                own = spread[problem.place("mount", k) :][:EXTRINSICS]
-            readout = float(spread[problem.place("readout", k)]) if free else math.nan
-            given = Adjusted(one.camera, 0.0, readout, wanted, state.extrinsics, own)
-            found.append(_as_in(given, state))
-        return tuple(found)
-
-    def _asked(self, deviation: float, inflation: float) -> list[ReadoutCheck | None]:
-        """Readout times that images ask for where others were given: a step from the minimum."""
-        known = [one.camera.readout_time > 0.0 for one in self.prepared.rig]
-        none: list[ReadoutCheck | None] = [None] * len(known)
-        if self.freedom.readout_time or not any(known) or not self.prepared.tells_readout:
-            return none
-        problem = self._problem(replace(self.freedom, readout_time=True))
-        try:
-            factored = Factored(problem.system(self.state, deviation))
-            step, variances = factored.step(), np.diag(factored.border_covariance())
-        except Undetermined:
-            return none
-        given = [float(one.readout_time) for one in problem.states(self.state)]
-        return [
-            ReadoutCheck(
-                given[k],
-                given[k] + float(step[problem.at[k]["readout"]]),
-                math.sqrt(inflation * variances[problem.place("readout", k)]),
-            )
-            if known[k]
-            else None
-            for k in range(len(known))
-        ]
 
 
 def _as_in(one: Adjusted, state: State) -> Adjusted:
@@ -471,20 +459,10 @@ def _as_in(one: Adjusted, state: State) -> Adjusted:
     return replace(one, camera=camera, readout_time=readout_time, extrinsics=state.extrinsics)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Placed:
-    """Map and motion in the frame of the map as it was given."""
-
-    points: Array  # (p,3) m
-    covariances: Array  # (p,3,3) m^2, inverse of the normal matrix
-    shared: Array  # (s,s) covariance of readout time and lens, likewise
-    spline: Spline
-
-
-def apply_similarity(
+def _laid(
     problem: Problem, state: State, factored: Factored, usable: BoolArray
-) -> Placed:
-    """Lay the map over the given one, unless landmarks of known place hold it.
+) -> tuple[Array, Array, Array, Spline]:
+    """Map and motion laid over the map as it was given, unless landmarks of known place hold it.
 
     Args:
         problem: whose minimum the state is.
@@ -492,11 +470,15 @@ def apply_similarity(
         factored: its normal equations; they are used up.
         usable: (p,) which landmarks may hold the whole.
 
+    Returns:
+        landmarks (p,3), and by the inverse of the normal matrix their covariances (p,3,3) and that
+        (s,s) of readout time and lens; the motion.
+
     Raises:
         Undetermined: when the images leave something open.
     """
     if not problem.floating:
-        return Placed(state.landmarks, *factored.block_covariances(), state.spline)
+        return state.landmarks, *factored.block_covariances(), state.spline
     given = problem.views[0].observations.landmarks
     whole, kept = laid_over(state.landmarks, given, usable)
     every = generators(state.landmarks, state.landmarks[kept].mean(axis=0))
@@ -504,6 +486,4 @@ def apply_similarity(
     spread = factored.solve(np.zeros((problem.groups.kept, 7)), of_kept)[1]
     covariances, shared = factored.block_covariances()
     held = as_held(covariances, spread, every, of_kept)
-    return Placed(
-        whole(state.landmarks), whole.covariances(held), shared, whole.moved(state.spline)
-    )
+    return whole(state.landmarks), whole.covariances(held), shared, whole.moved(state.spline)

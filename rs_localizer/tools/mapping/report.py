@@ -37,7 +37,7 @@ def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
         ("keyframes registered by COLMAP", joined + (f"; other parts: {others}" if others else "")),
         ("reprojection error of COLMAP", f"{structure.error:.2f} px (mean)"),
         ("images with a pose", f"{len(built.posed)} of {views}"),
-        ("landmarks", f"{len(built.landmarks)} of {len(structure.points)} points"),
+        ("landmarks", f"{len(built.landmarks)} of {len(structure.start.points)} points"),
         ("deviation of a landmark", f"{1e3 * np.median(spread):.1f} {unit} (median)"),
         ("deviation that landmarks share", f"{1e3 * np.median(shared):.1f} {unit} (median)"),
         ("noise before the refinement", f"{refined.before:.2f} px"),

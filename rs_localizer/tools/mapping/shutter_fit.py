@@ -17,7 +17,7 @@ from rs_localizer.tools.adjust.problem import LIMIT, noise_of
 from rs_localizer.tools.mapping.initial_trajectory import usual_accelerations
 from rs_localizer.tools.mapping.observations import MapFreedom, MapObservations, Start
 from rs_localizer.tools.mapping.refine import RefinedMap, refine
-from rs_localizer.tools.readout_belief import CHANCE, ShutterFit
+from rs_localizer.tools.readout_belief import CHANCE, ReadoutCheck, ShutterFit
 
 LEAST_FIT = 0.8
 """Share of the keypoints that fit a good map: nine in ten do."""
@@ -101,13 +101,36 @@ def fit_shutter(
     return smooth if smooth and apart.fit_share < LEAST_FIT else (apart, None)
 
 
+def refine_with_shutter(
+    camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
+    given: float | None, directions: Sequence[ScanDirection], done: Callable[[str], object],
+) -> tuple[RefinedMap, ShutterFit | None, ReadoutCheck | None]:  # fmt: skip
+    """The map refined with a given readout time (s) along the first direction, and its check.
+
+    Else, or where the images contradict it, as of :func:`fit_shutter`.
+    """
+    check = None
+    if given is not None:
+        known = replace(camera, readout_time=given, scan_direction=directions[0])
+        refined = refine(known, observations, start, freedom, done=done)
+        check = refined.readout_check
+        if check is None or not check.differs:
+            return refined, None, check
+        # A map adjusted with the wrong one is bent to it, and fits it nearly as well.
+        directions = directions[:1]
+    return *fit_shutter(camera, observations, start, freedom, directions, done), check
+
+
+def global_errors(camera: Camera, observations: MapObservations, start: Start) -> Array:
+    """Distances (n,), px, of keypoints from where a global shutter would have seen them."""
+    found = camera.project(start.local(observations)) - observations.pixels
+    return np.asarray(np.linalg.norm(found, axis=1))
+
+
 def _noise(camera: Camera, observations: MapObservations, start: Start) -> float:
     """Standard deviation (px) of what the first guess leaves."""
-    images = observations.images
-    away = start.points[observations.landmarks] - start.positions[images]
-    local = np.einsum("nji,nj->ni", start.rotations[images], away)
-    errors = np.sum((camera.project(local) - observations.pixels) ** 2, axis=1)
-    return noise_of(errors[np.isfinite(errors)], np.inf)
+    errors = global_errors(camera, observations, start)
+    return noise_of(errors[np.isfinite(errors)] ** 2, np.inf)
 
 
 def _of_one_motion(

@@ -45,7 +45,6 @@ from rs_localizer.tools.mapping.unknown_markers import (
     Filmed,
     Spotted,
     chain,
-    growth,
 )
 from rs_localizer.tools.readout_belief import ReadoutCheck
 
@@ -53,15 +52,6 @@ from rs_localizer.tools.readout_belief import ReadoutCheck
 _NOISES = (10.0,) * 6 + (1.0,) * 4
 # Of the cost of independent errors: the other pose is e^6 times less likely, or it may be true.
 _LEAST_DIFFERENCE = 12.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mirrored:
-    """What is known of the other pose of each marker."""
-
-    better: BoolArray  # (m,) which fit better mirrored
-    doubtful: BoolArray  # (m,) which fit nearly as well, one way or the other
-    state: State  # with those mirrored that fit better so
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,8 +106,13 @@ class Adjustable:
         return solve(self.problem(start, freedom, *free), start, deviation)
 
 
-def mirrored(given: Adjustable, fitted: Fit) -> Mirrored:
-    """Compare each marker with its mirror image, the motion held."""
+def _mirrored(given: Adjustable, fitted: Fit) -> tuple[BoolArray, BoolArray, State]:
+    """Each marker beside its mirror image, the motion held.
+
+    Returns:
+        which markers (m,) fit better mirrored, which fit nearly as well one way or the other, and
+        the state with those mirrored that fit better so.
+    """
     count = len(fitted.state.landmarks) // 4
     # The origin, too, may lie the other way among all others.
     problem = given.problem(fitted.state, fitted.freedom, markers_only=True)
@@ -135,7 +130,7 @@ def mirrored(given: Adjustable, fitted: Fit) -> Mirrored:
     chosen = np.where(
         np.repeat(better & ~same, 4)[:, None], other.landmarks, fitted.state.landmarks
     )
-    return Mirrored(better & ~same, doubtful & ~same, _at_the_origin(fitted.state, chosen))
+    return better & ~same, doubtful & ~same, _at_the_origin(fitted.state, chosen)
 
 
 def _turned_over(every: Sequence[Observations], state: State) -> Array:
@@ -281,7 +276,6 @@ def survey_rig(
     start_ns = min(image.stamp_ns for image in images)
     times = [one.times(start_ns) for one in filmed]
     frames = frames_of(times)
-    given, markers = markers, _resized(filmed, frames, markers)
     chained = chain(filmed, frames, markers, origin)
     if len(chained.markers) < 2:
         raise ValueError(
@@ -289,7 +283,7 @@ def survey_rig(
             "marker: there is nothing to survey"
         )
     try:
-        done = _adjusted(filmed, times, frames, (given, markers), chained)
+        done = _adjusted(filmed, times, frames, markers, chained)
     except Undetermined as error:
         raise ValueError(f"the images do not determine the markers' poses: {error}") from error
     if isinstance(done, Survey):
@@ -315,14 +309,14 @@ def _check(images: list[Spotted], markers: Sequence[Marker], origin: int | None)
 
 def _adjusted(
     filmed: Sequence[Filmed], times: Sequence[Array], frames: Sequence[Frame],
-    both: tuple[Sequence[Marker], Sequence[Marker]], chained: Chained,
+    said: Sequence[Marker], chained: Chained,
 ) -> Survey | list[int]:  # fmt: skip
     """The survey, or the markers that do not fit the others.
 
     Args:
-        both: the markers with the sizes that they are said to have, and to begin with.
+        said: the markers with the sizes that they are said to have.
     """
-    said, markers = both
+    markers = chained.sized
     posed = [frames[k] for k in chained.frames]
     shown = [sorted(image for frame in posed for camera, image in frame.images if camera == place)
              for place in range(len(filmed))]  # fmt: skip
@@ -408,15 +402,15 @@ def _first_motion(
 def _right_side_up(given: Adjustable, fitted: Fit) -> tuple[Fit, BoolArray]:
     """With all markers turned as they fit best, and for which (m,) that cannot be told."""
     for _ in range(_MOST_TURNS):
-        other = mirrored(given, fitted)
-        if not other.better.any():
+        better, doubtful, other = _mirrored(given, fitted)
+        if not better.any():
             break
-        turned = given.fit(other.state, fitted.freedom, fitted.deviation)
+        turned = given.fit(other, fitted.freedom, fitted.deviation)
         problem = given.problem(fitted.state, fitted.freedom)
         if problem.system(turned.state, fitted.deviation).cost > fitted.cost:
             break
         fitted = turned
-    return fitted, other.doubtful
+    return fitted, doubtful
 
 
 def _less_noise(given: Adjustable, fitted: Fit) -> Fit:
@@ -443,19 +437,6 @@ def _columns(fitted: Fit, markers: IntArray, width: int) -> IntArray:
     """The numbers (m,width) of markers (m,) in the border."""
     shared = len(fitted.border_covariance) - width * (len(fitted.state.landmarks) // 4 - 1)
     return np.asarray(shared + width * (markers - 1)[:, None] + np.arange(width), np.int64)
-
-
-def _resized(
-    filmed: Sequence[Filmed], frames: Sequence[Frame], markers: Sequence[Marker]
-) -> Sequence[Marker]:
-    """The markers, with sizes to begin with where those that are said cannot be."""
-    found = growth(filmed, frames, markers)
-    return [
-        replace(marker, corners=math.exp(found[k]) * marker.corners)
-        if abs(found.get(k, 0.0)) > _WRONG_SIZE
-        else marker
-        for k, marker in enumerate(markers)
-    ]
 
 
 def _sizes(state: State) -> Array:

@@ -46,20 +46,18 @@ def track_on_map(
         camera: with its readout time; 0: a global shutter, or unknown.
         done: called after each view.
     """
-    tracker = _MapTracker(Map(structure.points, None, structure.descriptors, "map"), camera)
-    order = np.argsort(structure.seen_views, kind="stable")
-    rows_of = structure.seen_views[order]
-    starts = np.searchsorted(rows_of, structure.views)
-    ends = np.searchsorted(rows_of, structure.views, side="right")
+    seen, start = structure.seen, structure.start
+    tracker = _MapTracker(Map(start.points, None, structure.descriptors, "map"), camera)
+    ends = np.searchsorted(seen.images, np.arange(len(structure.views) + 1)).tolist()
     keyframes = {view: k for k, view in enumerate(structure.views.tolist())}
     rows, poses, points, pixels = [], [], [], []
     for row, view in enumerate(views):
         k = keyframes.get(row)
         if k is not None:
-            of = order[starts[k] : ends[k]]
-            poses.append((structure.rotations[k], structure.positions[k]))
-            points.append(structure.seen_points[of])
-            pixels.append(structure.pixels[of])
+            own = slice(ends[k], ends[k + 1])
+            poses.append((start.rotations[k], start.positions[k]))
+            points.append(seen.landmarks[own])
+            pixels.append(seen.pixels[own])
             rows.append(row)
         else:
             estimate, matches = tracker.localize(view)
@@ -70,7 +68,7 @@ def track_on_map(
                 rows.append(row)
         done()
     counts = [len(of) for of in points]
-    seen = MapObservations(
+    shown = MapObservations(
         np.array([views[row].stamp_ns for row in rows], np.int64),
         np.repeat(np.arange(len(rows)), counts),
         np.concatenate([*points, np.zeros(0, np.int64)]),
@@ -78,7 +76,7 @@ def track_on_map(
     )
     rotations = np.array([rotation for rotation, _ in poses]).reshape(-1, 3, 3)
     positions = np.array([position for _, position in poses]).reshape(-1, 3)
-    return np.array(rows, np.int64), seen, Start(structure.points, rotations, positions)
+    return np.array(rows, np.int64), shown, Start(start.points, rotations, positions)
 
 
 class _MapTracker:

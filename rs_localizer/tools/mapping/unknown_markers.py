@@ -9,8 +9,9 @@ agrees for the true poses only; by what agrees most, all are chained.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -111,6 +112,7 @@ class Filmed(RigCamera):
 class Chained:
     """Markers that hang together, and the frames that show them."""
 
+    sized: Sequence[Marker]  # all, with sizes to begin with where those that are said cannot be
     markers: dict[int, Transform]  # origin_from_marker, by place in the list
     frames: list[int]  # places of those with a pose
     poses: list[Transform]  # origin_from_rig
@@ -147,7 +149,15 @@ def chain(
         origin: place of the one whose frame is that of the others; None: the first of the most
             that hang together.
     """
-    mounts, views = _views(filmed, frames, markers)
+    mounts = [Transform(m.axes, -m.axes @ m.centre) for m in (one.extrinsics for one in filmed)]
+    views = [_view(filmed, mounts, frame, markers) for frame in frames]
+    grown = {k: by for k, by in _growth(views).items() if abs(by) > _WRONG_SIZE}
+    if grown:
+        markers = [
+            replace(marker, corners=math.exp(grown.get(k, 0.0)) * marker.corners)
+            for k, marker in enumerate(markers)
+        ]
+        views = [_view(filmed, mounts, frame, markers) for frame in frames]
     seen = sorted({sight.marker for view in views for sight in view.sights})
     between, scores = _between(views, markers)
     parts = _parts(seen, scores)
@@ -155,24 +165,24 @@ def chain(
     own = next(part for part in parts if first in part)
     placed = _placed(first, own, between, scores)
     own_frames, poses = _frame_poses(views, mounts, placed, markers)
-    return Chained(placed, own_frames, poses, [part for part in parts if part is not own])
+    apart = [part for part in parts if part is not own]
+    return Chained(markers, placed, own_frames, poses, apart)
 
 
 # Of a pair of markers, so many images say how their sizes compare, if what they say agrees.
 _LEAST_SEEN, _AGREE = 6, 0.9
 _SIZE_ROUNDS = 10
+# Sizes that are wrong by more than this share: a first guess needs others.
+_WRONG_SIZE = 0.1
 
 
-def growth(
-    filmed: Sequence[Filmed], frames: Sequence[Frame], markers: Sequence[Marker]
-) -> dict[int, float]:
+def _growth(views: Sequence[_View]) -> dict[int, float]:
     """Logarithms of how much larger markers are than they are said to be, beside most others.
 
     The camera's way about a marker of the wrong size is too long or too short by that: two markers
     of one image are at the same place beside each other whatever the way, which tells the ratio of
     both. Least absolute deviations over all pairs.
     """
-    _, views = _views(filmed, frames, markers)
     ways: dict[tuple[int, int], list[tuple[Array, Array]]] = {}
     for view in views:
         for one, other in combinations(sorted(view.sights, key=lambda of: of.marker), 2):
@@ -200,14 +210,6 @@ def growth(
         found = np.linalg.lstsq(design * root[:, None], ratios * root, rcond=None)[0]
         weights = 1.0 / np.maximum(np.abs(design @ found - ratios), 1e-2)
     return dict(zip(numbers, (found - np.median(found)).tolist(), strict=True))
-
-
-def _views(
-    filmed: Sequence[Filmed], frames: Sequence[Frame], markers: Sequence[Marker]
-) -> tuple[list[Transform], list[_View]]:
-    """Where the cameras are, camera_from_rig, and what each frame shows."""
-    mounts = [Transform(m.axes, -m.axes @ m.centre) for m in (one.extrinsics for one in filmed)]
-    return mounts, [_view(filmed, mounts, frame, markers) for frame in frames]
 
 
 def _view(

@@ -1,11 +1,12 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Images as the mapping needs them: what is kept of each one when its pixels have been let go."""
+"""The images that a map is made from: what is kept of each when its pixels have been let go."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -13,16 +14,34 @@ import numpy as np
 
 from rs_localizer.config import FeatureKind
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.features.extraction import FeatureExtractor, Features
 from rs_localizer.io.images import Gray, Image
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.offline.detect import Cameras
+from rs_localizer.offline.image_sources import Carried, Shot
+from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.colmap import image_name
 
 # JPEG's quality of what COLMAP gets: at this one, errors are below a grey level.
 _QUALITY = 97
 # A view this much less sharp than those around it (so many each way) is blurred.
 _BLURRED, _AROUND = 0.6, 15
+# A view with fewer features is blurred, dark, or of a blank wall.
+_FEW_FEATURES = 50
+LEAST_VIEWS = 3
+# Pictures in which features move by less than this share of their size (median) show no depth.
+_LEAST_PARALLAX = 0.01
+# COLMAP gets all views of a short recording and so many a second of a long one: at a turn of 60
+# degrees a second, neighbours have three quarters of a picture of 60 degrees in common.
+_KEYFRAMES, _KEYFRAMES_PER_SECOND = 60, 4.0
+# After so many, images without features are refused: two seconds of a usual video.
+_EARLY_VIEWS = 30
+# Images a hair before their time are in time.
+_EARLY = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,3 +96,115 @@ def blurred(views: Sequence[View]) -> BoolArray:
     rows = np.arange(len(values))
     usual = [np.median(values[max(0, row - _AROUND) : row + _AROUND + 1]) for row in rows]
     return np.asarray(values < _BLURRED * np.array(usual))
+
+
+@dataclass(slots=True)
+class Looked:
+    """What was seen."""
+
+    views: list[View] = field(default_factory=list)
+    camera: Camera | None = None  # without its readout time; None: nobody has calibrated it
+    images: int = 0
+    moments: dict[float, int] = field(default_factory=dict)  # asked for, s -> row of its view
+    refused: dict[str, str] = field(default_factory=dict)  # the first detail of each reason
+    stamps_ns: list[int] = field(default_factory=list)
+
+    @property
+    def period(self) -> float:
+        """s from one image to the next, median; NaN for a single one."""
+        return float(np.median(np.diff(self.stamps_ns))) * 1e-9 if self.stamps_ns[1:] else np.nan
+
+
+def look(
+    shots: Iterable[Shot | Carried], looker: Looker, rate: float, moments: Sequence[float],
+    done: Callable[[], object],
+) -> Looked:  # fmt: skip
+    """Look at the images that are kept: so many a second, and the first ones at or after moments.
+
+    Args:
+        moments: s after the first image.
+        done: called after each image.
+
+    Raises:
+        ValueError: for a camera that changes, or images without features.
+    """
+    found, cameras, size = Looked(), Cameras(ScanDirection.TOP_TO_BOTTOM), None
+    for shot in shots:
+        if isinstance(shot, Carried):
+            continue
+        found.images += 1
+        done()
+        image = shot.image
+        if isinstance(image, Refusal):
+            found.refused.setdefault(image.reason, image.detail)
+            continue
+        camera = None if shot.camera_info is None else cameras.of(shot, image)
+        if size not in (None, image.pixels.shape) or (found.views and camera is not found.camera):
+            raise ValueError("the camera changes within the recording; cut it there")
+        found.camera, size = camera, image.pixels.shape
+        found.stamps_ns.append(image.stamp_ns)
+        since = (image.stamp_ns - found.stamps_ns[0]) * 1e-9
+        asked = [s for s in moments if s not in found.moments and since >= s - 1e-3]
+        found.moments |= dict.fromkeys(asked, len(found.views))
+        due_ns = 1e9 * _EARLY / rate
+        if asked or not found.views or image.stamp_ns - found.views[-1].stamp_ns >= due_ns:
+            found.views.append(looker.look(image))
+            if len(found.views) == _EARLY_VIEWS:
+                check_features(found.views)
+    return found
+
+
+def check_views(views: Sequence[View]) -> None:
+    """Refuse, before minutes of work, views that will make no map.
+
+    Raises:
+        MappingError: saying what was found and what to film instead.
+    """
+    if len(views) < LEAST_VIEWS:
+        raise MappingError(f"{len(views)} images make no map; at least {LEAST_VIEWS} are needed")
+    check_features(views)
+    first, step = views[0], max(1, len(views) // 8)
+    moved = [_moved(first, view) for view in views[step::step]]
+    if all(share < _LEAST_PARALLAX for share in moved):
+        raise MappingError(
+            f"the camera hardly moves (features by {100.0 * max(moved):.1f} % of the picture's "
+            "size): walk sideways and around what is to be mapped"
+        )
+
+
+def check_features(views: Sequence[View]) -> None:
+    """Refuse views that show too little.
+
+    Raises:
+        MappingError: saying what was found.
+    """
+    features = float(np.median([len(view.features) for view in views]))
+    if features < _FEW_FEATURES:
+        raise MappingError(
+            f"the images show {features:.0f} features each (median), at least {_FEW_FEATURES} are "
+            "needed: are they blurred, dark, or of blank walls?"
+        )
+
+
+def _moved(one: View, other: View) -> float:
+    """How far features move (median), by the size of the picture; infinite: they are others."""
+    if min(len(one.features), len(other.features)) < _FEW_FEATURES:
+        return math.inf
+    matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)
+    matches = matcher.match(
+        one.features.descriptors.astype(np.float32), other.features.descriptors.astype(np.float32)
+    )
+    here = one.features.pixels[[match.queryIdx for match in matches]]
+    there = other.features.pixels[[match.trainIdx for match in matches]]
+    if len(matches) < _FEW_FEATURES:
+        return math.inf
+    size = np.ptp(np.vstack([here, there]), axis=0).max()
+    return float(np.median(np.linalg.norm(there - here, axis=1)) / size)
+
+
+def choose_keyframes(views: Sequence[View]) -> IntArray:
+    """Rows (k,) of the views that COLMAP gets: evenly spaced, the sharpest of each few."""
+    seconds = 1e-9 * (views[-1].stamp_ns - views[0].stamp_ns)
+    count = max(_KEYFRAMES, math.ceil(_KEYFRAMES_PER_SECOND * seconds))
+    slots = np.array_split(np.arange(len(views)), min(count, len(views)))
+    return np.array([max(slot, key=lambda row: views[row].sharpness) for slot in slots], np.int64)
