@@ -27,9 +27,9 @@ from scipy.linalg import (
     cholesky_banded,
     solve_triangular,
 )
-from scipy.linalg.blas import dsymv, dtrmv
+from scipy.linalg.blas import dtrmv
 from scipy.linalg.lapack import dpotri
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import bsr_array, csc_array, csr_array, vstack
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from rs_localizer.core.arrays import Array, IntArray
@@ -38,6 +38,8 @@ from rs_localizer.tools.adjust.spline_kernels import CONTROL, LOCAL
 
 # A motion whose band would be wider than this part of it is solved as a dense one.
 _DENSE = 0.4
+# Rows of a dense matrix from which the blocks are taken at once: 100 MB of 10,000.
+_ROWS_AT_ONCE = 1000
 # Of the eigenvalue of a mode: a hundredth of what it makes of a deviation.
 _MODE_TOLERANCE = 0.01
 
@@ -57,9 +59,10 @@ class Rows(NamedTuple):
 
     def times(self, part: slice, by: Array) -> Array:
         """A part of the rows (m r,k) times what all unknowns are by others (N,k)."""
-        others, first = self.others[part], self.first[part]
-        columns = np.concatenate([first[:, None] + np.arange(_run(self)), others], axis=1)
-        return np.asarray(_sparse(self.values[part], columns, len(by)) @ by)
+        some = self._replace(
+            values=self.values[part], first=self.first[part], others=self.others[part]
+        )
+        return np.asarray(_sparse(some, len(by)) @ by)
 
 
 class Quadratic(NamedTuple):
@@ -89,11 +92,11 @@ class Groups:
 @kernel
 def _accumulate(
     values: Array, errors: Array, first: IntArray, others: IntArray, motion: int, kept: int,
-    shift: int, own: Array, cross: Array, corner: Array, slope: Array,
+    own: Array, cross: Array, corner: Array, slope: Array,
 ) -> None:  # fmt: skip
     """Add rows (n,r,k) to the lower triangle; unknowns from ``kept`` on are left out.
 
-    ``own[j, i - shift j]`` is the entry of row i and column j of the motion.
+    ``own[j, i - j]`` is the entry of row i and column j of the motion.
     """
     numbers, rest = values.shape[1], others.shape[1]
     run = values.shape[2] - rest
@@ -106,9 +109,9 @@ def _accumulate(
                 if x == 0.0:
                     continue
                 slope[base + b] += x * error
-                line, start = own[base + b], base - shift * (base + b)
+                line = own[base + b]
                 for a in range(b, run):
-                    line[start + a] += x * row[a]
+                    line[a - b] += x * row[a]
                 side = cross[base + b]
                 for k in range(rest):
                     i = others[n, k]
@@ -125,96 +128,20 @@ def _accumulate(
                         corner[i - motion, j - motion] += x * row[run + m]
 
 
-@kernel
-def _subtract(
-    starts: IntArray, touched: IntArray, halves: Array, motion: int, shift: int, own: Array,
-    cross: Array, corner: Array,
-) -> None:  # fmt: skip
-    """Take ``Y Y^T`` of each block off the lower triangle.
-
-    Args:
-        starts: (b + 1,) where the unknowns of each block begin in ``touched``.
-        touched: (m,) rising numbers of the unknowns that a block couples.
-        halves: (m,w) rows of Y.
-    """
-    width = halves.shape[1]
-    for block in range(len(starts) - 1):
-        begin, end = starts[block], starts[block + 1]
-        for b in range(begin, end):
-            j = touched[b]
-            for a in range(b, end):
-                i, total = touched[a], 0.0
-                for w in range(width):
-                    total += halves[a, w] * halves[b, w]
-                if i < motion:
-                    own[j, i - shift * j] -= total
-                elif j < motion:
-                    cross[j, i - motion] -= total
-                else:
-                    corner[i - motion, j - motion] -= total
-
-
 class _Blocks(NamedTuple):
     """The eliminated blocks, and what couples them with the kept unknowns."""
 
     information: Array  # (b,w,w)
-    slope: Array  # (b,w)
-    starts: IntArray  # (b + 1,)
-    touched: IntArray  # (m,)
-    coupled: Array  # (m,w)
-    of: IntArray  # (m,) the block of each
-
-    def times(self, right: Array) -> Array:
-        """``W^T x`` (b,w,q) of kept unknowns (N,q)."""
-        products = self.coupled[:, :, None] * right[self.touched][:, None, :]
-        return sums(products, self.of, len(self.slope))
-
-    def back(self, right: Array, kept: int) -> Array:
-        """``W y`` (N,q) of blocks (b,w,q)."""
-        return sums(np.einsum("mw,mwq->mq", self.coupled, right[self.of]), self.touched, kept)
+    slope: Array  # (b w,)
+    coupled: csc_array  # (N,b w)
 
 
-def sums(values: Array, groups: IntArray, count: int) -> Array:
-    """Sums (count,...) of values (n,...) by group (n,)."""
-    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
-    picks = csr_array(
-        (np.ones(len(groups)), (groups, np.arange(len(groups)))), shape=(count, len(groups))
-    )
-    return np.asarray(picks @ flat).reshape(count, *values.shape[1:])
+class Band(NamedTuple):
+    """A symmetric matrix of the kept unknowns, whose motion is a band."""
 
-
-class Matrix(NamedTuple):
-    """A symmetric matrix of the kept unknowns; ``own`` and ``corner`` are its lower triangles."""
-
-    shift: int  # 1: the motion is a band, 0: it is dense
-    own: Array  # (c,w) or (c,c): own[j, i - shift j] is of row i and column j
+    own: Array  # (c,w) own[j, i - j] is of row i >= j and column j
     cross: Array  # (c,b)
     corner: Array  # (b,b)
-    whole: Array | None  # (N,N) of which own and cross are parts, where the motion is dense
-
-    @classmethod
-    def zeros(cls, groups: Groups, reach: int | None) -> Matrix:
-        """With a band so wide; None: dense."""
-        count, border = groups.motion, groups.border
-        corner = np.zeros((border, border))
-        if reach is not None:
-            return cls(1, np.zeros((count, reach)), np.zeros((count, border)), corner, None)
-        return cls._dense(np.zeros((groups.kept, groups.kept)), count, corner)
-
-    @classmethod
-    def _dense(cls, whole: Array, count: int, corner: Array) -> Matrix:
-        return cls(0, whole[:count, :count], whole[:count, count:], corner, whole)
-
-    def damped(self, damping: float) -> Matrix:
-        """A copy whose diagonal is multiplied by 1 + this."""
-        if self.whole is not None:
-            out = self._dense(self.whole.copy(), len(self.own), self.corner.copy())
-            out.own[np.diag_indices(len(out.own))] *= 1.0 + damping
-        else:
-            out = Matrix(1, self.own.copy(), self.cross.copy(), self.corner.copy(), None)
-            out.own[:, :1] *= 1.0 + damping
-        out.corner[np.diag_indices(len(out.corner))] *= 1.0 + damping
-        return out
 
 
 class System:
@@ -227,45 +154,60 @@ class System:
 
     def __init__(self, groups: Groups, terms: Sequence[Rows | Quadratic]) -> None:
         self.groups = groups
-        rows = [term for term in terms if isinstance(term, Rows)]
+        rows = [term for term in terms if isinstance(term, Rows) and len(term.values)]
+        known = [term for term in terms if isinstance(term, Quadratic)]
         self.cost = sum(term.cost for term in terms)
         self.blocks = _eliminated(groups, rows) if groups.blocks else None
-        reach = max((_run(term) for term in rows if len(term.values)), default=LOCAL)
+        reach = max((_run(term) for term in rows), default=LOCAL)
         if self.blocks is not None:
             reach = max(reach, _reach(self.blocks, groups.motion))
-        self.dense = reach > _DENSE * groups.motion
-        self.matrix = Matrix.zeros(groups, None if self.dense else reach)
         self.slope = np.zeros(groups.kept)
-        for term in terms:
-            if isinstance(term, Quadratic):
-                at = term.columns - groups.motion
-                self.matrix.corner[np.ix_(at, at)] += np.tril(term.information)
-                self.slope[term.columns] += term.slope
-            elif len(term.values):
+        self.matrix: Array | Band  # (N,N) of a dense motion
+        if reach > _DENSE * groups.motion:
+            self.matrix = np.zeros((groups.kept, groups.kept))
+            for term in rows:
+                own = _sparse(term, groups.kept)
+                square = (own.T @ own).tocoo()
+                self.matrix[square.row, square.col] += square.data
+                self.slope += own.T @ term.errors.ravel()
+        else:
+            sizes = (groups.motion, reach), (groups.motion, groups.border), (groups.border,) * 2
+            self.matrix = Band(*map(np.zeros, sizes))
+            for term in rows:
                 _accumulate(
                     term.values, term.errors, term.first, term.others, groups.motion, groups.kept,
-                    *self.matrix[:4], self.slope,
+                    *self.matrix, self.slope,
                 )  # fmt: skip
+            self.corner[:] += np.tril(self.corner, -1).T
+        for one in known:
+            at = one.columns - groups.motion
+            self.corner[np.ix_(at, at)] += one.information
+            self.slope[one.columns] += one.slope
 
-    def product(self, x: Array) -> Array:
-        """``H x`` of the kept unknowns of a dense motion, as if the blocks were known."""
-        own, shared = np.split(x.ravel(), [self.groups.motion])
-        _, motion, cross, corner, _ = self.matrix
-        return np.concatenate([
-            dsymv(1.0, motion.T, own, lower=1) + cross @ shared,
-            cross.T @ own + (corner + np.tril(corner, -1).T) @ shared,
-        ])  # fmt: skip
+    @property
+    def dense(self) -> bool:
+        """Whether the motion is no band."""
+        return not isinstance(self.matrix, Band)
+
+    @property
+    def corner(self) -> Array:
+        """The border's own part (b,b)."""
+        if isinstance(self.matrix, Band):
+            return self.matrix.corner
+        return self.matrix[self.groups.motion :, self.groups.motion :]
 
 
 def _run(rows: Rows) -> int:
     return int(rows.values.shape[2] - rows.others.shape[1])
 
 
-def _sparse(values: Array, columns: IntArray, width: int) -> csr_array:
-    """Rows (n r,width) of derivatives (n,r,k) by unknowns (n,k); negative: there is none."""
-    absent = columns < 0
-    values = np.where(absent[:, None], 0.0, values)
-    columns = np.repeat(np.where(absent, columns[:, :1], columns), values.shape[1], axis=0)
+def _sparse(rows: Rows, width: int) -> csr_array:
+    """Derivatives (n r,width) by the first unknowns."""
+    columns = np.concatenate([rows.first[:, None] + np.arange(_run(rows)), rows.others], axis=1)
+    absent = (columns < 0) | (columns >= width)
+    values = np.where(absent[:, None], 0.0, rows.values)
+    columns = np.where(absent, np.clip(columns[:, :1], 0, width - 1), columns)
+    columns = np.repeat(columns, values.shape[1], axis=0)
     starts = columns.shape[1] * np.arange(len(columns) + 1)
     return csr_array((values.ravel(), columns.ravel(), starts), shape=(len(columns), width))
 
@@ -273,48 +215,24 @@ def _sparse(values: Array, columns: IntArray, width: int) -> csr_array:
 def _eliminated(groups: Groups, rows: Sequence[Rows]) -> _Blocks:
     """Blocks of the rows that have one each, or none."""
     count, width, kept = groups.blocks, groups.width, groups.kept
-    information, slope = np.zeros((count, width, width)), np.zeros((count, width))
-    coupled = csc_array((kept, count * width))
-    for term in rows:
-        # The numbers of a block follow each other, in the same columns in all rows of a factor.
-        inside = np.flatnonzero((term.others >= kept).any(axis=0))
-        if not len(inside):
-            continue
-        run = _run(term)
-        used = term.others[:, inside[0]] >= kept
-        of = (term.others[used, inside[0]] - kept) // width
-        own, errors = term.values[used][:, :, run + inside], term.errors[used]
-        information += sums(np.einsum("nri,nrj->nij", own, own), of, count)
-        slope += sums(np.einsum("nri,nr->ni", own, errors), of, count)
-        rest = np.setdiff1d(np.arange(term.others.shape[1]), inside)
-        first = term.first[used]
-        columns = np.column_stack([first[:, None] + np.arange(run), term.others[used][:, rest]])
-        if not columns.shape[1]:
-            continue
-        every = term.values[used]
-        values = np.concatenate([every[:, :, :run], every[:, :, run + rest]], axis=2)
-        at = width * of[:, None] + np.arange(width)
-        own_rows = _sparse(own, at, count * width)
-        coupled = coupled + (_sparse(values, columns, kept).T @ own_rows).tocsc()
-    coupled = csc_array(coupled)
+    with_block = [term for term in rows if np.any(term.others >= kept)]
+    whole = vstack([_sparse(term, kept + count * width) for term in with_block]).tocsc()
+    errors = np.concatenate([term.errors.ravel() for term in with_block])
+    rest, own = whole[:, :kept], whole[:, kept:]
+    information, square = np.zeros((count, width, width)), (own.T @ own).tocoo()
+    information[square.row // width, square.row % width, square.col % width] = square.data
+    coupled = csc_array(rest.T @ own)
     coupled.sort_indices()
-    sizes = np.diff(coupled.indptr)[::width]
-    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    block = np.repeat(np.arange(count), sizes)
-    # Columns of a block have the same unknowns: of each, one after the other.
-    place = width * starts[block] + (np.arange(len(block)) - starts[block])
-    touched = coupled.indices[place].astype(np.int64)
-    halves = np.column_stack([coupled.data[place + w * sizes[block]] for w in range(width)])
-    return _Blocks(information, slope, starts, touched, halves.reshape(-1, width), block)
+    return _Blocks(information, np.asarray(own.T @ errors), coupled)
 
 
 def _reach(blocks: _Blocks, motion: int) -> int:
     """Width of the band that the motion has without the blocks."""
-    own = blocks.touched < motion
-    low, high = np.full(len(blocks.slope), motion), np.full(len(blocks.slope), -1)
-    np.minimum.at(low, blocks.of[own], blocks.touched[own])
-    np.maximum.at(high, blocks.of[own], blocks.touched[own])
-    return int(np.max(high - low, initial=0)) + 1
+    own = csc_array(blocks.coupled[:motion])
+    own.sort_indices()
+    firsts, ends = own.indptr[:-1], own.indptr[1:]
+    some = ends > firsts
+    return int(np.max(own.indices[ends[some] - 1] - own.indices[firsts[some]], initial=0)) + 1
 
 
 class Factored:
@@ -329,35 +247,54 @@ class Factored:
     """
 
     def __init__(self, system: System, damping: float = 0.0) -> None:
-        self.system, groups = system, system.groups
-        matrix = system.matrix.damped(damping)
-        corner = matrix.corner
-        self._scale = 1.0 / np.sqrt(np.maximum(np.diag(corner), 1e-300))
+        self.system, blocks = system, system.blocks
         try:
-            if system.blocks is not None:
-                blocks, own = system.blocks, system.blocks.information.copy()
-                own[:, np.arange(groups.width), np.arange(groups.width)] *= 1.0 + damping
+            reduction: csr_array | None = None
+            if blocks is not None:
+                own = blocks.information.copy()
+                own[:, np.arange(own.shape[1]), np.arange(own.shape[1])] *= 1.0 + damping
                 self._inverses = np.linalg.inv(own)
-                roots = np.linalg.cholesky(self._inverses)
-                halves = np.einsum("mw,mwv->mv", blocks.coupled, roots[blocks.of])
-                _subtract(blocks.starts, blocks.touched, halves, groups.motion, *matrix[:4])
-            corner += np.tril(corner, -1).T
-            if matrix.whole is not None:
-                matrix.whole[groups.motion :, groups.motion :] = corner
-                self._whole = cho_factor(
-                    matrix.whole.T, lower=True, overwrite_a=True, check_finite=False
+                count = np.arange(len(own) + 1)
+                reduction = csr_array(
+                    blocks.coupled @ bsr_array((self._inverses, count[:-1], count))
+                )
+            if isinstance(system.matrix, Band):
+                self._factor_band(
+                    Band(*(part.copy() for part in system.matrix)), damping, reduction
                 )
             else:
-                self._factor_band(matrix)
+                self._factor_dense(system.matrix.copy(), damping, reduction)
         except (np.linalg.LinAlgError, ValueError) as error:
             raise Undetermined(f"the observations do not determine the motion: {error}") from error
 
-    def _factor_band(self, matrix: Matrix) -> None:
-        self._band = cholesky_banded(matrix.own.T, lower=True, check_finite=False)
-        self._cross = matrix.cross
-        self._lifted = self._solve_band(matrix.cross)  # how the controls follow the border
-        schur = matrix.corner - matrix.cross.T @ self._lifted
-        scaled = schur * self._scale[:, None] * self._scale
+    def _factor_dense(self, matrix: Array, damping: float, reduction: csr_array | None) -> None:
+        matrix[np.diag_indices(len(matrix))] *= 1.0 + damping
+        if reduction is not None:
+            assert self.system.blocks is not None
+            others = self.system.blocks.coupled.T
+            for first in range(0, len(matrix), _ROWS_AT_ONCE):
+                some = slice(first, first + _ROWS_AT_ONCE)
+                matrix[some] -= (reduction[some] @ others).toarray()
+        self._whole = cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
+
+    def _factor_band(self, band: Band, damping: float, reduction: csr_array | None) -> None:
+        band.own[:, 0] *= 1.0 + damping
+        band.corner[np.diag_indices(len(band.corner))] *= 1.0 + damping
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(band.corner), 1e-300))
+        if reduction is not None:
+            assert self.system.blocks is not None
+            motion, coupled = len(band.own), self.system.blocks.coupled
+            shared = coupled[motion:].toarray().T
+            band.corner[:] -= reduction[motion:] @ shared
+            band.cross[:] -= reduction[:motion] @ shared
+            square = (reduction[:motion] @ coupled[:motion].T).tocoo()
+            i, j, lower = square.row, square.col, square.row >= square.col
+            band.own[j[lower], (i - j)[lower]] -= square.data[lower]
+        self._band = cholesky_banded(band.own.T, lower=True, check_finite=False)
+        self._cross, self._scale = band.cross, scale
+        self._lifted = self._solve_band(band.cross)  # how the controls follow the border
+        schur = band.corner - band.cross.T @ self._lifted
+        scaled = schur * scale[:, None] * scale
         self._schur = cho_factor(scaled, lower=True) if len(schur) else None
 
     def _solve_band(self, right: Array) -> Array:
@@ -380,21 +317,22 @@ class Factored:
         border = self._solve_schur(shared - self._cross.T @ inner)
         return np.concatenate([inner - self._lifted @ border, border])
 
-    def solve(self, right: Array, of_blocks: Array | None = None) -> tuple[Array, Array]:
+    def solve(self, right: Array, of_blocks: Array) -> tuple[Array, Array]:
         """Solutions (N,q) and of the blocks (b,w,q), for right sides of these shapes."""
-        blocks, groups = self.system.blocks, self.system.groups
-        if blocks is None:
-            return self.kept(right), np.zeros((0, groups.width, right.shape[1]))
-        assert of_blocks is not None
+        blocks, count = self.system.blocks, right.shape[1]
+        assert blocks is not None
         own = self._inverses @ of_blocks
-        found = self.kept(right - blocks.back(own, groups.kept))
-        return found, own - self._inverses @ blocks.times(found)
+        found = self.kept(right - blocks.coupled @ own.reshape(-1, count))
+        back = (blocks.coupled.T @ found).reshape(own.shape)
+        return found, own - self._inverses @ back
 
     def step(self) -> Array:
         """The step of all unknowns in their order."""
-        blocks = self.system.blocks
-        of_blocks = None if blocks is None else -blocks.slope[:, :, None]
-        kept, others = self.solve(-self.system.slope[:, None], of_blocks)
+        right, blocks = -self.system.slope[:, None], self.system.blocks
+        if blocks is None:
+            return self.kept(right)[:, 0]
+        of_blocks = -blocks.slope.reshape(len(self._inverses), -1, 1)
+        kept, others = self.solve(right, of_blocks)
         return np.concatenate([kept[:, 0], others.ravel()])
 
     def border_covariance(self) -> Array:
@@ -407,7 +345,7 @@ class Factored:
         return self.kept(unit)[groups.motion :]
 
     def block_covariances(self) -> tuple[Array, Array]:
-        """Of each block (b,w,w) and of the border (b,b); the factors of a dense one are used up."""
+        """Covariances of each block (b,w,w) and of the border (b,b); a dense factor is used up."""
         blocks, motion = self.system.blocks, self.system.groups.motion
         assert blocks is not None
         assert self.system.dense
@@ -419,11 +357,16 @@ class Factored:
             lower = np.tril(inverse[np.ix_(at, at)])  # numbers rise
             return np.asarray(lower + np.tril(lower, -1).T)
 
-        out = self._inverses.copy()
+        out, starts = self._inverses.copy(), blocks.coupled.indptr
+        width = out.shape[1]
         for k in range(len(out)):
-            own = slice(blocks.starts[k], blocks.starts[k + 1])
-            gain = blocks.coupled[own] @ self._inverses[k]
-            out[k] += gain.T @ part(blocks.touched[own]) @ gain
+            ends = starts[width * k : width * (k + 1) + 1]
+            own = slice(ends[0], ends[-1])
+            at, place = np.unique(blocks.coupled.indices[own], return_inverse=True)
+            coupled = np.zeros((len(at), width))
+            coupled[place, np.repeat(np.arange(width), np.diff(ends))] = blocks.coupled.data[own]
+            gain = coupled @ self._inverses[k]
+            out[k] += gain.T @ part(at) @ gain
         return np.asarray(out), part(np.arange(motion, len(inverse)))
 
     def modes(self, count: int) -> Array:
@@ -434,8 +377,8 @@ class Factored:
         ``H x = (1 + l) S x``, of which ``l`` is the squared sum of these moves. Fewer where these
         do not converge.
         """
-        assert self.system.dense
-        size = self.system.groups.kept
+        size, matrix = self.system.groups.kept, self.system.matrix
+        assert not isinstance(matrix, Band)
         factor = self._whole[0]
         solve = partial(cho_solve, self._whole, check_finite=False)
 
@@ -446,7 +389,7 @@ class Factored:
         start = np.random.default_rng(0).normal(size=size)  # the same images, the same map
         try:
             _, modes = eigsh(
-                LinearOperator((size, size), self.system.product, dtype=float),
+                matrix,
                 min(count, size - 1),
                 LinearOperator((size, size), reduced, dtype=float),
                 Minv=LinearOperator((size, size), solve, dtype=float),
@@ -462,11 +405,12 @@ class Factored:
         From the blocks on and beside the diagonal of the inverse of the band (a recursion from
         its end to its beginning), and from the border's covariance.
         """
-        size, count = self.system.matrix.own.shape[1] - CONTROL, self.system.groups.motion
-        if self.system.dense:
+        count = self.system.groups.motion
+        if not isinstance(self.system.matrix, Band):
             inverse = self.kept(np.eye(self.system.groups.kept))
             at = CONTROL * firsts[:, None] + np.arange(LOCAL)
             return np.asarray(inverse[at[:, :, None], at[:, None, :]])
+        size = self.system.matrix.own.shape[1] - CONTROL
         diagonal, beside = self._inverse_blocks(size)
         border = self.border_covariance()
         out, pair = np.empty((len(firsts), LOCAL, LOCAL)), np.empty((2 * size, 2 * size))

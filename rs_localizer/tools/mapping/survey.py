@@ -150,11 +150,10 @@ def _turned_over(every: Sequence[Observations], state: State) -> Array:
 
 
 def _steps(system: System, count: int) -> Array:
-    """Of all markers (6 m,), each on its own."""
+    """Steps of all markers (6 m,), each on its own."""
     at = BODY * np.arange(count)[:, None] + np.arange(BODY)
-    lower = np.tril(system.matrix.corner[at[:, :, None], at[:, None, :]])
-    blocks = lower + np.tril(lower, -1).swapaxes(1, 2)
     slope = system.slope[system.groups.motion :]
+    blocks = system.corner[at[:, :, None], at[:, None, :]]
     return np.asarray(-np.linalg.solve(blocks, slope[at][..., None]).ravel())
 
 

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.tools.adjust.problem import MEDIAN
-from rs_localizer.tools.adjust.system import sums
 
 _STEPS = 12
 # Tukey's limit in standard deviations, and the errors (px) that are noise in any case.
@@ -80,8 +80,8 @@ def triangulate(camera: Camera, sights: Sights, count: int) -> Triangulated:
         weights = np.where(usable, np.maximum(1.0 - squared / limit**2, 0.0) ** 2, 0.0)
         errors, jacobians = np.nan_to_num(errors), np.nan_to_num(jacobians)
         weighted = weights[:, None, None] * jacobians
-        normal = sums(np.swapaxes(weighted, 1, 2) @ jacobians, sights.points, count)
-        slope = sums(np.einsum("nij,ni->nj", weighted, errors), sights.points, count)
+        normal = _sums(np.swapaxes(weighted, 1, 2) @ jacobians, sights.points, count)
+        slope = _sums(np.einsum("nij,ni->nj", weighted, errors), sights.points, count)
         points = points - np.einsum("pij,pj->pi", _inverses(normal), slope)
     counts = np.bincount(sights.points[weights > 0.0], minlength=count)
     determined = (counts > 1) & np.isfinite(points).all(axis=1)
@@ -110,7 +110,7 @@ def moves(
     every = np.empty((count, 3, len(others)))
     for k, (lens, seen) in enumerate(others):
         change = np.nan_to_num(_errors(lens, seen, points)[0] - errors)
-        slope = sums(np.einsum("nij,ni->nj", weighted, change), sights.points, count)
+        slope = _sums(np.einsum("nij,ni->nj", weighted, change), sights.points, count)
         every[:, :, k] = -np.einsum("pij,pj->pi", inverses, slope)
     return every
 
@@ -126,8 +126,8 @@ def _nearest_to_rays(camera: Camera, sights: Sights, count: int) -> Array:
     directions = np.nan_to_num(directions)
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     across[~usable] = 0.0
-    normal = sums(across, sights.points, count)
-    places = sums(np.einsum("nij,nj->ni", across, sights.positions), sights.points, count)
+    normal = _sums(across, sights.points, count)
+    places = _sums(np.einsum("nij,nj->ni", across, sights.positions), sights.points, count)
     least = np.linalg.eigvalsh(normal)[:, 0] / np.maximum(
         np.bincount(sights.points[usable], minlength=count), 1
     )
@@ -157,3 +157,11 @@ def _inverses(matrices: Array) -> Array:
     inverses = np.full_like(matrices, np.nan)
     inverses[good] = np.linalg.inv(matrices[good])
     return inverses
+
+
+def _sums(values: Array, groups: IntArray, count: int) -> Array:
+    """Sums (count,...) of values (n,...) by group (n,)."""
+    picks = csr_array(
+        (np.ones(len(groups)), (groups, np.arange(len(groups)))), shape=(count, len(groups))
+    )
+    return np.asarray(picks @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])
