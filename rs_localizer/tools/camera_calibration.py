@@ -133,7 +133,7 @@ _ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration(Evidence):
-    """What a recording says of its camera."""
+    """Findings of a recording on its camera."""
 
     formal_deviation: float  # s, of the noise of the readout time alone
     fit: Fit
@@ -152,7 +152,7 @@ class CameraCalibration(Evidence):
 
     @property
     def shape_deviation(self) -> float:
-        """Of the estimated landmarks (m, rms): by the noise, and half of the halves' difference."""
+        """Deviation of landmarks (m, rms), by noise and half of what halves differ by."""
         count = 3 * len(np.unique(self.posed.observations.points))
         first = 1 + len(self.fit.state.lens)
         variances = np.diag(self.fit.border_covariance)[first : first + count]
@@ -297,7 +297,7 @@ def _unsteady(
 
 
 def _jitter(camera: Camera, observations: Observations, state: State) -> float:
-    """What the images' own times are off their stamps, s rms.
+    """Distances of the images' own times from their stamps, s rms.
 
     By how one image differs from the mean of its neighbours: times that drift are nearly a motion
     that drifts. And by the fast images: in slow ones a hundredth of a pixel, which may be the

@@ -95,7 +95,7 @@ SUMMARY = ("median", "mean", "95 %", "largest")
 
 
 def summary(values: Array) -> dict[str, float]:
-    """What errors (n,) come to, by :data:`SUMMARY`; NaN for none."""
+    """Figures of errors (n,) by :data:`SUMMARY`; NaN for none."""
     if len(values) == 0:
         return dict.fromkeys(SUMMARY, np.nan)
     of = np.median(values), np.mean(values), np.percentile(values, 95), np.max(values)

@@ -224,7 +224,7 @@ def as_fisheye(lens: Camera, pixels: Array) -> Camera:
 
 
 def _equidistant(size: tuple[int, int], numbers: Array) -> Camera:
-    """Of focal lengths, centre and distortion (8)."""
+    """The lens of focal lengths, centre and distortion (8)."""
     K = np.array([[numbers[0], 0.0, numbers[2]], [0.0, numbers[1], numbers[3]], [0.0, 0.0, 1.0]])
     return Camera(*size, K=K, D=numbers[4:], distortion_model=DistortionModel.EQUIDISTANT)
 
@@ -271,7 +271,7 @@ def _calibrated(
 
 
 def _folds(lens: Camera) -> bool:
-    """Whether pixels of the image have no ray.
+    """True where pixels of the image have no ray.
 
     A series that fits the middle of the image, where the board was shown, may turn back towards the
     rim.
@@ -283,7 +283,7 @@ def _folds(lens: Camera) -> bool:
 
 
 def _cancels(lens: Camera, images: list[Observed]) -> bool:
-    """Whether numbers beyond those of any lens make up for each other, which nothing holds there.
+    """True where numbers beyond any lens's make up for each other, which nothing holds there.
 
     Under the prior of lenses they cost more than all that the points can tell.
     """

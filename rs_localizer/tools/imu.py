@@ -121,7 +121,7 @@ def gyro_samples(recording: ImuRecording, start_ns: int) -> GyroSamples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountFound:
-    """What a recording says of its IMU."""
+    """Findings of a recording on its IMU."""
 
     # s to add to a stamp of the IMU to get the camera's time, where images are stamped at the
     # exposure of their first row
@@ -208,7 +208,7 @@ def _with_noise(samples: GyroSamples, fitted: Fit) -> GyroSamples:
 
 
 def _worth_it(quieter: GyroSamples, finer: Fit, samples: GyroSamples, coarser: Fit) -> bool:
-    """Whether finer knots explain more than they cost: by the likelihood of both noises."""
+    """True where finer knots explain more than they cost, by the likelihood of both noises."""
     count = np.count_nonzero(quieter.covered(finer.state.spline.layout, 0.0, 0.0))
     gain = 6.0 * count * np.log(samples.deviation / quieter.deviation)
     gain += 4.0 * np.count_nonzero(coarser.inliers) * np.log(coarser.deviation / finer.deviation)
@@ -217,7 +217,7 @@ def _worth_it(quieter: GyroSamples, finer: Fit, samples: GyroSamples, coarser: F
 
 
 def mount_of(camera: Camera, fitted: Fit, samples: GyroSamples, inflation: float) -> MountFound:
-    """What a joint estimate says of the IMU.
+    """Findings of a joint estimate on the IMU.
 
     Args:
         camera: whose images were stamped when their first row was exposed.

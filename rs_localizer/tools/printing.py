@@ -137,7 +137,7 @@ def _rectangles(white: NDArray[np.bool_], cell: float) -> Array:
 
 
 def page_files(path: Path, count: int) -> list[Path]:
-    """Where so many pages are written to: one PDF, or a PNG for each.
+    """Files of so many pages: one PDF, or a PNG for each.
 
     Raises:
         PrintError: for another ending.

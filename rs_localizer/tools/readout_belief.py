@@ -72,7 +72,7 @@ _DISAGREEMENT = 0.01
 
 
 def disagreement(values: Array, deviations: Array) -> float:
-    """By how much deviations (b,) are too small (Birge's ratio), at least 1."""
+    """Factor by which deviations (b,) are too small (Birge's ratio), at least 1."""
     if len(values) < 2:
         return 1.0
     weights = deviations**-2.0
@@ -88,7 +88,7 @@ def disagreement(values: Array, deviations: Array) -> float:
 
 
 def discrepancy(value: float, values: Array, deviations: Array) -> float:
-    """By how much the whole's value differs from the mean of its parts (b,), beyond its noise.
+    """Difference of the whole's value from the mean of its parts (b,), beyond its noise.
 
     Corners that are off in all images of a part alike bend its lens and shape. The shorter it is,
     the more of the shutter is taken for those: then the whole lies beside all of its parts.
@@ -121,7 +121,7 @@ _LONGEST = 1.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What a recording says of a readout time."""
+    """Findings of a recording on a readout time."""
 
     readout_time: float  # s; negative: against the scan direction that was given
     deviation: float  # s, with what blocks and halves disagree in, and doubts of the stamps
@@ -151,22 +151,22 @@ class Evidence:
 
     @property
     def long_enough(self) -> bool:
-        """Whether parts of it can speak against the whole."""
+        """True where parts of it can speak against the whole."""
         return self.telling >= _LEAST_TELLING or self.seconds >= _LONG
 
     @property
     def determined(self) -> bool:
-        """Whether the motion determines the readout time."""
+        """True where the motion determines the readout time."""
         return self.deviation < self.limit and self.long_enough
 
     @property
     def near_zero(self) -> bool:
-        """Whether 0 lies within the error."""
+        """True where 0 lies within the error."""
         return abs(self.readout_time) < _GLOBAL_SIGMAS * self.deviation
 
     @property
     def global_shutter(self) -> bool:
-        """Whether nothing else than a global shutter is left."""
+        """True where nothing else than a global shutter is left."""
         sure = _GLOBAL_SIGMAS * self.deviation < _GLOBAL and self.inflation == 1.0
         return self.determined and self.near_zero and sure and self.own_stamps
 
@@ -177,7 +177,7 @@ class Evidence:
 
     @property
     def stabilised(self) -> bool:
-        """Whether the parts disagree as those of a camera that turns its picture do."""
+        """True where the parts disagree as those of a camera that turns its picture do."""
         least = max(_STABILISED * abs(self.readout_time), self.limit)
         apart, noise = apart_of(self.halves)
         by_halves = apart > max(_HALVES_SIGMAS * noise, 2.0 * least)
@@ -198,7 +198,7 @@ class Evidence:
         return f"not observable: {value}{why}" if why else ""
 
     def _why_not(self) -> str:
-        """What speaks against it, beginning with how that goes on from the value."""
+        """Reason against it, as it goes on from the value; or ''."""
         why = ""
         if self.jitter > _BESIDE:
             why += (
@@ -243,7 +243,7 @@ class Evidence:
 
 
 def apart_of(halves: tuple[Block, ...]) -> tuple[float, float]:
-    """By how much the readout times of two halves differ, and the deviation of that (s)."""
+    """Difference of the readout times of two halves, and its deviation (s)."""
     if len(halves) < 2:
         return 0.0, math.inf
     one, other = halves
@@ -262,7 +262,7 @@ CHANCE = 0.01
 
 @dataclass(frozen=True, slots=True)
 class ShutterFit:
-    """What an unknown shutter was found to be."""
+    """An unknown shutter as it was found."""
 
     readout_time: float  # s, of the rolling shutter that fits best
     deviation: float  # s
@@ -276,18 +276,18 @@ class ShutterFit:
 
     @property
     def possible(self) -> bool:
-        """Whether a camera can read an image out so slowly."""
+        """True where a camera can read an image out so slowly."""
         return self.readout_time < self.interval
 
     @property
     def visible(self) -> bool:
-        """Whether the images show a rolling shutter."""
+        """True where the images show a rolling shutter."""
         significant = self.readout_time > _SIGNIFICANT * self.deviation
         return significant and self.chance < CHANCE and self.possible
 
     @property
     def axis_known(self) -> bool:
-        """Whether they show along which axis it goes."""
+        """True where they show along which axis it goes."""
         return self.axis_chance < CHANCE
 
 
@@ -305,13 +305,13 @@ class ReadoutCheck:
 
     @property
     def differs(self) -> bool:
-        """Whether noise does not explain the difference."""
+        """True where noise does not explain the difference."""
         apart = abs(self.estimated - self.given)
         return apart > max(_CHECK_DEVIATIONS * self.deviation, _CHECK_LEAST)
 
     @property
     def message(self) -> str:
-        """What to say of it."""
+        """One sentence that warns of it."""
         reverse = " in the reverse direction" if self.estimated < 0.0 else ""
         return (
             f"estimated readout time is {1e3 * abs(self.estimated):.1f} ms{reverse}, but "

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the cameras of a rig are on it, and how their clocks differ, from recordings of each.
+"""Mounts and clocks of the cameras of a rig, from recordings of each.
 
 One motion runs through the keypoints of all cameras, that of the first one. Beside it each
 camera has what one alone has (:mod:`rs_localizer.tools.camera_calibration`), and each but the
@@ -70,7 +70,7 @@ class Mounted:
 
     @property
     def undetermined(self) -> str:
-        """What the recording does not determine, with figures; empty: all is."""
+        """Names and figures of what the recording does not determine; empty: all is."""
         units = (
             ("rotation", np.degrees(1.0), "deg"),
             ("position", 1e3, "mm"),
@@ -128,7 +128,7 @@ def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
 
 
 def _freedom(first: CameraCalibration, own: CameraCalibration) -> Freedom:
-    """What a camera's own calibration freed; the accelerations are the rig's."""
+    """Freedom of a camera's own calibration, with the accelerations of the rig."""
     names = ("lens", "lens_deviations", "landmarks", "paper", "stamps")
     return replace(first.fit.freedom, **{name: getattr(own.fit.freedom, name) for name in names})
 
@@ -205,7 +205,7 @@ class _Joint(NamedTuple):
 
     @property
     def states(self) -> tuple[State, ...]:
-        """Of all cameras."""
+        """States of all cameras."""
         return self.fit.state, *self.fit.state.others
 
     def numbers(self, place: int, about: Extrinsics) -> tuple[Array, Array]:

@@ -30,7 +30,7 @@ _WINDOW_NS, _MARGIN_NS = 20_000_000_000, 2_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedFrames:
-    """What the images say of the moments of one window."""
+    """Frames at the moments of one window, by all its images."""
 
     frames: list[Localized]
     bridged: IntArray  # (b,) ns, stamps of those without an image of their own

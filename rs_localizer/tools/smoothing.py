@@ -46,14 +46,14 @@ _NUMBERS, _USUAL = 6.0, np.array([2.0, 1.0])
 
 
 class Told(NamedTuple):
-    """What an estimate says of its prior, of angular and of linear accelerations."""
+    """Evidence of an estimate on its prior, of angular and of linear accelerations."""
 
     squares: Array  # (2,) sums, (rad/s^2)^2 and (m/s^2)^2
     numbers: Array  # (2,) how many of them the keypoints tell
 
 
 def told(fitted: Fit) -> Told:
-    """What an estimate says of the accelerations that were expected of it."""
+    """Evidence of an estimate on the accelerations that were expected of it."""
     spline = fitted.state.spline
     prior = fitted.freedom.accelerations(spline.layout.spacing)
     rows = acceleration_rows(spline, prior)
@@ -84,7 +84,7 @@ _SHAKEN, _SHAKEN_SIGMAS, _MOST_SHAKEN = 1.5, 5.0, 0.2
 _IN_FRAME, _NEXT = 1.0, 9
 _ROWS = np.linspace(-0.5, 0.5, 17)
 Parts = list[tuple[Camera, Observations]]
-"""What each camera saw."""
+"""The keypoints of each camera."""
 # The expected accelerations are settled when they change by less than this part.
 _ALIKE, _ROUNDS = 0.05, 6
 
@@ -226,7 +226,7 @@ class Smoothed:
         )
 
     def _beside_shaken(self, times: Array) -> BoolArray:
-        """Whether the image before or after these times (m,) is shaken."""
+        """Times (m,) before or after which the image is shaken."""
         after = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
         before = np.maximum(np.searchsorted(self.times, times, side="right") - 1, 0)
         return self.shaken[before] | self.shaken[after]
@@ -434,7 +434,7 @@ def _best(parts: Parts, start: State, fading: float) -> Fit:
 def _turned_pixels(
     camera: Camera, observations: Observations, fast: FastTurn, readout_time: float
 ) -> Array:
-    """Where the pixels (n,2) would be without the fast turn; NaN where no image point is."""
+    """Pixels (n,2) as they would be without the fast turn; NaN where no image point is."""
     rays = np.column_stack([camera.rays(observations.pixels), np.ones(len(observations.pixels))])
     turns = fast.rotations(observations.times + readout_time * observations.row_times)
     return camera.project(np.einsum("nij,nj->ni", turns, rays))

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a calibration means, in words."""
+"""Verdicts on a calibration, in words."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def refusal(result: CameraCalibration) -> str:
 
 
 def shape_is_free(result: CameraCalibration) -> bool:
-    """Whether the map's shape was estimated."""
+    """True where the map's shape was estimated."""
     return result.fit.freedom.landmarks > 0.0
 
 
@@ -131,7 +131,7 @@ def uncovered(result: CameraCalibration) -> list[str]:
 
 
 def table(found: CameraCalibration, rate: float | None) -> Iterator[str]:
-    """What was found, its parts, and remarks; ``rate``: of the images, as it was given."""
+    """Rows of what was found, its parts, and remarks; ``rate``: of the images, as it was given."""
     for name, text in (
         ("readout time", f"{1e3 * readout_time(found):.3f} ms"),
         ("standard deviation", f"{1e3 * found.deviation:.3f} ms"),

@@ -23,7 +23,7 @@ _STRETCH = 3e-3
 
 
 def is_flat(points: Array) -> bool:
-    """Whether points (p,3) lie in one plane."""
+    """True where points (p,3) lie in one plane."""
     sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(sizes[2] < _FLAT * sizes[0])
 

@@ -31,13 +31,13 @@ _DOUBT = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Pull:
-    """What errors pull at what is estimated, in its own covariance, all seconds together."""
+    """Pull of errors at what is estimated, in its own covariance, all seconds together."""
 
     measured: float
     expected: float  # of independent errors of the noise that the covariance stands for
 
     def inflation(self, independent: float) -> float:
-        """Of the covariance, if it would be so large for independent errors."""
+        """Factor of the covariance, if it would be so large for independent errors."""
         share = (self.measured + _DOUBT * independent) / (self.expected + _DOUBT)
         return max(share, independent)
 
@@ -83,7 +83,7 @@ def _seconds(times: Array) -> list[tuple[int, int]]:
 
 
 def pull_at_landmarks(rows: Array, landmarks: IntArray, times: Array, held: Array) -> Pull:
-    """What errors pull at landmarks, the motion taken for given.
+    """Pull of errors at landmarks, the motion taken for given.
 
     Args:
         rows: (n,2,4) whitened derivatives by the landmark, and the error.

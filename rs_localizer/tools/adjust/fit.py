@@ -104,7 +104,7 @@ def cost_at(camera: Camera, observations: Observations, fitted: Fit, readout_tim
 
 
 def cheaper(richer: Fit, plainer: Fit, parameters: float) -> bool:
-    """Whether so many more parameters are worth it, by the noise that the richer model leaves."""
+    """True where so many more parameters are worth it, by the noise of the richer model."""
     limit = (LIMIT * richer.deviation) ** 2
     costs = [float(np.sum(fitted.squared_errors.clip(max=limit))) for fitted in (plainer, richer)]
     return (costs[0] - costs[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
@@ -161,5 +161,5 @@ def steepness(squared: Array, deviation: float) -> float:
 
 
 def left_over(keypoints: int, used: int) -> float:
-    """By how much the noise's variance exceeds the mean square that is left."""
+    """Factor by which the noise's variance exceeds the mean square that is left."""
     return 2.0 * keypoints / max(2.0 * keypoints - used, 1.0)

@@ -66,7 +66,7 @@ class Sights(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """What is free beside the controls, in the order of a row's columns, and the noise."""
+    """Unknowns beside the controls, in the order of a row's columns, and the noise."""
 
     readout_time: float
     gradient: Array  # (2,) of the row time by the pixel

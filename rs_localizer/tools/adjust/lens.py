@@ -25,7 +25,7 @@ _GRID = 9  # points along each side of the image, of an error that is averaged o
 
 
 class LensPrior(NamedTuple):
-    """What is known of a lens beforehand."""
+    """Prior of a lens."""
 
     mean: Array  # (m,) as of lens_values
     information: Array  # (m,m)
@@ -89,7 +89,7 @@ def project(camera: Camera, values: Array, points: Array, free: bool) -> Project
 
 
 def lens_prior(camera: Camera, deviations: tuple[float, float] | None) -> LensPrior:
-    """What is known of a lens before its numbers are estimated.
+    """Prior of a lens whose numbers are estimated.
 
     Args:
         camera: a given lens, or a first guess of an unknown one.
@@ -121,14 +121,14 @@ def lens_prior(camera: Camera, deviations: tuple[float, float] | None) -> LensPr
 
 
 def lens_errors(camera: Camera, covariance: Array) -> LensErrors:
-    """What a covariance (m,m) of a camera's lens numbers means for its pixels."""
+    """Errors of pixels by a covariance (m,m) of a camera's lens numbers."""
     rays, design = _field(camera)
     by_lens = project(camera, lens_values(camera), rays, True).by_lens
     return _parts(design, (by_lens @ _root(covariance)).reshape(2 * len(rays), -1))
 
 
 def lens_difference(camera: Camera, other: Camera) -> LensErrors:
-    """By how much another lens is off this one."""
+    """Difference of another lens from this one."""
     rays, design = _field(camera)
     off = project(other, lens_values(other), rays, False).pixels
     off -= project(camera, lens_values(camera), rays, False).pixels
@@ -153,7 +153,7 @@ def _field(camera: Camera) -> tuple[Array, Array]:
 
 
 def _parts(design: Array, moved: Array) -> LensErrors:
-    """Of displacements (2 n, k) of pixels, k of them independent."""
+    """Parts of displacements (2 n, k) of pixels, k of them independent."""
     numbers = np.linalg.lstsq(design, moved, rcond=None)[0]
     rest = (moved - design @ numbers)[:8]  # the corners
     size = np.sqrt(np.sum(numbers**2, axis=1))

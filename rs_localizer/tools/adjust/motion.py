@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is expected of a motion: accelerations at its controls, and the velocity of single images.
+"""Priors of a motion: accelerations at its controls, and the velocity of single images.
 
 Accelerations have zero mean. With a memory, neighbouring ones are those of a first-order Markov
 process: what counts is by how much one is not what the one before lets expect.

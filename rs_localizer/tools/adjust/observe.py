@@ -23,7 +23,7 @@ _ROUGH = 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """What one image shows of the map."""
+    """Keypoints of one image, and the map's points that they show."""
 
     stamp_ns: int
     points: Array  # (n,3) m, map frame

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is known beforehand: of lens, mount, landmarks, times of images, and the whole's place."""
+"""Priors: of lens, mount, landmarks, times of images, and the whole's place."""
 
 from __future__ import annotations
 

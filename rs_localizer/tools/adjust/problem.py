@@ -31,7 +31,7 @@ from rs_localizer.tools.adjust.variables import EXTRINSICS, MOUNT, State, View
 # Errors beyond so many standard deviations do not count for the scale of the noise.
 _SCALE_LIMIT = 4.0
 MEDIAN = 2.0 * np.log(2.0)
-"""Of a squared error in two dimensions, in variances."""
+"""Median of a squared error in two dimensions, in variances."""
 _LOOSE_BODY = 100.0  # m, rad
 _STEPS, _MOST_DAMPINGS = 20, 6
 # A step that brings less than this, or than this part of the cost, is the last one; of a cost no
@@ -117,7 +117,7 @@ class Problem:
         return self.groups.border
 
     def place(self, name: str, view: int = 0) -> int:
-        """Where a camera's numbers begin in the border."""
+        """First of a camera's numbers in the border."""
         return self.at[view][name] - self.groups.motion
 
     def states(self, state: State) -> list[State]:
@@ -140,7 +140,7 @@ class Problem:
         return [of.look(curve, own) for of, own in zip(self.keypoints, states, strict=True)]
 
     def keypoint_rows(self, state: State, deviation: float) -> list[Rows]:
-        """Of each camera, at a standard deviation of the noise (px)."""
+        """Rows of each camera, at a standard deviation of the noise (px)."""
         curve, states = self._look(state)
         parts = zip(self.keypoints, states, self.at, self.ratios.tolist(), strict=True)
         return [of.rows(curve, own, at, deviation * ratio) for of, own, at, ratio in parts]
@@ -172,7 +172,7 @@ class Problem:
         return rows
 
     def _known(self, k: int, own: State) -> list[Rows | Quadratic]:
-        """What is known of a camera's unknowns beforehand."""
+        """Priors of a camera's unknowns."""
         terms: list[Rows | Quadratic] = []
         view, at, pieces = self.views[k], self.at[k], self.pieces[k]
         freedom = view.freedom
@@ -303,7 +303,7 @@ def noise_of(squared: Array, deviation: float) -> float:
 
 
 def _pieces(view: View, every: bool) -> Pieces:
-    """What is free of the map: all of it, bodies, or the landmarks that are seen."""
+    """The free parts of the map: all of it, bodies, or the landmarks that are seen."""
     observations, freedom = view.observations, view.freedom
     if every:
         return Pieces(np.arange(len(observations.landmarks)), rigid=False)
@@ -317,7 +317,7 @@ def _pieces(view: View, every: bool) -> Pieces:
 
 
 def _shape_information(view: View, pieces: Pieces) -> Array | None:
-    """Of the shape of a flat print; None: it is none."""
+    """Information on the shape of a flat print; None: it is none."""
     if not (view.freedom.paper and pieces.count and not pieces.rigid):
         return None
     landmarks = view.observations.landmarks[pieces.slots >= 0]

@@ -105,7 +105,7 @@ class States(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Where the knots of the stretches lie: one list of controls, cut at the gaps.
+    """Knots of the stretches: one list of controls, cut at the gaps.
 
     The controls ``firsts[k]`` to ``firsts[k + 1] - 1`` belong to stretch k, whose motion is
     defined from ``starts[k]`` on for as many spacings as it has controls, less three.

@@ -49,7 +49,7 @@ class Undetermined(ValueError):
 
 
 class Rows(NamedTuple):
-    """What n measurements of r numbers each say, in their own standard deviations."""
+    """Whitened rows of n measurements of r numbers each."""
 
     values: Array  # (n,r,w + k) derivatives by a run of w neighbours, then by k others
     first: IntArray  # (n,) number of the first unknown of the run
@@ -66,7 +66,7 @@ class Rows(NamedTuple):
 
 
 class Quadratic(NamedTuple):
-    """What is known of a few unknowns of the border together: ``cost = e^T information e``."""
+    """Knowledge of a few unknowns of the border together: ``cost = e^T information e``."""
 
     columns: IntArray  # (k,)
     information: Array  # (k,k)
@@ -186,7 +186,7 @@ class System:
 
     @property
     def dense(self) -> bool:
-        """Whether the motion is no band."""
+        """True where the motion is no band."""
         return not isinstance(self.matrix, Band)
 
     @property

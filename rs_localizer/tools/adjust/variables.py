@@ -24,7 +24,7 @@ MOUNT, DELAY = 13, 6
 
 
 class Accelerations(NamedTuple):
-    """What is expected of the accelerations at the controls.
+    """Expected accelerations at the controls.
 
     In each stretch a stationary first-order Markov process (Singer, see
     :mod:`rs_localizer.tracking`), or independent ones.
@@ -37,7 +37,7 @@ class Accelerations(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroSamples:
-    """What a gyroscope measured."""
+    """Samples of a gyroscope."""
 
     times: Array  # (k,) s, by its own stamps
     rates: Array  # (k,3) rad/s, in its own axes
@@ -117,7 +117,7 @@ class Observations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extrinsics:
-    """Where a camera is on a rig, ``X_camera = axes (X_rig - centre)``, and its clock."""
+    """Place of a camera on a rig, ``X_camera = axes (X_rig - centre)``, and its clock."""
 
     axes: Array  # (3,3) camera_from_rig
     centre: Array  # (3,) m
@@ -125,7 +125,7 @@ class Extrinsics:
 
     @classmethod
     def none(cls) -> Extrinsics:
-        """Of a camera whose axes are the rig's."""
+        """Extrinsics of a camera whose axes are the rig's."""
         return cls(np.eye(3), np.zeros(3), 0.0)
 
     def moved(self, step: Array) -> Extrinsics:
@@ -142,7 +142,7 @@ class Extrinsics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mounting:
-    """What is known of extrinsics beforehand."""
+    """Prior of extrinsics."""
 
     given: Extrinsics
     deviations: Array  # (7,) of a step from there: rad, m, s; infinite: nothing
@@ -150,7 +150,7 @@ class Mounting:
 
 @dataclass(frozen=True, slots=True)
 class Freedom:
-    """What is estimated beside the motion."""
+    """Unknowns beside the motion, and what is known of them."""
 
     readout_time: bool = True
     lens: bool = False
@@ -176,7 +176,7 @@ class Freedom:
     mounting: Mounting | None = None
 
     def accelerations(self, spacing: float) -> Accelerations:
-        """What is expected of them at controls that are so far apart (s)."""
+        """Accelerations at controls that are so far apart (s)."""
         memory = math.exp(-spacing / self.fading) if self.fading > 0.0 else 0.0
         return Accelerations(
             float(self.angular_acceleration), float(self.linear_acceleration), memory
@@ -185,7 +185,7 @@ class Freedom:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What one camera sees, and what of it is free."""
+    """Keypoints of one camera, and what of it is free."""
 
     camera: Camera
     observations: Observations

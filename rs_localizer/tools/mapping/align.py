@@ -25,7 +25,7 @@ def alignment(
     up: tuple[float, float, float] | None = None, floor: Sequence[int] = (),
     origin: int | None = None,
 ) -> Similarity:  # fmt: skip
-    """What brings a map to where it is wanted.
+    """The similarity that brings a map to where it is wanted.
 
     Args:
         scale: factor.

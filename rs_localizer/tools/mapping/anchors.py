@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What gives a map its scale and its place: markers of known places, points a known distance apart.
+"""Scale and place of a map, by markers of known places or points a known distance apart.
 
 Both are seen in images beside the landmarks, and triangulated with the refined motion. Markers also
 take part in the adjustment, where they hold frame, size and shape of the map.
@@ -42,7 +42,7 @@ class PointSight:
 
 @dataclass(frozen=True, slots=True)
 class Distance:
-    """What was measured between two named points."""
+    """Measured distance between two named points."""
 
     one: str
     other: str
@@ -85,7 +85,7 @@ class Anchors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placement:
-    """Where a map lies, and what says so."""
+    """Frame of a map, and what says so."""
 
     similarity: Similarity  # to metres
     scaled: bool
@@ -209,7 +209,7 @@ def marker_constraints(
     corners: MapObservations,
     places: Array,
 ) -> tuple[MapObservations, Start, Array | None]:
-    """What is adjusted with the corners of markers, in their frame; without, if too few are seen.
+    """Inputs with the corners of markers, in their frame; without, if too few are seen.
 
     With the deviations (p,) of all landmarks, m; None: without corners.
 

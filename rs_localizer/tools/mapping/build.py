@@ -70,7 +70,7 @@ _LEAST_SIGHTS, _MOST_DEVIATION = 3, 0.03
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Given:
-    """What a map is built from."""
+    """Inputs of a map."""
 
     views: Sequence[View]  # in the order of their stamps
     camera: Camera | None  # its lens; None: COLMAP finds it
@@ -86,7 +86,7 @@ class Given:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Workshop:
-    """Where and how the work is done."""
+    """Place and manner of the work."""
 
     folder: Path  # for COLMAP's files, which stay
     effort: Effort
@@ -95,7 +95,7 @@ class Workshop:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Where the camera was when it took some of the views."""
+    """Motion of the camera, and the views that it took on it."""
 
     rows: IntArray  # (g,) of the views
     times: Array  # (g,) s since the refinement's start, of the middle rows

@@ -134,7 +134,7 @@ def build_structure(
 def observed(
     model: Model, names: Sequence[str], stamps_ns: IntArray
 ) -> tuple[MapObservations, Start]:
-    """What images of a model show of its points, by their names in the order of stamps (g,).
+    """Keypoints of images of a model, by their names in the order of stamps (g,); and the model.
 
     Raises:
         MappingError: for keypoints of points that are not there.

@@ -117,7 +117,7 @@ def _map(task: dict[str, Any], database: Path, folder: Path) -> list[Any]:
 
 
 def _statistics(database: Path) -> dict[str, Any]:
-    """Of what the model was made: features in all, and pairs of images that agree."""
+    """Counts of what the model was made of: features, and pairs of images that agree."""
     with pycolmap.Database.open(database) as tables:
         _, matches = tables.read_two_view_geometry_num_inliers()
         return {

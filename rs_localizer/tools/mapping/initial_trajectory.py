@@ -24,7 +24,7 @@ _MOST_TURN = 0.5 * math.pi
 _LEAST_IMAGES = 10
 _LEAST_ACCELERATION = 0.5  # rad/s^2, m/s^2
 ANGULAR_VELOCITY, LINEAR_VELOCITY = 2.0, 1.0
-"""Of images that stand alone, a hand that walks: rad/s, m/s."""
+"""Velocity of images that stand alone, a hand that walks: rad/s, m/s."""
 
 
 def following(times: Array, rotations: Array) -> BoolArray:
@@ -54,7 +54,7 @@ def initial_trajectory(
 
 
 def usual_accelerations(times: Array, rotations: Array, positions: Array) -> tuple[float, float]:
-    """Of images (g,) that follow each other, rms: rad/s^2, m/s^2 (0: no three do)."""
+    """Accelerations of images (g,) in a row, rms: rad/s^2, m/s^2 (0: no three are)."""
     steps = np.diff(times)
     follow = following(times, rotations)
     near = follow[1:] & follow[:-1]

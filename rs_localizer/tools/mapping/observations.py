@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a map is refined from: keypoints of known landmarks and a first guess of all."""
+"""Keypoints of known landmarks, and a first guess of all: what a map is refined from."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class RigCamera:
 
     @property
     def extrinsics(self) -> Extrinsics:
-        """As they are given."""
+        """The mount as it is given."""
         return Extrinsics.none() if self.mounting is None else self.mounting.given
 
     @property
@@ -156,7 +156,7 @@ class Start:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapFreedom:
-    """What is estimated beside landmarks and motion, and what is known of them."""
+    """Unknowns beside landmarks and motion, and what is known of them."""
 
     readout_time: bool = False
     lens: bool = False

@@ -163,7 +163,7 @@ class Refinement:
         )
 
     def _observations(self) -> list[Observations]:
-        """Of each camera."""
+        """Keypoints of each camera."""
         every = []
         for k, one in enumerate(self.rig):
             used = self.keypoints(k)
@@ -182,7 +182,7 @@ class Refinement:
         return every
 
     def problem(self, freedom: Freedom, held: bool = False) -> Problem:
-        """Of map and motion; ``held``: the map is as it is, and nothing but the motion is free."""
+        """The problem of map and motion; ``held``: the map is as it is, only the motion is free."""
         views = [
             View(one.camera, own, replace(freedom, mounting=None if held else one.mounting))
             for one, own in zip(self.rig, self.seen, strict=True)
@@ -334,7 +334,7 @@ class Refinement:
 __all__ = ["MapFreedom", "MapObservations", "RefinedMap", "Start", "refine", "refine_rig"]
 
 DRIFT = 0.01
-"""Of a deviation: so little that landmarks follow in proportion, however large that is."""
+"""Part of a deviation, so little that landmarks follow in proportion, however large that is."""
 # A landmark that is not known to this part of the map's size is not refined.
 _KNOWN = 0.1
 # Nor one that is known worse than to so many times what landmarks usually moved by: seen from one
@@ -377,17 +377,17 @@ class RefinedMap:
 
     @property
     def readout_time(self) -> float:
-        """Of the first camera, s; negative: against the scan direction."""
+        """The first camera's readout time, s; negative: against the scan direction."""
         return self.cameras[0].readout_time
 
     @property
     def readout_time_deviation(self) -> float:
-        """Of the first camera, s; NaN where it was given."""
+        """The first camera's deviation, s; NaN where it was given."""
         return self.cameras[0].readout_time_deviation
 
     @property
     def readout_check(self) -> ReadoutCheck | None:
-        """Of the first camera."""
+        """The first camera's check."""
         return self.cameras[0].readout_check
 
     @property
@@ -399,7 +399,7 @@ class RefinedMap:
         return replace(self.camera, scan_direction=direction)
 
     def poses(self) -> tuple[Array, Array]:
-        """Of the rig's axes in the map (g,3,3), (g,3) at the images' middle rows."""
+        """Poses of the rig's axes in the map (g,3,3), (g,3) at the images' middle rows."""
         states = self.spline.states(self.times)
         return states.rotations, states.positions
 

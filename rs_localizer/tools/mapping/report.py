@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is to be said of a map that was built."""
+"""Table and advice on a map that was built."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
 
 
 def advice(built: Built, views: Sequence[View]) -> list[str]:
-    """What to film otherwise, for a better map."""
+    """Sentences on how to film a better map."""
     said = []
     posed = np.zeros(len(views), np.bool_)
     posed[built.posed] = True

@@ -42,7 +42,7 @@ _LENS_DEVIATIONS = 0.005, 0.02
 
 
 def colmap_freedom(seen: MapObservations, start: Start, lens: bool) -> MapFreedom:
-    """What is free of a map that COLMAP has begun; ``lens``: that of its lens, too.
+    """Unknowns of a map that COLMAP has begun; ``lens``: its lens, too.
 
     A time lapse, whose stamps are closer than its images were, moves faster than any hand.
     """
@@ -137,7 +137,7 @@ def _of_one_motion(
     camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
     directions: Sequence[ScanDirection], done: Callable[[str], object],
 ) -> tuple[RefinedMap, ShutterFit | None]:  # fmt: skip
-    """As :func:`fit_shutter`, with one smooth motion through images that follow each other."""
+    """The map by one smooth motion through images in a row; see :func:`fit_shutter`."""
     still = refine(camera, observations, start, freedom, done=done)
     if not still.tells_readout:
         return still, None

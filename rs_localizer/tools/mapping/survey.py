@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where markers are, from recordings that show them, by one camera or by those of a rig.
+"""Places of markers, from recordings that show them, by one camera or by those of a rig.
 
 Continuous-time adjustment with the poses of the markers free, each a rigid square of known size.
 The first marker is the origin; whatever shows several of them closes loops.
@@ -56,7 +56,7 @@ _LEAST_DIFFERENCE = 12.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjustable:
-    """What the cameras saw: four corners of each marker; the first, the origin, is known."""
+    """Keypoints of the cameras: four corners of each marker; the first, the origin, is known."""
 
     filmed: Sequence[Filmed]
     seen: Sequence[Observations]  # of the landmarks that all see
@@ -73,7 +73,7 @@ class Adjustable:
         readout_times: bool = False,
         markers_only: bool = False,
     ) -> Problem:
-        """Of all cameras.
+        """The problem of all cameras.
 
         Args:
             freedom: of the motion.
@@ -158,7 +158,7 @@ def _steps(system: System, count: int) -> Array:
 
 
 def _costs(problem: Problem, state: State, deviation: float) -> Array:
-    """Of the corners of each marker (m,), Tukey's."""
+    """Tukey's costs of the corners of each marker (m,)."""
     limit = (LIMIT * deviation) ** 2
     rest = np.maximum(1.0 - problem.errors(state) / limit, 0.0)
     costs = (1.0 - rest**3) * limit / (3.0 * deviation**2)
@@ -167,7 +167,7 @@ def _costs(problem: Problem, state: State, deviation: float) -> Array:
 
 
 def _normals(state: State) -> Array:
-    """Of the markers (m,3)."""
+    """Normals of the markers (m,3)."""
     corners = state.landmarks.reshape(-1, 4, 3)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
     return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])
@@ -199,7 +199,7 @@ _LEAST_FIT = 0.8
 # A place that is known worse than to this part of a marker's size is worth little.
 _POOR = 0.1
 MISFIT = "is their size right, and each id used once?"
-"""What is asked of markers whose corners do not fit."""
+"""Question about markers whose corners do not fit."""
 # Markers that were turned over may hide others.
 _MOST_TURNS = 3
 
@@ -425,7 +425,7 @@ def _less_noise(given: Adjustable, fitted: Fit) -> Fit:
 
 
 def _covariance(fitted: Fit, order: list[int]) -> Array:
-    """Of the markers (6 m, 6 m) in an order whose first is the origin, number 0."""
+    """Covariance of markers (6 m, 6 m) in an order whose first is the origin, number 0."""
     columns = _columns(fitted, np.array(order[1:]), BODY).ravel()
     covariance = np.zeros((BODY * len(order),) * 2)
     covariance[BODY:, BODY:] = fitted.border_covariance[np.ix_(columns, columns)]

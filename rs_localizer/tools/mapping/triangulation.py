@@ -95,7 +95,7 @@ def moves(
     camera: Camera, sights: Sights, triangulated: Triangulated,
     others: Sequence[tuple[Camera, Sights]],
 ) -> Array:  # fmt: skip
-    """By how much points would lie elsewhere (p,3,k) if the same keypoints were seen otherwise.
+    """Displacements of points (p,3,k) if the same keypoints were seen otherwise.
 
     To first order, with the weights that they have.
 

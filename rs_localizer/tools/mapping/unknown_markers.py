@@ -253,7 +253,7 @@ def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Trans
 def _between(
     views: list[_View], markers: Sequence[Marker]
 ) -> tuple[dict[tuple[int, int], Transform], dict[tuple[int, int], float]]:
-    """Of each pair a < b, a_from_b, and by how many images it is said."""
+    """Transforms a_from_b of each pair a < b, and by how many images they are said."""
     images: dict[tuple[int, int], list[tuple[_Sight, _Sight]]] = {}
     apart: dict[tuple[int, int], list[tuple[_Sight, _Sight]]] = {}  # in images of two cameras
     for view in views:
@@ -280,7 +280,7 @@ def _between(
 
 
 def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Transform, float]:
-    """What most images say, each of several things that fit more or less; and by how many."""
+    """The transform that most images say, of several that fit more or less; and by how many."""
     image = np.array([k for k, _, _ in said])
     turns = np.array([of.rotation for _, of, _ in said])
     places = np.array([of.translation for _, of, _ in said])

@@ -46,7 +46,7 @@ _EARLY = 0.9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What an image shows."""
+    """Features and markers of an image."""
 
     stamp_ns: int
     image: Path  # its picture, by colmap.image_name
@@ -76,7 +76,7 @@ class Looker:
         self._detector = None if marker_map is None else MarkerDetector(marker_map)
 
     def look(self, image: Image) -> View:
-        """What is needed of an image."""
+        """The view of an image."""
         path = self._images / image_name(self._count)
         self._count += 1
         quality = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
@@ -100,7 +100,7 @@ def blurred(views: Sequence[View]) -> BoolArray:
 
 @dataclass(slots=True)
 class Looked:
-    """What was seen."""
+    """Views of a recording."""
 
     views: list[View] = field(default_factory=list)
     camera: Camera | None = None  # without its readout time; None: nobody has calibrated it

@@ -265,7 +265,7 @@ def _rays(camera: Camera, sideways: bool) -> NDArray[np.float32]:
 
 
 FORMAT = "jpeg"
-"""As sensor_msgs/CompressedImage says it."""
+"""Format of sensor_msgs/CompressedImage."""
 _QUALITY = 95  # its artefacts stay below the noise of a corner
 T = TypeVar("T")
 R = TypeVar("R")

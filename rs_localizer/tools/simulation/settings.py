@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What simulations can be asked for. Imports nothing that takes time: commands show it as help."""
+"""Settings of simulations. Imports nothing that takes time: commands show it as help."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ BODY_FROM_CAMERA = {
 
 @dataclass(frozen=True, slots=True)
 class FrameSettings:
-    """What is seen in each frame, and how badly."""
+    """Points of each frame, and how badly they are seen."""
 
     points: int = 150  # at most; fewer where the map shows fewer
     noise: float = 1.0  # standard deviation of u and of v, raw pixels
@@ -27,7 +27,7 @@ class FrameSettings:
 
 @dataclass(frozen=True, slots=True)
 class ImageSettings:
-    """What the sensor does to the picture."""
+    """Faults of the sensor."""
 
     exposure: float = 0.0  # s that each row is exposed, around its row time; 0: an instant
     noise: float = 0.0  # standard deviation of a grey level (of 255)

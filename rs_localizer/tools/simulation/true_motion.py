@@ -38,7 +38,7 @@ class TrueState:
 
 
 class TrueMotion(Protocol):
-    """What the simulation needs to know of a motion."""
+    """Interface of a motion that is simulated."""
 
     @property
     def intervals_ns(self) -> list[tuple[int, int]]:

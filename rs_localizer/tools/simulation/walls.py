@@ -140,7 +140,7 @@ _PICTURE_TEXEL = 0.003
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What a rendered camera looks at."""
+    """Things that a rendered camera looks at."""
 
     planes: tuple[TexturedPlane, ...]
     marker_map: MarkerMap | None = None  # None: a scene without markers
