@@ -29,9 +29,9 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.integrity import Integrity
 from rs_localizer.localizer import Localizer
-from rs_localizer.tools.simulation.frames import simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 from rs_localizer.tracking import Tracker
 

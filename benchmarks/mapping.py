@@ -20,10 +20,10 @@ from benchmarks.independent.rotations import Array, exponential
 from rs_localizer.cli.options import integer
 from rs_localizer.core.camera import Camera
 from rs_localizer.markers.families import family
-from rs_localizer.tools.adjust.problem import LIMIT
+from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.mapping.gauge import through
-from rs_localizer.tools.mapping.observations import MapObservations, Start
-from rs_localizer.tools.mapping.refine import MapFreedom, refine
+from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations, Start
+from rs_localizer.tools.mapping.refinement import refine
 from rs_localizer.tools.mapping.survey import Survey, survey
 from rs_localizer.tools.mapping.unknown_markers import Spotted, every_marker
 

@@ -25,12 +25,12 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.tools.mapping.anchors import Anchors
 from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map
-from rs_localizer.tools.mapping.colmap import Effort, Stage
 from rs_localizer.tools.mapping.gauge import through
-from rs_localizer.tools.mapping.views import Looker, View
-from rs_localizer.tools.simulation.frames import frame_stamps, middle_stamp
+from rs_localizer.tools.mapping.seen_images import Looker, SeenImage
+from rs_localizer.tools.mapping.structure import Effort, Stage
 from rs_localizer.tools.simulation.renderer import Renderer, in_order
-from rs_localizer.tools.simulation.settings import ImageSettings
+from rs_localizer.tools.simulation.simulated_frames import frame_stamps, middle_stamp
+from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.tools.simulation.walls import marked_room
 
@@ -74,14 +74,14 @@ class Room:
 
         return in_order(render, self.stamps(piece))
 
-    def look(self, piece: Piece, images: Path) -> list[View]:
+    def look(self, piece: Piece, images: Path) -> list[SeenImage]:
         """The views of a piece; their images go to a folder."""
         looker = Looker(self._most, images, self.marker_map)
         return [looker.look(image) for image in self.images(piece)]
 
     def build(
         self,
-        views: Sequence[View],
+        views: Sequence[SeenImage],
         folder: Path,
         stage: Stage | None = None,
         effort: Effort | None = None,

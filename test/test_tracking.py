@@ -10,9 +10,9 @@ from rs_localizer import data
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.pose_at_time import twist_at
-from rs_localizer.tools.simulation.frames import simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.tracking import FrameContext, Tracker
 

@@ -16,11 +16,11 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.tools import verdict
-from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
-from rs_localizer.tools.simulation.frames import frame_stamps, simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import frame_stamps, simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion
 
 _RATE = 30.0  # Hz
@@ -137,7 +137,7 @@ def _trial(motion: RecordedMotion, seconds: float, k: int, seed: int) -> Trial:
     settings = FrameSettings(points=_POINTS, noise=_NOISE, outliers=outliers, rate=_RATE)
     points = _map(motion, scene, rng)
     frames = simulate_frames(camera, motion, points, settings, stamps_ns=stamps, seed=k)
-    images = [Observed(frame.stamp_ns, frame.points, frame.pixels) for frame in frames]
+    images = [ImagePoints(frame.stamp_ns, frame.points, frame.pixels) for frame in frames]
     found = calibrate(replace(camera, readout_time=0.0), images)
     return Trial(scene, direction, outliers, truth, found)
 

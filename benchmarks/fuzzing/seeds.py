@@ -28,9 +28,9 @@ from rs_localizer.io.imu import make_reading
 from rs_localizer.io.maps.files import write_npz
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.recording import make_camera_info
-from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 _ROS = b"""

@@ -16,9 +16,9 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_correspondences
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.ros.node.conversion import copy_message
-from rs_localizer.tools.simulation.frames import simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 
 _K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])

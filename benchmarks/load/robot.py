@@ -45,9 +45,9 @@ from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_corre
 from rs_localizer.io.transforms import Transform, make_transform, read_transform
 from rs_localizer.ros.graph.live import LiveNode
 from rs_localizer.ros.node.conversion import make_message
-from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import BODY_FROM_CAMERA, FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA, FrameSettings
 from rs_localizer.tools.simulation.true_motion import TrueState, sampled_states
 
 _STAND_IN = Path(__file__).parents[2] / "test" / "ros" / "stand_in"

@@ -19,7 +19,7 @@ from rs_localizer.io.video import Video
 from rs_localizer.markers.boards import find_chessboard
 from rs_localizer.markers.prints import Chessboard
 from rs_localizer.tools import verdict
-from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.camera_calibration import calibrate
 from rs_localizer.tools.first_lens import first_lens
 
@@ -36,7 +36,7 @@ class Clip:
     """The images of one video that show the board."""
 
     name: str
-    images: list[Observed]
+    images: list[ImagePoints]
     size: tuple[int, int]
     interval: float  # s, median
 
@@ -76,7 +76,7 @@ def clip_of(path: Path, board: Chessboard, cache: Path, most: int) -> Clip:
     points = (board.points - board.points[0]) @ np.diag([1.0, -1.0, -1.0])
     times = stored["times"][:most]
     images = [
-        Observed(round(1e9 * time), points, pixels)
+        ImagePoints(round(1e9 * time), points, pixels)
         for time, pixels in zip(times, stored["pixels"], strict=False)
     ]
     width, height = stored["size"].tolist()
@@ -99,7 +99,7 @@ def _detect(path: Path, board: Chessboard, file: Path) -> None:
     np.savez(file, times=seconds[shown], pixels=corners, size=size)
 
 
-def opencv_lens(clip: Clip, images: list[Observed] | None = None) -> Camera:
+def opencv_lens(clip: Clip, images: list[ImagePoints] | None = None) -> Camera:
     """The lens that ``cv2.calibrateCamera`` finds on some of the images."""
     chosen = clip.images if images is None else images
     picks = np.unique(np.linspace(0, len(chosen) - 1, _CALIBRATION_IMAGES).astype(int))
@@ -142,7 +142,7 @@ def shutter_of(clip: Clip, cache: Path) -> Shutter:
     )
 
 
-def _calibrated(clip: Clip, images: list[Observed]) -> dict[str, object]:
+def _calibrated(clip: Clip, images: list[ImagePoints]) -> dict[str, object]:
     unknown = {"readout_time": 0.0, "direction": "", "K": None, "D": None}
     try:
         found = calibrate(first_lens(clip.size, images), images, intrinsics=True)

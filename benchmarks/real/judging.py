@@ -23,7 +23,7 @@ from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.state import ANGULAR, POSE, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
-from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tracking import FrameContext, Memory, Tracker
 
 Pose = Estimate | GlobalPose
@@ -66,7 +66,9 @@ def judged(clip: Clip, lens: Camera, shutter: Shutter, config: NodeConfig) -> di
     return row
 
 
-def localized(name: str, camera: Camera, images: Sequence[Observed], config: NodeConfig) -> Poses:
+def localized(
+    name: str, camera: Camera, images: Sequence[ImagePoints], config: NodeConfig
+) -> Poses:
     """Each image, by one of the methods.
 
     default: as a node without any parameter; single: with the readout time, each image alone;
@@ -144,7 +146,7 @@ def _twists(clip: Clip, poses: Poses, peer: Poses, readout_time: float) -> dict[
     }
 
 
-def _halves(camera: Camera, images: Sequence[Observed], config: NodeConfig) -> dict[str, float]:
+def _halves(camera: Camera, images: Sequence[ImagePoints], config: NodeConfig) -> dict[str, float]:
     """Poses of one half of the corners against those of the other, and what each says of the
     other's corners: rolling over global shutter, the direction of the scan, and the reversed one.
 
@@ -170,17 +172,17 @@ def _halves(camera: Camera, images: Sequence[Observed], config: NodeConfig) -> d
     return row
 
 
-def _sides(image: Observed, number: int) -> tuple[IntArray, IntArray]:
+def _sides(image: ImagePoints, number: int) -> tuple[IntArray, IntArray]:
     """Left and right, or upper and lower half of the board in turn."""
     order = np.argsort(image.points[:, number % 2], kind="stable")
     return order[: len(order) // 2], order[len(order) // 2 :]
 
 
 def _parts(
-    images: Sequence[Observed], split: Callable[[Observed, int], tuple[IntArray, IntArray]]
-) -> list[list[Observed]]:
+    images: Sequence[ImagePoints], split: Callable[[ImagePoints, int], tuple[IntArray, IntArray]]
+) -> list[list[ImagePoints]]:
     """The images with one part of their corners, and with the other."""
-    parts: list[list[Observed]] = [[], []]
+    parts: list[list[ImagePoints]] = [[], []]
     for number, image in enumerate(images):
         for part, chosen in zip(parts, split(image, number), strict=True):
             part.append(replace(image, points=image.points[chosen], pixels=image.pixels[chosen]))
@@ -232,7 +234,7 @@ def _at_known_motion(estimate: Estimate) -> tuple[Array, Array]:
     return covariance[POSE, POSE] - gain @ covariance[VELOCITIES, POSE], gain
 
 
-def _errors(camera: Camera, poses: Poses, held_out: Sequence[Observed]) -> Array:
+def _errors(camera: Camera, poses: Poses, held_out: Sequence[ImagePoints]) -> Array:
     """Mean squared errors (f,) of corners that no pose has seen, px^2; NaN without a pose."""
     errors = np.full(len(poses), np.nan)
     for k, (pose, image) in enumerate(zip(poses, held_out, strict=True)):

@@ -37,10 +37,10 @@ from rs_localizer.io.rigs import make_mounts, read_camchain
 from rs_localizer.io.topics import TF_STATIC
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.settings import write_parameters
-from rs_localizer.tools.simulation.frames import SimulatedFrame
-from rs_localizer.tools.simulation.recording import write_simulated, write_truth
 from rs_localizer.tools.simulation.renderer import RenderedFrame
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame
+from rs_localizer.tools.simulation.simulated_recording import write_simulated, write_truth
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import TrueMotion
 from rs_localizer.tools.simulation.walls import Scene
 

@@ -22,7 +22,7 @@ from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.imu import make_reading
 from rs_localizer.io.recording import CAMERA_FRAME
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.tools.simulation.settings import BODY_FROM_CAMERA
+from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA
 from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])  # m/s^2, in a map with z up

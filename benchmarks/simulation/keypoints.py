@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.io.maps.landmarks import Descriptors, Map
-from rs_localizer.tools.simulation.frames import SimulatedFrame
+from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame
 
 # Share of the bits that differ between two views of a landmark; ORB's median is about this.
 BIT_ERRORS = 0.1

@@ -24,9 +24,9 @@ from rs_localizer.io.recording import (
     make_image,
 )
 from rs_localizer.io.rigs import RIG_FRAME, RigParts, node_parameters, optical_frame
-from rs_localizer.tools.simulation.frames import SimulatedFrame, frame_stamps
-from rs_localizer.tools.simulation.recording import write_truth
 from rs_localizer.tools.simulation.renderer import FORMAT, RenderedFrame
+from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, frame_stamps
+from rs_localizer.tools.simulation.simulated_recording import write_truth
 from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
 # How far the rates of cameras' oscillators are off, as a part of themselves: common quartz.

@@ -50,11 +50,11 @@ if WORKING:
     from rs_localizer.pipeline.marker_detector import FrameDetector
     from rs_localizer.settings import write_camera_file
     from rs_localizer.tools import verdict
-    from rs_localizer.tools.adjust.lens import LensErrors
-    from rs_localizer.tools.adjust.observe import Observed, in_order
+    from rs_localizer.tools.adjust.intrinsics import LensErrors
+    from rs_localizer.tools.adjust.observe import ImagePoints, in_order
     from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
     from rs_localizer.tools.first_lens import covered, first_lens
-    from rs_localizer.tools.rig import Mounted, Recording, calibrate_rig
+    from rs_localizer.tools.rig_mounts import Mounted, Recording, calibrate_rig
 
 # Beside FILE.yaml, as FILE_...
 _MAP, _TRANSFORMS = "map.yaml", "transforms.launch.xml"
@@ -93,7 +93,7 @@ class Options(TargetOptions, ImageOptions):
 class _Input:
     """Images with correspondences, and their camera."""
 
-    images: list[Observed]
+    images: list[ImagePoints]
     camera: Camera
     new_lens: bool = False  # it is a first guess of this command
     imu: ImuRecording | None = None
@@ -238,7 +238,7 @@ def _correspondences(args: Options, bag: BagReader, config: NodeConfig) -> _Inpu
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     recorded = read_recording(bag, topics, config.matching, landmarks)
     camera = given_lens(args) or recorded.calibration.camera(0.0, config.scan_direction)
-    images = [Observed(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in recorded.clouds]
+    images = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in recorded.clouds]
     return _Input(images, camera)
 
 
@@ -247,7 +247,7 @@ def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
     detector.warm_up()
     sizes = BoardSizes(marker_map)
-    images: list[Observed] = []
+    images: list[ImagePoints] = []
     camera: Camera | None = None
     size = (0, 0)
     seen = seen_by(shots, NodeConfig().scan_direction)
@@ -255,7 +255,7 @@ def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
         camera, size = camera or own, image.pixels.shape[::-1]
         found = detector.detect(image).detections
         sizes.look(image.pixels, len(found.points) > 0)
-        images.append(Observed(image.stamp_ns, found.points, found.pixels))
+        images.append(ImagePoints(image.stamp_ns, found.points, found.pixels))
     shown = sum(len(image.points) > 0 for image in images)
     print(f"{shown} of {len(images)} images show the map")
     if fault := sizes.fault():

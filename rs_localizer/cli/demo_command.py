@@ -18,7 +18,7 @@ import numpy as np
 from rs_localizer.cli import WORKING, Compiling, import_ros, stage
 from rs_localizer.cli.options import option
 from rs_localizer.config import NodeConfig
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 
 if WORKING:
     from scipy.spatial.transform import Rotation
@@ -43,8 +43,12 @@ if WORKING:
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.settings import build, load_params_file
     from rs_localizer.tools import cube_clip, errors
-    from rs_localizer.tools.simulation.frames import frame_stamps, middle_stamp, simulate_frames
     from rs_localizer.tools.simulation.scene import room
+    from rs_localizer.tools.simulation.simulated_frames import (
+        frame_stamps,
+        middle_stamp,
+        simulate_frames,
+    )
     from rs_localizer.tools.simulation.true_motion import RecordedMotion, TrueMotion
 
 # The part of the hand's motion that is flown (s): it begins slowly and ends in quick turns.

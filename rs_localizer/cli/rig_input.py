@@ -26,8 +26,8 @@ if WORKING:
     from rs_localizer.io.video import count_lenses
     from rs_localizer.offline.image_sources import LENSES
     from rs_localizer.offline.recordings import camera_topics, optical_frame, transform_between
-    from rs_localizer.tools.adjust.variables import Extrinsics, Mounting
-    from rs_localizer.tools.rig import DETERMINED
+    from rs_localizer.tools.adjust.variables import Extrinsics, MountPrior
+    from rs_localizer.tools.rig_mounts import DETERMINED
     from rs_localizer.tools.verdict import numbers
 
 
@@ -121,7 +121,7 @@ class MapCamera(Generic[T]):
     name: str  # empty: it is alone
     args: T  # with its recording and topics
     config: NodeConfig  # with its shutter and clock
-    mounting: Mounting | None  # None: the axes are its own
+    mounting: MountPrior | None  # None: the axes are its own
 
 
 def map_cameras(args: T, recordings: Sequence[Path], config: NodeConfig) -> list[MapCamera[T]]:
@@ -160,7 +160,7 @@ def map_cameras(args: T, recordings: Sequence[Path], config: NodeConfig) -> list
         pose, mounting = given[name] @ first, None
         if cameras:
             extrinsics = Extrinsics(pose.rotation, -pose.rotation.T @ pose.translation, 0.0)
-            mounting = Mounting(extrinsics, np.repeat(DETERMINED, [3, 3, 1]))
+            mounting = MountPrior(extrinsics, np.repeat(DETERMINED, [3, 3, 1]))
         shutter = {each.name: getattr(shutters[name], each.name) for each in fields(CameraSettings)}
         cameras.append(MapCamera(name, own.args, replace(config, **shutter), mounting))
     return cameras

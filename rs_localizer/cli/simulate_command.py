@@ -18,7 +18,7 @@ from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.camera_files import pinhole_matrix, read_calibration
 from rs_localizer.io.recording import MARKER_MAP, PARAMETERS
 from rs_localizer.settings import build, camera_values, settings, write_parameters
-from rs_localizer.tools.simulation.settings import FrameSettings, ImageSettings
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings, ImageSettings
 from rs_localizer.tools.simulation.walls import SCENES, Scene
 
 if WORKING:
@@ -31,10 +31,14 @@ if WORKING:
     from rs_localizer.io.bags import BagWriter
     from rs_localizer.io.trajectories import read_tum
     from rs_localizer.markers.map_files import write_marker_map
-    from rs_localizer.tools.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
-    from rs_localizer.tools.simulation.recording import write_simulated
     from rs_localizer.tools.simulation.renderer import RenderedFrame, Renderer, rendered_frames
     from rs_localizer.tools.simulation.scene import room
+    from rs_localizer.tools.simulation.simulated_frames import (
+        SimulatedFrame,
+        frame_stamps,
+        simulate_frames,
+    )
+    from rs_localizer.tools.simulation.simulated_recording import write_simulated
     from rs_localizer.tools.simulation.true_motion import (
         ConstantVelocity,
         RecordedMotion,

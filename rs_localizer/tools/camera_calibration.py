@@ -18,20 +18,20 @@ from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools.adjust.bodies import is_flat
 from rs_localizer.tools.adjust.fit import Fit, cheaper, cost_at, fit, image_speeds
-from rs_localizer.tools.adjust.lens import LensErrors, lens_difference, lens_errors
-from rs_localizer.tools.adjust.observe import Observed, Posed, collect, in_order, localize_each
+from rs_localizer.tools.adjust.intrinsics import LensErrors, lens_difference, lens_errors
+from rs_localizer.tools.adjust.observe import ImagePoints, Posed, collect, in_order, localize_each
 from rs_localizer.tools.adjust.spline import LONGEST_SPACING, Spline, first_spline, refined
 from rs_localizer.tools.adjust.system import Undetermined
 from rs_localizer.tools.adjust.variables import (
     DELAY,
     MOUNT,
     Freedom,
-    Observations,
-    State,
+    SplineKeypoints,
+    Unknowns,
     start_state,
 )
 from rs_localizer.tools.first_lens import as_fisheye
-from rs_localizer.tools.imu import MountFound, NoMount, gyro_samples, mount_of, with_gyro
+from rs_localizer.tools.imu_mount import MountFound, NoMount, gyro_samples, mount_of, with_gyro
 from rs_localizer.tools.readout_belief import (
     Block,
     Evidence,
@@ -57,7 +57,7 @@ _BLOCK_SECONDS, _LEAST_BLOCKS, _MOST_BLOCKS = 3.0, 3, 8
 
 
 def blocks_of(
-    camera: Camera, observations: Observations, whole: Fit, count: int | None = None
+    camera: Camera, observations: SplineKeypoints, whole: Fit, count: int | None = None
 ) -> tuple[Block, ...]:
     """Equal parts of the recording, each with a lens and a shape of the map of its own.
 
@@ -94,7 +94,7 @@ def _delay(own: Fit) -> tuple[float, float]:
     return own.state.mount.delay, math.sqrt(float(own.border_covariance[at, at]))
 
 
-def cut(state: State, start: float, end: float) -> State | None:
+def cut(state: Unknowns, start: float, end: float) -> Unknowns | None:
     """The state with the motion between two times only."""
     layout = state.spline.layout
     intervals = np.column_stack([layout.starts, layout.ends])
@@ -166,7 +166,7 @@ class CameraCalibration(Evidence):
 
 def calibrate(
     camera: Camera,
-    images: list[Observed],
+    images: list[ImagePoints],
     *,
     intrinsics: bool = False,
     imu: ImuRecording | None = None,
@@ -219,7 +219,7 @@ def calibrate(
 
 
 def _fitted(
-    camera: Camera, images: list[Observed], interval: float, intrinsics: bool,
+    camera: Camera, images: list[ImagePoints], interval: float, intrinsics: bool,
     done: Callable[[], object],
 ) -> tuple[Posed, Fit]:  # fmt: skip
     """Images with their own poses, and one motion through them with all that is free."""
@@ -238,7 +238,7 @@ def _fitted(
         raise ValueError(str(error)) from error
 
 
-def _thinned(images: list[Observed]) -> list[Observed]:
+def _thinned(images: list[ImagePoints]) -> list[ImagePoints]:
     """Images with no more keypoints in all than are worth their time, others in each image."""
     every = sum(len(image.points) for image in images) / _MOST_SIGHTS
     if every <= 1.0:
@@ -251,7 +251,7 @@ def _thinned(images: list[Observed]) -> list[Observed]:
     ]
 
 
-def _freedom(observations: Observations, intrinsics: bool) -> Freedom:
+def _freedom(observations: SplineKeypoints, intrinsics: bool) -> Freedom:
     landmarks, sights = observations.landmarks, len(observations.points)
     often = len(landmarks) <= min(_MOST_BOARD_POINTS, sights / _LEAST_SIGHTS)
     size = float(np.linalg.norm(np.ptp(landmarks, axis=0)))
@@ -285,7 +285,7 @@ def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fi
 
 
 def _unsteady(
-    camera: Camera, observations: Observations, fitted: Fit, interval: float, freedom: Freedom
+    camera: Camera, observations: SplineKeypoints, fitted: Fit, interval: float, freedom: Freedom
 ) -> Fit:
     """With a time of its own for each image, from tight to loose to what they turn out to be."""
     own, other = _calm(fitted.state, freedom), fitted
@@ -296,7 +296,7 @@ def _unsteady(
     return fit(camera, observations, other.state, own, other.deviation)
 
 
-def _jitter(camera: Camera, observations: Observations, state: State) -> float:
+def _jitter(camera: Camera, observations: SplineKeypoints, state: Unknowns) -> float:
     """Distances of the images' own times from their stamps, s rms.
 
     By how one image differs from the mean of its neighbours: times that drift are nearly a motion
@@ -311,7 +311,7 @@ def _jitter(camera: Camera, observations: Observations, state: State) -> float:
     return float(np.sqrt(weights @ beside**2 / (6.0 * np.sum(weights))))
 
 
-def _calm(state: State, freedom: Freedom) -> Freedom:
+def _calm(state: Unknowns, freedom: Freedom) -> Freedom:
     """With a prior of the accelerations that the motion itself shows."""
     layout = state.spline.layout
     states = state.spline.states(layout.control_times())
@@ -326,7 +326,7 @@ def _calm(state: State, freedom: Freedom) -> Freedom:
     )
 
 
-def within(observations: Observations, spline: Spline) -> Observations:
+def within(observations: SplineKeypoints, spline: Spline) -> SplineKeypoints:
     """Those keypoints that the motion covers."""
     return observations.subset(spline.layout.inside(observations.times))
 
@@ -334,7 +334,7 @@ def within(observations: Observations, spline: Spline) -> Observations:
 def _judged(
     camera: Camera,
     posed: Posed,
-    observations: Observations,
+    observations: SplineKeypoints,
     stamps: Stamps,
     fitted: Fit,
     images: int,

@@ -19,9 +19,9 @@ from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.io.video import Image
 from rs_localizer.markers.detection import Detections, MarkerDetector
 from rs_localizer.markers.prints import Marker
-from rs_localizer.tools.simulation.frames import frame_stamps, middle_stamp, true_poses_at
 from rs_localizer.tools.simulation.renderer import Renderer, in_order
-from rs_localizer.tools.simulation.settings import ImageSettings
+from rs_localizer.tools.simulation.simulated_frames import frame_stamps, middle_stamp, true_poses_at
+from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.tools.simulation.walls import three_walls
 

@@ -15,10 +15,10 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.tools.adjust.fit import fit
-from rs_localizer.tools.adjust.lens import lens_prior, lens_values, project
-from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.adjust.intrinsics import lens_prior, lens_values, project
+from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.adjust.spline import spline_through
-from rs_localizer.tools.adjust.variables import Freedom, Observations, start_state
+from rs_localizer.tools.adjust.variables import Freedom, SplineKeypoints, start_state
 
 _MOST_IMAGES, _LEAST_IMAGES = 30, 4
 # Of the points that the fullest image shows.
@@ -77,7 +77,7 @@ _ALONE = Freedom(
 _FLAT = 1e-6  # thickness of a plane by its size
 
 
-def first_lens(size: tuple[int, int], images: list[Observed]) -> Camera:
+def first_lens(size: tuple[int, int], images: list[ImagePoints]) -> Camera:
     """A lens of the simplest model that predicts images it has not seen as well as any.
 
     Args:
@@ -103,7 +103,7 @@ def first_lens(size: tuple[int, int], images: list[Observed]) -> Camera:
         chosen = [chosen[k] for k in alike]
 
 
-def _of_simplest_model(size: tuple[int, int], images: list[Observed]) -> Camera:
+def _of_simplest_model(size: tuple[int, int], images: list[ImagePoints]) -> Camera:
     best, least = None, np.inf
     for candidate in _CANDIDATES:
         lens = _calibrated(size, images, candidate)
@@ -117,7 +117,7 @@ def _of_simplest_model(size: tuple[int, int], images: list[Observed]) -> Camera:
     return best
 
 
-def _unseen_error(lens: Camera, images: list[Observed], candidate: _Candidate) -> float:
+def _unseen_error(lens: Camera, images: list[ImagePoints], candidate: _Candidate) -> float:
     """Error (px rms) of each half of the images under a lens of the other half."""
     halves = images[::2], images[1::2]
     squared, count = 0.0, 0
@@ -131,7 +131,7 @@ def _unseen_error(lens: Camera, images: list[Observed], candidate: _Candidate) -
     return float(np.sqrt(squared / count))
 
 
-def reprojection_error(camera: Camera, image: Observed) -> float:
+def reprojection_error(camera: Camera, image: ImagePoints) -> float:
     """Error (px rms of u and v together) of the best global-shutter pose; infinite without one."""
     pose = _pose(camera, image)
     if pose is None:
@@ -141,7 +141,7 @@ def reprojection_error(camera: Camera, image: Observed) -> float:
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
-def _pose(camera: Camera, image: Observed) -> tuple[Array, Array] | None:
+def _pose(camera: Camera, image: ImagePoints) -> tuple[Array, Array] | None:
     """Rotation (3,3) and translation (3,) of the best pose; None as for an infinite error."""
     rays = camera.rays(image.pixels)
     if not np.isfinite(rays).all():
@@ -179,7 +179,7 @@ def _refined(
     return rotation, centre
 
 
-def _fisheye(size: tuple[int, int], images: list[Observed], K: Array) -> tuple[float, Camera]:
+def _fisheye(size: tuple[int, int], images: list[ImagePoints], K: Array) -> tuple[float, Camera]:
     """Squared errors (px^2), and the equidistant lens near ``K`` (3,3) that leaves them.
 
     OpenCV's own asks for boards that are flat, one to an image.
@@ -192,7 +192,7 @@ def _fisheye(size: tuple[int, int], images: list[Observed], K: Array) -> tuple[f
     if len(found) < max(_LEAST_IMAGES, len(images) // 2):
         raise ValueError("no poses by this focal length")
     counts, times = [len(image.points) for image, _ in found], np.arange(len(found), dtype=float)
-    seen = Observations(
+    seen = SplineKeypoints(
         times=np.repeat(times, counts), row_times=np.zeros(sum(counts)),
         pixels=np.concatenate([image.pixels for image, _ in found]),
         landmarks=np.concatenate([image.points for image, _ in found]),
@@ -237,7 +237,7 @@ def _by_lens(camera: Camera, rays: Array) -> Array:
 
 def _calibrated(
     size: tuple[int, int],
-    images: list[Observed],
+    images: list[ImagePoints],
     candidate: _Candidate,
     start: Array | None = None,
 ) -> Camera | None:
@@ -282,7 +282,7 @@ def _folds(lens: Camera) -> bool:
     return not np.isfinite(lens.rays(rim)).all()
 
 
-def _cancels(lens: Camera, images: list[Observed]) -> bool:
+def _cancels(lens: Camera, images: list[ImagePoints]) -> bool:
     """True where numbers beyond any lens's make up for each other, which nothing holds there.
 
     Under the prior of lenses they cost more than all that the points can tell.
@@ -293,7 +293,7 @@ def _cancels(lens: Camera, images: list[Observed]) -> bool:
     return bool(off @ prior.information[4:, 4:] @ off > equations)
 
 
-def _slow(images: list[Observed]) -> list[Observed]:
+def _slow(images: list[ImagePoints]) -> list[ImagePoints]:
     """Images that show much of the map and in which it hardly moves, from all of the recording."""
     fullest = max((len(image.points) for image in images), default=0)
     least = max(_LEAST_SHARE * fullest, _LEAST_POINTS)
@@ -307,7 +307,7 @@ def _slow(images: list[Observed]) -> list[Observed]:
     return [full[min(part, key=lambda k: slower[k])] for part in parts]
 
 
-def _speed(before: Observed, after: Observed) -> float:
+def _speed(before: ImagePoints, after: ImagePoints) -> float:
     """px per s, of what both images show."""
     common = (before.points[:, None] == after.points[None]).all(axis=2)
     first, second = np.nonzero(common)

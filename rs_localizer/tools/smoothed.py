@@ -18,7 +18,7 @@ from rs_localizer.offline.replay import inlier_columns
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.pose_at_time import pose_at, published_moment, twist_at
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.adjust.spline import LEAST_FRAMES, stretches
 from rs_localizer.tools.smoothing import RigFrame, Smoothed, smooth, smooth_rig
 
@@ -208,7 +208,7 @@ def _motion(
     assert calibration is not None
     camera = calibration.camera(config.readout_time, config.scan_direction)
     images = [
-        Observed(frame.input_stamp_ns, inlier_columns(frame, "xyz"), inlier_columns(frame, "uv"))
+        ImagePoints(frame.input_stamp_ns, inlier_columns(frame, "xyz"), inlier_columns(frame, "uv"))
         for frame in frames
     ]
     motion = smooth(camera, images, [frame.estimate for frame in frames], config.stamp_offset)
@@ -220,7 +220,7 @@ def _rig_frame(frame: Localized) -> RigFrame:
     counts = np.cumsum([share.inliers for share in frame.cameras])[:-1]
     points, pixels = (np.split(inlier_columns(frame, names), counts) for names in ("xyz", "uv"))
     images = {
-        share.name: Observed(share.start_ns, *own)
+        share.name: ImagePoints(share.start_ns, *own)
         for share, *own in zip(frame.cameras, points, pixels, strict=True)
     }
     # Times of a rig's estimate count from its first image.

@@ -28,15 +28,17 @@ from rs_localizer.inertial.gyroscope_noise import SCALE_DEVIATION
 from rs_localizer.inertial.turning import MOST_ROUGH
 from rs_localizer.tools.adjust.fit import Fit, cheaper, solve
 from rs_localizer.tools.adjust.motion import acceleration_rows
-from rs_localizer.tools.adjust.observe import Observed, collect
-from rs_localizer.tools.adjust.problem import LIMIT, Problem, View
+from rs_localizer.tools.adjust.observe import ImagePoints, collect
+from rs_localizer.tools.adjust.problem import Problem
+from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.adjust.spline import LONGEST_SPACING, Spline, States, first_spline, refined
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.variables import (
+    CameraView,
     Extrinsics,
     Freedom,
-    Observations,
-    State,
+    SplineKeypoints,
+    Unknowns,
     rig_state,
 )
 
@@ -45,14 +47,14 @@ from rs_localizer.tools.adjust.variables import (
 _NUMBERS, _USUAL = 6.0, np.array([2.0, 1.0])
 
 
-class Told(NamedTuple):
+class PriorEvidence(NamedTuple):
     """Evidence of an estimate on its prior, of angular and of linear accelerations."""
 
     squares: Array  # (2,) sums, (rad/s^2)^2 and (m/s^2)^2
     numbers: Array  # (2,) how many of them the keypoints tell
 
 
-def told(fitted: Fit) -> Told:
+def told(fitted: Fit) -> PriorEvidence:
     """Evidence of an estimate on the accelerations that were expected of it."""
     spline = fitted.state.spline
     prior = fitted.freedom.accelerations(spline.layout.spacing)
@@ -62,7 +64,7 @@ def told(fitted: Fit) -> Told:
     each = np.array([rows.errors**2, variances]).reshape(2, len(rows.errors), 2, 3)
     squares, unknown = each.sum(axis=(1, 3))
     usual = np.array([prior.angular, prior.linear]) ** 2
-    return Told(usual * squares, 3 * len(rows.first) - unknown)
+    return PriorEvidence(usual * squares, 3 * len(rows.first) - unknown)
 
 
 # Between images the motion is told as long as its deviations stay within so many of the usual ones.
@@ -83,7 +85,7 @@ _SHAKEN, _SHAKEN_SIGMAS, _MOST_SHAKEN = 1.5, 5.0, 0.2
 # deg at 60 Hz all do, by 1.3 to 5.4 times.
 _IN_FRAME, _NEXT = 1.0, 9
 _ROWS = np.linspace(-0.5, 0.5, 17)
-Parts = list[tuple[Camera, Observations]]
+Parts = list[tuple[Camera, SplineKeypoints]]
 """The keypoints of each camera."""
 # The expected accelerations are settled when they change by less than this part.
 _ALIKE, _ROUNDS = 0.05, 6
@@ -299,7 +301,7 @@ def _deviations(covariances: Array) -> Array:
 
 
 def smooth(
-    camera: Camera, images: list[Observed], estimates: list[Estimate], stamp_offset: float = 0.0
+    camera: Camera, images: list[ImagePoints], estimates: list[Estimate], stamp_offset: float = 0.0
 ) -> Smoothed:
     """The motion through images with a pose, in the order of their stamps.
 
@@ -353,7 +355,7 @@ class RigFrame:
     """A frame of a rig with a pose: what its cameras saw, by their names."""
 
     time_ns: int  # of the pose
-    images: Mapping[str, Observed]  # their inliers; stamps are exposures of first rows
+    images: Mapping[str, ImagePoints]  # their inliers; stamps are exposures of first rows
     estimate: Estimate
 
 
@@ -401,12 +403,12 @@ def _knots(times: Array) -> tuple[float, float]:
     return min(_NARROW_SPACING if fading else LONGEST_SPACING, interval), fading
 
 
-def _all_inliers(estimate: Estimate, image: Observed) -> Estimate:
+def _all_inliers(estimate: Estimate, image: ImagePoints) -> Estimate:
     return replace(estimate, inliers=np.ones(len(image.points), dtype=np.bool_))
 
 
-def _problem(parts: Parts, state: State, freedom: Freedom) -> Problem:
-    return Problem([View(*part, freedom) for part in parts], state)
+def _problem(parts: Parts, state: Unknowns, freedom: Freedom) -> Problem:
+    return Problem([CameraView(*part, freedom) for part in parts], state)
 
 
 def _through(
@@ -419,7 +421,7 @@ def _through(
     return best, _shaken(best, parts, focal_length, estimates)
 
 
-def _best(parts: Parts, start: State, fading: float) -> Fit:
+def _best(parts: Parts, start: Unknowns, fading: float) -> Fit:
     """With the accelerations that the motion shows, and finer knots if they are worth it."""
     freedom = Freedom(readout_time=False, fading=fading)
     fitted = _lively(parts, solve(_problem(parts, start, freedom), start))
@@ -432,7 +434,7 @@ def _best(parts: Parts, start: State, fading: float) -> Fit:
 
 
 def _turned_pixels(
-    camera: Camera, observations: Observations, fast: FastTurn, readout_time: float
+    camera: Camera, observations: SplineKeypoints, fast: FastTurn, readout_time: float
 ) -> Array:
     """Pixels (n,2) as they would be without the fast turn; NaN where no image point is."""
     rays = np.column_stack([camera.rays(observations.pixels), np.ones(len(observations.pixels))])

@@ -19,8 +19,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.telemetry import CAMERA_FROM_SENSOR
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03

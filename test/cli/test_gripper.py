@@ -20,7 +20,7 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.offline.frame_table import read_parquet
 from rs_localizer.tools.mapping.gauge import through
-from rs_localizer.tools.simulation.settings import ImageSettings
+from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 
 pytest.importorskip("pycolmap")
 pytest.importorskip("pyarrow", reason="needs pyarrow", exc_type=ImportError)

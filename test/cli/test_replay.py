@@ -20,9 +20,9 @@ from rs_localizer.io.outputs import TYPES, Localized
 from rs_localizer.io.trajectories import read_motions, read_tum, read_twists
 from rs_localizer.offline.results import Tally, figures
 from rs_localizer.pipeline.readout_estimate import MeasuredReadout
-from rs_localizer.tools.simulation.recording import write_simulated
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_recording import write_simulated
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 
 FRAMES = 6
 # Nanoseconds since 1970 that a float of seconds cannot hold.

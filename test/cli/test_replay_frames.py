@@ -14,9 +14,9 @@ from rs_localizer.cli.commands import main
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.trajectories import read_tum, read_twists
-from rs_localizer.tools.simulation.recording import write_simulated
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_recording import write_simulated
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 
 FRAMES = 5
 EYE = "camera_optical_frame"

@@ -17,9 +17,9 @@ from benchmarks.independent.rigs import Mounted, Scene, views
 from rs_localizer import data
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.tools.simulation.frames import frame_stamps, simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import frame_stamps, simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion
 
 # The reference shows signatures, no examples.

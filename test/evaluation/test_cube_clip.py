@@ -15,7 +15,7 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.tools import cube_clip
-from rs_localizer.tools.simulation.frames import middle_stamp
+from rs_localizer.tools.simulation.simulated_frames import middle_stamp
 
 CAMERA = Camera(
     640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]),

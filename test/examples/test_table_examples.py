@@ -18,8 +18,8 @@ from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.tools.simulation.frames import middle_stamp
 from rs_localizer.tools.simulation.renderer import Renderer
+from rs_localizer.tools.simulation.simulated_frames import middle_stamp
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 from rs_localizer.tools.simulation.walls import TexturedPlane, collage
 

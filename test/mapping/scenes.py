@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
-from rs_localizer.tools.mapping.observations import MapObservations, Start
+from rs_localizer.tools.mapping.map_keypoints import MapObservations, Start
 from rs_localizer.tools.mapping.unknown_markers import Spotted
 
 READOUT = 0.03

@@ -18,8 +18,8 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.tools.mapping.build import Built
 from rs_localizer.tools.mapping.gauge import through
-from rs_localizer.tools.mapping.views import View
-from rs_localizer.tools.simulation.settings import ImageSettings
+from rs_localizer.tools.mapping.seen_images import SeenImage
+from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 
 pytest.importorskip("pycolmap")
 
@@ -37,7 +37,7 @@ def room() -> Room:
 
 
 @pytest.fixture(scope="module")
-def views(room, tmp_path_factory) -> list[View]:
+def views(room, tmp_path_factory) -> list[SeenImage]:
     return room.look(WALK, tmp_path_factory.mktemp("images"))
 
 
@@ -92,7 +92,7 @@ def test_what_landmarks_share_is_told(room, built):
     assert np.mean(told) < 10.0
 
 
-def truth(room: Room, views: list[View], built: Built) -> tuple[Array, Array, Rotation]:
+def truth(room: Room, views: list[SeenImage], built: Built) -> tuple[Array, Array, Rotation]:
     """Where the camera was in the map and in the room (g,3), at the middle rows, and how the map
     is turned into the room on average.
     """

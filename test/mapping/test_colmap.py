@@ -13,9 +13,10 @@ import pytest
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import colmap_camera, colmap_parameters
-from rs_localizer.tools.mapping import MappingError, colmap
-from rs_localizer.tools.mapping.colmap import Effort, build_structure, image_name, pairs_of
+from rs_localizer.tools.mapping import MappingError
+from rs_localizer.tools.mapping import structure as structures
 from rs_localizer.tools.mapping.shutter_fit import global_errors
+from rs_localizer.tools.mapping.structure import Effort, build_structure, image_name, pairs_of
 from rs_localizer.tools.simulation.walls import collage
 
 K = np.array([[260.0, 0.0, 161.0], [0.0, 255.0, 118.0], [0.0, 0.0, 1.0]])
@@ -52,7 +53,7 @@ def test_the_lens_is_the_same_for_colmap(model, D):
     np.testing.assert_allclose(back.project(points), camera.project(points), atol=1e-9)
 
 
-def build(images: Path, folder: Path, count: int) -> colmap.Structure:
+def build(images: Path, folder: Path, count: int) -> structures.Structure:
     folder.mkdir()
     rows = np.arange(count)
     silent = lambda *_: nullcontext(lambda count: None)  # noqa: E731
@@ -65,7 +66,7 @@ def test_a_process_that_dies_is_named(tmp_path, monkeypatch):
         "import os, sys\nsys.stderr.write('free(): invalid pointer\\n')\n"
         "sys.stderr.flush()\nos.abort()\n"
     )
-    monkeypatch.setattr(colmap, "_SCRIPT", dying)
+    monkeypatch.setattr(structures, "_SCRIPT", dying)
     with pytest.raises(MappingError, match=r"ended with signal SIGABRT: free\(\): invalid pointer"):
         build(tmp_path, tmp_path / "out", 3)
 
@@ -75,7 +76,7 @@ def test_pycolmap_stays_out_of_this_process():
     pytest.importorskip("pycolmap")
     code = (
         "import sys, cv2, rs_localizer.tools.mapping.build\n"
-        "import rs_localizer.tools.mapping.colmap as c\n"
+        "import rs_localizer.tools.mapping.structure as c\n"
         "c.require()\nassert 'pycolmap' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

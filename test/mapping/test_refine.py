@@ -18,11 +18,10 @@ from scipy.linalg import eigh
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.system import Factored
-from rs_localizer.tools.adjust.variables import Freedom, State
+from rs_localizer.tools.adjust.variables import Freedom, Unknowns
 from rs_localizer.tools.mapping.gauge import through
-from rs_localizer.tools.mapping.observations import MapObservations, RigCamera
-from rs_localizer.tools.mapping.refine import (
-    MapFreedom,
+from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations, RigCamera
+from rs_localizer.tools.mapping.refinement import (
     RefinedMap,
     Refinement,
     refine,
@@ -37,7 +36,7 @@ def errors(found: RefinedMap, truth: Walk) -> np.ndarray:
     return np.linalg.norm(through(ours, true)(ours) - true, axis=1)
 
 
-def small_problem() -> tuple[Problem, State]:
+def small_problem() -> tuple[Problem, Unknowns]:
     rng = np.random.default_rng(0)
     scene = walk(rng, np.array([0.0, 0.03, 0.06, 1.0, 2.0]), points=120, count=25)
     whole = Refinement([RigCamera(camera())], scene.seen, scene.start, MapFreedom())

@@ -9,8 +9,8 @@ import pytest
 from scenes import READOUT, camera, walk
 
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.tools.mapping.observations import MapFreedom
-from rs_localizer.tools.mapping.refine import RefinedMap
+from rs_localizer.tools.mapping.map_keypoints import MapFreedom
+from rs_localizer.tools.mapping.refinement import RefinedMap
 from rs_localizer.tools.mapping.shutter_fit import fit_shutter
 from rs_localizer.tools.readout_belief import ShutterFit
 

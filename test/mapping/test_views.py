@@ -11,9 +11,9 @@ import pytest
 from rs_localizer.features.extraction import Features
 from rs_localizer.io.images import Image
 from rs_localizer.tools.mapping import MappingError
-from rs_localizer.tools.mapping.views import (
+from rs_localizer.tools.mapping.seen_images import (
     Looker,
-    View,
+    SeenImage,
     blurred,
     check_views,
     choose_keyframes,
@@ -24,16 +24,16 @@ from rs_localizer.tools.simulation.walls import collage
 PICTURE = collage(900, 700, np.random.default_rng(0))
 
 
-def views_of(sharpnesses: list[float], rate: float = 15.0) -> list[View]:
+def views_of(sharpnesses: list[float], rate: float = 15.0) -> list[SeenImage]:
     nothing = Features(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.uint8))
     none = np.zeros(0, np.int64)
     return [
-        View(round(k * 1e9 / rate), Path(), nothing, value, np.zeros((0, 2)), none)
+        SeenImage(round(k * 1e9 / rate), Path(), nothing, value, np.zeros((0, 2)), none)
         for k, value in enumerate(sharpnesses)
     ]
 
 
-def chosen(views: list[View]) -> list[int]:
+def chosen(views: list[SeenImage]) -> list[int]:
     rows: list[int] = choose_keyframes(views).tolist()
     return rows
 

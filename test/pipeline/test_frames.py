@@ -23,9 +23,9 @@ from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters, read
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.settings import build, camera_values, write_camera_file
-from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 from .clouds import cloud_of

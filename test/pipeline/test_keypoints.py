@@ -19,9 +19,9 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.tools.simulation.frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03

@@ -9,9 +9,9 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.tools.simulation.frames import simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 from .clouds import cloud_of

@@ -25,9 +25,9 @@ from rs_localizer.offline.replay import find_topics, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.tools.simulation.frames import simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import simulate_frames
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import (
     ConstantVelocity,
     RecordedMotion,

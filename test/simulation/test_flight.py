@@ -7,7 +7,7 @@ import numpy as np
 from rs_localizer.cli.commands import main
 from rs_localizer.io.trajectories import read_motions
 from rs_localizer.tools.errors import errors_of
-from rs_localizer.tools.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC
+from rs_localizer.tools.simulation.simulated_recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC
 
 # Two walls and the floor come by while the hand shakes the camera, at 60 deg/s and more.
 FLIGHT = "--images --trajectory tum_vi_room5 --start 21 --duration 0.8 --exposure 0.002".split()

@@ -9,9 +9,13 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import Trajectory
-from rs_localizer.tools.simulation.frames import SimulatedFrame, frame_stamps, simulate_frames
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import (
+    SimulatedFrame,
+    frame_stamps,
+    simulate_frames,
+)
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])

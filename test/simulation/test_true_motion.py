@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import Trajectory
-from rs_localizer.tools.simulation.settings import BODY_FROM_CAMERA
+from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
 
 START_NS = 1_520_531_467_575_280_000

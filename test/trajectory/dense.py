@@ -9,7 +9,7 @@ import numpy as np
 
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.system import Groups, Quadratic, Rows
-from rs_localizer.tools.adjust.variables import State
+from rs_localizer.tools.adjust.variables import Unknowns
 
 
 def unknowns(groups: Groups) -> int:
@@ -44,7 +44,7 @@ def normal_of(groups: Groups, terms: Sequence[Rows | Quadratic]) -> tuple[np.nda
 
 
 def are_derivatives(
-    rows_of: Callable[[State], Rows], problem: Problem, state: State, step: float = 1e-6
+    rows_of: Callable[[Unknowns], Rows], problem: Problem, state: Unknowns, step: float = 1e-6
 ) -> None:
     """Assert that the values of rows are the derivatives of their errors by each unknown."""
     count = unknowns(problem.groups)
@@ -59,7 +59,7 @@ def are_derivatives(
         )
 
 
-def fitting(problem: Problem, state: State) -> Problem:
+def fitting(problem: Problem, state: Unknowns) -> Problem:
     """Of pixels without errors: whitening, and so its derivative, counts for nothing."""
     views = [
         replace(view, observations=replace(

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.camera import Camera
 from rs_localizer.tools import first_lens as first_lens_module
 from rs_localizer.tools import verdict
-from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
 from rs_localizer.tools.first_lens import first_lens
 
@@ -24,13 +24,13 @@ CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D
 def recording(
     readout: float = 0.02, points: str = "board", turn: float = 0.1, seconds: float = 2.5,
     outliers: float = 0.0, noise: float = 0.1, seed: int = 21,
-) -> tuple[Observed, ...]:  # fmt: skip
+) -> tuple[ImagePoints, ...]:  # fmt: skip
     rng = np.random.default_rng(seed)
     motion = projector.Motion.random(rng, turn, 0.8 * turn)
     landmarks = projector.board() if points == "board" else projector.room(rng)
     frames = projector.record(rng, motion, landmarks, readout=readout, seconds=seconds,
                               noise=noise, outliers=outliers)  # fmt: skip
-    return tuple(Observed(round(1e9 * (10.0 + f.stamp)), f.points, f.pixels) for f in frames)
+    return tuple(ImagePoints(round(1e9 * (10.0 + f.stamp)), f.points, f.pixels) for f in frames)
 
 
 def agrees(found: CameraCalibration, readout: float, least: float) -> None:
@@ -124,7 +124,7 @@ def test_the_distortion_model_is_that_of_the_lens(model, deep):
         there = Rotation.from_rotvec([-aside[1], aside[0], 0.0]).apply([0.0, 0.0, 0.45])
         pixels = camera.project(turn.apply(flat) + there) + rng.normal(0.0, 0.1, (len(flat), 2))
         if np.all(camera.inside(pixels)):
-            images.append(Observed(10**9 + 10**8 * len(images), flat, pixels))
+            images.append(ImagePoints(10**9 + 10**8 * len(images), flat, pixels))
     found = first_lens(camera.size, images)
     assert found.distortion_model == model
     corner = np.array([[0.8, 0.6]]) if model == "equidistant" else np.array([[0.5, 0.4]])
@@ -165,7 +165,7 @@ def test_images_by_whose_first_pose_points_are_behind_the_camera_are_left_out(mo
     for k in range(8):
         turn = Rotation.from_rotvec(rng.normal(0.0, 0.4, 3))
         pixels = lens.project(turn.apply(board - board.mean(axis=0)) + np.array([0.0, 0.0, 0.5]))
-        images.append(Observed(10**9 + 10**8 * k, board - board.mean(axis=0), pixels))
+        images.append(ImagePoints(10**9 + 10**8 * k, board - board.mean(axis=0), pixels))
     pose = first_lens_module._pose
     monkeypatch.setattr(
         first_lens_module,

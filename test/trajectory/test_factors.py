@@ -14,22 +14,23 @@ from rs_localizer.core import so3
 from rs_localizer.tools.adjust.gyro import Gyroscope
 from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
 from rs_localizer.tools.adjust.priors import Floating, block_rows
-from rs_localizer.tools.adjust.problem import Problem, View
+from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.spline import Layout, Spline
 from rs_localizer.tools.adjust.system import Factored, Quadratic, System
 from rs_localizer.tools.adjust.variables import (
     Accelerations,
+    CameraView,
     Extrinsics,
     Freedom,
     GyroMount,
     GyroSamples,
-    Mounting,
-    Observations,
-    State,
+    MountPrior,
+    SplineKeypoints,
+    Unknowns,
     start_state,
 )
 
-MOUNTED = Mounting(
+MOUNTED = MountPrior(
     Extrinsics(so3.exp(np.array([0.1, 0.2, -0.1])), np.array([0.05, -0.02, 0.1]), 2e-3),
     np.full(7, 0.1),
 )
@@ -45,7 +46,7 @@ FREEDOMS = {
 def small(
     of: str = "board", direction: str = "top_to_bottom", distortion: str = "plumb_bob",
     controls: float = 0.4,
-) -> tuple[Problem, State]:  # fmt: skip
+) -> tuple[Problem, Unknowns]:  # fmt: skip
     """Keypoints of one camera with errors of zero."""
     rng, camera = np.random.default_rng(0), make_camera(scan_direction=direction)
     if distortion == "equidistant":
@@ -56,7 +57,7 @@ def small(
     spline = Spline(layout, *motion.pose(layout.control_times()))
     count = 60
     pixels, frames = rng.uniform(0.0, 400.0, (count, 2)), np.sort(rng.integers(0, 5, count))
-    seen = Observations(
+    seen = SplineKeypoints(
         times=0.05 + 0.07 * frames, row_times=camera.row_time(pixels), pixels=pixels,
         landmarks=landmarks, points=rng.integers(0, 8, count), frames=frames,
         trusted=np.ones(count, bool),
@@ -65,7 +66,7 @@ def small(
     state = start_state(camera, seen, spline, READOUT)
     extrinsics = MOUNTED.given if FREEDOMS[of].mounting else state.extrinsics
     state = replace(state, delays=rng.normal(0.0, 1e-3, 5), extrinsics=extrinsics)
-    return fitting(Problem([View(camera, seen, FREEDOMS[of])], state), state), state
+    return fitting(Problem([CameraView(camera, seen, FREEDOMS[of])], state), state), state
 
 
 @pytest.mark.parametrize("of", list(FREEDOMS))
@@ -117,7 +118,7 @@ def test_what_is_known_beforehand(of, count):
     step[: problem.groups.motion] = 0.0
     off = problem.moved(state, np.r_[step, np.zeros(problem.groups.blocks)])
 
-    def priors(one: State) -> list[Quadratic]:
+    def priors(one: Unknowns) -> list[Quadratic]:
         return [term for term in problem.terms(one, 100.0) if isinstance(term, Quadratic)]
 
     known = priors(off)

@@ -12,7 +12,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.tools.adjust.fit import fit
 from rs_localizer.tools.adjust.spline import Spline, first_spline
-from rs_localizer.tools.adjust.variables import Freedom, Observations, start_state
+from rs_localizer.tools.adjust.variables import Freedom, SplineKeypoints, start_state
 
 READOUT = 0.03
 
@@ -22,12 +22,12 @@ def make_camera(**changes: object) -> Camera:
                   **changes)  # fmt: skip
 
 
-def observe(camera: Camera, frames: list[projector.Frame]) -> Observations:
+def observe(camera: Camera, frames: list[projector.Frame]) -> SplineKeypoints:
     counts = [len(frame.points) for frame in frames]
     points = np.concatenate([frame.points for frame in frames])
     landmarks, rows = np.unique(points, axis=0, return_inverse=True)
     pixels = np.concatenate([frame.pixels for frame in frames])
-    return Observations(
+    return SplineKeypoints(
         times=np.repeat([frame.stamp for frame in frames], counts),
         row_times=camera.row_time(pixels),
         pixels=pixels,

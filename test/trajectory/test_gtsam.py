@@ -9,10 +9,10 @@ from dense import fitting
 from test_fit import make_camera
 
 from rs_localizer.core import so3
-from rs_localizer.tools.adjust.problem import Problem, View
+from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.spline import Layout, Spline
 from rs_localizer.tools.adjust.system import Factored
-from rs_localizer.tools.adjust.variables import Freedom, Observations, start_state
+from rs_localizer.tools.adjust.variables import CameraView, Freedom, SplineKeypoints, start_state
 
 gtsam = pytest.importorskip("gtsam")
 gtsam_unstable = pytest.importorskip("gtsam_unstable")
@@ -20,10 +20,10 @@ NOISE, HELD = 0.5, 0.05  # px, m
 POSE, POINT = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
 
 
-def observed(camera, times, points, frames) -> Observations:
+def observed(camera, times, points, frames) -> SplineKeypoints:
     """Pixels are set later."""
     pixels = np.random.default_rng(1).uniform(0.0, 400.0, (len(frames), 2))
-    return Observations(
+    return SplineKeypoints(
         times=times[frames], row_times=camera.row_time(pixels), pixels=pixels,
         landmarks=points, points=np.tile(np.arange(len(points)), len(times)), frames=frames,
         trusted=np.ones(len(frames), bool),
@@ -39,7 +39,7 @@ def test_deviations_of_landmarks_are_those_of_its_bundle_adjustment():
     seen = observed(camera, times, points, np.repeat(np.arange(5), 12))
     free = Freedom(readout_time=False, angular_velocity=2.0, linear_velocity=1.0)
     state = start_state(camera, seen, spline)
-    problem = Problem([View(camera, seen, free)], state, deviations=np.full(12, HELD))
+    problem = Problem([CameraView(camera, seen, free)], state, deviations=np.full(12, HELD))
     problem = fitting(problem, state)
     found, _ = Factored(problem.system(state, NOISE)).block_covariances()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -73,7 +73,7 @@ def test_errors_are_those_of_its_rolling_shutter_factor():
     spline = Spline(layout, turns, np.tile(place, (len(turns), 1)))
     seen = observed(camera, np.zeros(1), points, np.zeros(30, int))
     state = start_state(camera, seen, spline, readout)
-    errors = Problem([View(camera, seen, Freedom())], state).sights(state)[0].errors
+    errors = Problem([CameraView(camera, seen, Freedom())], state).sights(state)[0].errors
     K, noise = camera.K, gtsam.noiseModel.Unit.Create(2)
     lens = gtsam.Cal3_S2(K[0, 0], K[1, 1], 0.0, K[0, 2], K[1, 2])
     values = gtsam.Values()

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.imu import ImuRecording
-from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.camera_calibration import calibrate
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
@@ -32,7 +32,7 @@ def test_offset_rotation_and_bias_are_found():
     motion = projector.Motion.random(rng)
     frames = projector.record(rng, motion, projector.room(rng), readout=readout, seconds=seconds,
                               count=60)  # fmt: skip
-    images = [Observed(round(1e9 * (10.0 + f.stamp)), f.points, f.pixels) for f in frames]
+    images = [ImagePoints(round(1e9 * (10.0 + f.stamp)), f.points, f.pixels) for f in frames]
     shape = 0.01 * np.array([[1.0, 0.3, 0.0], [0.3, -1.0, 0.2], [0.0, 0.2, 0.5]])
     times, rates = gyroscope(rng, motion, seconds, shape)
     rates[100] = 50.0  # a message that went wrong

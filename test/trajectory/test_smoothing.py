@@ -12,14 +12,14 @@ from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
 from rs_localizer.localizer import Localizer
-from rs_localizer.tools.adjust.observe import Observed
+from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.smoothing import Smoothed, smooth
 from rs_localizer.tracking import Tracker
 
 READOUT = 0.03
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D,
                 readout_time=READOUT)  # fmt: skip
-Frames = list[tuple[float, Observed, Estimate]]
+Frames = list[tuple[float, ImagePoints, Estimate]]
 
 
 def track(frames: list[projector.Frame]) -> Frames:
@@ -30,7 +30,7 @@ def track(frames: list[projector.Frame]) -> Frames:
         result = tracker.localize(stamp_ns + round(0.5e9 * READOUT), frame.points, frame.pixels)
         if isinstance(result, Estimate):
             keep = result.inliers
-            seen = Observed(stamp_ns, frame.points[keep], frame.pixels[keep])
+            seen = ImagePoints(stamp_ns, frame.points[keep], frame.pixels[keep])
             found.append((frame.stamp + 0.5 * READOUT, seen, result))
     return found
 
@@ -98,7 +98,7 @@ def test_frames_that_shake_faster_than_the_motion_are_said_to():
     scene = projector.room(rng, 1500)
     for motion, share in ((calm, 0.0), (shaking, 1.0)):
         recorded = projector.record(rng, motion, scene, readout=READOUT, seconds=1.2)
-        images = [Observed(round(1e9 * f.stamp), f.points, f.pixels) for f in recorded]
+        images = [ImagePoints(round(1e9 * f.stamp), f.points, f.pixels) for f in recorded]
         poses = zip(*motion.pose([f.stamp + 0.5 * READOUT for f in recorded]), strict=True)
         one = Localizer(CAMERA).localize(recorded[0].points, recorded[0].pixels)
         # As with the gyroscope's turn: the poses are right, and the noise is all that is left.

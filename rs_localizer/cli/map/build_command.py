@@ -36,9 +36,9 @@ if WORKING:
     from rs_localizer.settings import build, write_camera_file
     from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
     from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map
-    from rs_localizer.tools.mapping.colmap import Effort, require
     from rs_localizer.tools.mapping.report import advice, rows, written
-    from rs_localizer.tools.mapping.views import Looked, Looker, look
+    from rs_localizer.tools.mapping.seen_images import Looked, Looker, look
+    from rs_localizer.tools.mapping.structure import Effort, require
 
 
 def shutter_of(args: Options) -> tuple[float | None, str | None]:

@@ -36,8 +36,13 @@ if WORKING:
     from rs_localizer.offline.replay import find_topics
     from rs_localizer.settings import build
     from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, undo_shutter
-    from rs_localizer.tools.mapping.observations import RecordedMap, RigCamera, from_recordings
-    from rs_localizer.tools.mapping.refine import MapFreedom, RefinedMap, refine_rig
+    from rs_localizer.tools.mapping.map_keypoints import (
+        MapFreedom,
+        RecordedMap,
+        RigCamera,
+        from_recordings,
+    )
+from rs_localizer.tools.mapping.refinement import RefinedMap, refine_rig
 
 _HOLD = 0.001  # m, of landmarks of known place: as a tape or a total station measures them
 _step = partial(print, "adjusted:", flush=True)

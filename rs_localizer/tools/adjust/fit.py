@@ -14,11 +14,12 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.tools.adjust.lens import with_lens
-from rs_localizer.tools.adjust.problem import LIMIT, Problem, View, minimise, settle
+from rs_localizer.tools.adjust.intrinsics import with_lens
+from rs_localizer.tools.adjust.problem import Problem, minimise, settle
+from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import Factored
-from rs_localizer.tools.adjust.variables import Freedom, Observations, State
+from rs_localizer.tools.adjust.variables import CameraView, Freedom, SplineKeypoints, Unknowns
 
 _FEW_STEPS = 6
 # Richer models must lower the cost by this much per new parameter (Akaike).
@@ -29,7 +30,7 @@ _COST_PER_PARAMETER = 2.0
 class Fit:
     """An estimate with what is known of its errors."""
 
-    state: State
+    state: Unknowns
     camera: Camera
     deviation: float  # px, standard deviation of the noise of u and of v
     cost: float  # sum of the weighted squared errors in noise variances
@@ -56,8 +57,8 @@ class Fit:
 
 def fit(
     camera: Camera,
-    observations: Observations,
-    start: State,
+    observations: SplineKeypoints,
+    start: Unknowns,
     freedom: Freedom,
     deviation: float | None = None,
 ) -> Fit:
@@ -74,10 +75,10 @@ def fit(
     Raises:
         Undetermined: when the keypoints do not determine what is free.
     """
-    return solve(Problem([View(camera, observations, freedom)], start), start, deviation)
+    return solve(Problem([CameraView(camera, observations, freedom)], start), start, deviation)
 
 
-def solve(problem: Problem, start: State, deviation: float | None = None) -> Fit:
+def solve(problem: Problem, start: Unknowns, deviation: float | None = None) -> Fit:
     """:func:`fit` of one camera or of a rig, whose noise is that of its first camera's keypoints.
 
     Raises:
@@ -91,14 +92,16 @@ def solve(problem: Problem, start: State, deviation: float | None = None) -> Fit
     return _finish(problem, state, deviation)
 
 
-def cost_at(camera: Camera, observations: Observations, fitted: Fit, readout_time: float) -> float:
+def cost_at(
+    camera: Camera, observations: SplineKeypoints, fitted: Fit, readout_time: float
+) -> float:
     """The least cost with this readout time (s), to be compared with ``fitted.cost``.
 
     Less exact where it is far from the least of all.
     """
     held = replace(fitted.freedom, readout_time=False)
     start = replace(fitted.state, readout_time=readout_time)
-    problem = Problem([View(camera, observations, held)], start)
+    problem = Problem([CameraView(camera, observations, held)], start)
     least = minimise(problem, start, fitted.deviation, _FEW_STEPS)
     return problem.system(least, fitted.deviation).cost
 
@@ -110,16 +113,16 @@ def cheaper(richer: Fit, plainer: Fit, parameters: float) -> bool:
     return (costs[0] - costs[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
 
 
-def image_speeds(camera: Camera, observations: Observations, state: State) -> Array:
+def image_speeds(camera: Camera, observations: SplineKeypoints, state: Unknowns) -> Array:
     """How fast the keypoints (n,) move in their images, px/s."""
-    problem = Problem([View(camera, observations, Freedom())], state)
+    problem = Problem([CameraView(camera, observations, Freedom())], state)
     sights = problem.sights(state)[0]
     local, velocity = sights.local, sights.velocity
     by_ray = (velocity[:, :2] - velocity[:, 2:] * local[:, :2] / local[:, 2:]) / local[:, 2:]
     return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", sights.by_ray, by_ray), axis=1))
 
 
-def _finish(problem: Problem, state: State, deviation: float) -> Fit:
+def _finish(problem: Problem, state: Unknowns, deviation: float) -> Fit:
     """The estimate with its covariances."""
     squared = problem.errors(state)
     system = problem.system(state, deviation)

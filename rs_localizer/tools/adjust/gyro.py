@@ -15,7 +15,7 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.tools.adjust.priors import known
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import Quadratic, Rows
-from rs_localizer.tools.adjust.variables import DELAY, MOUNT, GyroSamples, State
+from rs_localizer.tools.adjust.variables import DELAY, MOUNT, GyroSamples, Unknowns
 
 # What a first guess of turn (rad), bias (rad/s) and delay (s) may be off: as good as nothing, but
 # what the motion does not tell stays where it is. Scales and angles of consumer gyroscopes are good
@@ -36,13 +36,13 @@ class Gyroscope:
         start: with a first guess of the mount.
     """
 
-    def __init__(self, samples: GyroSamples, start: State) -> None:
+    def __init__(self, samples: GyroSamples, start: Unknowns) -> None:
         assert start.mount is not None
         delay = start.mount.delay
         self.samples = samples.subset(samples.covered(start.spline.layout, delay, _MARGIN))
         self.start = start.mount
 
-    def _look(self, state: State) -> tuple[IntArray, Array, Array]:
+    def _look(self, state: Unknowns) -> tuple[IntArray, Array, Array]:
         """First controls (k,), derivatives (k,3,24 + 13) by controls and mount, errors (k,3)."""
         mount = state.mount
         assert mount is not None
@@ -58,18 +58,18 @@ class Gyroscope:
         by_all = np.concatenate([mount.matrix @ jacobians[:, 6:9], by_mount], axis=2)
         return first, by_all, self._errors(state)
 
-    def _errors(self, state: State) -> Array:
+    def _errors(self, state: Unknowns) -> Array:
         mount = state.mount
         assert mount is not None
         rates = state.spline.states(self.samples.times + mount.delay).angular
         return np.asarray(rates @ mount.matrix.T + mount.bias - self.samples.rates)
 
-    def noise(self, state: State) -> float:
+    def noise(self, state: Unknowns) -> float:
         """Standard deviation of an axis (rad/s), by the errors' median."""
         squared = np.sum(np.square(self._errors(state)), axis=1)
         return float(np.sqrt(np.median(squared) / _MEDIAN))
 
-    def terms(self, state: State, column: int) -> list[Rows | Quadratic]:
+    def terms(self, state: Unknowns, column: int) -> list[Rows | Quadratic]:
         """Samples with Tukey's weights, and what is known of the mount, from a column on."""
         first, values, errors = self._look(state)
         deviation, squared = self.samples.deviation, np.sum(np.square(errors), axis=1)

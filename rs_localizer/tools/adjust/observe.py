@@ -14,7 +14,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
-from rs_localizer.tools.adjust.variables import Observations
+from rs_localizer.tools.adjust.variables import SplineKeypoints
 
 # What a wrong lens looks like in one image, and how much larger errors may be there.
 _OF_THE_LENS = (Reason.MODEL_ERROR, Reason.RESIDUAL)
@@ -22,7 +22,7 @@ _ROUGH = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observed:
+class ImagePoints:
     """Keypoints of one image, and the map's points that they show."""
 
     stamp_ns: int
@@ -34,21 +34,21 @@ class Observed:
 class Posed:
     """All keypoints of a recording, and a first pose of each image that has one."""
 
-    observations: Observations
+    observations: SplineKeypoints
     start_ns: int  # time 0 of all seconds
     times: Array  # (f,) s, of the images with a pose
     rotations: Array  # (f,3,3) map_from_camera
     positions: Array  # (f,3) m
 
 
-def in_order(images: Iterable[Observed]) -> list[Observed]:
+def in_order(images: Iterable[ImagePoints]) -> list[ImagePoints]:
     """Images by their stamps, one for each, and only those that show something."""
     once = {image.stamp_ns: image for image in images if len(image.points)}
     return [once[stamp] for stamp in sorted(once)]
 
 
 def localize_each(
-    camera: Camera, images: list[Observed], done: Callable[[], object] = lambda: None
+    camera: Camera, images: list[ImagePoints], done: Callable[[], object] = lambda: None
 ) -> list[Estimate | Failure]:
     """Each image on its own: the readout time need not be known.
 
@@ -68,7 +68,7 @@ def localize_each(
 
 
 def collect(
-    camera: Camera, images: list[Observed], results: list[Estimate | Failure], delay: float = 0.0
+    camera: Camera, images: list[ImagePoints], results: list[Estimate | Failure], delay: float = 0.0
 ) -> Posed:
     """Keypoints and poses of images in the order of their stamps.
 
@@ -90,7 +90,7 @@ def collect(
     posed = np.flatnonzero([bool(result) for result in results])
     estimates = [result for result in results if isinstance(result, Estimate)]
     return Posed(
-        Observations(
+        SplineKeypoints(
             times=np.repeat(times, counts),
             row_times=camera.row_time(pixels),
             pixels=pixels,

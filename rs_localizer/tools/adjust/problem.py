@@ -13,10 +13,10 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.tools.adjust.bodies import BODY, Pieces, paper_covariance
 from rs_localizer.tools.adjust.gyro import Gyroscope
-from rs_localizer.tools.adjust.keypoints import LIMIT, Curve, Keypoints, Sights
-from rs_localizer.tools.adjust.lens import lens_prior
+from rs_localizer.tools.adjust.intrinsics import lens_prior
 from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
 from rs_localizer.tools.adjust.priors import Floating, block_rows, known
+from rs_localizer.tools.adjust.reprojection import LIMIT, Curve, Projections, Reprojection
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import (
     Factored,
@@ -26,7 +26,7 @@ from rs_localizer.tools.adjust.system import (
     System,
     Undetermined,
 )
-from rs_localizer.tools.adjust.variables import EXTRINSICS, MOUNT, State, View
+from rs_localizer.tools.adjust.variables import EXTRINSICS, MOUNT, CameraView, Unknowns
 
 # Errors beyond so many standard deviations do not count for the scale of the noise.
 _SCALE_LIMIT = 4.0
@@ -56,7 +56,7 @@ class Problem:
     """
 
     def __init__(
-        self, views: Sequence[View], start: State, noises: Array | None = None,
+        self, views: Sequence[CameraView], start: Unknowns, noises: Array | None = None,
         one_map: bool = False, deviations: Array | None = None, floating: bool = False,
     ) -> None:  # fmt: skip
         self.views, self._one_map, self.deviations = list(views), one_map, deviations
@@ -67,12 +67,12 @@ class Problem:
         self.pieces = [_pieces(view, deviations is not None) for view in self.views]
         self._columns(start)
         pairs = list(zip(self.views, self.pieces, strict=True))
-        self.keypoints = [Keypoints(*pair) for pair in pairs]
+        self.keypoints = [Reprojection(*pair) for pair in pairs]
         self._shapes = [_shape_information(*pair) for pair in pairs]
         self.floating = Floating(start.spline) if floating else None
-        self._last: tuple[State, Curve, list[State]] | None = None
+        self._last: tuple[Unknowns, Curve, list[Unknowns]] | None = None
 
-    def _columns(self, start: State) -> None:
+    def _columns(self, start: Unknowns) -> None:
         """Number all unknowns: controls, each camera's border, landmarks of all, gyroscope."""
         controls = CONTROL * len(start.spline.positions)
         self.at: list[dict[str, int]] = []
@@ -120,11 +120,11 @@ class Problem:
         """First of a camera's numbers in the border."""
         return self.at[view][name] - self.groups.motion
 
-    def states(self, state: State) -> list[State]:
+    def states(self, state: Unknowns) -> list[Unknowns]:
         """Those of the cameras, of one spline."""
         return self._look(state)[1]
 
-    def _look(self, state: State) -> tuple[Curve, list[State]]:
+    def _look(self, state: Unknowns) -> tuple[Curve, list[Unknowns]]:
         if self._last is None or self._last[0] is not state:
             spline = state.spline
             curve = Curve(
@@ -134,22 +134,22 @@ class Problem:
             self._last = state, curve, [state, *others]
         return self._last[1:]
 
-    def sights(self, state: State) -> list[Sights]:
+    def sights(self, state: Unknowns) -> list[Projections]:
         """The keypoints of each camera, on the spline."""
         curve, states = self._look(state)
         return [of.look(curve, own) for of, own in zip(self.keypoints, states, strict=True)]
 
-    def keypoint_rows(self, state: State, deviation: float) -> list[Rows]:
+    def keypoint_rows(self, state: Unknowns, deviation: float) -> list[Rows]:
         """Rows of each camera, at a standard deviation of the noise (px)."""
         curve, states = self._look(state)
         parts = zip(self.keypoints, states, self.at, self.ratios.tolist(), strict=True)
         return [of.rows(curve, own, at, deviation * ratio) for of, own, at, ratio in parts]
 
-    def system(self, state: State, deviation: float) -> System:
+    def system(self, state: Unknowns, deviation: float) -> System:
         """Cost and normal equations at a standard deviation of the noise (px)."""
         return System(self.groups, self.terms(state, deviation))
 
-    def terms(self, state: State, deviation: float) -> list[Rows | Quadratic]:
+    def terms(self, state: Unknowns, deviation: float) -> list[Rows | Quadratic]:
         """All that is measured and known."""
         terms: list[Rows | Quadratic] = [*self.keypoint_rows(state, deviation)]
         terms += self._expected_motion(state)
@@ -164,14 +164,14 @@ class Problem:
             terms += self.gyro.terms(state, self.at[0]["gyro"])
         return terms
 
-    def _expected_motion(self, state: State) -> list[Rows]:
+    def _expected_motion(self, state: Unknowns) -> list[Rows]:
         freedom, spline = self.freedom, state.spline
         rows = [acceleration_rows(spline, freedom.accelerations(spline.layout.spacing))]
         if len(spline.layout.alone()) and freedom.angular_velocity < math.inf:
             rows.append(rest_rows(spline, freedom.angular_velocity, freedom.linear_velocity))
         return rows
 
-    def _known(self, k: int, own: State) -> list[Rows | Quadratic]:
+    def _known(self, k: int, own: Unknowns) -> list[Rows | Quadratic]:
         """Priors of a camera's unknowns."""
         terms: list[Rows | Quadratic] = []
         view, at, pieces = self.views[k], self.at[k], self.pieces[k]
@@ -202,7 +202,7 @@ class Problem:
             terms.append(block_rows(own.delays[:, None], deviations, at["delays"]))
         return terms
 
-    def moved(self, state: State, step: Array) -> State:
+    def moved(self, state: Unknowns, step: Array) -> Unknowns:
         """The state after a step of all unknowns."""
         spline = state.spline.moved(step[: self.groups.motion])
         states = enumerate(self.states(state))
@@ -212,7 +212,7 @@ class Problem:
             first = replace(first, mount=state.mount.moved(step[at : at + MOUNT]))
         return replace(first, spline=spline, others=tuple(others))
 
-    def _camera_moved(self, k: int, own: State, step: Array) -> State:
+    def _camera_moved(self, k: int, own: Unknowns, step: Array) -> Unknowns:
         at, pieces = self.at[k], self.pieces[k]
         changed: dict[str, object] = {}
         if "readout" in at:
@@ -228,22 +228,22 @@ class Problem:
             changed["delays"] = own.delays + step[at["delays"] :][: len(own.delays)]
         return replace(own, **changed)  # type: ignore[arg-type]
 
-    def errors(self, state: State) -> Array:
+    def errors(self, state: Unknowns) -> Array:
         """Squared whitened errors (n,), px^2 of the first camera."""
         curve, states = self._look(state)
         parts = zip(self.keypoints, states, self.ratios, strict=True)
         return np.concatenate([of.squared_errors(curve, own) / r**2 for of, own, r in parts])
 
-    def noise(self, state: State, deviation: float) -> float:
+    def noise(self, state: Unknowns, deviation: float) -> float:
         """Standard deviation of the noise (px), from errors that the last one lets count."""
         return max(noise_of(self.errors(state), deviation), self.freedom.least_noise)
 
-    def of(self, views: Sequence[View], start: State) -> Problem:
+    def of(self, views: Sequence[CameraView], start: Unknowns) -> Problem:
         """The same of other views of the cameras."""
         floating = self.floating is not None
         return Problem(views, start, self.noises, self._one_map, self.deviations, floating)
 
-    def trusted(self, start: State) -> Problem:
+    def trusted(self, start: Unknowns) -> Problem:
         """The same with the trusted keypoints only."""
         return self.of([view.subset(view.observations.trusted) for view in self.views], start)
 
@@ -254,7 +254,7 @@ class Problem:
         return sum(len(np.unique(of[own])) for of, own in zip(frames, parts, strict=True))
 
 
-def minimise(problem: Problem, state: State, deviation: float, steps: int = _STEPS) -> State:
+def minimise(problem: Problem, state: Unknowns, deviation: float, steps: int = _STEPS) -> Unknowns:
     """The state of least cost near to this one, by Levenberg and Marquardt, after so many steps."""
     system = problem.system(state, deviation)
     damping = _FIRST_DAMPING
@@ -280,7 +280,7 @@ def minimise(problem: Problem, state: State, deviation: float, steps: int = _STE
     return state
 
 
-def settle(problem: Problem, state: State, deviation: float) -> tuple[State, float]:
+def settle(problem: Problem, state: Unknowns, deviation: float) -> tuple[Unknowns, float]:
     """State and noise (px) when neither changes any more."""
     for _ in range(_ROUNDS):
         state = minimise(problem, state, deviation)
@@ -302,7 +302,7 @@ def noise_of(squared: Array, deviation: float) -> float:
     return float(np.sqrt(np.median(near) / MEDIAN))
 
 
-def _pieces(view: View, every: bool) -> Pieces:
+def _pieces(view: CameraView, every: bool) -> Pieces:
     """The free parts of the map: all of it, bodies, or the landmarks that are seen."""
     observations, freedom = view.observations, view.freedom
     if every:
@@ -316,12 +316,9 @@ def _pieces(view: View, every: bool) -> Pieces:
     return Pieces(slots, rigid=False)
 
 
-def _shape_information(view: View, pieces: Pieces) -> Array | None:
+def _shape_information(view: CameraView, pieces: Pieces) -> Array | None:
     """Information on the shape of a flat print; None: it is none."""
     if not (view.freedom.paper and pieces.count and not pieces.rigid):
         return None
     landmarks = view.observations.landmarks[pieces.slots >= 0]
     return np.asarray(np.linalg.inv(paper_covariance(landmarks, view.freedom.landmarks)))
-
-
-__all__ = ["LIMIT", "MEDIAN", "Problem", "Undetermined", "View", "minimise", "noise_of", "settle"]

@@ -14,7 +14,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.tools.adjust.lens import lens_values
+from rs_localizer.tools.adjust.intrinsics import lens_values
 from rs_localizer.tools.adjust.spline import Layout, Spline
 
 EXTRINSICS = 7
@@ -95,7 +95,7 @@ class GyroMount:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observations:
+class SplineKeypoints:
     """Keypoints of all frames."""
 
     times: Array  # (n,) s, when the middle row of their frame was exposed, readout time aside
@@ -109,7 +109,7 @@ class Observations:
     # (p,) number of the free rigid body that each landmark is part of, from 0 on; -1: known.
     bodies: IntArray | None = None
 
-    def subset(self, chosen: BoolArray) -> Observations:
+    def subset(self, chosen: BoolArray) -> SplineKeypoints:
         """The chosen keypoints (n,), with all landmarks."""
         names = ("times", "row_times", "pixels", "points", "frames", "trusted")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
@@ -141,7 +141,7 @@ class Extrinsics:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mounting:
+class MountPrior:
     """Prior of extrinsics."""
 
     given: Extrinsics
@@ -173,7 +173,7 @@ class Freedom:
     # own, a robust estimate rejects all but those it can run through, and ends at no noise at all.
     least_noise: float = 1e-4  # recordings without noise are simulated
     # Where the camera is on the rig that the motion is of, and its clock; None: that is known.
-    mounting: Mounting | None = None
+    mounting: MountPrior | None = None
 
     def accelerations(self, spacing: float) -> Accelerations:
         """Accelerations at controls that are so far apart (s)."""
@@ -184,20 +184,20 @@ class Freedom:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class CameraView:
     """Keypoints of one camera, and what of it is free."""
 
     camera: Camera
-    observations: Observations
+    observations: SplineKeypoints
     freedom: Freedom
 
-    def subset(self, chosen: BoolArray) -> View:
+    def subset(self, chosen: BoolArray) -> CameraView:
         """With the chosen keypoints (n,)."""
         return replace(self, observations=self.observations.subset(chosen))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class State:
+class Unknowns:
     """All that is estimated."""
 
     spline: Spline
@@ -209,23 +209,27 @@ class State:
     # Of the camera; the motion is that of what it is mounted to.
     extrinsics: Extrinsics = field(default_factory=Extrinsics.none)
     # Of the other cameras of a rig; they move along this spline, whatever theirs are.
-    others: tuple[State, ...] = ()
+    others: tuple[Unknowns, ...] = ()
 
-    def with_landmarks(self, landmarks: Array) -> State:
+    def with_landmarks(self, landmarks: Array) -> Unknowns:
         """With the same landmarks (p,3) for all cameras."""
         others = tuple(replace(one, landmarks=landmarks) for one in self.others)
         return replace(self, landmarks=landmarks, others=others)
 
 
 def start_state(
-    camera: Camera, observations: Observations, spline: Spline, readout_time: float = 0.0
-) -> State:
+    camera: Camera, observations: SplineKeypoints, spline: Spline, readout_time: float = 0.0
+) -> Unknowns:
     """A first guess with the camera's own lens and the map as it is given."""
     delays = np.zeros(int(observations.frames.max(initial=-1)) + 1)
-    return State(spline, readout_time, lens_values(camera), observations.landmarks.copy(), delays)
+    return Unknowns(
+        spline, readout_time, lens_values(camera), observations.landmarks.copy(), delays
+    )
 
 
-def rig_state(spline: Spline, cameras: Iterable[tuple[Camera, Observations, Extrinsics]]) -> State:
+def rig_state(
+    spline: Spline, cameras: Iterable[tuple[Camera, SplineKeypoints, Extrinsics]]
+) -> Unknowns:
     """A first guess of cameras on what moves, with their own readout times and clocks."""
     first, *others = (
         replace(start_state(camera, seen, spline, camera.readout_time), extrinsics=mounted)

@@ -18,9 +18,9 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.gauge import Similarity, through, upright
-from rs_localizer.tools.mapping.observations import MapObservations, Start
+from rs_localizer.tools.mapping.map_keypoints import MapObservations, Start
+from rs_localizer.tools.mapping.seen_images import SeenImage
 from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, triangulate
-from rs_localizer.tools.mapping.views import View
 
 # Corners of markers are where their map says to this part of their extent, or one of both is wrong.
 _MOST_MISFIT = 0.02
@@ -70,7 +70,7 @@ class Anchors:
     def count(self) -> int:
         return self.corners + len(self.names)
 
-    def seen(self, views: Sequence[View]) -> tuple[IntArray, IntArray, Array]:
+    def seen(self, views: Sequence[SeenImage]) -> tuple[IntArray, IntArray, Array]:
         """Views (n,), anchors (n,) and pixels (n,2) of all sights."""
         names = self.names
         every = [

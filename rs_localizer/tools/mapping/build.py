@@ -31,29 +31,29 @@ from rs_localizer.tools.mapping.anchors import (
     marker_constraints,
     placement,
 )
-from rs_localizer.tools.mapping.colmap import Effort, Stage, Structure, build_structure
 from rs_localizer.tools.mapping.gauge import Similarity, laid_on_held, scaled
-from rs_localizer.tools.mapping.observations import (
+from rs_localizer.tools.mapping.map_keypoints import (
     MapObservations,
     Start,
     adjusted_part,
 )
-from rs_localizer.tools.mapping.refine import DRIFT, RefinedMap
+from rs_localizer.tools.mapping.refinement import DRIFT, RefinedMap
+from rs_localizer.tools.mapping.seen_images import (
+    LEAST_VIEWS,
+    SeenImage,
+    blurred,
+    check_views,
+    choose_keyframes,
+)
 from rs_localizer.tools.mapping.shutter_fit import (
     LEAST_FIT,
     colmap_freedom,
     likely_axes,
     refine_with_shutter,
 )
+from rs_localizer.tools.mapping.structure import Effort, Stage, Structure, build_structure
 from rs_localizer.tools.mapping.track_on_map import track_on_map
 from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, moves, triangulate
-from rs_localizer.tools.mapping.views import (
-    LEAST_VIEWS,
-    View,
-    blurred,
-    check_views,
-    choose_keyframes,
-)
 from rs_localizer.tools.readout_belief import ReadoutCheck, ShutterFit
 
 # Settings of the localizer are in metres: so far (m) is the median landmark taken to be from where
@@ -72,7 +72,7 @@ _LEAST_SIGHTS, _MOST_DEVIATION = 3, 0.03
 class Given:
     """Inputs of a map."""
 
-    views: Sequence[View]  # in the order of their stamps
+    views: Sequence[SeenImage]  # in the order of their stamps
     camera: Camera | None  # its lens; None: COLMAP finds it
     anchors: Anchors
     readout_time: float | None = None  # s, 0: a global shutter; None: estimated
@@ -94,7 +94,7 @@ class Workshop:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class ViewMotion:
     """Motion of the camera, and the views that it took on it."""
 
     rows: IntArray  # (g,) of the views
@@ -171,7 +171,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
     refined, shutter, check = _refined(inputs, adjusted, near, camera, work)
     estimated = None if inputs.camera is not None else structure.camera.focal_length
     check_fit(refined.fit_share, estimated)
-    motion = Motion(rows[used], refined.times, refined)
+    motion = ViewMotion(rows[used], refined.times, refined)
     seen = rows[shown.images], shown.landmarks, shown.pixels
     triangulated = triangulate(refined.camera, motion.sights(*seen), len(structure.start.points))
     anchors = inputs.anchors.seen(inputs.views)
@@ -279,7 +279,7 @@ def check_fit(share: float, focal_length: float | None) -> None:
     )
 
 
-def _kept(triangulated: Triangulated, motion: Motion) -> IntArray:
+def _kept(triangulated: Triangulated, motion: ViewMotion) -> IntArray:
     """Rows of the points that are good enough to be landmarks."""
     _, positions = motion.refined.poses()
     away = np.linalg.norm(triangulated.points - np.median(positions, axis=0), axis=1)

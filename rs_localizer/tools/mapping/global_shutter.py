@@ -18,18 +18,18 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rectification import transferred
 from rs_localizer.io.maps.colmap import Model, ModelImage, Points
-from rs_localizer.tools.adjust.problem import LIMIT
+from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.mapping import MappingError
-from rs_localizer.tools.mapping.build import Motion, usual_size
-from rs_localizer.tools.mapping.colmap import HALF, Effort, observed
-from rs_localizer.tools.mapping.observations import LEAST_KEYPOINTS, adjusted_part
-from rs_localizer.tools.mapping.refine import RefinedMap
+from rs_localizer.tools.mapping.build import ViewMotion, usual_size
+from rs_localizer.tools.mapping.map_keypoints import LEAST_KEYPOINTS, adjusted_part
+from rs_localizer.tools.mapping.refinement import RefinedMap
 from rs_localizer.tools.mapping.shutter_fit import (
     colmap_freedom,
     global_errors,
     likely_axes,
     refine_with_shutter,
 )
+from rs_localizer.tools.mapping.structure import HALF, Effort, observed
 from rs_localizer.tools.mapping.triangulation import triangulate
 from rs_localizer.tools.readout_belief import ReadoutCheck, ShutterFit
 
@@ -86,7 +86,7 @@ def undo_shutter(
     refined, shutter, check = refine_with_shutter(
         camera, some, near, freedom, readout_time, directions, done
     )
-    motion = Motion(used, refined.times, refined)
+    motion = ViewMotion(used, refined.times, refined)
     projected = motion.sights(seen.images, seen.landmarks, seen.pixels)
     posed = np.isin(seen.images, used)
     at, rows, pixels = seen.images[posed], seen.landmarks[posed], seen.pixels[posed]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.tools.adjust.spline import LONGEST_GAP, LONGEST_SPACING, Spline, spline_through
-from rs_localizer.tools.adjust.variables import Freedom, State
+from rs_localizer.tools.adjust.variables import Freedom, Unknowns
 
 # A stretch reaches so far beyond its images (s), half as long as readouts take; and this share of
 # a known one.
@@ -71,7 +71,7 @@ def usual_accelerations(times: Array, rotations: Array, positions: Array) -> tup
     return angular, linear
 
 
-def acceleration_prior(state: State, freedom: Freedom) -> Freedom | None:
+def acceleration_prior(state: Unknowns, freedom: Freedom) -> Freedom | None:
     """With a prior of the accelerations as large as the motion's own, where stretches suffice."""
     layout = state.spline.layout
     counts = np.diff(layout.firsts)

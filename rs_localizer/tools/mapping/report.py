@@ -10,7 +10,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import BoolArray
 from rs_localizer.tools.mapping.build import Built
-from rs_localizer.tools.mapping.views import View
+from rs_localizer.tools.mapping.seen_images import SeenImage
 
 # Advice is given where more than this share of the images is blurred or has no pose.
 _MANY = 0.1
@@ -49,7 +49,7 @@ def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
     ]
 
 
-def advice(built: Built, views: Sequence[View]) -> list[str]:
+def advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
     """Sentences on how to film a better map."""
     said = []
     posed = np.zeros(len(views), np.bool_)
@@ -75,7 +75,7 @@ def advice(built: Built, views: Sequence[View]) -> list[str]:
     return said
 
 
-def written(built: Built, images: int, views: Sequence[View]) -> str:
+def written(built: Built, images: int, views: Sequence[SeenImage]) -> str:
     """The same as a page of Markdown."""
     table = "\n".join(f"| {name} | {text} |" for name, text in rows(built, images, len(views)))
     film = "".join(f"* {text}\n" for text in advice(built, views))

@@ -13,10 +13,11 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.tools.adjust.problem import LIMIT, noise_of
+from rs_localizer.tools.adjust.problem import noise_of
+from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.mapping.initial_trajectory import usual_accelerations
-from rs_localizer.tools.mapping.observations import MapFreedom, MapObservations, Start
-from rs_localizer.tools.mapping.refine import RefinedMap, refine
+from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations, Start
+from rs_localizer.tools.mapping.refinement import RefinedMap, refine
 from rs_localizer.tools.readout_belief import CHANCE, ReadoutCheck, ShutterFit
 
 LEAST_FIT = 0.8

@@ -28,10 +28,18 @@ from rs_localizer.markers.prints import Marker
 from rs_localizer.tools.adjust.bodies import BODY, PLACE, SIZED
 from rs_localizer.tools.adjust.cluster_robust import cluster_robust
 from rs_localizer.tools.adjust.fit import Fit, solve
-from rs_localizer.tools.adjust.problem import LIMIT, Problem, View
+from rs_localizer.tools.adjust.problem import Problem
+from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.adjust.spline import Spline
 from rs_localizer.tools.adjust.system import System, Undetermined
-from rs_localizer.tools.adjust.variables import EXTRINSICS, Freedom, Observations, State, rig_state
+from rs_localizer.tools.adjust.variables import (
+    EXTRINSICS,
+    CameraView,
+    Freedom,
+    SplineKeypoints,
+    Unknowns,
+    rig_state,
+)
 from rs_localizer.tools.mapping.gauge import of_the_shape, through
 from rs_localizer.tools.mapping.initial_trajectory import (
     ANGULAR_VELOCITY,
@@ -39,7 +47,7 @@ from rs_localizer.tools.mapping.initial_trajectory import (
     acceleration_prior,
     initial_trajectory,
 )
-from rs_localizer.tools.mapping.observations import Adjusted, Frame, frames_of
+from rs_localizer.tools.mapping.map_keypoints import Adjusted, RigImages, frames_of
 from rs_localizer.tools.mapping.unknown_markers import (
     Chained,
     Filmed,
@@ -59,16 +67,16 @@ class Adjustable:
     """Keypoints of the cameras: four corners of each marker; the first, the origin, is known."""
 
     filmed: Sequence[Filmed]
-    seen: Sequence[Observations]  # of the landmarks that all see
+    seen: Sequence[SplineKeypoints]  # of the landmarks that all see
 
-    def start(self, spline: Spline) -> State:
+    def start(self, spline: Spline) -> Unknowns:
         """A first guess."""
         pairs = zip(self.filmed, self.seen, strict=True)
         return rig_state(spline, ((one.camera, own, one.extrinsics) for one, own in pairs))
 
     def problem(
         self,
-        start: State,
+        start: Unknowns,
         freedom: Freedom,
         readout_times: bool = False,
         markers_only: bool = False,
@@ -93,20 +101,20 @@ class Adjustable:
                 mounting=None if markers_only else one.mounting,
             )
             seen = seen if bodies is None else replace(seen, bodies=bodies)
-            views.append(View(one.camera, seen, own))
+            views.append(CameraView(one.camera, seen, own))
         return Problem(views, start, one_map=True)
 
-    def fit_roughly(self, start: State, freedom: Freedom, *free: bool) -> Fit:
+    def fit_roughly(self, start: Unknowns, freedom: Freedom, *free: bool) -> Fit:
         """The same from far off, as at the end of a chain, where large errors are no outliers."""
         errors = np.sqrt(self.problem(start, freedom, *free).errors(start))
         return self.fit(start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE)), *free)
 
-    def fit(self, start: State, freedom: Freedom, deviation: float, *free: bool) -> Fit:
+    def fit(self, start: Unknowns, freedom: Freedom, deviation: float, *free: bool) -> Fit:
         """The minimum of a problem."""
         return solve(self.problem(start, freedom, *free), start, deviation)
 
 
-def _mirrored(given: Adjustable, fitted: Fit) -> tuple[BoolArray, BoolArray, State]:
+def _mirrored(given: Adjustable, fitted: Fit) -> tuple[BoolArray, BoolArray, Unknowns]:
     """Each marker beside its mirror image, the motion held.
 
     Returns:
@@ -133,7 +141,7 @@ def _mirrored(given: Adjustable, fitted: Fit) -> tuple[BoolArray, BoolArray, Sta
     return better & ~same, doubtful & ~same, _at_the_origin(fitted.state, chosen)
 
 
-def _turned_over(every: Sequence[Observations], state: State) -> Array:
+def _turned_over(every: Sequence[SplineKeypoints], state: Unknowns) -> Array:
     """Corners (p,3) of each marker mirrored in depth as its images see it."""
     layout, corners = state.spline.layout, state.landmarks.reshape(-1, 4, 3)
     middles, sight = corners.mean(axis=1), np.zeros((len(corners), 3))
@@ -157,7 +165,7 @@ def _steps(system: System, count: int) -> Array:
     return np.asarray(-np.linalg.solve(blocks, slope[at][..., None]).ravel())
 
 
-def _costs(problem: Problem, state: State, deviation: float) -> Array:
+def _costs(problem: Problem, state: Unknowns, deviation: float) -> Array:
     """Tukey's costs of the corners of each marker (m,)."""
     limit = (LIMIT * deviation) ** 2
     rest = np.maximum(1.0 - problem.errors(state) / limit, 0.0)
@@ -166,14 +174,14 @@ def _costs(problem: Problem, state: State, deviation: float) -> Array:
     return np.asarray(np.bincount(points // 4, costs, len(state.landmarks) // 4), np.float64)
 
 
-def _normals(state: State) -> Array:
+def _normals(state: Unknowns) -> Array:
     """Normals of the markers (m,3)."""
     corners = state.landmarks.reshape(-1, 4, 3)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
     return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])
 
 
-def _at_the_origin(state: State, landmarks: Array) -> State:
+def _at_the_origin(state: Unknowns, landmarks: Array) -> Unknowns:
     """With these landmarks (p,3), and all moved so that the first four stay where they were."""
     back = through(landmarks[:4], state.landmarks[:4])
     moved = back(landmarks)
@@ -307,7 +315,7 @@ def _check(images: list[Spotted], markers: Sequence[Marker], origin: int | None)
 
 
 def _adjusted(
-    filmed: Sequence[Filmed], times: Sequence[Array], frames: Sequence[Frame],
+    filmed: Sequence[Filmed], times: Sequence[Array], frames: Sequence[RigImages],
     said: Sequence[Marker], chained: Chained,
 ) -> Survey | list[int]:  # fmt: skip
     """The survey, or the markers that do not fit the others.
@@ -383,7 +391,7 @@ def _adjusted(
 
 
 def _first_motion(
-    filmed: Sequence[Filmed], times: Sequence[Array], posed: Sequence[Frame], chained: Chained
+    filmed: Sequence[Filmed], times: Sequence[Array], posed: Sequence[RigImages], chained: Chained
 ) -> Spline:
     """Through the frames with a pose."""
     rotations = np.array([pose.rotation for pose in chained.poses])
@@ -438,14 +446,14 @@ def _columns(fitted: Fit, markers: IntArray, width: int) -> IntArray:
     return np.asarray(shared + width * (markers - 1)[:, None] + np.arange(width), np.int64)
 
 
-def _sizes(state: State) -> Array:
+def _sizes(state: Unknowns) -> Array:
     """Sides of the markers (m,), m."""
     corners = state.landmarks.reshape(-1, 4, 3)
     sides = np.linalg.norm(np.roll(corners, 1, axis=1) - corners, axis=2)
     return np.asarray(sides.mean(axis=1))
 
 
-def _of_size(state: State, said: Sequence[Marker]) -> State:
+def _of_size(state: Unknowns, said: Sequence[Marker]) -> Unknowns:
     """With markers as large as they are said to be."""
     corners = state.landmarks.reshape(-1, 4, 3)
     middles = corners.mean(axis=1, keepdims=True)
@@ -471,7 +479,7 @@ def _wrong_sizes(fitted: Fit, said: Sequence[Marker]) -> list[str]:
 
 
 def _fitting(
-    posed: Sequence[Frame], seen: Sequence[Observations], inliers: BoolArray, count: int
+    posed: Sequence[RigImages], seen: Sequence[SplineKeypoints], inliers: BoolArray, count: int
 ) -> tuple[BoolArray, BoolArray]:
     """Which markers (m,) hang together by frames in which they fit, and which others do not fit.
 
@@ -557,7 +565,7 @@ def _often(filmed: Sequence[Filmed], shown: Sequence[list[int]], chained: Chaine
 def _observations(
     filmed: Filmed, images: list[int], times: Array, markers: Sequence[Marker], chained: Chained,
     own: list[int],
-) -> Observations:  # fmt: skip
+) -> SplineKeypoints:  # fmt: skip
     """All corners of some images of a camera.
 
     Args:
@@ -577,7 +585,7 @@ def _observations(
         for m in own
     ])  # fmt: skip
     all_pixels, all_frames = np.concatenate(pixels), np.array(frames, np.int64)
-    return Observations(
+    return SplineKeypoints(
         times=times[all_frames],
         row_times=filmed.camera.row_time(all_pixels),
         pixels=all_pixels,

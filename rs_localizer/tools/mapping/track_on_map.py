@@ -21,9 +21,9 @@ from rs_localizer.io.clouds import Keypoints
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher, Matches
-from rs_localizer.tools.mapping.colmap import Structure
-from rs_localizer.tools.mapping.observations import MapObservations, Start
-from rs_localizer.tools.mapping.views import View
+from rs_localizer.tools.mapping.map_keypoints import MapObservations, Start
+from rs_localizer.tools.mapping.seen_images import SeenImage
+from rs_localizer.tools.mapping.structure import Structure
 from rs_localizer.tracking import Tracker
 
 # A map that a global shutter has bent is off by more than good ones (px).
@@ -31,7 +31,7 @@ _THRESHOLD = 4.0
 
 
 def track_on_map(
-    views: Sequence[View],
+    views: Sequence[SeenImage],
     structure: Structure,
     camera: Camera,
     done: Callable[[], object] = lambda: None,
@@ -88,7 +88,7 @@ class _MapTracker:
         self._tracker = Tracker(self._localizer) if camera.readout_time > 0.0 else None
         self._camera = camera
 
-    def localize(self, view: View) -> tuple[Estimate | Failure, Matches]:
+    def localize(self, view: SeenImage) -> tuple[Estimate | Failure, Matches]:
         features = view.features
         keypoints = Keypoints(
             view.stamp_ns, features.pixels, None, features.descriptors, features.scores, 0

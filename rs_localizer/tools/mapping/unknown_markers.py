@@ -29,7 +29,7 @@ from rs_localizer.markers.map_check import whole_markers
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
-from rs_localizer.tools.mapping.observations import Frame, RigCamera
+from rs_localizer.tools.mapping.map_keypoints import RigCamera, RigImages
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +119,7 @@ class Chained:
     apart: list[list[int]]  # markers that do not hang together with these, part by part
 
 
-class _Sight(NamedTuple):
+class _MarkerSight(NamedTuple):
     """A marker in an image of one of the cameras."""
 
     marker: int
@@ -129,15 +129,15 @@ class _Sight(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _View:
+class _FrameView:
     """One frame: the markers of the images of all cameras that were taken at about one time."""
 
     time: float  # s
-    sights: list[_Sight]
+    sights: list[_MarkerSight]
 
 
 def chain(
-    filmed: Sequence[Filmed], frames: Sequence[Frame], markers: Sequence[Marker],
+    filmed: Sequence[Filmed], frames: Sequence[RigImages], markers: Sequence[Marker],
     origin: int | None,
 ) -> Chained:  # fmt: skip
     """Place the markers that hang together with one of them.
@@ -176,7 +176,7 @@ _SIZE_ROUNDS = 10
 _WRONG_SIZE = 0.1
 
 
-def _growth(views: Sequence[_View]) -> dict[int, float]:
+def _growth(views: Sequence[_FrameView]) -> dict[int, float]:
     """Logarithms of how much larger markers are than they are said to be, beside most others.
 
     The camera's way about a marker of the wrong size is too long or too short by that: two markers
@@ -213,8 +213,8 @@ def _growth(views: Sequence[_View]) -> dict[int, float]:
 
 
 def _view(
-    filmed: Sequence[Filmed], mounts: list[Transform], frame: Frame, markers: Sequence[Marker]
-) -> _View:
+    filmed: Sequence[Filmed], mounts: list[Transform], frame: RigImages, markers: Sequence[Marker]
+) -> _FrameView:
     sights = []
     for place, image in frame.images:
         camera, spotted = filmed[place].camera, filmed[place].spotted[image]
@@ -224,8 +224,8 @@ def _view(
             found = _square_poses(markers[marker].corners, own, _SHUTTER / camera.focal_length)
             if np.isfinite(own).all() and found:
                 found = [(back @ pose, fit) for pose, fit in found]
-                sights.append(_Sight(marker, place, own, found))
-    return _View(frame.time, sights)
+                sights.append(_MarkerSight(marker, place, own, found))
+    return _FrameView(frame.time, sights)
 
 
 def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Transform, float]]:
@@ -251,11 +251,13 @@ def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Trans
 
 
 def _between(
-    views: list[_View], markers: Sequence[Marker]
+    views: list[_FrameView], markers: Sequence[Marker]
 ) -> tuple[dict[tuple[int, int], Transform], dict[tuple[int, int], float]]:
     """Transforms a_from_b of each pair a < b, and by how many images they are said."""
-    images: dict[tuple[int, int], list[tuple[_Sight, _Sight]]] = {}
-    apart: dict[tuple[int, int], list[tuple[_Sight, _Sight]]] = {}  # in images of two cameras
+    images: dict[tuple[int, int], list[tuple[_MarkerSight, _MarkerSight]]] = {}
+    apart: dict[
+        tuple[int, int], list[tuple[_MarkerSight, _MarkerSight]]
+    ] = {}  # in images of two cameras
     for view in views:
         by_marker = sorted(view.sights, key=lambda sight: sight.marker)
         for one, other in combinations(by_marker, 2):
@@ -339,7 +341,7 @@ def _placed(
 
 
 def _frame_poses(
-    views: list[_View], mounts: list[Transform], placed: dict[int, Transform],
+    views: list[_FrameView], mounts: list[Transform], placed: dict[int, Transform],
     markers: Sequence[Marker],
 ) -> tuple[list[int], list[Transform]]:  # fmt: skip
     """Frames with a pose, and origin_from_rig of each."""

@@ -22,8 +22,8 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.io.video import Image
-from rs_localizer.tools.simulation.frames import middle_stamp
-from rs_localizer.tools.simulation.settings import ImageSettings
+from rs_localizer.tools.simulation.simulated_frames import middle_stamp
+from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 from rs_localizer.tools.simulation.walls import TexturedPlane
 

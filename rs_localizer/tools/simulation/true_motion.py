@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import Trajectory, split_at_gaps
-from rs_localizer.tools.simulation.settings import BODY_FROM_CAMERA
+from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA
 
 # Motion capture at 100 Hz and more shakes by a few tenths of a degree from sample to sample: a
 # spline through every sample turns that into accelerations that no hand has (0.24 degrees median,

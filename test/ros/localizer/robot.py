@@ -24,10 +24,10 @@ from rs_localizer.io.bags import BagWriter, open_bag, typestore
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.ros.node.conversion import copy_message, message_class
-from rs_localizer.tools.simulation.frames import simulate_frames
-from rs_localizer.tools.simulation.recording import write_simulated
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import simulate_frames
+from rs_localizer.tools.simulation.simulated_recording import write_simulated
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""COLMAP at work, in a process of its own: ``python colmap_process.py TASK.json``.
+"""COLMAP at work, in a process of its own: ``python structure_process.py TASK.json``.
 
 OpenCV and pycolmap in one process abort on some machines ("free(): invalid pointer"), so this file
 imports nothing of this package and is run by its path; it leaves a model and its database. On

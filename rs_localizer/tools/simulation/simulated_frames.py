@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.tools.simulation.settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
 # No points closer than this (m): a lens sees them as a blur.

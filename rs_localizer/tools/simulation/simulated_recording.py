@@ -14,8 +14,8 @@ from rs_localizer.io.recording import (
     make_image,
     write_frame,
 )
-from rs_localizer.tools.simulation.frames import SimulatedFrame
 from rs_localizer.tools.simulation.renderer import FORMAT, RenderedFrame
+from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame
 from rs_localizer.tools.simulation.true_motion import TrueState
 
 TRUE_POSE_TOPIC = "/truth/pose"

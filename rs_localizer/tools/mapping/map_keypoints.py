@@ -18,8 +18,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.maps.landmarks import Map, make_map
-from rs_localizer.tools.adjust.observe import Observed, localize_each
-from rs_localizer.tools.adjust.variables import Extrinsics, Mounting
+from rs_localizer.tools.adjust.observe import ImagePoints, localize_each
+from rs_localizer.tools.adjust.variables import Extrinsics, MountPrior
 from rs_localizer.tools.mapping.gauge import Similarity
 from rs_localizer.tools.readout_belief import ReadoutCheck
 
@@ -40,7 +40,7 @@ class RigCamera:
 
     camera: Camera  # its readout time: 0: a global shutter, or it is to be found
     stamp_offset: float = 0.0  # s from a stamp to the first row's exposure, by the rig's clock
-    mounting: Mounting | None = None  # None: its axes are those of the rig
+    mounting: MountPrior | None = None  # None: its axes are those of the rig
 
     @property
     def extrinsics(self) -> Extrinsics:
@@ -65,14 +65,14 @@ class Adjusted:
     deviations: Array  # (7,) of a step of the extrinsics: rad, m, s; zeros: they are the rig's axes
 
 
-class Frame(NamedTuple):
+class RigImages(NamedTuple):
     """Images of several cameras, one of each at most, that were taken at about one time."""
 
     time: float  # s, mean of the images' middle rows
     images: list[tuple[int, int]]  # the camera, and its image
 
 
-def frames_of(times: Sequence[Array]) -> list[Frame]:
+def frames_of(times: Sequence[Array]) -> list[RigImages]:
     """Which images belong together, by the times (g,), s, of each camera's."""
     every = sorted(
         (float(time), camera, image)
@@ -87,7 +87,7 @@ def frames_of(times: Sequence[Array]) -> list[Frame]:
         else:
             groups.append([one])
     return [
-        Frame(sum(of[0] for of in group) / len(group), [of[1:] for of in group])
+        RigImages(sum(of[0] for of in group) / len(group), [of[1:] for of in group])
         for group in groups
     ]  # fmt: skip
 
@@ -295,7 +295,7 @@ def from_recordings(
         once = {cloud.stamp_ns: cloud for cloud in own if len(cloud.points)}
         every = [once[stamp] for stamp in sorted(once)]
         images += [(k, cloud) for cloud in every]
-        observed = [Observed(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in every]
+        observed = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in every]
         results += localize_each(camera, observed, done)
     if landmarks is None:
         landmarks = _own_map([cloud for _, cloud in images])

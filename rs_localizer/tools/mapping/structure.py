@@ -5,7 +5,7 @@
 Extraction, matching, incremental mapping and self-calibration are COLMAP's with its defaults
 (J. L. Schoenberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016), in a process of its
 own. It assumes a global shutter: the structure is bent as far as the shutter's distortions look
-like depth, and is a start for :mod:`.refine`. It has a scale and axes of its own.
+like depth, and is a start for :mod:`.refinement`. It has a scale and axes of its own.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import colmap_parameters
 from rs_localizer.io.maps.colmap import DATABASE, Model, read_model
 from rs_localizer.tools.mapping import MappingError
-from rs_localizer.tools.mapping.observations import MapObservations, Start
+from rs_localizer.tools.mapping.map_keypoints import MapObservations, Start
 
 SPARSE, _TASK = "sparse", "task.json"
-_SCRIPT = Path(__file__).with_name("colmap_process.py")
+_SCRIPT = Path(__file__).with_name("structure_process.py")
 # So few images are matched each with each (COLMAP's exhaustive matching: 435 pairs take 20 s on
 # two cores); of more, each with so many that follow it, and with those 2^k later (its
 # sequential matching), and every n-th with every n-th, so many of them: there loops close.

@@ -16,7 +16,13 @@ from rs_localizer.tools.adjust.fit import Fit, fit
 from rs_localizer.tools.adjust.gyro import Gyroscope
 from rs_localizer.tools.adjust.spline import Spline, refined
 from rs_localizer.tools.adjust.system import Undetermined
-from rs_localizer.tools.adjust.variables import DELAY, MOUNT, GyroMount, GyroSamples, Observations
+from rs_localizer.tools.adjust.variables import (
+    DELAY,
+    MOUNT,
+    GyroMount,
+    GyroSamples,
+    SplineKeypoints,
+)
 
 # The noise of the gyroscope has settled when it changes by less than this share.
 _ROUNDS, _SETTLED = 6, 0.03
@@ -150,11 +156,11 @@ class MountFound:
 
 def with_gyro(
     camera: Camera,
-    observations: Observations,
+    observations: SplineKeypoints,
     fitted: Fit,
     samples: GyroSamples,
     given: Array | None,
-) -> tuple[Observations, Fit]:
+) -> tuple[SplineKeypoints, Fit]:
     """The motion again, with a gyroscope and its mount in it.
 
     Args:
@@ -189,7 +195,7 @@ def with_gyro(
 
 
 def _settled(
-    camera: Camera, observations: Observations, samples: GyroSamples, fitted: Fit
+    camera: Camera, observations: SplineKeypoints, samples: GyroSamples, fitted: Fit
 ) -> tuple[GyroSamples, Fit]:
     """The joint estimate when the noise of the gyroscope does not change any more."""
     samples = _with_noise(samples, fitted)

@@ -24,7 +24,7 @@ from rs_localizer.offline.detect import Cameras
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.tools.mapping import MappingError
-from rs_localizer.tools.mapping.colmap import image_name
+from rs_localizer.tools.mapping.structure import image_name
 
 # JPEG's quality of what COLMAP gets: at this one, errors are below a grey level.
 _QUALITY = 97
@@ -45,7 +45,7 @@ _EARLY = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class SeenImage:
     """Features and markers of an image."""
 
     stamp_ns: int
@@ -75,7 +75,7 @@ class Looker:
         self._images, self._count = images, 0
         self._detector = None if marker_map is None else MarkerDetector(marker_map)
 
-    def look(self, image: Image) -> View:
+    def look(self, image: Image) -> SeenImage:
         """The view of an image."""
         path = self._images / image_name(self._count)
         self._count += 1
@@ -87,10 +87,10 @@ class Looker:
             detections = self._detector.detect(image.pixels, image.stamp_ns)
             corners, ids = detections.pixels, detections.ids
         features = self._extractor.extract(image.pixels)
-        return View(image.stamp_ns, path, features, sharpness(image.pixels), corners, ids)
+        return SeenImage(image.stamp_ns, path, features, sharpness(image.pixels), corners, ids)
 
 
-def blurred(views: Sequence[View]) -> BoolArray:
+def blurred(views: Sequence[SeenImage]) -> BoolArray:
     """Which views (n,) are much less sharp than those around them."""
     values = np.array([view.sharpness for view in views])
     rows = np.arange(len(values))
@@ -102,7 +102,7 @@ def blurred(views: Sequence[View]) -> BoolArray:
 class Looked:
     """Views of a recording."""
 
-    views: list[View] = field(default_factory=list)
+    views: list[SeenImage] = field(default_factory=list)
     camera: Camera | None = None  # without its readout time; None: nobody has calibrated it
     images: int = 0
     moments: dict[float, int] = field(default_factory=dict)  # asked for, s -> row of its view
@@ -154,7 +154,7 @@ def look(
     return found
 
 
-def check_views(views: Sequence[View]) -> None:
+def check_views(views: Sequence[SeenImage]) -> None:
     """Refuse, before minutes of work, views that will make no map.
 
     Raises:
@@ -172,7 +172,7 @@ def check_views(views: Sequence[View]) -> None:
         )
 
 
-def check_features(views: Sequence[View]) -> None:
+def check_features(views: Sequence[SeenImage]) -> None:
     """Refuse views that show too little.
 
     Raises:
@@ -186,7 +186,7 @@ def check_features(views: Sequence[View]) -> None:
         )
 
 
-def _moved(one: View, other: View) -> float:
+def _moved(one: SeenImage, other: SeenImage) -> float:
     """How far features move (median), by the size of the picture; infinite: they are others."""
     if min(len(one.features), len(other.features)) < _FEW_FEATURES:
         return math.inf
@@ -202,7 +202,7 @@ def _moved(one: View, other: View) -> float:
     return float(np.median(np.linalg.norm(there - here, axis=1)) / size)
 
 
-def choose_keyframes(views: Sequence[View]) -> IntArray:
+def choose_keyframes(views: Sequence[SeenImage]) -> IntArray:
     """Rows (k,) of the views that COLMAP gets: evenly spaced, the sharpest of each few."""
     seconds = 1e-9 * (views[-1].stamp_ns - views[0].stamp_ns)
     count = max(_KEYFRAMES, math.ceil(_KEYFRAMES_PER_SECOND * seconds))

@@ -21,12 +21,20 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.tools.adjust.cluster_robust import Pull, pull_at_landmarks
 from rs_localizer.tools.adjust.fit import inflation_of, left_over, steepness
-from rs_localizer.tools.adjust.lens import with_lens
-from rs_localizer.tools.adjust.problem import LIMIT, Problem, View, settle
+from rs_localizer.tools.adjust.intrinsics import with_lens
+from rs_localizer.tools.adjust.problem import Problem, settle
+from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.adjust.spline import LONGEST_GAP, Spline
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import Factored, Undetermined
-from rs_localizer.tools.adjust.variables import EXTRINSICS, Freedom, Observations, State, rig_state
+from rs_localizer.tools.adjust.variables import (
+    EXTRINSICS,
+    CameraView,
+    Freedom,
+    SplineKeypoints,
+    Unknowns,
+    rig_state,
+)
 from rs_localizer.tools.mapping.gauge import as_held, generators, laid_over
 from rs_localizer.tools.mapping.initial_trajectory import (
     ANGULAR_VELOCITY,
@@ -35,7 +43,7 @@ from rs_localizer.tools.mapping.initial_trajectory import (
     following,
     initial_trajectory,
 )
-from rs_localizer.tools.mapping.observations import (
+from rs_localizer.tools.mapping.map_keypoints import (
     LEAST_KEYPOINTS,
     Adjusted,
     MapFreedom,
@@ -162,14 +170,14 @@ class Refinement:
             self.used & (self.shown.of_cameras[self.shown.images] == camera), np.bool_
         )
 
-    def _observations(self) -> list[Observations]:
+    def _observations(self) -> list[SplineKeypoints]:
         """Keypoints of each camera."""
         every = []
         for k, one in enumerate(self.rig):
             used = self.keypoints(k)
             images, pixels = self.shown.images[used], self.shown.pixels[used]
             every.append(
-                Observations(
+                SplineKeypoints(
                     times=self.times[images],
                     row_times=one.camera.row_time(pixels),
                     pixels=pixels,
@@ -184,7 +192,7 @@ class Refinement:
     def problem(self, freedom: Freedom, held: bool = False) -> Problem:
         """The problem of map and motion; ``held``: the map is as it is, only the motion is free."""
         views = [
-            View(one.camera, own, replace(freedom, mounting=None if held else one.mounting))
+            CameraView(one.camera, own, replace(freedom, mounting=None if held else one.mounting))
             for one, own in zip(self.rig, self.seen, strict=True)
         ]
         if held:
@@ -331,8 +339,6 @@ class Refinement:
         ]
 
 
-__all__ = ["MapFreedom", "MapObservations", "RefinedMap", "Start", "refine", "refine_rig"]
-
 DRIFT = 0.01
 """Part of a deviation, so little that landmarks follow in proportion, however large that is."""
 # A landmark that is not known to this part of the map's size is not refined.
@@ -452,7 +458,7 @@ def refine_rig(
         raise ValueError(f"the map cannot be refined: {error}") from error
 
 
-def _as_in(one: Adjusted, state: State) -> Adjusted:
+def _as_in(one: Adjusted, state: Unknowns) -> Adjusted:
     """A camera with the lens, the readout time and the extrinsics of a state."""
     readout_time = float(state.readout_time)
     camera = with_lens(replace(one.camera, readout_time=abs(readout_time)), state.lens)
@@ -460,7 +466,7 @@ def _as_in(one: Adjusted, state: State) -> Adjusted:
 
 
 def _laid(
-    problem: Problem, state: State, factored: Factored, usable: BoolArray
+    problem: Problem, state: Unknowns, factored: Factored, usable: BoolArray
 ) -> tuple[Array, Array, Array, Spline]:
     """Map and motion laid over the map as it was given, unless landmarks of known place hold it.
 

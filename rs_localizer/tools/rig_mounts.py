@@ -24,13 +24,20 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.tools.adjust.cluster_robust import cluster_robust
 from rs_localizer.tools.adjust.fit import Fit, solve
-from rs_localizer.tools.adjust.lens import with_lens
-from rs_localizer.tools.adjust.problem import Problem, View
+from rs_localizer.tools.adjust.intrinsics import with_lens
+from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.spline import Spline, refined
 from rs_localizer.tools.adjust.system import Undetermined
-from rs_localizer.tools.adjust.variables import EXTRINSICS, Extrinsics, Freedom, Mounting, State
+from rs_localizer.tools.adjust.variables import (
+    EXTRINSICS,
+    CameraView,
+    Extrinsics,
+    Freedom,
+    MountPrior,
+    Unknowns,
+)
 from rs_localizer.tools.camera_calibration import CameraCalibration, cut
-from rs_localizer.tools.imu import middle_row
+from rs_localizer.tools.imu_mount import middle_row
 from rs_localizer.tools.readout_belief import disagreement, discrepancy
 
 # Turn rates are compared at this interval (s), over at least this time and this part of the shorter
@@ -99,8 +106,8 @@ def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
     spacing = min(each.calibration.fit.state.spline.layout.spacing for each in recordings.values())
     if spacing < spline.layout.spacing:
         spline = refined(spline, spacing)
-    cameras: list[View] = []
-    states: list[State] = []
+    cameras: list[CameraView] = []
+    states: list[Unknowns] = []
     for name, (camera, calibration) in recordings.items():
         state, shift = calibration.fit.state, 1e-9 * (calibration.posed.start_ns - start_ns)
         freedom = _freedom(own, calibration)
@@ -109,14 +116,14 @@ def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
                 extrinsics = first_extrinsics(spline, state.spline, shift)
             except Undetermined as error:
                 raise ValueError(f"{name}: {error}") from error
-            nothing = Mounting(extrinsics, np.full(EXTRINSICS, np.inf))
+            nothing = MountPrior(extrinsics, np.full(EXTRINSICS, np.inf))
             state = replace(state, extrinsics=extrinsics)
             freedom = replace(freedom, mounting=nothing)
         seen = calibration.posed.observations
         seen = replace(seen, times=seen.times + shift)
         seen = seen.subset(spline.layout.inside(seen.times + state.extrinsics.offset))
         states.append(replace(state, spline=spline, mount=None))
-        cameras.append(View(camera, seen, freedom))
+        cameras.append(CameraView(camera, seen, freedom))
     noises = np.array([each.calibration.fit.deviation for each in recordings.values()])
     start = replace(states[0], others=tuple(states[1:]))
     try:
@@ -196,7 +203,7 @@ class _Joint(NamedTuple):
     fit: Fit
 
     @classmethod
-    def of(cls, problem: Problem, start: State) -> _Joint:
+    def of(cls, problem: Problem, start: Unknowns) -> _Joint:
         """The estimate; with errors of a second taken together, unless images have own times."""
         found = solve(problem, start)
         if any(camera.freedom.stamps > 0.0 for camera in problem.views):
@@ -204,7 +211,7 @@ class _Joint(NamedTuple):
         return cls(problem, cluster_robust(problem, found))
 
     @property
-    def states(self) -> tuple[State, ...]:
+    def states(self) -> tuple[Unknowns, ...]:
         """States of all cameras."""
         return self.fit.state, *self.fit.state.others
 

@@ -18,7 +18,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.tools.adjust.bodies import Pieces
-from rs_localizer.tools.adjust.lens import project
+from rs_localizer.tools.adjust.intrinsics import project
 from rs_localizer.tools.adjust.spline_kernels import (
     CONTROL,
     LOCAL,
@@ -29,7 +29,7 @@ from rs_localizer.tools.adjust.spline_kernels import (
     rates,
 )
 from rs_localizer.tools.adjust.system import Rows
-from rs_localizer.tools.adjust.variables import EXTRINSICS, State, View
+from rs_localizer.tools.adjust.variables import EXTRINSICS, CameraView, Unknowns
 
 LIMIT = 6.0
 """Tukey's limit in standard deviations: 97 % efficient on Gaussian noise in two dimensions."""
@@ -48,7 +48,7 @@ class Curve(NamedTuple):
     spacing: float
 
 
-class Sights(NamedTuple):
+class Projections(NamedTuple):
     """Keypoints, where on the spline they are seen, and what the lens makes of them."""
 
     first: IntArray  # (n,) first of the four controls
@@ -117,7 +117,7 @@ def look(
 
 
 @kernel
-def _whitened(sights: Sights, terms: Terms, n: int, by_point: Array, flow: Array) -> bool:
+def _whitened(sights: Projections, terms: Terms, n: int, by_point: Array, flow: Array) -> bool:
     """Fill the whitened derivative (2,3) of the pixel by the camera point; false if useless.
 
     With the inverse of A (rows 2 and 3 of ``flow``) and the unwhitened flow per second (row 0).
@@ -147,7 +147,7 @@ def _whitened(sights: Sights, terms: Terms, n: int, by_point: Array, flow: Array
 
 
 @kernel
-def squared_errors(sights: Sights, terms: Terms, out: Array) -> None:
+def squared_errors(sights: Projections, terms: Terms, out: Array) -> None:
     """Squared whitened errors (n,), px^2; infinite for keypoints that say nothing."""
     by_point, flow = np.empty((2, 3)), np.empty((4, 2))
     for n in range(len(sights.first)):
@@ -162,7 +162,7 @@ def squared_errors(sights: Sights, terms: Terms, out: Array) -> None:
 
 @kernel
 def _of_camera(
-    sights: Sights, terms: Terms, n: int, r: int, flow: Array, by_point: Array, by_body: Array,
+    sights: Projections, terms: Terms, n: int, r: int, flow: Array, by_point: Array, by_body: Array,
     row: Array,
 ) -> int:  # fmt: skip
     """Fill the derivatives of coordinate r by readout time, lens and mount; the column behind."""
@@ -189,7 +189,7 @@ def _of_camera(
 
 @kernel
 def _of_landmark(
-    sights: Sights, terms: Terms, n: int, column: int, by_landmark: Array, row: Array
+    sights: Projections, terms: Terms, n: int, column: int, by_landmark: Array, row: Array
 ) -> None:
     """Fill the derivatives by the landmark's place, and by its body's turn and size."""
     arm = sights.arms[n]
@@ -204,7 +204,7 @@ def _of_landmark(
 
 @kernel
 def fill_rows(
-    curve: Curve, sights: Sights, terms: Terms, values: Array, errors: Array
+    curve: Curve, sights: Projections, terms: Terms, values: Array, errors: Array
 ) -> float:  # fmt: skip
     """Fill whitened, weighted derivatives (n,2,24 + k) and errors (n,2); returns the cost.
 
@@ -262,7 +262,7 @@ def fill_rows(
     return cost
 
 
-class Keypoints:
+class Reprojection:
     """The keypoints of one camera: a factor.
 
     Args:
@@ -270,12 +270,12 @@ class Keypoints:
         pieces: what of the map is free.
     """
 
-    def __init__(self, view: View, pieces: Pieces) -> None:
+    def __init__(self, view: CameraView, pieces: Pieces) -> None:
         self.camera, self.observations, self.pieces = view.camera, view.observations, pieces
         self.free = view.freedom
-        self._last: tuple[State, Sights] | None = None
+        self._last: tuple[Unknowns, Projections] | None = None
 
-    def look(self, curve: Curve, own: State) -> Sights:
+    def look(self, curve: Curve, own: Unknowns) -> Projections:
         """All keypoints on the spline."""
         if self._last and self._last[0] is own:
             return self._last[1]
@@ -289,14 +289,14 @@ class Keypoints:
         ahead = np.where(local[:, 2:] > 0.0, local, (0.0, 0.0, 1.0))
         seen_as = project(self.camera, own.lens, ahead, self.free.lens)
         arms = self.pieces.arms(own.landmarks)
-        sights = Sights(
+        sights = Projections(
             first, u, seen.row_times, local, velocity, seen_as.pixels - seen.pixels,
             seen_as.by_ray, seen_as.by_lens, arms[seen.points], axes, centre,
         )  # fmt: skip
         self._last = own, sights
         return sights
 
-    def terms(self, own: State, deviation: float) -> Terms:
+    def terms(self, own: Unknowns, deviation: float) -> Terms:
         """At a standard deviation of the noise (px)."""
         free, width = self.free, self.pieces.width if self.pieces.count else 0
         return Terms(
@@ -305,14 +305,14 @@ class Keypoints:
             (LIMIT * deviation) ** 2,
         )  # fmt: skip
 
-    def squared_errors(self, curve: Curve, own: State) -> Array:
+    def squared_errors(self, curve: Curve, own: Unknowns) -> Array:
         """Squared whitened errors (n,), px^2; infinite for keypoints that say nothing."""
         sights = self.look(curve, own)
         squared = np.empty(len(sights.first))
         squared_errors(sights, self.terms(own, 1.0), squared)
         return squared
 
-    def rows(self, curve: Curve, own: State, at: Mapping[str, int], deviation: float) -> Rows:
+    def rows(self, curve: Curve, own: Unknowns, at: Mapping[str, int], deviation: float) -> Rows:
         """Whitened rows.
 
         Args:
