@@ -25,7 +25,7 @@ from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations, Start
 from rs_localizer.tools.mapping.refinement import refine
 from rs_localizer.tools.mapping.survey import Survey, survey
-from rs_localizer.tools.mapping.unknown_markers import Spotted, every_marker
+from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, every_marker
 
 _HALF = 2.5  # m, of the room
 _SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
@@ -250,7 +250,8 @@ def _survey(wall: bool, seeds: list[int]) -> _Errors:
     size = 0.06 if wall else 0.15
     film = Film(_CAMERA, walk, np.arange(0.0, 30.0, 1.0 / 30.0))
     camera = _believed(_READOUT)
-    found = survey(camera, film.spot(poses, size, rng), every_marker([family(_FAMILY)], size, {}))
+    filmed = Filmed(camera, spotted=film.spot(poses, size, rng))
+    found = survey([filmed], every_marker([family(_FAMILY)], size, {}))
     turn, origin = poses[found.markers[0].id]
     true = [(turn.T @ poses[m.id][0], turn.T @ (poses[m.id][1] - origin)) for m in found.markers]
     off = _off(found, true, np.eye(3), np.zeros(3))

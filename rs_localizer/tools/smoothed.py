@@ -12,7 +12,7 @@ import numpy as np
 
 from rs_localizer.config import PoseTime
 from rs_localizer.core.arrays import IntArray
-from rs_localizer.core.rig import RigEstimate
+from rs_localizer.core.rig import Rig, RigEstimate
 from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import inlier_columns
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -20,7 +20,7 @@ from rs_localizer.pipeline.pose_at_time import pose_at, published_moment, twist_
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.adjust.spline import LEAST_FRAMES, stretches
-from rs_localizer.tools.smoothing import RigFrame, Smoothed, smooth, smooth_rig
+from rs_localizer.tools.smoothing import PosedFrame, Smoothed, smooth
 
 # Recordings are smoothed in windows of so many seconds and so much on both sides of them: what an
 # image farther away says is forgotten, since accelerations fade within 0.1 s. An image of 60 points
@@ -197,25 +197,28 @@ def _motion(
     """The motion through frames, and the moments (m,) ns that are published of inputs (m,)."""
     config, calibration = localizer.config, localizer.calibration
     if config.of_cameras:
-        rig = [_rig_frame(frame) for frame in frames]
+        rig, posed = localizer.rig, [_rig_frame(frame) for frame in frames]
         if config.pose_time != PoseTime.MID_FRAME:
-            return smooth_rig(localizer.rig, rig), inputs
-        pairs = zip(frames, rig, strict=True)
+            return smooth(rig, posed), inputs
+        pairs = zip(frames, posed, strict=True)
         delays = {f.input_stamp_ns: r.time_ns - f.input_stamp_ns for f, r in pairs}
         usual = round(float(np.median(list(delays.values()))))
         moments = inputs + np.array([delays.get(stamp, usual) for stamp in inputs.tolist()])
-        return smooth_rig(localizer.rig, rig), moments
+        return smooth(rig, posed), moments
     assert calibration is not None
     camera = calibration.camera(config.readout_time, config.scan_direction)
-    images = [
-        ImagePoints(frame.input_stamp_ns, inlier_columns(frame, "xyz"), inlier_columns(frame, "uv"))
-        for frame in frames
-    ]
-    motion = smooth(camera, images, [frame.estimate for frame in frames], config.stamp_offset)
-    return motion, inputs + published_moment(config, camera, 0)[0]
+    rig, offset_ns = Rig.of(camera), round(1e9 * config.stamp_offset)
+    delay_ns = round(-1e9 * camera.readout_time * camera.first_row_time)
+    (name,), posed = rig.cameras, []
+    for frame in frames:
+        start_ns = frame.input_stamp_ns + offset_ns
+        points, pixels = (inlier_columns(frame, names) for names in ("xyz", "uv"))
+        image = ImagePoints(start_ns, points, pixels)
+        posed.append(PosedFrame(start_ns + delay_ns, {name: image}, frame.estimate))
+    return smooth(rig, posed), inputs + published_moment(config, camera, 0)[0]
 
 
-def _rig_frame(frame: Localized) -> RigFrame:
+def _rig_frame(frame: Localized) -> PosedFrame:
     assert isinstance(frame.estimate, RigEstimate)
     counts = np.cumsum([share.inliers for share in frame.cameras])[:-1]
     points, pixels = (np.split(inlier_columns(frame, names), counts) for names in ("xyz", "uv"))
@@ -225,4 +228,4 @@ def _rig_frame(frame: Localized) -> RigFrame:
     }
     # Times of a rig's estimate count from its first image.
     time_ns = frame.cameras[0].start_ns + round(1e9 * frame.estimate.time)
-    return RigFrame(time_ns, images, frame.estimate)
+    return PosedFrame(time_ns, images, frame.estimate)

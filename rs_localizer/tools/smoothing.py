@@ -31,7 +31,7 @@ from rs_localizer.tools.adjust.motion import acceleration_rows
 from rs_localizer.tools.adjust.observe import ImagePoints, collect
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.reprojection import LIMIT
-from rs_localizer.tools.adjust.spline import LONGEST_SPACING, Spline, States, first_spline, refined
+from rs_localizer.tools.adjust.spline import LONGEST_SPACING, States, first_spline, refined
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.variables import (
     CameraView,
@@ -300,79 +300,65 @@ def _deviations(covariances: Array) -> Array:
     return deviations
 
 
-def smooth(
-    camera: Camera, images: list[ImagePoints], estimates: list[Estimate], stamp_offset: float = 0.0
-) -> Smoothed:
-    """The motion through images with a pose, in the order of their stamps.
-
-    Args:
-        camera: with its readout time.
-        images: their inliers.
-        estimates: a first motion of each image.
-        stamp_offset: s from the stamp to the first row's exposure.
-
-    Raises:
-        ValueError: without a readout time, or when the images determine no motion.
-    """
-    readout_time = camera.readout_time
-    if not readout_time > 0.0:
-        raise ValueError("smoothing needs the readout time of the camera, which is 0 (unknown)")
-    if not images:
-        raise ValueError("no image has a pose: there is nothing to smooth")
-    known = [_all_inliers(one, image) for one, image in zip(estimates, images, strict=True)]
-    delay = stamp_offset - readout_time * camera.first_row_time
-    posed = collect(camera, images, list(known), delay)
-    observations = posed.observations
-    spacing, fading = _knots(posed.times)
-    fast = fast_turn(posed.times, estimates, readout_time)
-    rotations = posed.rotations
-    if fast is not None:
-        turned = _turned_pixels(camera, observations, fast, readout_time)
-        moved = float(np.median(np.hypot(*(turned - observations.pixels).T)))
-        if moved < _LEAST_SHARE * np.median([one.residual_rms for one in estimates]):
-            fast = None
-        else:
-            observations = replace(observations, pixels=turned)
-            rotations = rotations @ np.swapaxes(fast.rotations(posed.times), 1, 2)
-    spline = first_spline(posed.times, rotations, posed.positions, spacing, readout_time)
-    observations = observations.subset(
-        spline.layout.inside(observations.times) & np.isfinite(observations.pixels[:, 0])
-    )
-    best, shaken = _through(
-        [(camera, observations)], [Extrinsics.none()], spline, fading, camera.focal_length,
-        estimates,
-    )  # fmt: skip
-    counted = shaken if fast is None else shaken[fast.covered]
-    if counted.mean() > _MOST_SHAKEN:
-        shaken[:] = True
-    elif fast is not None and fast.vibrates:  # few images beside each other may look smooth
-        shaken |= ~fast.covered
-    return Smoothed(best, readout_time, posed.start_ns, posed.times, shaken, fast)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class RigFrame:
-    """A frame of a rig with a pose: what its cameras saw, by their names."""
+class PosedFrame:
+    """A frame with a pose: what the cameras saw, by their names."""
 
     time_ns: int  # of the pose
     images: Mapping[str, ImagePoints]  # their inliers; stamps are exposures of first rows
     estimate: Estimate
 
 
-def smooth_rig(rig: Rig, frames: list[RigFrame]) -> Smoothed:
-    """The motion of a rig through frames in their order; as :func:`smooth`, of its first camera.
+def smooth(rig: Rig, frames: list[PosedFrame]) -> Smoothed:
+    """The motion of a rig, or of a camera alone, through frames in their order.
+
+    Args:
+        rig: with the readout times of its cameras.
+        frames: with a first motion each.
 
     Raises:
-        ValueError: when the frames determine no motion.
+        ValueError: without a readout time, or when the frames determine no motion.
     """
-    start_ns = frames[0].time_ns
+    readout_time = next(iter(rig.cameras.values())).readout_time
+    if not readout_time > 0.0:
+        raise ValueError("smoothing needs the readout time of the camera, which is 0 (unknown)")
+    if not frames:
+        raise ValueError("no image has a pose: there is nothing to smooth")
+    start_ns, estimates = frames[0].time_ns, [frame.estimate for frame in frames]
     times = np.array([(frame.time_ns - start_ns) * 1e-9 for frame in frames])
-    estimates = [frame.estimate for frame in frames]
     spacing, fading = _knots(times)
     rotations = np.array([one.rotation.T for one in estimates])
     positions = np.array([one.position for one in estimates])
-    longest = max(one.span for one in estimates)
+    parts, mounted = _parts(rig, frames, start_ns)
+    fast = fast_turn(times, estimates, readout_time) if len(rig.cameras) == 1 else None
+    if fast is not None:
+        ((camera, seen),) = parts
+        turned = _turned_pixels(camera, seen, fast, readout_time)
+        moved = float(np.median(np.hypot(*(turned - seen.pixels).T)))
+        if moved < _LEAST_SHARE * np.median([one.residual_rms for one in estimates]):
+            fast = None
+        else:
+            parts = [(camera, replace(seen, pixels=turned))]
+            rotations = rotations @ np.swapaxes(fast.rotations(times), 1, 2)
+    longest = max(readout_time, *(one.span for one in estimates))
     spline = first_spline(times, rotations, positions, spacing, longest)
+    parts = [
+        (one, of.subset(spline.layout.inside(of.times) & np.isfinite(of.pixels[:, 0])))
+        for one, of in parts
+    ]
+    start = rig_state(spline, ((*part, one) for part, one in zip(parts, mounted, strict=True)))
+    best = _best(parts, start, fading)
+    shaken = _shaken(best, parts, rig.focal_length, estimates)
+    counted = shaken if fast is None else shaken[fast.covered]
+    if counted.mean() > _MOST_SHAKEN:
+        shaken[:] = True
+    elif fast is not None and fast.vibrates:  # few images beside each other may look smooth
+        shaken |= ~fast.covered
+    return Smoothed(best, readout_time, start_ns, times, shaken, fast)
+
+
+def _parts(rig: Rig, frames: list[PosedFrame], start_ns: int) -> tuple[Parts, list[Extrinsics]]:
+    """The cameras that saw something, with their keypoints and mounts."""
     parts: Parts = []
     mounted: list[Extrinsics] = []
     for name, camera in rig.cameras.items():
@@ -380,20 +366,18 @@ def smooth_rig(rig: Rig, frames: list[RigFrame]) -> Smoothed:
         if not own:
             continue
         images = [frames[k].images[name] for k in own]
-        known = [_all_inliers(estimates[k], image) for k, image in zip(own, images, strict=True)]
-        delay = -camera.readout_time * camera.first_row_time
-        posed = collect(camera, images, list(known), delay)
-        seen = posed.observations
-        shift = (posed.start_ns - start_ns) * 1e-9
-        seen = replace(seen, times=seen.times + shift, frames=np.array(own)[seen.frames])
-        parts.append((camera, seen.subset(spline.layout.inside(seen.times))))
+        known = [
+            replace(frames[k].estimate, inliers=np.ones(len(image.points), np.bool_))
+            for k, image in zip(own, images, strict=True)
+        ]
+        posed = collect(camera, images, list(known), -camera.readout_time * camera.first_row_time)
+        seen, shift = posed.observations, (posed.start_ns - start_ns) * 1e-9
+        parts.append(
+            (camera, replace(seen, times=seen.times + shift, frames=np.array(own)[seen.frames]))
+        )
         axes, moved = rig.camera_from_rig[name]
         mounted.append(Extrinsics(axes, -axes.T @ moved, 0.0))
-    best, shaken = _through(parts, mounted, spline, fading, rig.focal_length, estimates)
-    if shaken.mean() > _MOST_SHAKEN:
-        shaken[:] = True
-    readout_time = next(iter(rig.cameras.values())).readout_time
-    return Smoothed(best, readout_time, start_ns, times, shaken)
+    return parts, mounted
 
 
 def _knots(times: Array) -> tuple[float, float]:
@@ -403,22 +387,8 @@ def _knots(times: Array) -> tuple[float, float]:
     return min(_NARROW_SPACING if fading else LONGEST_SPACING, interval), fading
 
 
-def _all_inliers(estimate: Estimate, image: ImagePoints) -> Estimate:
-    return replace(estimate, inliers=np.ones(len(image.points), dtype=np.bool_))
-
-
 def _problem(parts: Parts, state: Unknowns, freedom: Freedom) -> Problem:
     return Problem([CameraView(*part, freedom) for part in parts], state)
-
-
-def _through(
-    parts: Parts, mounted: list[Extrinsics], spline: Spline, fading: float, focal_length: float,
-    estimates: list[Estimate],
-) -> tuple[Fit, BoolArray]:  # fmt: skip
-    """The motion, and which images (f,) shake in a way that it does not follow."""
-    start = rig_state(spline, ((*part, one) for part, one in zip(parts, mounted, strict=True)))
-    best = _best(parts, start, fading)
-    return best, _shaken(best, parts, focal_length, estimates)
 
 
 def _best(parts: Parts, start: Unknowns, fading: float) -> Fit:

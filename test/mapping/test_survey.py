@@ -20,7 +20,7 @@ from rs_localizer.markers.families import family
 from rs_localizer.markers.map_check import other_units
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.tools.mapping.survey import Survey, survey
-from rs_localizer.tools.mapping.unknown_markers import Chained, Spotted, chain, every_marker
+from rs_localizer.tools.mapping.unknown_markers import Chained, Filmed, Spotted, chain, every_marker
 
 SIZE = 0.15
 STAMPS = np.arange(0.0, 3.0, 1.0 / 30.0)
@@ -52,7 +52,7 @@ def check(found: Survey, poses: Poses, limit: float) -> None:
 
 @pytest.fixture(scope="module")
 def right(spotted) -> Survey:
-    return survey(camera(), spotted, MARKERS)
+    return survey([Filmed(camera(), spotted=spotted)], MARKERS)
 
 
 def test_markers_are_where_they_are(right, poses):
@@ -76,22 +76,24 @@ def only(spotted: list[Spotted], kept: list[set[int]]) -> list[Spotted]:
 
 
 def test_what_does_not_hang_together_is_named(spotted):
-    found = survey(camera(), only(spotted, [{0, 1, 2}, {3, 4}]), MARKERS)
+    parts = only(spotted, [{0, 1, 2}, {3, 4}])
+    found = survey([Filmed(camera(), spotted=parts)], MARKERS)
     assert [marker.id for marker in found.markers] == [0, 1, 2]
     assert [[marker.id for marker in part] for part in found.apart] == [[3, 4]]
 
 
 def test_a_survey_that_few_corners_fit_is_refused(spotted):
     with pytest.raises(ValueError, match=r"% of the corners fit .* check the readout time"):
-        survey(camera(0.3 * READOUT), spotted, MARKERS)
+        survey([Filmed(camera(0.3 * READOUT), spotted=spotted)], MARKERS)
 
 
 @pytest.mark.parametrize("wrong", [{4: 1.04}, {2: 0.6}, {0: 1.5}])
 def test_markers_that_disagree_about_metres_are_named_with_the_sizes_that_fit(spotted, wrong):
     """The origin's, too, and one that is off by a little."""
     sizes = {id_: share * SIZE for id_, share in wrong.items()}
+    markers = every_marker([family("4x4_50")], SIZE, sizes)
     with pytest.raises(ValueError, match="disagree with the others about metres") as error:
-        survey(camera(), spotted, every_marker([family("4x4_50")], SIZE, sizes))
+        survey([Filmed(camera(), spotted=spotted)], markers)
     found = re.findall(r"marker 4x4_50 (\d+) ([\d.]+) m \(given ([\d.]+)\)", str(error.value))
     assert [int(id_) for id_, _, _ in found] == list(wrong)
     for id_, size, given in found:
@@ -121,6 +123,6 @@ def test_a_marker_that_was_turned_over_is_turned_back(spotted, poses, origin, mo
         "rs_localizer.tools.mapping.survey.chain", lambda *given: turned_over(chain(*given), 2)
     )
     # All of it would turn it back on the way.
-    found = survey(camera(), spotted[:40], MARKERS, origin=origin)
+    found = survey([Filmed(camera(), spotted=spotted[:40])], MARKERS, origin=origin)
     assert found.rare == ()
     check(found, poses, 0.03)

@@ -10,10 +10,11 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Rig
 from rs_localizer.core.types import Estimate
 from rs_localizer.localizer import Localizer
 from rs_localizer.tools.adjust.observe import ImagePoints
-from rs_localizer.tools.smoothing import Smoothed, smooth
+from rs_localizer.tools.smoothing import PosedFrame, Smoothed, smooth
 from rs_localizer.tracking import Tracker
 
 READOUT = 0.03
@@ -56,7 +57,10 @@ def errors(
 
 
 def run(frames: Frames) -> Smoothed:
-    return smooth(CAMERA, [image for _, image, _ in frames], [e for _, _, e in frames])
+    rig, later = Rig.of(CAMERA), round(0.5e9 * READOUT)
+    (name,) = rig.cameras
+    posed = [PosedFrame(seen.stamp_ns + later, {name: seen}, one) for _, seen, one in frames]
+    return smooth(rig, posed)
 
 
 @pytest.mark.parametrize("turn", [0.14, pytest.param(0.35, marks=pytest.mark.bench)])
@@ -110,7 +114,7 @@ def test_frames_that_shake_faster_than_the_motion_are_said_to():
             )
             for image, (rotation, position) in zip(images, poses, strict=True)
         ]  # fmt: skip
-        found = smooth(CAMERA, images, estimates)
+        found = run([(0.0, *of) for of in zip(images, estimates, strict=True)])
         assert np.mean(found.shaken) == share
         if share:
             stamps = np.array([image.stamp_ns for image in images])

@@ -28,7 +28,7 @@ if WORKING:
     from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.markers.prints import Marker
     from rs_localizer.offline.detect import seen_by
-    from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey_rig
+    from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey
     from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
 
 _LISTED = 12
@@ -67,7 +67,7 @@ def run(args: Options) -> None:
     refuse_existing(args)
     spotter, cameras = Spotter(markers), map_cameras(args, args.recordings, config)
     filmed = [_filmed(camera, spotter) for camera in cameras]
-    found = survey_rig(filmed, markers, origin=origin)
+    found = survey(filmed, markers, origin=origin)
     every = found.deviations_of_shape
     _tell(found, every, cameras, filmed)
     for camera, result in zip(cameras, found.cameras, strict=True):

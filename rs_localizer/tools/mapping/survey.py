@@ -22,7 +22,6 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.camera import Camera
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.tools.adjust.bodies import BODY, PLACE, SIZED
@@ -248,23 +247,9 @@ class Survey:
 
 
 def survey(
-    camera: Camera, spotted: Sequence[Spotted], markers: Sequence[Marker],
-    *, origin: int | None = None, stamp_offset: float = 0.0,
-) -> Survey:  # fmt: skip
-    """Poses of the markers of a recording, as of :func:`survey_rig`.
-
-    Args:
-        camera: its lens, scan direction and readout time (0: it is to be found).
-        spotted: images in the order of their stamps.
-        stamp_offset: s from a stamp to the first row's exposure.
-    """
-    return survey_rig([Filmed(camera, stamp_offset, spotted=spotted)], markers, origin=origin)
-
-
-def survey_rig(
     filmed: Sequence[Filmed], markers: Sequence[Marker], *, origin: int | None = None
 ) -> Survey:
-    """Poses of the markers that the cameras of a rig show, which need not see the same.
+    """Poses of the markers that a camera shows, or those of a rig, which need not see the same.
 
     Args:
         filmed: by each camera; the motion is that of the rig's axes.
@@ -301,7 +286,7 @@ def survey_rig(
         names = ", ".join(marker.name for marker in lost)
         raise ValueError(f"{names}: the corners do not fit those of other markers: {MISFIT}")
     rest = [replace(one, spotted=[image.without(done) for image in one.spotted]) for one in filmed]
-    found = survey_rig(rest, markers, origin=origin)
+    found = survey(rest, markers, origin=origin)
     return replace(found, misfits=lost + found.misfits)
 
 
