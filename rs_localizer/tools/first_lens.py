@@ -188,7 +188,12 @@ def _fisheye(size: tuple[int, int], images: list[ImagePoints], K: Array) -> tupl
         ValueError: when no such lens fits.
     """
     lens = _equidistant(size, np.r_[K[0, 0], K[1, 1], K[0, 2], K[1, 2], np.zeros(4)])
-    found = [(image, pose) for image in images if (pose := _pose(lens, image)) is not None]
+    posed = [(image, pose) for image in images if (pose := _pose(lens, image)) is not None]
+    found = [
+        (image, (turn, place))
+        for image, (turn, place) in posed
+        if np.all(image.points @ turn[2] + place[2] > 0.0)
+    ]
     if len(found) < max(_LEAST_IMAGES, len(images) // 2):
         raise ValueError("no poses by this focal length")
     counts, times = [len(image.points) for image, _ in found], np.arange(len(found), dtype=float)
