@@ -292,10 +292,10 @@ def _cancels(lens: Camera, images: list[ImagePoints]) -> bool:
 
     Under the prior of lenses they cost more than all that the points can tell.
     """
-    prior = lens_prior(lens, None)
-    off = (lens_values(lens) - prior.mean)[4:]
+    mean, information = lens_prior(lens, None)
+    off = (lens_values(lens) - mean)[4:]
     equations = 2 * sum(len(image.points) for image in images)
-    return bool(off @ prior.information[4:, 4:] @ off > equations)
+    return bool(off @ information[4:, 4:] @ off > equations)
 
 
 def _slow(images: list[ImagePoints]) -> list[ImagePoints]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -47,24 +46,21 @@ from rs_localizer.tools.adjust.variables import (
 _NUMBERS, _USUAL = 6.0, np.array([2.0, 1.0])
 
 
-class PriorEvidence(NamedTuple):
-    """Evidence of an estimate on its prior, of angular and of linear accelerations."""
+def told(fitted: Fit) -> tuple[Array, Array]:
+    """Evidence of an estimate on the accelerations that were expected of it, angular and linear.
 
-    squares: Array  # (2,) sums, (rad/s^2)^2 and (m/s^2)^2
-    numbers: Array  # (2,) how many of them the keypoints tell
-
-
-def told(fitted: Fit) -> PriorEvidence:
-    """Evidence of an estimate on the accelerations that were expected of it."""
-    spline = fitted.state.spline
-    prior = fitted.freedom.accelerations(spline.layout.spacing)
-    rows = acceleration_rows(spline, prior)
+    Returns:
+        their sums of squares (2,), (rad/s^2)^2 and (m/s^2)^2, and how many numbers (2,) the
+        keypoints tell.
+    """
+    expected = fitted.freedom
+    rows = acceleration_rows(fitted.state.spline, expected)
     spread = fitted.factored.local_covariances(rows.first // CONTROL)
     variances = np.einsum("nri,nij,nrj->nr", rows.values, spread, rows.values)
     each = np.array([rows.errors**2, variances]).reshape(2, len(rows.errors), 2, 3)
     squares, unknown = each.sum(axis=(1, 3))
-    usual = np.array([prior.angular, prior.linear]) ** 2
-    return PriorEvidence(usual * squares, 3 * len(rows.first) - unknown)
+    usual = np.array([expected.angular_acceleration, expected.linear_acceleration]) ** 2
+    return usual * squares, 3 * len(rows.first) - unknown
 
 
 # Between images the motion is told as long as its deviations stay within so many of the usual ones.
@@ -399,7 +395,7 @@ def _best(parts: Parts, start: Unknowns, fading: float) -> Fit:
     halved = replace(fitted.state, spline=refined(spline, 0.5 * spline.layout.spacing))
     finer = solve(_problem(parts, halved, fitted.freedom), halved, fitted.deviation)
     finer = _lively(parts, finer)
-    more = np.sum(told(finer).numbers) - np.sum(told(fitted).numbers)
+    more = np.sum(told(finer)[1]) - np.sum(told(fitted)[1])
     return finer if cheaper(finer, fitted, float(more)) else fitted
 
 
@@ -445,9 +441,9 @@ def _lively(parts: Parts, fitted: Fit) -> Fit:
     Each round is a step nearer to the greatest marginal likelihood.
     """
     for _ in range(_ROUNDS):
-        before, of = fitted.freedom, told(fitted)
-        squares = of.squares + _NUMBERS * _USUAL**2
-        angular, linear = np.sqrt(squares / (np.maximum(of.numbers, 0.0) + _NUMBERS)).tolist()
+        before, (squares, numbers) = fitted.freedom, told(fitted)
+        known = np.maximum(numbers, 0.0) + _NUMBERS
+        angular, linear = np.sqrt((squares + _NUMBERS * _USUAL**2) / known).tolist()
         freedom = replace(before, angular_acceleration=angular, linear_acceleration=linear)
         problem = _problem(parts, fitted.state, freedom)
         fitted = solve(problem, fitted.state, fitted.deviation)

@@ -18,7 +18,6 @@ from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.spline import Layout, Spline
 from rs_localizer.tools.adjust.system import Factored, Quadratic, System
 from rs_localizer.tools.adjust.variables import (
-    Accelerations,
     CameraView,
     Extrinsics,
     Freedom,
@@ -78,10 +77,10 @@ def test_keypoints(of, direction, distortion):
     are_derivatives(lambda one: problem.keypoint_rows(one, 100.0)[0], problem, state)
 
 
-@pytest.mark.parametrize("memory", [0.0, 0.7])
-def test_accelerations(memory):
+@pytest.mark.parametrize("fading", [0.0, 0.1])
+def test_accelerations(fading):
     problem, state = small()
-    expected = Accelerations(3.0, 2.0, memory)
+    expected = Freedom(angular_acceleration=3.0, linear_acceleration=2.0, fading=fading)
     are_derivatives(lambda one: acceleration_rows(one.spline, expected), problem, state)
 
 

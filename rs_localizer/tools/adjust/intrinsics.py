@@ -24,13 +24,6 @@ _WIDEST = np.tan(np.radians(70.0))  # corners are not looked at beyond: no pinho
 _GRID = 9  # points along each side of the image, of an error that is averaged over it
 
 
-class LensPrior(NamedTuple):
-    """Prior of a lens."""
-
-    mean: Array  # (m,) as of lens_values
-    information: Array  # (m,m)
-
-
 class LensErrors(NamedTuple):
     """Standard deviations of a calibration, as parts of the error that do not overlap."""
 
@@ -88,8 +81,8 @@ def project(camera: Camera, values: Array, points: Array, free: bool) -> Project
     return Projected((sensor - offset) / binning, by_ray / steps, by_lens / steps)
 
 
-def lens_prior(camera: Camera, deviations: tuple[float, float] | None) -> LensPrior:
-    """Prior of a lens whose numbers are estimated.
+def lens_prior(camera: Camera, deviations: tuple[float, float] | None) -> tuple[Array, Array]:
+    """Mean (m,) and information (m,m) of a lens whose numbers are estimated.
 
     Args:
         camera: a given lens, or a first guess of an unknown one.
@@ -101,7 +94,7 @@ def lens_prior(camera: Camera, deviations: tuple[float, float] | None) -> LensPr
     spread = np.empty(len(values))
     if deviations is not None:
         spread[:4], spread[4:] = deviations[0] * focal, deviations[1]
-        return LensPrior(values, np.diag(spread**-2.0))
+        return values, np.diag(spread**-2.0)
     width, height = camera.size
     mean = values.copy()
     mean[2:] = 0.0
@@ -117,7 +110,7 @@ def lens_prior(camera: Camera, deviations: tuple[float, float] | None) -> LensPr
     information = np.diag(spread**-2.0)
     square = np.array([1.0, -1.0]) / (_ASPECT * focal)
     information[:2, :2] += np.outer(square, square)
-    return LensPrior(mean, information)
+    return mean, information
 
 
 def lens_errors(camera: Camera, covariance: Array) -> LensErrors:

@@ -3,11 +3,13 @@
 """Priors of a motion: accelerations at its controls, and the velocity of single images.
 
 Accelerations have zero mean. With a memory, neighbouring ones are those of a first-order Markov
-process: what counts is by how much one is not what the one before lets expect.
+process (Singer, see :mod:`rs_localizer.tracking`): what counts is by how much one is not what the
+one before lets expect.
 """
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +18,7 @@ from rs_localizer.core.arrays import IntArray
 from rs_localizer.tools.adjust.spline import Layout, Spline
 from rs_localizer.tools.adjust.spline_kernels import CONTROL, LOCAL
 from rs_localizer.tools.adjust.system import Rows
-from rs_localizer.tools.adjust.variables import Accelerations
+from rs_localizer.tools.adjust.variables import Freedom
 
 
 def _places(layout: Layout) -> tuple[IntArray, IntArray]:
@@ -26,13 +28,14 @@ def _places(layout: Layout) -> tuple[IntArray, IntArray]:
     return np.concatenate(parts), begins
 
 
-def acceleration_rows(spline: Spline, expected: Accelerations) -> Rows:
+def acceleration_rows(spline: Spline, expected: Freedom) -> Rows:
     """Six rows for each control with an acceleration: turns, then places."""
+    spacing, fading = spline.layout.spacing, expected.fading
     at, begins = _places(spline.layout)
     vectors, inverses = spline.steps()
     first = at - 2 + begins
     values, errors = np.zeros((len(at), 6, LOCAL)), np.zeros((len(at), 6))
-    memory = np.where(begins, 0.0, expected.memory)
+    memory = np.where(begins, 0.0, math.exp(-spacing / fading) if fading > 0.0 else 0.0)
     rows, axes = np.arange(len(at)), np.arange(3)
     for back in (0, 1):
         share = -memory if back else np.ones(len(at))
@@ -50,8 +53,9 @@ def acceleration_rows(spline: Spline, expected: Accelerations) -> Rows:
                     values[own, i, column + j] += scale[:, 0] * by[:, i, j]
             weight = scale * (-2.0 if place == 1 else 1.0)
             values[own[:, None], 3 + axes, column[:, None] + 3 + axes] += weight
-    usual = spline.layout.spacing**2 * np.sqrt(1.0 - memory**2)
-    weights = np.repeat([1.0 / expected.angular, 1.0 / expected.linear], 3) / usual[:, None]
+    usual = spacing**2 * np.sqrt(1.0 - memory**2)
+    sizes = np.array([expected.angular_acceleration, expected.linear_acceleration])
+    weights = np.repeat(1.0 / sizes, 3) / usual[:, None]
     errors *= weights
     values *= weights[:, :, None]
     none = np.zeros((len(at), 0), np.int64)

@@ -166,7 +166,7 @@ class Problem:
 
     def _expected_motion(self, state: Unknowns) -> list[Rows]:
         freedom, spline = self.freedom, state.spline
-        rows = [acceleration_rows(spline, freedom.accelerations(spline.layout.spacing))]
+        rows = [acceleration_rows(spline, freedom)]
         if len(spline.layout.alone()) and freedom.angular_velocity < math.inf:
             rows.append(rest_rows(spline, freedom.angular_velocity, freedom.linear_velocity))
         return rows
@@ -177,8 +177,8 @@ class Problem:
         view, at, pieces = self.views[k], self.at[k], self.pieces[k]
         freedom = view.freedom
         if "lens" in at:
-            prior = self._lens_priors[k]
-            terms.append(known(own.lens - prior.mean, prior.information, at["lens"]))
+            mean, information = self._lens_priors[k]
+            terms.append(known(own.lens - mean, information, at["lens"]))
         if (mounting := freedom.mounting) is not None:
             off = own.extrinsics.beside(mounting.given)
             terms.append(known(off, np.diag(mounting.deviations**-2.0), at["mount"]))

@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,18 +20,6 @@ EXTRINSICS = 7
 """Numbers of a camera's mount: turn in its own axes, centre in the body's, offset of its clock."""
 MOUNT, DELAY = 13, 6
 """Numbers of a gyroscope's mount: turn in its own axes, bias, delay, shape; place of the delay."""
-
-
-class Accelerations(NamedTuple):
-    """Expected accelerations at the controls.
-
-    In each stretch a stationary first-order Markov process (Singer, see
-    :mod:`rs_localizer.tracking`), or independent ones.
-    """
-
-    angular: float  # rad/s^2, standard deviation of each component
-    linear: float  # m/s^2
-    memory: float  # correlation of neighbouring controls; 0: they are independent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,13 +161,6 @@ class Freedom:
     least_noise: float = 1e-4  # recordings without noise are simulated
     # Where the camera is on the rig that the motion is of, and its clock; None: that is known.
     mounting: MountPrior | None = None
-
-    def accelerations(self, spacing: float) -> Accelerations:
-        """Accelerations at controls that are so far apart (s)."""
-        memory = math.exp(-spacing / self.fading) if self.fading > 0.0 else 0.0
-        return Accelerations(
-            float(self.angular_acceleration), float(self.linear_acceleration), memory
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
