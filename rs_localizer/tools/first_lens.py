@@ -158,7 +158,7 @@ def _pose(camera: Camera, image: ImagePoints) -> tuple[Array, Array] | None:
 
 
 def _refined(
-    camera: Camera, image: Observed, rotation: Array, centre: Array
+    camera: Camera, image: ImagePoints, rotation: Array, centre: Array
 ) -> tuple[Array, Array] | None:
     """A pose in pixels, not in rays: far from the middle they are not the same."""
     for _ in range(_POSE_STEPS):

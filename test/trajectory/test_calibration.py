@@ -153,7 +153,7 @@ def test_an_image_before_two_walls_has_a_pose():
         pixels = pixels[inside]
         pixels += np.outer((pixels[:, 1] - 240.0) / 480.0, rng.normal(0.0, 12.0, 2))  # the shutter
         pixels += rng.normal(0.0, 0.3, pixels.shape)
-        error = first_lens_module.reprojection_error(camera, Observed(0, walls[inside], pixels))
+        error = first_lens_module.reprojection_error(camera, ImagePoints(0, walls[inside], pixels))
         assert error < 20.0
 
 
