@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.gyro_rotation import GyroRotation
+from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.scales import Scales
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN, step_between
@@ -26,7 +27,7 @@ from rs_localizer.inertial.gyroscope_noise import OFFSET_DEVIATION, InertialSett
 from rs_localizer.inertial.offset_search import OffsetSearch, Orientation
 from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.status import Alone, InertialStatus
+from rs_localizer.inertial.status import InertialStatus, Unused
 from rs_localizer.inertial.turning import TurnBetween, TurnWithin
 from rs_localizer.inertial.watch import GyroscopeWatch
 
@@ -101,7 +102,7 @@ class GyroscopeAid:
         self.filter = GyroscopeFilter(settings)
         self._watch = GyroscopeWatch(settings, self.filter)
         self._last_ns: int | None = None
-        self._state = Alone.NO_SAMPLES
+        self._unused: Unused | None = Unused(ImuReason.LATE)  # in the last frame
         self._status: InertialStatus | None = None  # until it is asked for
         self._search = OffsetSearch() if settings.estimate_time_offset else None
         self._shaken = False  # in this frame, by the gyroscope
@@ -111,7 +112,7 @@ class GyroscopeAid:
     def status(self) -> InertialStatus:
         """What became of the gyroscope in the last frame."""
         if self._status is None:
-            self._status = self._watch.status(self._state)
+            self._status = self._watch.status(self._unused)
         return self._status
 
     def reset(self) -> None:
@@ -168,7 +169,8 @@ class GyroscopeAid:
         if foreseen is None:
             self.filter.forget_motion()
             alone = localized(None)
-            if self._state is Alone.NOT_COVERED and self._strayed(samples, middle_ns):
+            late = self._unused is not None and self._unused.reason is ImuReason.LATE
+            if late and self._strayed(samples, middle_ns):
                 self.filter.reset()
                 self._contradicted(middle_ns, alone[0])
             else:
@@ -179,7 +181,7 @@ class GyroscopeAid:
         if step is not None and not (_contradicts(foreseen, step) or self.filter.strange):
             if self._learn(foreseen, found[0], step):
                 return found
-            self._state = Alone.DOUBTED
+            self._unused = Unused(ImuReason.DOUBTED)
             self.filter.forget_motion()
             return localized(None)
         alone = localized(None)
@@ -196,7 +198,7 @@ class GyroscopeAid:
 
         None unless the last frame agreed with the gyroscope, and samples cover this one.
         """
-        if self._state is not Alone.NONE:
+        if self._unused is not None:
             return None
         errors = self.filter.errors
         turn = turning.turn_within(samples, middle_ns, self._readout_time, errors)
@@ -210,15 +212,15 @@ class GyroscopeAid:
     ) -> GyroPrediction | None:
         """What is known of a frame before its points; None: the camera has to go alone."""
         if samples is None or len(samples) == 0:
-            self._state = Alone.NO_SAMPLES
+            self._unused = Unused(ImuReason.LATE)
             return None
         self._watch.hear(samples)
-        if self._watch.dropped is not Alone.NONE:
-            self._state = self._watch.dropped
+        if self._watch.dropped is not None:
+            self._unused = self._watch.dropped
             return None
         turn = turning.turn_within(samples, middle_ns, self._readout_time, self.filter.errors)
         if turn is None:
-            self._state = Alone.NOT_COVERED
+            self._unused = Unused(ImuReason.LATE)
             return None
         self._shaken = turn.known.roughness > turning.MOST_ROUGH
         last = before()
@@ -266,7 +268,7 @@ class GyroscopeAid:
     def _learn(self, foreseen: GyroPrediction, found: Estimate | Failure, step: Array) -> bool:
         """Take in a frame that agrees with the gyroscope; whether the time offset does, too."""
         assert found
-        self._state = Alone.NONE
+        self._unused = None
         if self._shaken and self._stepped and self._search is not None and self._search.hopes:
             return False  # of a vibration whose phase nobody knows, turns say nothing
         self._watch.judge(False, None)
@@ -301,14 +303,11 @@ class GyroscopeAid:
         searching = self._shaken and self._search is not None and self._search.is_young
         if not searching:  # else the offset may be all that is wrong
             self._watch.judge(bool(alone), _oriented(middle_ns, alone) if alone else None)
-        self._state = Alone.NONE
-        if alone:
-            dropped = self._watch.dropped
-            self._state = Alone.DOUBTED if dropped is Alone.NONE else dropped
+        self._unused = (self._watch.dropped or Unused(ImuReason.DOUBTED)) if alone else None
 
     def _compare(self, middle_ns: int, alone: Estimate | Failure) -> None:
         """Compare a gyroscope that was dropped with what the camera sees without it."""
-        if alone and self._watch.dropped is not Alone.NONE:
+        if alone and self._watch.dropped is not None:
             self._watch.judge(False, _oriented(middle_ns, alone))
 
 

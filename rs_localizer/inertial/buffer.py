@@ -11,12 +11,13 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.reasons import ImuReason
 from rs_localizer.inertial.samples import span_of
+from rs_localizer.inertial.status import Unused
 
 Vector = tuple[float, float, float]
 
@@ -35,29 +36,6 @@ _CLOSEST_NS = 250_000
 _SATURATED_COUNT, _SATURATED_RATE = 4, 2.0
 # The rate is that of the last readings.
 _RATE_COUNT = 64
-
-
-class Lack(StrEnum):
-    """Why there are no readings of an exposure."""
-
-    NEVER = "never"  # none has come so far
-    NOT_YET = "not_yet"  # the newest is of before its end, and others may follow
-    STOPPED = "stopped"  # the newest is of long before its beginning
-    TOO_LATE = "too_late"  # the oldest that is remembered is of after its beginning
-    GAP = "gap"  # some have been lost
-    TOO_SLOW = "too_slow"  # they come at too low a rate
-    SATURATED = "saturated"  # the turn rate exceeds the gyroscope's range
-
-
-@dataclass(frozen=True, slots=True)
-class Lacking:
-    """No readings, with one sentence that says what was found; false in a condition."""
-
-    lack: Lack
-    detail: str
-
-    def __bool__(self) -> bool:
-        return False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,23 +63,17 @@ class ReadingBuffer:
     def __len__(self) -> int:
         return self._last - self._first
 
-    def clear(self) -> None:
-        """Forget all readings."""
-        with self._lock:
-            self._first = self._last = 0
-
     def add(
         self,
         stamp_ns: int,
         frame: str,
         angular_velocity: Vector,
         specific_force: Vector | None = None,
-    ) -> bool:
-        """Take a reading; whether it went on in time, and the clock was not set back."""
+    ) -> None:
+        """Take a reading; one of a clock that was set back takes the place of all before."""
         with self._lock:
             newest = int(self._stamps[self._last - 1]) if len(self) else stamp_ns
-            set_back = stamp_ns < newest - _SET_BACK_NS
-            if set_back or frame != self.frame:
+            if stamp_ns < newest - _SET_BACK_NS or frame != self.frame:
                 self._first = self._last = 0
                 self.frame = frame
             place = self._insert(stamp_ns)
@@ -112,7 +84,6 @@ class ReadingBuffer:
                 row[6:] = np.abs(row[:3])
                 if place > self._first:
                     np.maximum(row[6:], self._values[place - 1, 6:], out=row[6:])
-            return not set_back
 
     def _insert(self, stamp_ns: int) -> int | None:
         """Make room for a reading: its row; None where its stamp is there already."""
@@ -155,7 +126,7 @@ class ReadingBuffer:
 
     def between(
         self, start_ns: int, end_ns: int, since_ns: int | None = None, until_ns: int | None = None
-    ) -> Readings | Lacking:
+    ) -> Readings | Unused:
         """The readings that cover an interval, and those around it.
 
         Args:
@@ -167,7 +138,7 @@ class ReadingBuffer:
         until_ns = end_ns if until_ns is None else max(until_ns, end_ns)
         with self._lock:
             if not len(self):
-                return Lacking(Lack.NEVER, "no message has come")
+                return Unused(ImuReason.NEVER, "no message has come")
             self._first = self._oldest()
             known = self._stamps[self._first : self._last]
             if (outside := _outside(known, start_ns, end_ns)) is not None:
@@ -182,22 +153,22 @@ class ReadingBuffer:
             stamps, values = stamps[kept], values[kept]
             span = span_of(stamps, start_ns, end_ns)
         if span.period > LONGEST_PERIOD_NS:
-            return Lacking(
-                Lack.TOO_SLOW,
+            return Unused(
+                ImuReason.TOO_SLOW,
                 f"readings come every {_span(span.period)}; vibration needs one every "
                 f"{_span(LONGEST_PERIOD_NS)} at least",
             )
         if span.gap:
             step = _span(span.gap)
-            return Lacking(Lack.GAP, f"no reading for {step} within the exposure")
+            return Unused(ImuReason.GAP, f"no reading for {step} within the exposure")
         begin, end = span.begin, span.end
         greatest = values[-1, 6:]
         if greatest.max() >= _SATURATED_RATE:
             ends = _at_the_end_of_the_range(values[:, :3], greatest)
             if np.any(ends[span.first : span.last]):
                 most = float(np.abs(values[span.first : span.last, :3]).max())
-                return Lacking(
-                    Lack.SATURATED,
+                return Unused(
+                    ImuReason.SATURATED,
                     f"the gyroscope is saturated at {most:.2f} rad/s",
                 )
             # Cut on both sides of what it could not tell.
@@ -210,23 +181,23 @@ class ReadingBuffer:
         return Readings(stamps[begin:end], rates, None if lacking else forces)
 
 
-def _outside(stamps: IntArray, start_ns: int, end_ns: int) -> Lacking | None:
+def _outside(stamps: IntArray, start_ns: int, end_ns: int) -> Unused | None:
     oldest, newest = int(stamps[0]), int(stamps[-1])
     if start_ns < oldest:
-        return Lacking(
-            Lack.TOO_LATE,
+        return Unused(
+            ImuReason.BEGINS_LATER,
             f"the first reading is {_span(oldest - start_ns)} younger than the first row: a late "
             "start, or another clock",
         )
     if newest < start_ns - _SET_BACK_NS:
-        return Lacking(
-            Lack.STOPPED,
+        return Unused(
+            ImuReason.STOPPED,
             f"the last reading is {_span(start_ns - newest)} older than the first row: the IMU "
             "stopped, or has another clock",
         )
     if newest < end_ns:
-        return Lacking(
-            Lack.NOT_YET, f"the last reading is {_span(end_ns - newest)} older than the last row"
+        return Unused(
+            ImuReason.LATE, f"the last reading is {_span(end_ns - newest)} older than the last row"
         )
     return None
 

@@ -17,11 +17,12 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.reasons import ImuReason
 from rs_localizer.inertial.filter import GyroscopeFilter
 from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.offset_search import BY_TURNS, OffsetSearch, Orientation
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.status import Alone, InertialStatus
+from rs_localizer.inertial.status import InertialStatus, Unused
 from rs_localizer.inertial.turning import turn_between
 
 # Turns that a rotation explains, as a part of their sum of squares that it leaves.
@@ -67,8 +68,7 @@ class GyroscopeWatch:
 
     def reset(self) -> None:
         """Forget all frames."""
-        self.dropped = Alone.NONE
-        self.angle = 0.0
+        self.dropped: Unused | None = None
         self._contradictions: deque[bool] = deque(maxlen=_WATCHED)
         # From one time (ns) to another, of the camera as a rotation vector.
         self._turns: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)
@@ -104,9 +104,9 @@ class GyroscopeWatch:
         self._contradictions.append(contradicts)
         if frame is not None:
             self._follow(frame)
-        if self.dropped is Alone.NONE:
+        if self.dropped is None:
             if sum(self._contradictions) >= _CONTRADICTIONS:
-                self.dropped, self._untried = Alone.DISAGREES, 0
+                self.dropped, self._untried = Unused(ImuReason.DISAGREES), 0
                 self._search = OffsetSearch(step=BY_TURNS)
                 self._filter.reset()  # what it learned of such a gyroscope is nothing
             return
@@ -145,23 +145,25 @@ class GyroscopeWatch:
             self.take_up()
             return
         angle = turned_by(shown, seen) if len(seen) else None
-        self.dropped = Alone.DISAGREES if angle is None else Alone.TURNED
-        self.angle = angle or 0.0
+        self.dropped = (
+            Unused(ImuReason.DISAGREES)
+            if angle is None
+            else Unused(ImuReason.TURNED, f"by {math.degrees(angle):.0f} degrees")
+        )
 
     def take_up(self) -> None:
         """Believe it again."""
-        self.dropped, self.angle = Alone.NONE, 0.0
+        self.dropped = None
         self._contradictions.clear()
 
-    def status(self, alone: Alone) -> InertialStatus:
+    def status(self, unused: Unused | None) -> InertialStatus:
         """What to tell."""
         errors = self._filter.errors
         *biases, offset = errors.covariance.diagonal().tolist()
         return InertialStatus(
-            alone,
+            unused,
             errors.bias,
             math.sqrt(sum(biases) / len(biases)),
             errors.time_offset,
             math.sqrt(offset),
-            self.angle,
         )

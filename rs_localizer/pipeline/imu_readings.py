@@ -19,10 +19,10 @@ from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.simd.jit import NotCompiled
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.inertial.buffer import LONGEST_PERIOD_NS, Lack, Lacking, ReadingBuffer, Readings
+from rs_localizer.inertial.buffer import LONGEST_PERIOD_NS, ReadingBuffer, Readings
 from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.status import Alone, InertialStatus
+from rs_localizer.inertial.status import InertialStatus, Unused
 from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.transforms import TransformError, Transforms
 from rs_localizer.pipeline.compiling import plain_frames
@@ -43,34 +43,11 @@ _SOME = 30
 # Hz: at less, a shaking of 30 Hz turns by half a cycle between two readings.
 _LEAST_RATE = 1e9 / LONGEST_PERIOD_NS
 
-_OF_LACK = {
-    Lack.NEVER: ImuReason.NEVER,
-    Lack.NOT_YET: ImuReason.LATE,
-    Lack.STOPPED: ImuReason.STOPPED,
-    Lack.TOO_LATE: ImuReason.BEGINS_LATER,
-    Lack.GAP: ImuReason.GAP,
-    Lack.TOO_SLOW: ImuReason.TOO_SLOW,
-    Lack.SATURATED: ImuReason.SATURATED,
-}
-_OF_ALONE = {
-    Alone.NO_SAMPLES: ImuReason.LATE,
-    Alone.NOT_COVERED: ImuReason.LATE,
-    Alone.DOUBTED: ImuReason.DOUBTED,
-    Alone.DISAGREES: ImuReason.DISAGREES,
-    Alone.TURNED: ImuReason.TURNED,
-}
 
-
-@dataclass(frozen=True, slots=True)
-class Unused:
-    """Why a frame was localized by the camera alone."""
-
-    reason: ImuReason
-    detail: str = ""  # what was found
-
-    def __str__(self) -> str:
-        means = IMU_REASONS[self.reason].means
-        return f"{means}: {self.detail}" if self.detail else means
+def in_words(unused: Unused) -> str:
+    """Meaning of a reason, and what was found."""
+    means = IMU_REASONS[unused.reason].means
+    return f"{means}: {unused.detail}" if unused.detail else means
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +148,7 @@ class ImuInput:
         readings = self._buffer.between(
             start_ns, start_ns, start_ns - _BEFORE_NS, time_ns + _AROUND_NS
         )
-        if isinstance(readings, Lacking):
+        if isinstance(readings, Unused):
             return None
         times_ns = readings.stamps_ns + round(1e9 * config.imu.time_offset)
         try:
@@ -218,7 +195,7 @@ class ImuInput:
                 self._count(config, tracker, Unused(ImuReason.COMPILING))
                 return localized(None)
             result = localized(samples)
-            self._count(config, tracker, _why(tracker.inertial))
+            self._count(config, tracker, tracker.inertial.unused)
             self._compare_gravity(config, samples, result)
         return result
 
@@ -260,11 +237,11 @@ class ImuInput:
         readings = self._buffer.between(
             start_ns, end_ns, start_ns - _BEFORE_NS, end_ns + _AROUND_NS
         )
-        if isinstance(readings, Lacking):
-            slow = readings.lack is Lack.NOT_YET and self._buffer.rate() < _LEAST_RATE
+        if isinstance(readings, Unused):
+            slow = readings.reason is ImuReason.LATE and self._buffer.rate() < _LEAST_RATE
             if slow:  # which is why they are late, and what is to be said of them
                 return Unused(ImuReason.TOO_SLOW, f"{self._buffer.rate():.0f} Hz")
-            return Unused(_OF_LACK[readings.lack], readings.detail)
+            return readings
         times_ns = readings.stamps_ns + round(1e9 * config.imu.time_offset)
         try:
             frames = camera_frame, self.frame
@@ -287,7 +264,7 @@ class ImuInput:
         self._in_a_row.append(unused.reason)
         if self._in_a_row.count(unused.reason) == _LONG and self._reported != unused.reason:
             self._reported = unused.reason
-            self._notice(unused.reason, f"the IMU is not used: {unused}")
+            self._notice(unused.reason, f"the IMU is not used: {in_words(unused)}")
 
 
 def inertial_settings(config: NodeConfig) -> InertialSettings | None:
@@ -309,17 +286,6 @@ def _exposure(config: NodeConfig, time_ns: int, tracker: Tracker) -> tuple[int, 
     middle_ns = time_ns - round(1e9 * (config.imu.time_offset + estimated))
     half_ns = round(0.5e9 * config.readout_time)
     return middle_ns - half_ns, middle_ns + half_ns
-
-
-def _why(status: InertialStatus | None) -> Unused | None:
-    """Why the tracker went without the samples that it had; None: it did not."""
-    if status is None:
-        return Unused(ImuReason.NOT_TRACKING)
-    if status.used:
-        return None
-    angle = math.degrees(status.extrinsic_angle)
-    detail = f"by {angle:.0f} degrees" if status.alone == Alone.TURNED else ""
-    return Unused(_OF_ALONE[status.alone], detail)
 
 
 def in_camera_axes(

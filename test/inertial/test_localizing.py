@@ -7,10 +7,11 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.so3 import log
 from rs_localizer.core.types import Estimate
 from rs_localizer.inertial.gyroscope_noise import InertialSettings
-from rs_localizer.inertial.status import Alone
+from rs_localizer.inertial.status import Unused
 from rs_localizer.inertial.turning import GyroscopeErrors, turn_between, turn_within
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
@@ -100,4 +101,4 @@ def test_without_samples_everything_is_as_without_a_gyroscope(camera):
             assert all(
                 np.array_equal(x, y, equal_nan=field.name == "residuals") for x, y in parts
             ), field.name
-        assert aided.inertial.alone is Alone.NO_SAMPLES
+        assert aided.inertial.unused == Unused(ImuReason.LATE)

@@ -208,7 +208,7 @@ def test_a_wrong_mounting_is_noticed_and_told_with_its_angle(flight):
     flown = fly(flight, mounting=upside_down)
     flown.assert_none_is_lost_or_wrong(count(flight))
     assert flown.state.mostly.reason == ImuReason.TURNED
-    angle = re.search(r"by (\d+) degrees", str(flown.state.mostly))
+    angle = re.search(r"by (\d+) degrees", flown.state.mostly.detail)
     assert 175 <= int(angle[1]) <= 180
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rs_localizer.io.outputs import Localized
-from rs_localizer.pipeline.imu_readings import ImuState
+from rs_localizer.pipeline.imu_readings import ImuState, in_words
 from rs_localizer.pipeline.inputs import Role, input_named, said
 from rs_localizer.pipeline.map_to_odom import Holding
 from rs_localizer.pipeline.readout_estimate import MeasuredReadout
@@ -65,7 +65,7 @@ def imu_oddity(state: ImuState | None) -> dict[str, str]:
     oddities = {}
     if state.mostly is not None and state.share < _FEW:
         look_at = IMU_REASONS[state.mostly.reason].look_at
-        oddities["imu"] = f"the IMU is not used: {state.mostly} ({look_at})"
+        oddities["imu"] = f"the IMU is not used: {in_words(state.mostly)} ({look_at})"
     if state.gravity is not None and state.gravity > _MOST_TILT:
         oddities["imu.gravity"] = (
             f"the accelerometer shows gravity {math.degrees(state.gravity):.0f} degrees off "
@@ -87,8 +87,9 @@ def imu_values(state: ImuState | None) -> dict[str, str]:
     """Values by readable names; what is not known is left out."""
     if state is None:
         return {}
-    mostly = f"not used: {state.mostly}" if state.share < _FEW else "used"
-    values = {"IMU": mostly, "IMU used (share of the last frames)": f"{state.share:.0%}"}
+    alone = state.mostly if state.share < _FEW else None
+    use = "used" if alone is None else f"not used: {in_words(alone)}"
+    values = {"IMU": use, "IMU used (share of the last frames)": f"{state.share:.0%}"}
     if state.gravity is not None:
         finite = math.isfinite(state.gravity)
         values["IMU gravity off gravity_in_map (deg)"] = (
