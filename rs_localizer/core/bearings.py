@@ -30,7 +30,7 @@ _RESULTS = 7
 
 
 def bearings(camera: Camera, pixels: Array) -> tuple[Array, Array]:
-    """As :meth:`Camera.rays_and_jacobian` of raw pixels (n,2), to rounding errors."""
+    """Rays and derivatives by raw pixels (n,2) as :meth:`Camera.rays_and_jacobian`, to rounding."""
     lens = pinhole(camera)
     if lens is None or len(pixels) == 0:
         return camera.rays_and_jacobian(pixels)

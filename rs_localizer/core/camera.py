@@ -335,7 +335,7 @@ class Camera:
 
     @property
     def sees_behind(self) -> bool:
-        """Whether some of the image shows what lies behind the image plane."""
+        """True if some of the image shows what lies behind the image plane."""
         if self._sphere is None:
             return False
         # All over the image: its corners may show nothing, the middle of a side nothing behind.
@@ -352,7 +352,7 @@ class Camera:
         return self.distort(np.asarray(rays, float))[1]
 
     def inside(self, pixels: Array) -> NDArray[np.bool_]:
-        """Which raw pixels (n,2) lie in the delivered image."""
+        """Mask (n,) of raw pixels (n,2) that lie in the delivered image."""
         limit = np.array(self.size) - 0.5
         inside: NDArray[np.bool_] = np.all((pixels > -0.5) & (pixels < limit), axis=1)
         return inside  # NaN compares false

@@ -19,7 +19,7 @@ from rs_localizer.core.lens_laws import LensLaw, Seen, onto_sensor, sphere_law
 
 
 def see(bearings: Array, D: Array) -> Seen:
-    """Where bearings (n,3) are seen, in focal lengths, with all derivatives."""
+    """Places where bearings (n,3) are seen, in focal lengths, with all derivatives."""
     xi, alpha = D[:2]
     x, y, z = bearings.T
     first = np.sqrt((bearings**2).sum(axis=1))

@@ -38,7 +38,7 @@ def widest(D: Array) -> float:
 
 
 def see(bearings: Array, D: Array) -> Seen:
-    """Where bearings (n,3) are seen, with all derivatives; NaN beyond :func:`widest`."""
+    """Places where bearings (n,3) are seen, with all derivatives; NaN beyond :func:`widest`."""
     z = bearings[:, 2]
     across = np.hypot(bearings[:, 0], bearings[:, 1])
     angle = np.where((angle := np.arctan2(across, z)) < widest(D), angle, np.nan)

@@ -19,7 +19,7 @@ from rs_localizer.core.lens_laws import LensLaw, Seen, onto_sensor, sphere_law
 
 
 def see(bearings: Array, D: Array) -> Seen:
-    """Where bearings (n,3) are seen, in focal lengths, with all derivatives."""
+    """Places where bearings (n,3) are seen, in focal lengths, with all derivatives."""
     alpha, beta = D[:2]
     x, y, z = bearings.T
     square = x * x + y * y

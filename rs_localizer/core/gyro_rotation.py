@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How the camera turned during the readout, as a gyroscope knows it.
+"""Turn of the camera during the readout, as a gyroscope knows it.
 
 The body rate is a natural cubic spline through the samples (:mod:`rs_localizer.core.rate_spline`).
 Beside it, image points as a camera without that turn would see them (:func:`gyro_compensated`).
@@ -92,18 +92,18 @@ class GyroRotation:
 
     @property
     def spline(self) -> tuple[Array, Array, Array, Array]:
-        """What :func:`find_turn` takes."""
+        """Arguments of :func:`find_turn`."""
         return self.tau, self.rates, self.rotations, self.parabola
 
     @property
     def numbers(self) -> Turning:
-        """As kernels take it."""
+        """Numbers as kernels take them."""
         error = _UNKNOWN if self.rate_error is None else self.rate_error
         return Turning(*self.spline, self.rate, self.change, self.delay, self.rate_noise, error)
 
 
 class Turning(NamedTuple):
-    """What kernels need of a :class:`GyroRotation`; the fields are the same."""
+    """Fields of a :class:`GyroRotation` that kernels need."""
 
     tau: Array
     rates: Array
@@ -169,7 +169,7 @@ def late_at(tau: float, times: Array, cubics: Array, parabola: Array) -> tuple[A
 
 @kernel
 def turn_of(tau: Array, rates: Array) -> tuple[Array, Array, Array, Array, Array, float]:
-    """What a :class:`GyroRotation` holds of rates (k,3) at row times (k,)."""
+    """Fields of a :class:`GyroRotation` of rates (k,3) at row times (k,)."""
     cubics = spline(tau, rates)
     rotations = rotations_at_knots(tau, cubics)
     moments, squares = np.zeros((3, 3)), np.zeros(3)

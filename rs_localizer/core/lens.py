@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a calibration lacks: distortion, focal lengths, centre.
+"""Errors of a calibration: distortion, focal lengths, centre.
 
 Most of what a calibration may have wrong is radial: an image point at ``r`` from the axis moves
 along the radius by ``r (a r^2 + b r^4)``; a little is tangential, ``c`` and ``d`` (Brown,
@@ -44,7 +44,7 @@ def corner_of(camera: Camera) -> float:
 
 @_remembered
 def coefficients_of(camera: Camera) -> int:
-    """How many coefficients may be off."""
+    """Number of coefficients that may be off."""
     return _distorting(camera) + _OF_MATRIX
 
 
@@ -92,7 +92,7 @@ def _distortion_of(camera: Camera) -> Array:
 
 @_remembered
 def _scales_of(camera: Camera) -> Array:
-    """What OpenCV's parameters change by one of the coefficients (k,)."""
+    """Changes of OpenCV's parameters by one of the coefficients (k,)."""
     corner = corner_of(camera)
     focal = np.diag(camera.K)[:2]
     law = _law_of(camera)

@@ -31,7 +31,7 @@ class Projection(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Where bearings are seen, in focal lengths from the centre."""
+    """Places where bearings are seen, in focal lengths from the centre."""
 
     places: Array  # (n,2)
     by_bearing: Array  # (n,2,3)
@@ -45,7 +45,7 @@ class Sphere(NamedTuple):
     look: Callable[[Array, Array], Array]  # places, D: bearings (n,3) of any length
 
     def project(self, bearings: Array, K: Array, D: Array) -> Projection:
-        """As that of a law, of bearings (n,3) in place of rays: ``by_ray`` is (n,2,3)."""
+        """Projection as of a law, of bearings (n,3) in place of rays: ``by_ray`` is (n,2,3)."""
         seen, focal = self.see(bearings, D), np.diag(K)[:2]
         by_matrix = np.zeros((len(bearings), 2, 4))
         for axis in range(2):
@@ -80,7 +80,7 @@ class LensLaw(NamedTuple):
     limits: tuple[tuple[float, float], ...] | None = None
 
     def see(self, towards: Array, K: Array, D: Array) -> Projection:
-        """As ``project``, of rays (n,2) or bearings (n,3): ``by_ray`` is (n,2,2) or (n,2,3)."""
+        """Projection of rays (n,2) or bearings (n,3): ``by_ray`` is (n,2,2) or (n,2,3)."""
         if towards.shape[1] == 2:
             return self.project(towards, K, D)
         assert self.sphere is not None  # who else has bearings

@@ -119,7 +119,7 @@ def twist_of(
 
 @inlined
 def _better_known(turn: Turning, tau: float, covariance: Array) -> bool:
-    """Whether the gyroscope alone knows the rate better; the covariance (6,6) is its own then."""
+    """True if the gyroscope alone knows the rate better; the covariance (6,6) is its own then."""
     if not turn.tau[0] <= tau <= turn.tau[-1]:
         return False
     late = turn.delay * change_at(tau, turn.tau, turn.rates)
@@ -160,7 +160,7 @@ def _shaken(shake: Array, tau: float, count: int) -> tuple[Array, Array, Array, 
 
 @kernel
 def _columns(joint: Array) -> int:
-    """How many polynomials a joint covariance is of."""
+    """Number of polynomials that a joint covariance is of."""
     return (len(joint) - PARAMETERS) // 3
 
 

@@ -8,7 +8,7 @@ from enum import StrEnum
 
 
 class Reason(StrEnum):
-    """Why there is no pose, or nothing to make one of."""
+    """Reason for which there is no pose, or nothing to make one of."""
 
     # Points that give no motion.
     TOO_FEW_POINTS = "too_few_points"
@@ -47,7 +47,7 @@ class Reason(StrEnum):
 
 
 class ImuReason(StrEnum):
-    """Why an image was localized by the camera alone."""
+    """Reason for which an image was localized by the camera alone."""
 
     NEVER = "imu_never"
     LATE = "imu_late"
@@ -66,7 +66,7 @@ class ImuReason(StrEnum):
 
 
 class Notice(StrEnum):
-    """What is odd, and yet no reason to refuse anything."""
+    """Oddity that is no reason to refuse anything."""
 
     # Of frames.
     TIME_WENT_BACK = "time_went_back"

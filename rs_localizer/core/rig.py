@@ -107,7 +107,7 @@ class Rig:
     def exposure(
         self, names: Sequence[str] | None = None, stamps: Mapping[str, float] | None = None
     ) -> Exposure:
-        """When and from where some of the cameras see a frame.
+        """Times at which, and places from where, some of the cameras see a frame.
 
         Args:
             names: of the cameras that have a part in it; None: all.
@@ -212,7 +212,7 @@ def _sides_of(camera: Camera) -> tuple[Array | None, ...]:
 
 
 class Side(NamedTuple):
-    """What a camera sees about one axis, as a camera of its own that looks there.
+    """View of a camera about one axis, as a camera of its own that looks there.
 
     Rays ``x/z, y/z`` end at 90 degrees from the axis, and long before that a pixel is many of them
     wide. A lens that sees more is six cameras at one place, each with less than 55 degrees.
@@ -244,7 +244,7 @@ class Side(NamedTuple):
 
 
 class Mounts(NamedTuple):
-    """How the k sides of a frame's cameras are mounted to the rig, and how their shutters run."""
+    """Mounting of the k sides of a frame's cameras to the rig, and the way their shutters run."""
 
     axes: Array  # (k,3,3) side_from_rig
     centres: Array  # (k,3) m, of the cameras in the rig
@@ -252,13 +252,13 @@ class Mounts(NamedTuple):
 
     @classmethod
     def one(cls, gradient: Array) -> Mounts:
-        """Of a camera alone."""
+        """Mounts of a camera alone."""
         return cls(np.eye(3)[None], np.zeros((1, 3)), np.asarray(gradient, float)[None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
-    """When and from where the k cameras of one frame see it.
+    """Times at which, and places from where, the k cameras of one frame see it.
 
     Row times of a frame are counted from the middle of all exposures, in the span from the first
     exposed row of any camera to the last one: from -0.5 to 0.5.
@@ -275,11 +275,11 @@ class Exposure:
 
     @property
     def alone(self) -> bool:
-        """Whether one camera sees the frame."""
+        """True if one camera sees the frame."""
         return len(self.cameras) == 1
 
     def ahead(self, pixels: Array | None = None) -> Exposure:
-        """Of a camera alone: what it sees before its image plane.
+        """Exposure of a camera alone, by what it sees before its image plane.
 
         Args:
             pixels: (n,2) raw; where some show more than that, the exposure is as it was.

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What goes from frame to frame: how a camera shakes, how fast it moves, how far its map is off."""
+"""Scales that go from frame to frame: of shaking, speed, and errors of the map."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ VIBRATIONS = len(SPECTRA) * len(FACTORS) + 1
 
 
 class Scales(NamedTuple):
-    """Of one frame, or of many: a Gaussian of a logarithm, and logarithms of odds."""
+    """Scales by one frame, or many: a Gaussian of a logarithm, and logarithms of odds."""
 
     size: Array  # (2,) of the logarithm of the smooth error (px): mean, and precision; 0: unknown
     vibrations: Array  # (v,) logarithms of the odds of none and of each vibration
@@ -36,7 +36,7 @@ class Scales(NamedTuple):
 
     @classmethod
     def nothing(cls) -> Scales:
-        """Of no frame."""
+        """Scales by no frame."""
         return cls(np.zeros(2), np.zeros(VIBRATIONS), np.zeros(len(SPEEDS)))
 
 
@@ -50,7 +50,7 @@ INDEPENDENT = 0.3
 
 
 def joined(before: Scales, newest: Scales) -> Scales:
-    """What the frames so far say together, the newest the most."""
+    """Scales by all frames so far, the newest the most."""
     old, new = _MEMORY * before.size[1], INDEPENDENT * newest.size[1]
     mean = (old * before.size[0] + new * newest.size[0]) / max(old + new, 1e-12)
     vibrations = _MEMORY * before.vibrations + INDEPENDENT * newest.vibrations

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How the shutter moves over the image; settings name it without loading a camera model."""
+"""Directions of the shutter over the image; settings name them without a camera model."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the numbers of a motion stand: in its state, and in a step or a covariance.
+"""Places of a motion's numbers: in its state, and in a step or a covariance.
 
 A state holds rotation (9, row-major) and translation (3), camera_from_map at the middle row, the
 angular and linear velocities (3, 3) and the accelerations (3, 3) there, per readout and per

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What passes between the stages and out of the library."""
+"""Types that pass between the stages and out of the library."""
 
 from __future__ import annotations
 

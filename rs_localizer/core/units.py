@@ -37,11 +37,6 @@ class CameraState:
         """Velocity (3,) of the camera centre, m/s, along the axes of the map."""
         return np.asarray(self.rotation @ self.linear_velocity)
 
-    @property
-    def angular_velocity_in_map(self) -> Array:
-        """Angular velocity (3,), rad/s, along the axes of the map."""
-        return np.asarray(self.rotation @ self.angular_velocity)
-
 
 def camera_state(motion: Motion, camera: Camera | Rig, tau: float = 0.0) -> CameraState:
     """An estimate in SI units, at one of its rows.

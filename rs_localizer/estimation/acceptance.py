@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether an estimate may be published: nothing rather than a wrong pose."""
+"""Acceptance of estimates: nothing is published rather than a wrong pose."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def refusal(
     threshold: float,
     rolling: bool,
 ) -> Failure | None:
-    """What is wrong with an estimate, or None.
+    """Reason to refuse an estimate, or None.
 
     Args:
         posterior: ``declared`` is all that map and calibration are known to be off.
@@ -184,7 +184,7 @@ def _not_ruled_out(other: Mirror, name: str) -> Failure:
 
 
 def uncertain(estimate: Estimate, most: float) -> Failure | None:
-    """Why an estimate is too uncertain to be published, or None.
+    """Reason for which an estimate is too uncertain to be published, or None.
 
     What points do not tell because the camera may move, its covariance says: a global-shutter
     estimator, which takes the camera for one at rest, would publish that pose.

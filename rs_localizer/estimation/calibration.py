@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What errors of the calibration and of the map, the same in all frames, do to a pose.
+"""Effect of errors of calibration and map, the same in all frames, on a pose.
 
 Centre, focal length and distortion of an ordinary calibration have errors; so has a map that is
 bent, or whatever else a smooth error was fitted for; and landmarks that were found together are off
@@ -60,14 +60,14 @@ class ErrorModes:
         self._modes = np.concatenate([modes, np.zeros((1, *modes.shape[1:]), modes.dtype)])
 
     def at(self, points: Array) -> Array:
-        """Of points (m,3): (m,3,k), zeros for those that are no landmarks."""
+        """Modes (m,3,k) of points (m,3), zeros for those that are no landmarks."""
         _, rows = self._tree.query(points, distance_upper_bound=_SAME)  # n: there is none
         modes: Array = self._modes[rows].astype(np.float64)
         return modes
 
 
 class CalibrationEffect(NamedTuple):
-    """What the errors of calibration and map, one standard deviation of each, do to a frame."""
+    """Effect of the errors of calibration and map, one standard deviation of each, on a frame."""
 
     covariance: Array  # (12,12) of pose and velocities
     shifts: Array  # (18,m) of the motion by each error, of whose motion no other frame tells
@@ -200,7 +200,7 @@ def _effect(
 def _shifts(
     products: Array, crossed: Array, state: Array, terms: PriorTerms, variance: float
 ) -> Array:
-    """By how much each error moves the motion (18,m), the smooth error at its best beside it."""
+    """Shifts (18,m) of the motion by each error, the smooth error at its best beside it."""
     information, slope = products[:PARAMETERS, :PARAMETERS].copy(), np.zeros(PARAMETERS)
     add_prior(terms, state, variance, information, slope)
     whole = products.copy()
@@ -211,7 +211,7 @@ def _shifts(
 
 
 def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Array:
-    """By how many pixels a standard deviation of each error moves rays or bearings: (n,2,4)."""
+    """Shifts (n,2,4) in px of rays or bearings by a standard deviation of each error."""
     corner = corner_of(camera)
     corner_pixels = corner * camera.focal_length / camera.binning[0]
     columns = np.zeros((len(towards), 2, _ERRORS))

@@ -82,7 +82,7 @@ class SmoothError(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """What the fit without a smooth error says of the noise."""
+    """Noise by the fit without a smooth error."""
 
     deviation: float  # px
     correction: float  # of the mean square, because the gate cuts errors off
@@ -115,7 +115,7 @@ class Sized(NamedTuple):
 
 @kernel
 def smooth_columns(by_motion: Array, rays: Array, bend: Array) -> Array:
-    """By how many pixels a coefficient of a smooth error of 1 px moves points: (n,2,q).
+    """Shifts (n,2,q) in px of points by each coefficient of a smooth error of 1 px.
 
     Args:
         by_motion: (n,2,18) derivatives; a point that moves is a camera that moves back.

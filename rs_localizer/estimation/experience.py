@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the frames so far say of shaking, speed and errors of map and lens: the next share them."""
+"""Experience of shaking, speed and errors of map and lens, which the next frames share."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def _go_with_rows(lines: Lines, chosen: BoolArray) -> float:
 
 @inlined
 def _clearly_moving(best: Best, terms: PriorTerms, turn_known: bool) -> bool:
-    """Whether neither rest nor another typical speed would change anything."""
+    """True if neither rest nor another typical speed would change anything."""
     first = LINEAR.start if turn_known else VELOCITIES.start  # of the others a gyroscope knows
     spread = best.covariance[first : VELOCITIES.stop, first : VELOCITIES.stop].copy()
     information, part, squared = inverted(spread), 0.0, 0.0

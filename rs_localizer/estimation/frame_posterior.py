@@ -87,7 +87,7 @@ def frame_posterior(
     observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed,
     one_lens: bool = True,
 ) -> Posterior:  # fmt: skip
-    """What the points leave possible, near a first motion.
+    """Posterior of the motion by the points, near a first motion.
 
     Args:
         observations: the points; of very many a part is enough, evenly taken.
@@ -190,7 +190,7 @@ def _of_points(
 
 
 def _size_of(declared: float, assumed: Assumed) -> tuple[float, float]:
-    """What is known of the logarithm of the size of the smooth error: mean and precision."""
+    """Mean and precision of the logarithm of the size of the smooth error."""
     mean, precision = assumed.scales.size.tolist()
     own = math.log(declared if declared > 0.0 else ORDINARY)
     return (own + precision * mean) / (1.0 + precision), 1.0 + precision

@@ -57,7 +57,7 @@ _ELSE = 0.1
 
 
 class LeftOut(NamedTuple):
-    """What is odd about the points that are left out."""
+    """Oddity of the points that are left out."""
 
     failure: Failure | None = None
     notice: str = ""
@@ -66,7 +66,7 @@ class LeftOut(NamedTuple):
 def left_out(
     search: MotionSearch, observed: Observed, posterior: Posterior, threshold: float, known: bool
 ) -> LeftOut:
-    """Whether the points that a motion leaves out speak against it.
+    """Judgement of the points that a motion leaves out: what speaks against it.
 
     Args:
         posterior: of an accepted motion.
@@ -107,7 +107,7 @@ def left_out(
 def _moved(
     search: MotionSearch, observed: Observed, posterior: Posterior, threshold: float, most: float
 ) -> LeftOut:
-    """Whether the points that are left out have a motion of their own.
+    """Oddity of points that are left out and have a motion of their own.
 
     Args:
         most: points that are no reason to refuse the frame.
@@ -137,7 +137,7 @@ def _moved(
 
 
 def _chance(observed: Observed, distance: float) -> float:
-    """Of a mismatch, to lie within a distance (px) of its place."""
+    """Chance of a mismatch to lie within a distance (px) of its place."""
     area = min(math.prod(camera.size) for camera in observed.sighted.exposure.cameras)
     return min(math.pi * distance**2 / area, 1.0)
 
@@ -230,7 +230,7 @@ def _surprise(total: int, size: int, chance: float) -> float:
 
 
 def _described(observed: Observed, posterior: Posterior, state: Array, group: BoolArray) -> str:
-    """Where a group of points lies, and how far away its own pose is."""
+    """Place of a group of points, and how far away its own pose is."""
     step = step_between(posterior.state, state)
     turn, move = float(np.linalg.norm(step[TURN])), float(np.linalg.norm(step[MOVE]))
     where = _side(observed, posterior.inliers, group)

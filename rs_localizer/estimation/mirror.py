@@ -29,7 +29,7 @@ _COVERED = 4.0
 
 
 def is_plane(points: Array, inliers: BoolArray) -> bool:
-    """Whether the points (n,3) that count lie on a plane."""
+    """True if the points (n,3) that count lie on a plane."""
     return bool(plane_of(points, inliers)[0])
 
 
@@ -37,9 +37,9 @@ def is_plane(points: Array, inliers: BoolArray) -> bool:
 def leaning_less(
     points: Array, inliers: BoolArray, state: Array, leans: float
 ) -> tuple[bool, Array]:
-    """Whether there is a state (24,) whose view of the plane leans by so many times its lean less.
+    """True and the state (24,) whose view of the plane leans by so many times its lean less.
 
-    Twice its lean less it is mirrored, once it faces the camera. None if the points (n,3) that
+    Twice its lean less it is mirrored, once it faces the camera. False if the points (n,3) that
     count are no plane, or face the camera.
     """
     plane, centre, axis_of_plane = plane_of(points, inliers)
@@ -74,7 +74,7 @@ def leaning_less(
 
 @inlined
 def plane_of(points: Array, inliers: BoolArray) -> tuple[bool, Array, Array]:
-    """Whether the points that count lie on a plane, their centre (3,) and its normal (3,)."""
+    """True if the points that count lie on a plane, their centre (3,) and its normal (3,)."""
     centre, spread, count = np.zeros(3), np.zeros((3, 3)), 0
     for i in range(len(points)):
         if inliers[i]:

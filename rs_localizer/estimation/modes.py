@@ -217,7 +217,7 @@ class Frame(NamedTuple):
 
 
 class _Held(NamedTuple):
-    """What does not change with the lean of a mode."""
+    """Numbers that do not change with the lean of a mode."""
 
     taken: Array  # (q,) by the smooth error
     noise: float  # px
@@ -390,7 +390,7 @@ def _keep(modes: _Modes, count: int, speed: int, mode: Mode) -> int:
 
 @kernel
 def _contends(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tuple[bool, Array]:
-    """Whether the optimum near a mirrored lean fits nearly as well beside noise alone, and its
+    """True if the optimum near a mirrored lean fits nearly as well beside noise alone, and its
     state (24,).
 
     Beside a smooth error a lean that is wrong looks like a board that is bent.
@@ -405,7 +405,7 @@ def _contends(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tuple
 
 @inlined
 def _apart(mode: Mode, other: Mode) -> bool:
-    """Whether two modes are not the same optimum: by the squared angle between them, rad^2, for
+    """True if two modes are not the same optimum: by the squared angle between them, rad^2, for
     small ones.
     """
     squared, spread = 0.0, 0.0

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From one image to a later one: accelerations that fade while new ones come.
+"""Motion from one image to a later one: accelerations that fade while new ones come.
 
 R. Singer, "Estimating optimal tracking filter performance for manned maneuvering targets", 1970.
 """
@@ -193,7 +193,7 @@ def surprises_of(step: Array, covariance: Array, posterior: Array) -> Array:
 
 @kernel
 def _place_of(i: int, part: int) -> int:
-    """Where a step has the i-th number of what turns (0) or moves (1)."""
+    """Place in a step of the i-th number of what turns (0) or moves (1)."""
     place: int = 6 * (i // 3) + 3 * part + i % 3
     return place
 

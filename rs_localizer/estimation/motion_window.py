@@ -80,7 +80,7 @@ class Gaussian(NamedTuple):
 
 
 class MotionSample(NamedTuple):
-    """What the points of one frame say of its motion."""
+    """Motion of one frame by its points."""
 
     time_ns: int
     state: Array  # (24,) the frame's estimate
@@ -136,7 +136,7 @@ class MotionWindow:
 
     @property
     def times(self) -> list[int]:
-        """Of its frames, ns."""
+        """Times of its frames, ns."""
         return [self.start.time_ns, *(sample.time_ns for sample in self.samples)]
 
     @property
@@ -290,7 +290,7 @@ def _predicted(
 
 @kernel
 def _noise(seconds: float, deviations: Array) -> Array:
-    """What new accelerations add (18,18)."""
+    """Covariance (18,18) that new accelerations add."""
     unit = singer(abs(seconds))
     noise = np.zeros((PARAMETERS, PARAMETERS))
     for i in range(3):
@@ -395,7 +395,7 @@ def _told_by_points(covariance: Array, known: Array) -> Array:
 
 
 def _per_second(span: float) -> Array:
-    """Of a step (18,): per second what is per readout."""
+    """Step (18,) per second of one per readout."""
     units: Array = np.repeat(1.0 / span ** np.array([0, 0, 1, 1, 2, 2]), 3)
     return units
 
@@ -407,7 +407,7 @@ def _state(motion: Motion, units: Array) -> Array:
 
 
 def gaussian_of(estimate: Estimate, time_ns: int) -> Gaussian:
-    """What one frame says of its motion without its shaking, and without a gyroscope's turn."""
+    """Motion by one frame without its shaking, and without a gyroscope's turn."""
     motion, covariance, _, _ = unshaken(estimate)
     if estimate.turn is not None:
         motion, covariance = with_mean_turn(motion, covariance, estimate.turn)
@@ -445,7 +445,7 @@ def motion_of(gaussian: Gaussian, span: float) -> tuple[Motion, Array]:
 def sample_of(
     estimate: Estimate, time_ns: int, known: PriorTerms, configured: PriorTerms
 ) -> MotionSample:
-    """What the points of an estimate say beside what was known of its motion before.
+    """Sample by the points of an estimate, beside what was known of its motion before.
 
     Args:
         known: that, in the map's frame.

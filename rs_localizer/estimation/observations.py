@@ -130,7 +130,7 @@ def checked_of_rig(
 
 
 def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Failure | None:
-    """Why points cannot carry a pose whatever the motion, or None.
+    """Reason for which points cannot carry a pose whatever the motion, or None.
 
     Args:
         pixels: (n,2) of all points.
@@ -265,12 +265,12 @@ class Observations:
         return errors
 
     def within(self, state: Array, distance: float) -> BoolArray:
-        """Which points (n,) are reprojected to within a distance (px)."""
+        """Mask (n,) of points that are reprojected to within a distance (px)."""
         near: BoolArray = squared_errors(self.packed, self.count, state) < distance**2
         return near
 
     def median_depth(self, state: Array, chosen: BoolArray) -> float:
-        """How far before their cameras the median of some points is (chosen: (n,)); NaN: none."""
+        """Median depth of some points before their cameras (chosen: (n,)); NaN: none."""
         depth: float = median_depth(self.packed, state, chosen)
         return depth
 
@@ -357,7 +357,7 @@ _FARTHEST_POINT = 1e9
 
 
 class Usable(NamedTuple):
-    """What can be used of the points."""
+    """Points that can be used."""
 
     indices: IntArray  # of those that are finite, distinct and inside the image
     shown: BoolArray  # (n,) which lie in the image
@@ -431,7 +431,7 @@ def find_usable(
 def _rays(
     exposure: Exposure, place: int, pixels: Array, tau: Array, turn: GyroRotation | None
 ) -> tuple[Array, Array, IntArray]:
-    """As :meth:`Exposure.look`, compensated."""
+    """Rays as of :meth:`Exposure.look`, compensated."""
     rays, by_ray, side = exposure.look(place, pixels)
     if turn is not None:
         gradient = exposure.mounts.gradients[0]  # of a camera alone
@@ -443,7 +443,7 @@ def _rays(
 def _select(
     points: Array, pixels: Array, rays: Array, side: IntArray, sizes: Array, keys: Array
 ) -> tuple[IntArray, BoolArray, Array, float, bool]:
-    """Which points can be used, but for copies.
+    """Places of points that can be used, but for copies.
 
     Args:
         side: (n,) by which each is seen, of a camera with an image of a size (k,2).

@@ -98,12 +98,12 @@ class Posterior(NamedTuple):
 
     @property
     def determined(self) -> bool:
-        """Whether points and prior together determine all parameters."""
+        """True if points and prior together determine all parameters."""
         return self.smallest_eigenvalue > LEAST_EIGENVALUE
 
     @property
     def inflation(self) -> float:
-        """Of the variances, because the noise itself is an estimate.
+        """Inflation of the variances, because the noise itself is an estimate.
 
         Squared distances follow an F distribution; this makes its 95 % quantile that of the
         chi-squared one, to half a percent from 40 degrees of freedom.
@@ -142,7 +142,7 @@ def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float
 
 @inlined
 def decided(inverse: Array, prior: PriorTerms, noise: float) -> float:
-    """How many of the parameters the points decide, and not the prior.
+    """Number of parameters that the points decide, and not the prior.
 
     Args:
         inverse: (18,18) of the information of both, px^-2.
@@ -159,7 +159,7 @@ def decided(inverse: Array, prior: PriorTerms, noise: float) -> float:
 
 @inlined
 def _least_eigenvalue(information: Array, inverse: Array) -> float:
-    """Of an information matrix scaled to a unit diagonal; where it is large enough, a bound."""
+    """Least eigenvalue of an information matrix of unit diagonal; where large enough, a bound."""
     total = 0.0  # of the eigenvalues of the scaled inverse
     for i in range(len(information)):
         total += inverse[i, i] * information[i, i]
@@ -209,5 +209,5 @@ def best_motion(data: Array, count: int, start: Array, prior: PriorTerms, thresh
 def maximum_a_posteriori(
     observations: Observations, start: Array, prior: PriorTerms, threshold: float
 ) -> Posterior:
-    """As :func:`best_motion`, near a state (24,)."""
+    """Best motion as of :func:`best_motion`, near a state (24,)."""
     return Posterior(*best_motion(observations.packed, observations.count, start, prior, threshold))

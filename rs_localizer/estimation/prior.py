@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of the motion before the image: Gaussian priors and the direction of gravity.
+"""Priors of the motion before the image: Gaussians and the direction of gravity.
 
 :class:`Prior` is what a user gives, :class:`PriorTerms` what kernels take, and :func:`add_prior`
 what it adds to the normal equations. :func:`assumptions` makes them of the configuration.
@@ -44,7 +44,7 @@ _FAULTS = ("", "finite where its diagonal is", "symmetric", "positive definite")
 
 
 def check_motion(motion: Motion) -> None:
-    """Whether a motion may be one that is expected.
+    """Check that a motion may be one that is expected.
 
     Raises:
         ValueError: wrong shapes, values that are not finite, a rotation that is none.
@@ -68,7 +68,7 @@ def check_motion(motion: Motion) -> None:
 
 
 def check_covariance(covariance: Array) -> None:
-    """Whether an array may be a prior motion's covariance; infinite variances know nothing.
+    """Check that an array may be a prior motion's covariance; infinite variances know nothing.
 
     Raises:
         ValueError: wrong shape, values that are not finite, no covariance.
@@ -97,7 +97,7 @@ def _fault_of(covariance: Array) -> int:
 
 @inlined
 def _is_positive(matrix: Array, scale: Array) -> bool:
-    """Whether a matrix, scaled to a unit diagonal, is positive definite; by Cholesky."""
+    """True if a matrix, scaled to a unit diagonal, is positive definite; by Cholesky."""
     size = len(matrix)
     factor = np.empty((size, size))
     for i in range(size):
@@ -122,7 +122,7 @@ _LEAST_DEVIATION = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """What else is known of one frame; give any of the three.
+    """Knowledge of one frame besides its points; give any of the three.
 
     Args:
         motion, covariance: expected motion and its (12,12) covariance, in the order of
@@ -253,7 +253,7 @@ def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
 
 @kernel
 def _with_turn(informations: Array, error: Array) -> Array:
-    """Of a motion beside a known turn; error (6,6): see ``GyroRotation.error``."""
+    """Prior of a motion beside a known turn; error (6,6): see ``GyroRotation.error``."""
     changed, precision = informations.copy(), np.linalg.inv(error)
     for i in range(6):
         for j in range(6):
@@ -263,7 +263,7 @@ def _with_turn(informations: Array, error: Array) -> Array:
 
 @kernel
 def _turning(i: int) -> int:
-    """Where a step has the turn rate, and its change six places behind it."""
+    """Place in a step of the turn rate, and of its change six places behind it."""
     place: int = 6 + i + i // 3 * 3
     return place
 
@@ -295,7 +295,7 @@ def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
 
 
 def knows_motion(prior: Prior) -> bool:
-    """Whether a prior's motion is more than a first guess."""
+    """True if a prior's motion is more than a first guess."""
     return prior.covariance is not None and not np.isinf(np.diagonal(prior.covariance)).all()
 
 
@@ -534,7 +534,7 @@ _UNKNOWN_READOUT_TIME = 0.03
 
 @dataclass(frozen=True, slots=True)
 class TurnSeen:
-    """What a gyroscope says of the speed of a motion."""
+    """Speed of a motion as a gyroscope says it."""
 
     squared_rate: float  # (rad per readout)^2
     variance: float  # of each axis, if the camera is at rest
@@ -548,7 +548,7 @@ class TurnSeen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assumed:
-    """What is assumed of a camera and its map, beside the prior of the motion."""
+    """Assumptions on a camera and its map, beside the prior of the motion."""
 
     map_deviation: float  # m
     focal_length: float  # px
@@ -562,7 +562,7 @@ class Assumed:
 def assumptions(
     span: float, rig: Rig, config: LocalizerConfig, solver: Solver
 ) -> tuple[PriorTerms, Assumed]:
-    """What the configuration assumes of motion, cameras and map, per span of the row times.
+    """Assumptions of the configuration on motion, cameras and map, per span of the row times.
 
     Args:
         span: s; 0: unknown.
@@ -628,7 +628,7 @@ def of_frame(
 
 
 def turn_seen(terms: PriorTerms, turn: GyroRotation) -> TurnSeen:
-    """What a known turn says of the speed, beside the prior of the configuration."""
+    """Speed by a known turn, beside the prior of the configuration."""
     variance = sum(turn.error.diagonal()[:3].tolist()) / 3.0 + turn.rate_noise**2
     precision = float(terms.informations[0, ANGULAR.start, ANGULAR.start])
     typical = 1.0 / precision if precision > 0.0 else math.inf

@@ -265,7 +265,7 @@ def descend(
     prior: PriorTerms,
     noise: float,
 ) -> tuple[Array, float]:
-    """As :func:`optimize`, of one state, with steps that are tried before they are taken.
+    """Optimum as of :func:`optimize`, of one state, with steps tried before they are taken.
 
     It takes ten times as long and comes through where pose and motion are hard to tell apart.
     """
@@ -315,7 +315,7 @@ class Hypotheses(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """Where samples come from, and how many there may be."""
+    """Pools that samples come from, and how many there may be."""
 
     rotation: Array  # (3,3) to start from
     pools: Pools

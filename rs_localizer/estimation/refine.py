@@ -278,7 +278,7 @@ def squared(half: Array, scale: Array) -> Array:
 
 @kernel
 def smallest_eigenvalue(information: Array) -> float:
-    """Of an information matrix scaled to a unit diagonal; 0 where it is none."""
+    """Least eigenvalue of an information matrix scaled to a unit diagonal; 0 where it is none."""
     size = len(information)
     scaled = np.empty((size, size))
     for i in range(size):

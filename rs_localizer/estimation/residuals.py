@@ -173,7 +173,7 @@ class View:
         return [a - b for a, b in zip(cross(self.rig_point, omega), drift, strict=True)]
 
     def _shake_turn(self, offset: Any) -> list[Vector]:
-        """By how much the camera is turned beside its motion, this far from the measured row."""
+        """Turn of the camera beside its motion, this far from the measured row."""
         angle = [-(a - offset * b) for a, b in zip(self._shake[0:3], self._shake[3:6], strict=True)]
         squared = dot(angle, angle)
         return _outer_turn(angle, _series(squared, 1), _series(squared, 2))

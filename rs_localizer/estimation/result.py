@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a posterior to what users get, the delay of a known turn among it.
+"""The way from a posterior to what users get, the delay of a known turn among it.
 
 A turn that comes too early by ``d`` turns each row by too much, or too little; where the camera
 vibrates, no motion under constant acceleration looks like that, and a single frame tells the delay
@@ -57,7 +57,7 @@ _CLEARLY, _OTHER = 12.0, 3
 def delay_of(
     observations: Observations, posterior: Posterior, turn: GyroRotation
 ) -> tuple[float, float]:
-    """By how many readouts the known turn has to be delayed, and the variance of that.
+    """Delay (readouts) that the known turn needs, and the variance of that.
 
     An infinite variance says that it is not known, or that it is beyond what was tried.
     """
@@ -89,7 +89,7 @@ def delay_of(
 def _costs(
     observations: Observations, posterior: Posterior, turn: GyroRotation, delays: Array
 ) -> Array:
-    """What delays (k,) leave, in noise variances."""
+    """Costs of delays (k,), in noise variances."""
     count = observations.count
     errors, by_motion, by_turn, tau, _ = linearized(
         observations.packed,

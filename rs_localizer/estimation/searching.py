@@ -212,7 +212,7 @@ class MotionSearch:
         return Candidate(optimized, cost)
 
     def global_shutter_inliers(self, observed: Observed, start: Candidate) -> int:
-        """How many points a global-shutter pose explains at the inlier threshold."""
+        """Number of points that a global-shutter pose explains at the inlier threshold."""
         threshold, observations = self._config.inlier_threshold, observed.observations
         explained: int = _at_rest(
             observations.packed, observations.count, start.state, 2.0 * _SCORE_SCALE * threshold,
@@ -254,7 +254,7 @@ def _at_rest(
     data: Array, count: int, start: Array, wide: float, threshold: float, held: PriorTerms,
     noise: float,
 ) -> int:  # fmt: skip
-    """How many points a pose near this one of a camera that does not move explains."""
+    """Number of points that a pose near this one explains, of a camera that does not move."""
     states = np.zeros((1, STATE_SIZE))
     states[0, :POSE_SIZE] = start[:POSE_SIZE]
     state, _ = optimize(states, np.zeros(1), data, wide, threshold, held, noise)

@@ -53,7 +53,7 @@ TURNS = 3 * RESOLVED
 
 
 def _halves() -> Array:
-    """Of each spectrum, a root ``L`` (54,54) of its covariance ``L L^T`` of the columns."""
+    """Root ``L`` (54,54) of each spectrum's covariance ``L L^T`` of the columns."""
     halves = []
     for sizes in SPECTRA:
         spread = IN_COMBINATIONS @ np.diag(np.repeat(sizes, 2) ** 2) @ IN_COMBINATIONS.T
@@ -305,7 +305,7 @@ def hidden_turn(
     lines: Lines, state: Array, inliers: BoolArray, smooth: SmoothError, size: float,
     terms: PriorTerms, noise: float, freedom: float, odds: Array,
 ) -> tuple[float, Array, Array]:  # fmt: skip
-    """What vibration would explain and do at the best motion without it.
+    """Effect and evidence of vibration at the best motion without it.
 
     Returns:
         logarithm of its evidence, against none, with the odds of before; (v,) logarithms of how

@@ -65,7 +65,7 @@ class Before:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroPrediction:
-    """What the gyroscope says of a frame."""
+    """The gyroscope's knowledge of a frame."""
 
     middle_ns: int
     within: TurnWithin
@@ -110,7 +110,7 @@ class GyroscopeAid:
 
     @property
     def status(self) -> InertialStatus:
-        """What became of the gyroscope in the last frame."""
+        """State of the gyroscope after the last frame."""
         if self._status is None:
             self._status = self._watch.status(self._unused)
         return self._status
@@ -194,7 +194,7 @@ class GyroscopeAid:
         return int(samples.times_ns[-1]) + round(1e9 * self.filter.errors.time_offset) - 1
 
     def ahead(self, samples: ImuSamples, middle_ns: int, last: Before) -> GyroPrediction | None:
-        """What is known of a moment after the last frame, as if it were a frame's.
+        """Prediction of a moment after the last frame, as if it were a frame's.
 
         None unless the last frame agreed with the gyroscope, and samples cover this one.
         """
@@ -210,7 +210,7 @@ class GyroscopeAid:
     def _foreseen(
         self, samples: ImuSamples | None, middle_ns: int, before: Callable[[], Before | None]
     ) -> GyroPrediction | None:
-        """What is known of a frame before its points; None: the camera has to go alone."""
+        """Prediction of a frame before its points; None: the camera has to go alone."""
         if samples is None or len(samples) == 0:
             self._unused = Unused(ImuReason.LATE)
             return None
@@ -233,7 +233,7 @@ class GyroscopeAid:
         return GyroPrediction(middle_ns, turn, self._gravity(samples, middle_ns), None)
 
     def _strayed(self, samples: ImuSamples | None, middle_ns: int) -> bool:
-        """Whether samples do not cover a frame for an offset that is hardly known.
+        """True if samples do not cover a frame for an offset that is hardly known.
 
         Such a one would never be tried again: a gyroscope that shows something else leads there.
         """
@@ -324,7 +324,7 @@ def changed(samples: ImuSamples, seconds: float) -> float:
 
 
 def _better(found: Estimate | Failure, alone: Estimate | Failure) -> bool:
-    """Whether a result with a gyroscope that contradicts the camera is the better one."""
+    """True if a result with a gyroscope that contradicts the camera is the better one."""
     if not alone or not found:
         return bool(found) or not alone
     fewer = _BETTER_SHARE * np.count_nonzero(alone.inliers) + _BETTER_COUNT
@@ -356,7 +356,7 @@ def _step(foreseen: GyroPrediction, found: Estimate | Failure) -> Array | None:
 
 
 def _contradicts(foreseen: GyroPrediction, step: Array) -> bool:
-    """Whether a frame moved what the gyroscope says by more than its covariance allows."""
+    """True if a frame moved what the gyroscope says by more than its covariance allows."""
     if foreseen.predicted is None:
         moved, covariance = step[ANGULAR], foreseen.turn.error[:3, :3]
     else:
@@ -369,7 +369,7 @@ def _contradicts(foreseen: GyroPrediction, step: Array) -> bool:
 
 
 def without_gyro(prior: Prior | None, turn: GyroRotation) -> Prior | None:
-    """What the camera alone predicts, for a motion beside a known turn."""
+    """Prediction of the camera alone, for a motion beside a known turn."""
     if prior is None:
         return None
     assert prior.motion is not None

@@ -114,7 +114,7 @@ class ReadingBuffer:
         return self._first + int(stamps.searchsorted(stamps[-1] - MEMORY_NS))
 
     def lag(self, stamp_ns: int) -> int:
-        """By how many ns the newest reading is older than this moment; without one, its stamp."""
+        """Age (ns) of the newest reading at this moment; without one, the moment itself."""
         with self._lock:
             return stamp_ns - (int(self._stamps[self._last - 1]) if len(self) else 0)
 
@@ -203,7 +203,7 @@ def _outside(stamps: IntArray, start_ns: int, end_ns: int) -> Unused | None:
 
 
 def _apart(stamps: IntArray) -> IntArray:
-    """Which of the readings (n,) are kept, so that none is too close to the one before."""
+    """Places of readings (n,) that are kept, so that none is too close to the one before."""
     kept = [0]
     for i in range(1, len(stamps)):
         if stamps[i] - stamps[kept[-1]] >= _CLOSEST_NS:
@@ -212,7 +212,7 @@ def _apart(stamps: IntArray) -> IntArray:
 
 
 def _at_the_end_of_the_range(rates: Array, greatest: Array) -> BoolArray:
-    """Which of the readings (n,3) show the greatest value so far, several times in a row."""
+    """Mask (n,) of readings (n,3) that show the greatest value so far, several times in a row."""
     found = np.zeros(len(rates), np.bool_)
     for axis in np.flatnonzero(greatest >= _SATURATED_RATE):
         same = np.abs(rates[:, axis]) == greatest[axis]

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the frames say of the gyroscope: bias and time offset, tracked beside the camera's motion.
+"""Filter of the gyroscope's bias and time offset, tracked beside the camera's motion.
 
 The gyroscope's parameters are a part of the state of the tracker's Kalman filter that no image
 shows; they are correlated with what is predicted, because they made the prediction. An image that
@@ -90,11 +90,11 @@ class GyroscopeFilter:
 
     @property
     def strange(self) -> bool:
-        """Whether no gyroscope has such a bias."""
+        """True for a bias that no gyroscope has."""
         return float(np.abs(self.errors.bias).max()) > _MOST_BIAS * BIAS_DEVIATION
 
     def contradicts(self, time_offset: float, deviation: float) -> bool:
-        """Whether another time offset, known to a deviation (s), is not the one of the frames."""
+        """True if another time offset, known to a deviation (s), is not the one of the frames."""
         own = math.sqrt(self.errors.covariance[OFFSET, OFFSET])
         off = abs(time_offset - self.errors.time_offset)
         return off > _FAR * math.hypot(deviation, JITTER) or own > _FAR * deviation
@@ -142,7 +142,7 @@ class GyroscopeFilter:
         return Predicted(motion_of(later), predicted, with_parameters)
 
     def _fits(self, covariance: Array) -> bool:
-        """Whether what ties parameters and motion can stand beside this covariance of the motion.
+        """True if what ties parameters and motion can stand beside this covariance of the motion.
 
         Where the tracker has put another one in the place of that of the update, as of rest, a
         smaller one would make the prediction indefinite, or a variance of the parameters negative.

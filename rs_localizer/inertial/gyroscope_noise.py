@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is assumed of a gyroscope."""
+"""Assumptions on a gyroscope."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ JITTER = 4e-5
 
 @dataclass(frozen=True, slots=True)
 class InertialSettings:
-    """What the user says of the IMU."""
+    """The user's settings of the IMU."""
 
     gyroscope_noise: float  # rad/s/sqrt(Hz)
     gyroscope_bias_walk: float  # rad/s^2/sqrt(Hz)

@@ -100,16 +100,16 @@ class OffsetSearch:
 
     @property
     def hopes(self) -> bool:
-        """Whether it has not looked at frames for long in vain."""
+        """True while it has not looked at frames for long in vain."""
         return self._seen < _PATIENCE
 
     @property
     def is_young(self) -> bool:
-        """Whether it may yet find the offset of a gyroscope that is sound."""
+        """True while it may yet find the offset of a gyroscope that is sound."""
         return self._seen < _YOUNG
 
     def wants(self) -> bool:
-        """Whether the next frame is to be looked at."""
+        """Count a frame; true if it is to be looked at."""
         self._seen += 1
         return self._seen < _PATIENCE or self._seen % _LATER == 0
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame says of turns of its rows, whichever time offset is supposed."""
+"""Likelihood of turns of a frame's rows, whichever time offset is supposed."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class RowOffsetLikelihood:
 def row_offset_likelihood(
     camera: Camera, points: ArrayLike, pixels: ArrayLike, found: Estimate, middle_ns: int
 ) -> RowOffsetLikelihood | None:
-    """What inliers of a frame say; None where they are too few.
+    """Likelihood by the inliers of a frame; None where they are too few.
 
     Args:
         points, pixels: as they were localized, (n,3) and (n,2).

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a gyroscope and an accelerometer measured, by the camera's clock and in its axes."""
+"""Samples of a gyroscope and an accelerometer, by the camera's clock and in its axes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ImuSamples:
         return len(self.times_ns)
 
     def around(self, first_ns: int, last_ns: int) -> slice | None:
-        """Which samples cover an interval, and a few on both sides; None if they do not."""
+        """Samples that cover an interval, and a few on both sides; None if they do not."""
         first = int(self.times_ns.searchsorted(first_ns, "right"))
         last = int(self.times_ns.searchsorted(last_ns))
         if first == 0 or last == len(self):

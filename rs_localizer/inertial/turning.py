@@ -119,7 +119,7 @@ _Turn = tuple[Array, Array, Array, Array, Array, Array, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroscopeErrors:
-    """What is known of a gyroscope's errors."""
+    """Estimates of a gyroscope's errors."""
 
     bias: Array  # (3,) rad/s, to be taken from its rates
     time_offset: float  # s, to be added to its times
@@ -138,7 +138,7 @@ class TurnBetween:
 
     @property
     def numbers(self) -> tuple[Array, Array, Array]:
-        """What kernels take."""
+        """Numbers as kernels take them."""
         return self.rotation, self.by_parameters, self.variances
 
 
@@ -155,14 +155,14 @@ class TurnWithin:
 
     @property
     def numbers(self) -> tuple[Array, Array]:
-        """What kernels take."""
+        """Numbers as kernels take them."""
         return self.by_parameters, self.variances
 
 
 def turn_within(
     samples: ImuSamples, middle_ns: int, readout_time: float, errors: GyroscopeErrors
 ) -> TurnWithin | None:
-    """How the camera turns during a frame; None if the samples do not cover it.
+    """Turn of the camera during a frame; None if the samples do not cover it.
 
     Args:
         middle_ns: exposure of the middle row.
@@ -187,7 +187,7 @@ def turn_within(
 def turn_between(
     samples: ImuSamples, from_ns: int, to_ns: int, errors: GyroscopeErrors
 ) -> TurnBetween | None:
-    """How the camera turns from one moment to a later one; None if the samples do not cover it."""
+    """Turn of the camera from one moment to a later one; None if the samples do not cover it."""
     length = 1e-9 * (to_ns - from_ns)
     here_ns = _by_samples(to_ns, errors)
     span = samples.around(here_ns - (to_ns - from_ns), here_ns)
@@ -267,7 +267,7 @@ def _within(
 
 @kernel
 def _shift(deviation: float, before: float, after: float) -> float:
-    """As far as the deviation and the samples reach; never so little that rounding decides."""
+    """Shift as far as deviation and samples reach; never so little that rounding decides."""
     shift: float = max(min(deviation, -before, after), _LEAST_SHIFT)
     return shift
 

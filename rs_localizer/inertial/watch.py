@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a gyroscope can be believed, by what the camera sees.
+"""Watch over a gyroscope: it is believed as long as the camera agrees.
 
 One that contradicts it in many frames is dropped, until another offset of its stamps makes the two
 agree; or another rotation camera <- imu would, which is then said: the rotation that carries the
@@ -157,7 +157,7 @@ class GyroscopeWatch:
         self._contradictions.clear()
 
     def status(self, unused: Unused | None) -> InertialStatus:
-        """What to tell."""
+        """State of the gyroscope, for who tells of it."""
         errors = self._filter.errors
         *biases, offset = errors.covariance.diagonal().tolist()
         return InertialStatus(

@@ -118,7 +118,7 @@ def make_folder(folder: Path) -> None:
 
 
 def digest(part: str, package: Path = _PACKAGE) -> str:
-    """Of all sources that may be compiled into a kernel of this part.
+    """Digest of all sources that may be compiled into a kernel of this part.
 
     Numba notices a change of the file that holds a kernel, not of what the kernel calls in other
     files; after an update it would run the old code. Hence one folder per state of the sources.
@@ -179,7 +179,7 @@ def _compiled(function: F, inline: str) -> F:
 
 
 def is_global(function: Any) -> bool:
-    """Whether it can be looked up in its module; one that is made within a function cannot."""
+    """True if it can be looked up in its module; one that is made within a function cannot."""
     return "<locals>" not in function.__qualname__
 
 
@@ -271,7 +271,7 @@ class _Implementation(CompileResultCacheImpl):
 
 
 class _AnotherCallee(ValueError):
-    """What a kernel in the cache calls was compiled again since, by a process beside this one."""
+    """A kernel's callee was compiled again since, by a process beside this one."""
 
 
 class _Called(NamedTuple):
@@ -337,7 +337,7 @@ class _Cache(FunctionCache):
         self._cache_file: _File = _File(self._cache_path, self._impl.filename_base, stamp)
 
     def holds(self, signature: Any, target: Any) -> bool:
-        """Whether a signature is there, by its files."""
+        """True if a signature is there, by its files."""
         with contextlib.suppress(*_DAMAGE, OSError):
             _refresh_once(target)
             return self._cache_file.load(self._index_key(signature, target.codegen())) is not None
@@ -382,7 +382,7 @@ def _refresh_once(target: Any) -> None:
 
 @functools.cache
 def _is_ours(folder: Path) -> bool:
-    """Whether nobody else puts files into a folder: what is there runs in this process.
+    """True if nobody else puts files into a folder: what is there runs in this process.
 
     Marks the one above as used, once a day: :func:`compiler.serve` removes what nobody used.
     """
