@@ -60,7 +60,7 @@ def log(stream: Any, shot: Shot) -> None:
     if row["residual"] is not None:
         curves["residual (px rms)"] = [row["residual"]]
     for name, values in curves.items():
-        stream.log(f"plots/{name}", rr.Scalars(values))
+        stream.log(["plots", name], rr.Scalars(values))  # parts: names have blanks
 
 
 def main(table: str, out: str) -> None:
