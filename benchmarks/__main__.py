@@ -110,12 +110,14 @@ def run(args: argparse.Namespace) -> None:
         write_result(args.out, results[name])
         # After each, so that an interrupted run leaves what it found.
         write_summary(args.out, results, context)
-        print(f"{name} ({time.perf_counter() - start:.0f} s)")
+        sys.stderr.write(f"{name} ({time.perf_counter() - start:.0f} s)\n")
         for one in results[name].claims:
-            print(f"  {one.verdict:13} {one.statement}: {one.finding} ({one.criterion})")
-        print(*(f"\n{note}\n" for note in results[name].notes), sep="")
+            said = f"  {one.verdict:13} {one.statement}: {one.finding} ({one.criterion})\n"
+            sys.stderr.write(said)
+        print(*results[name].notes, sep="\n", flush=True)
     claims = [claim for result in results.values() for claim in result.claims]
-    print(f"{verdicts(claims)}; written to {args.out / SUMMARY}")
+    print(verdicts(claims))
+    sys.stderr.write(f"written to {args.out / SUMMARY}\n")
 
 
 def _track(name: str, items: Iterable[T], total: int) -> Iterator[T]:

@@ -14,12 +14,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 
 import rs_localizer as rsl
+from benchmarks.experiments.results import Table
 from rs_localizer.core.arrays import Array
 
 Random = np.random.Generator
@@ -120,11 +121,14 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", default=[])
     parser.add_argument("--seed", type=int, default=0, help="other frames of the same kinds")
     options = parser.parse_args()
-    sys.stdout.write(f"{'':24} published  beyond {_FAR:g}  refused\n")
+    kinds = [one for one in FAULTS if any(_has(scene, one, options.only) for scene in SCENES)]
+    rows: list[tuple[str, ...]] = []
     for scene in SCENES:
-        for fault in FAULTS:
+        cells = []
+        for fault in kinds:
             name = f"{scene}/{fault}"
-            if not all(word in name for word in options.only):
+            if not _has(scene, fault, options.only):
+                cells.append("")
                 continue
             kind = (list(SCENES).index(scene), FAULTS.index(fault))
             random = np.random.default_rng([*kind, options.seed])
@@ -138,9 +142,17 @@ def main() -> int:
                 else:
                     reasons[str(result.reason)] += 1
             why = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
-            sys.stdout.write(f"{name:24} {published:9} {far:9}  {why}\n")
-            sys.stdout.flush()
+            sys.stderr.write(f"{name:24} {published:9} {far:9}  {why}\n")
+            cells.append(f"{published}, {far}")
+        if any(cells):
+            rows.append((scene, *cells))
+    heads = [kind.replace("a tenth wrong", "tenth wrong") for kind in kinds]
+    print(Table((f"published, beyond {_FAR:g}", *heads), rows).text())
     return 0
+
+
+def _has(scene: str, fault: str, words: Sequence[str]) -> bool:
+    return all(word in f"{scene}/{fault}" for word in words)
 
 
 if __name__ == "__main__":

@@ -89,6 +89,7 @@ def run(context: Context) -> Result:
                 noisy, CHOICE, _X_LABEL, (ORIENTATION, POSITION)
             ),
         },
+        [noisy.orientations("deg", 0.0, 15.0, 30.0)],
     )  # fmt: skip
 
 

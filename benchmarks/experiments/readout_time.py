@@ -81,6 +81,13 @@ def run(context: Context) -> Result:
     )
     axes.axhline(0.0, color="#c9c9c9")
     charts.tidy(axes, "recording", "error of the readout time (us), 95 %")
+    said = (
+        f"{count} recordings of {seconds:g} s: median error "
+        f"{1e6 * np.median([abs(t.error) for t in moving]):.0f} us, {ratio:.2f} of the "
+        f"Cramér-Rao bound (rms);\n{np.mean(inside):.0%} inside the intervals of 95 %; "
+        f"{sum(still)} of {len(still)} global shutters named, {sum(taken)} of {len(moving)} "
+        "others called one"
+    )
     return Result(
         "Readout time",
         f"{count} recordings of {seconds:g} s from the recorded motion of a hand, {_RATE:g} "
@@ -119,7 +126,7 @@ def run(context: Context) -> Result:
                 ],
             )
         },
-        {"readout_time": drawn},
+        {"readout_time": drawn}, [said],
     )  # fmt: skip
 
 

@@ -56,10 +56,13 @@ class Table:
     rows: Sequence[Sequence[str | float | int]]
 
     def text(self) -> str:
+        """Aligned columns, the first one flush left."""
         cells = [self.columns, *([_cell(x) for x in row] for row in self.rows)]
         widths = [max(len(row[k]) for row in cells) + 2 for k in range(len(self.columns))]
         return "\n".join(
-            "".join(x.rjust(width) for x, width in zip(row, widths, strict=True)) for row in cells
+            row[0].ljust(widths[0] - 2)
+            + "".join(x.rjust(width) for x, width in zip(row[1:], widths[1:], strict=True))
+            for row in cells
         )
 
     def write(self, file: Path) -> None:
@@ -135,6 +138,11 @@ def verdicts(claims: Sequence[Claim]) -> str:
     """``12 held, 3 did not hold``."""
     held = sum(claim.held for claim in claims)
     return f"{held} held, {len(claims) - held} did not hold"
+
+
+def rounded(value: float) -> str:
+    """Two significant digits, without an exponent."""
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def _cell(value: str | float | int) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.experiments.methods import Method, estimate
-from benchmarks.experiments.results import Context, Table
+from benchmarks.experiments.results import Context, Table, rounded
 from benchmarks.experiments.trials import Motions, Setting, Trials, angles, draw_trials
 from rs_localizer.core.arrays import Array
 
@@ -65,6 +65,16 @@ class Curves:
     def at(self, method: Method, metric: int, x: float) -> float:
         """Median at one of the places."""
         return float(self.medians(method)[np.argmin(np.abs(self.x - x)), metric])
+
+    def orientations(self, unit: str, *places: float) -> str:
+        """Medians of all methods at some places of the sweep, deg, as text."""
+        columns = ("orientation (deg), motion:", *(f"{x:g} {unit}" for x in places))
+        nearest = [np.argmin(np.abs(self.x - x)) for x in places]
+        rows = [
+            (name, *(rounded(float(values[k, 1, ORIENTATION])) for k in nearest))
+            for name, values in self.quartiles.items()
+        ]
+        return Table(columns, rows).text()
 
     def table(self) -> Table:
         columns = (self.x_name, "method", "metric", "p25", "median", "p75")

@@ -17,8 +17,8 @@ _SPEEDS = tuple(np.linspace(0.0, 0.3, 11).tolist())
 _FROM = 0.1  # per frame
 _X_LABEL = "translation per frame"
 _REST = (
-    "Below {:.3f} per frame P3P has the best orientation: noise outweighs the motion. P3P's is the "
-    "triplet nearest to the truth, which nobody can pick."
+    "Below {:.3f} per frame P3P has the best orientation: noise outweighs the motion.\n"
+    "P3P's is the triplet nearest to the truth, which nobody can pick."
 )
 
 
@@ -57,7 +57,5 @@ def run(context: Context) -> Result:
                 curves, CHOICE, _X_LABEL, (ORIENTATION, POSITION)
             ),
         },
-        [
-            _REST.format(passes)
-        ],
+        [curves.orientations("per frame", 0.0, 0.15, 0.3), _REST.format(passes)],
     )  # fmt: skip

@@ -24,7 +24,8 @@ from typing import Any
 
 import yaml
 
-from benchmarks.frames.compared import compare, read, totals, totals_line, write
+from benchmarks.experiments.results import Table
+from benchmarks.frames.compared import compare, read, totals, write
 from benchmarks.frames.conditions import BENCHES, Condition, conditions
 from benchmarks.frames.judged import Judged, judge
 from benchmarks.frames.timed import gate, times
@@ -35,6 +36,12 @@ _SHOWN = {
     "mm_50": "mm", "deg/s_50": "deg/s", "m/s_50": "m/s", "sharp_turn_s": "shp_t@s",
     "sharp_turn": "shp_turn", "sharp_way": "shp_way", "sharp_angular": "shp_w",
     "sharp_linear": "shp_v", "ms": "ms", "ms_95": "ms95",
+}  # fmt: skip
+
+_TOGETHER = {
+    "localized": "localized", "pose@m": "poses", "twist@m": "twists", ">5s": "beyond_5",
+    "deg": "deg", "mm": "mm", "deg/s": "deg/s", "m/s": "m/s", "s_turn": "sharpness", "ms": "ms",
+    "ms_95": "ms_95",
 }  # fmt: skip
 
 
@@ -98,21 +105,22 @@ def _run(options: argparse.Namespace) -> int:
                 table.writeheader()
             if not judged or wanted[len(judged) - 1].bench != condition.bench:
                 heads = " ".join(f"{name:>8}" for name in _SHOWN.values())
-                sys.stdout.write(f"{condition.bench:{width}} {heads}\n")
+                sys.stderr.write(f"{condition.bench:{width}} {heads}\n")
                 if judged:  # who stops the run keeps the benches that are done
                     write(options.out, wanted, judged)
             judged.append(one)
             table.writerow(row)
             file.flush()
             cells = " ".join(f"{_short(row[name]):>8}" for name in _SHOWN)
-            sys.stdout.write(f"{condition.name:{width}} {cells}  {row['reasons']}\n")
-            sys.stdout.flush()
+            sys.stderr.write(f"{condition.name:{width}} {cells}  {row['reasons']}\n")
         if pool:
             pool.shutdown()
     write(options.out, wanted, judged)
-    sys.stdout.write(f"\n{totals_line('', None)}\n")
-    for bench, total in totals(read(options.out)).items():
-        sys.stdout.write(f"{totals_line(bench, total)}\n")
+    rows = [
+        (bench, *(f"{total[name]:.3g}" for name in _TOGETHER))
+        for bench, total in totals(read(options.out)).items()
+    ]
+    sys.stdout.write(f"{Table(('', *_TOGETHER.values()), rows).text()}\n")
     return 0
 
 

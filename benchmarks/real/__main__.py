@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m benchmarks.real FOLDER``: a table of real videos of boards.
+"""``python -m benchmarks.real FOLDER``: real videos of boards, together; each in OUT/real.csv.
 
 ``python -m benchmarks.real gyro RECORDING --gyroscope FILE``: turn rates before a gyroscope.
 
@@ -16,11 +16,13 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 
 from benchmarks.experiments.results import Table
 from benchmarks.real import gyro, motion
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
-from benchmarks.real.judging import judged
+from benchmarks.real.judging import METHODS, judged
+from benchmarks.real.peers import PEERS
 from benchmarks.real.recordings import add_settings
 from rs_localizer.cli.settings_args import given_settings
 
@@ -49,11 +51,39 @@ def main(argv: Sequence[str]) -> None:
         if config.readout_time > 0.0:
             of_config = (config.readout_time, config.readout_time_deviation)
             shutter = replace(shutter, readout_time=of_config[0], deviation=of_config[1])
-        print(f"{clip.name}: {len(clip.images)} images, calibrate: {shutter.verdict}", flush=True)
+        said = f"{clip.name}: {len(clip.images)} images, calibrate: {shutter.verdict}"
+        print(said, file=sys.stderr, flush=True)
         rows[clip.name] = judged(clip, opencv_lens(clip), shutter, config)
         args.out.mkdir(parents=True, exist_ok=True)
         table(rows).write(args.out / "real.csv")  # who stops it keeps the videos that are done
-    print(table(rows).text())
+    print(together(rows).text())
+
+
+_FIGURES = {
+    "jitter, median": "turn50", "jitter, 95 %": "turn95", "two sides inside, %": "inside",
+    "claimed over actual": "turn_claimed", "held-out corners": "held",
+    "turn rates inside, %": "twist_inside", "ms": "ms",
+}  # fmt: skip
+
+
+def together(rows: Mapping[str, Mapping[str, float]]) -> Table:
+    """Medians of all videos, and their extremes, of each method."""
+    names = (*METHODS, *PEERS)
+
+    def cell(name: str, figure: str) -> str:
+        scale = 100.0 if figure.endswith("inside") else 1.0
+        values = [scale * row.get(f"{name}_{figure}", math.nan) for row in rows.values()]
+        known = [value for value in values if not math.isnan(value)]
+        if not known:
+            return ""
+        return f"{median(known):.3g} ({min(known):.2g}-{max(known):.2g})"
+
+    localized = [f"{sum(row[f'{name}_localized'] for row in rows.values()):.0f}" for name in names]
+    figures = [(head, *(cell(name, of) for name in names)) for head, of in _FIGURES.items()]
+    images = sum(row["images"] for row in rows.values())
+    return Table(
+        (f"{len(rows)} videos, {images:.0f} images", *names), [("localized", *localized), *figures]
+    )
 
 
 def table(rows: Mapping[str, Mapping[str, float]]) -> Table:

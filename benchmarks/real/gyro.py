@@ -16,6 +16,7 @@ printed board, nothing else is needed:
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.experiments.results import Table
 from benchmarks.real.gyroscopes import Gyroscope, aligned, read_board_video
 from benchmarks.real.motion import AHEAD
 from benchmarks.real.peers import PEERS, GlobalPose, solve_pnp_ransac
@@ -151,8 +153,8 @@ def predicted(recording: Recording, gyroscope: Gyroscope, config: LocalizerConfi
     for ahead, of in errors.items():
         inside = np.mean([off @ np.linalg.solve(spread, off) < _INSIDE for off, spread in of])
         median, high = _spread(np.array([off for off, _ in of]))
-        lines.append(f"{1e3 * ahead:.0f} ms ahead: {len(of)} rates, {median:.2f}, {high:.1f}"
-                     f" deg/s, {inside:.0%} inside")  # fmt: skip
+        lines.append(f"predicted {1e3 * ahead:.0f} ms ahead: {median:.2f}, {high:.1f} deg/s, "
+                     f"{inside:.0%} inside")  # fmt: skip
     return lines
 
 
@@ -191,13 +193,14 @@ def _spread(errors: Array) -> tuple[float, float]:
 
 
 _HEADINGS = (
-    "localized", "turn between neighbours", "central differences", "twist", "claimed",
-    "over actual", "inside", "within 1 px", "fastest",
+    "", "localized", "turns", "central", "twist", "claims", "ratio", "inside", "1px", "fast",
 )  # fmt: skip
 
 
-def text(judged: Judged) -> str:
-    """The table: median and 95 % of errors in deg/s, shares in %."""
+def table(judged: Judged) -> Table:
+    """Errors in deg/s, median and 95 %: of turns between neighbours, of central differences and
+    of twists; shares in %.
+    """
 
     def pair(values: tuple[float, float] | None) -> str:
         return "" if values is None else f"{values[0]:.2f}, {values[1]:.1f}"
@@ -205,15 +208,14 @@ def text(judged: Judged) -> str:
     def number(value: float, form: str) -> str:
         return "" if np.isnan(value) else format(value, form)
 
-    lines = ["| | " + " | ".join(_HEADINGS) + " |", "|" + "---|" * (len(_HEADINGS) + 1)]
-    for name, row in judged.rows.items():
-        cells = (
-            f"{row.localized} of {len(judged.times)}", pair(row.between), pair(row.central),
+    return Table(_HEADINGS, [
+        (
+            name, f"{row.localized}/{len(judged.times)}", pair(row.between), pair(row.central),
             pair(row.twist), number(row.claimed, ".1f"), number(row.ratio, ".2f"),
             number(100.0 * row.inside, ".0f"), f"{row.near:.3f}", f"{row.near_fastest:.3f}",
-        )  # fmt: skip
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        )
+        for name, row in judged.rows.items()
+    ])  # fmt: skip
 
 
 def draw(judged: Judged, gyroscope: Gyroscope, readout_time: float, file: Path) -> None:
@@ -251,7 +253,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--align", action="store_true", help="find its clock, axes and bias")
     parser.add_argument("--board", default="9x6", help="inner corners, of a video")
     parser.add_argument("--square", type=float, default=0.025, help="m, its side")
-    parser.add_argument("--out", type=Path, default=Path("real"), help="table and picture")
+    parser.add_argument("--out", type=Path, default=Path("real"), help="picture")
     add_settings(parser)
     args = parser.parse_args(argv)
     config = given_settings(args)
@@ -264,9 +266,7 @@ def main(argv: Sequence[str]) -> None:
         recording, gyroscope = read_bag(args.recording, config), Gyroscope.read(args.gyroscope)
     if args.align or args.gyroscope is None:
         gyroscope, said = aligned(gyroscope, recording)
-        print(said)
+        print(said, file=sys.stderr)
     judged = judge(recording, gyroscope, config)
-    table = "\n".join([text(judged), "", *predicted(recording, gyroscope, config)])
-    print(table)
-    (args.out / "gyro.md").write_text(table + "\n", encoding="utf-8")
+    print(table(judged).text(), *predicted(recording, gyroscope, config), sep="\n")
     draw(judged, gyroscope, recording.camera.readout_time, args.out / "gyro.png")

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from benchmarks.experiments.results import Table, rounded
 from benchmarks.independent.cameras import Camera as TrueCamera
 from benchmarks.real.peers import PEERS
 from benchmarks.real.recordings import Frame, Recording
@@ -37,6 +38,7 @@ _MARGIN = 2.0  # px from the rim
 _NEAREST, _FARTHEST = 0.3, 30.0  # m
 _INSIDE = 12.592  # 95 % quantile of chi-squared with six degrees of freedom
 _RATE = 30.0  # Hz
+HELD = ", held"  # poses without a prediction
 AHEAD = (0.01, 0.03, 0.1)  # s after the middle of an image, for which the tracker is asked
 _EVERY = 0.001  # s, within rows and between images
 # Of a gyroscope: rad/s/sqrt(Hz); rad/s; s; ns from a reading to who asks for it.
@@ -231,14 +233,19 @@ def at_any_time(
         asked += [(f"{1e3 * ahead:.0f} ms ahead", round(1e9 * ahead)) for ahead in AHEAD]
         for name, later in asked:
             there = tracker.at(each.middle_ns + later, _until(samples, each.middle_ns + later))
-            others = {"": there}
+            others: dict[str, Estimate | None] = {"": there}
             if later > half:
-                others |= {", held": one, ", same velocity": one.at_time(1e-9 * later)}
+                others |= {HELD: one, ", same velocity": one.at_time(1e-9 * later)}
             for how, estimate in others.items():
                 if estimate is not None:
                     found.setdefault(name + how, []).append((each.middle_ns + later, estimate))
         before = one
-    return {name: _row(some, camera, motion) for name, some in found.items()}
+    rows = {name: _row(some, camera, motion) for name, some in found.items()}
+    for name, row in rows.items():
+        if name.endswith(HELD):  # a pose alone, without a twist or a region
+            row.errors[2:] = np.nan
+            rows[name] = replace(row, inside=(np.nan, np.nan))
+    return rows
 
 
 def _seconds(middle_ns: int) -> float:
@@ -284,17 +291,16 @@ def _percentiles(errors: Array) -> Array:
     return found
 
 
-def text(rows: dict[str, Row]) -> str:
-    """The table."""
-    lines = [
-        "| | localized | deg | mm | deg/s | m/s | pose, twist inside (%) |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for name, row in rows.items():
-        cells = [f"{a:.3g}, {b:.3g}" if np.isfinite(a) else "" for a, b in row.errors]
-        inside = ", ".join(f"{100.0 * x:.0f}" for x in row.inside if np.isfinite(x))
-        lines.append(f"| {name} | {row.localized} | " + " | ".join([*cells, inside]) + " |")
-    return "\n".join(lines)
+def table(rows: dict[str, Row]) -> Table:
+    """Errors, median and 95 %, and how many truths (%) lie inside the regions of 95 %."""
+    return Table(("", "poses", "deg", "mm", "deg/s", "m/s", "pose, twist inside"), [
+        (
+            name, row.localized,
+            *(f"{rounded(a)}, {rounded(b)}" if np.isfinite(a) else "" for a, b in row.errors),
+            ", ".join(f"{100.0 * x:.0f}" for x in row.inside if np.isfinite(x)),
+        )
+        for name, row in rows.items()
+    ])  # fmt: skip
 
 
 def main(argv: Sequence[str]) -> None:
@@ -307,7 +313,6 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--points", type=int, default=150, help="of each image")
     parser.add_argument("--noise", type=float, default=0.5, help="px")
     parser.add_argument("--gyroscope", type=float, default=0.0, help="Hz of one for any time")
-    parser.add_argument("--out", type=Path, default=Path("real"), help="table")
     args = parser.parse_args(argv)
     read = read_aria if args.folder.is_dir() else read_trajectory
     motion, points = read(args.folder)
@@ -318,7 +323,4 @@ def main(argv: Sequence[str]) -> None:
     recording = simulated(args.folder.name, motion, points, camera, args.points, args.noise)
     samples = gyroscope(motion, args.gyroscope) if args.gyroscope > 0.0 else None
     rows = judge(recording, motion) | at_any_time(recording, motion, samples)
-    table = text(rows)
-    print(table)
-    args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "aria.md").write_text(table + "\n", encoding="utf-8")
+    print(table(rows).text())

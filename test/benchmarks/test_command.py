@@ -15,9 +15,10 @@ def test_tables_figures_and_summary(tmp_path, capsys):
     out = tmp_path / "new" / "folder"
     words = ["translation", "--trials", "20", "--seed", "3", "--out", str(out)]
     assert main(words) == 0
-    printed = capsys.readouterr().out
-    assert "translation (" in printed
-    assert str(out / "summary.md") in printed
+    printed, said = capsys.readouterr()
+    assert printed.startswith("orientation (deg), motion:")
+    assert "translation (" in said
+    assert str(out / "summary.md") in said
     names = {path.name for path in out.iterdir()}
     assert {"translation.csv", "translation.png", "summary.md"} <= names
     with (out / "translation.csv").open(newline="") as file:

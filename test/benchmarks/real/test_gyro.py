@@ -82,15 +82,17 @@ def test_right_twists_are_near_and_turned_round_ones_far(recording, gyroscope):
     assert backwards["single"].inside < 0.2
 
 
-def test_the_command_writes_table_and_picture(recording, gyroscope, tmp_path):
+def test_the_command_prints_a_table_and_draws_a_picture(recording, gyroscope, tmp_path, capsys):
     text = tmp_path / "gyroscope.txt"
     np.savetxt(text, np.column_stack([gyroscope.times, gyroscope.rates]), fmt="%.9f")
     command.main(["gyro", str(recording), "--gyroscope", str(text), "--out", str(tmp_path),
                   "-p", f"readout_time:={TRUE.readout_time}"])  # fmt: skip
-    table = (tmp_path / "gyro.md").read_text()
-    rows, ahead = (part.splitlines() for part in table.split("\n\n"))
-    assert len(rows) == 2 + len(PEERS) + 4  # single, and tracked at once, one later, two later
-    assert [line.split(":")[0] for line in ahead] == [f"{ms} ms ahead" for ms in (10, 30, 100)]
+    lines = capsys.readouterr().out.splitlines()
+    rows, ahead = lines[:-3], lines[-3:]
+    assert len(rows) == 1 + len(PEERS) + 4  # single, and tracked at once, one later, two later
+    assert [line.split(":")[0] for line in ahead] == [
+        f"predicted {ms} ms ahead" for ms in (10, 30, 100)
+    ]
     assert (tmp_path / "gyro.png").stat().st_size > 10_000
 
 

@@ -1,0 +1,57 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m benchmarks.demo``: the medians of ``rs_localizer demo``, ours beside P3P's."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tempfile
+
+from benchmarks.experiments.results import Table, rounded
+
+_TITLE = re.compile(r"(.+), (\d+) frames  .*median")
+_ROW = re.compile(r"(.+), (\w+) +(\d+) +([\d.]+)")
+
+
+def main() -> int:
+    """Run the demo and print its table; the exit code."""
+    with tempfile.TemporaryDirectory() as out:
+        words = ["-m", "rs_localizer", "demo", "--json", "--out", out]
+        demo = subprocess.run([sys.executable, *words], check=True, stdout=subprocess.PIPE)
+    print(summary(json.loads(demo.stdout)["text"]))
+    return 0
+
+
+def summary(lines: list[str]) -> str:
+    """Table of the medians that the demo has printed, and what it says of cube and node."""
+    rows: dict[tuple[str, str], dict[str, str]] = {}
+    said, recording, frames = [], "", 0
+    for line in lines:
+        if title := _TITLE.match(line):
+            recording, frames = title[1], int(title[2])
+        elif row := _ROW.match(line):
+            quantity, solver, count, middle = row.groups()
+            if quantity == "inliers":
+                continue
+            localized = rows.setdefault((f"{recording}, {frames} frames", "localized"), {})
+            localized[solver] = f"{100.0 * int(count) / frames:.1f} %"
+            scale, unit = (1e3, "mm") if quantity == "position (m)" else (1.0, "m")
+            name = quantity.replace("(m)", f"({unit})")
+            rows.setdefault((f"{recording}, {frames} frames", name), {})[solver] = rounded(
+                scale * float(middle)
+            )
+        elif "farthest corner" in line or "live node has answered" in line:
+            said.append(line)
+    solvers = list(dict.fromkeys(solver for row in rows.values() for solver in row))
+    cells = [
+        (f"{of}: {name}", *(row.get(solver, "") for solver in solvers))
+        for (of, name), row in rows.items()
+    ]
+    return "\n".join([Table(("medians", *solvers), cells).text(), *said])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,75 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``COMMAND | python -m benchmarks.page NAME``: what a bench prints, into docs/benchmarks.md.
+
+The page's prose is written by hand. Its figures stand in blocks after ``<!-- NAME -->``, each
+filled with ``results/NAME.txt``: what the bench printed, its commit and date. Without a name all
+blocks are filled anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+from datetime import date
+from pathlib import Path
+
+PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
+RESULTS = Path(__file__).parent / "results"
+_BLOCK = re.compile(r"^(<!-- ([\w-]+) -->\n```text\n).*?^```$", re.MULTILINE | re.DOTALL)
+
+
+def blocks(page: str) -> dict[str, str]:
+    """Figures of a page by the names of their blocks."""
+    return {
+        found[2]: found[0].removeprefix(found[1]).removesuffix("```")
+        for found in _BLOCK.finditer(page)
+    }
+
+
+def filled(page: str, results: Path = RESULTS) -> str:
+    """The page with each block as its bench printed it.
+
+    Raises:
+        FileNotFoundError: when a block's bench has never run.
+    """
+
+    def fill(found: re.Match[str]) -> str:
+        return f"{found[1]}{(results / f'{found[2]}.txt').read_text(encoding='utf-8')}```"
+
+    return _BLOCK.sub(fill, page)
+
+
+def record(name: str, printed: str) -> None:
+    """Keep what a bench has printed, with the commit that is checked out and the date."""
+    git = ["git", "-C", str(RESULTS.parent), "describe", "--always", "--dirty", "--abbrev=8"]
+    commit = subprocess.run(git, check=True, capture_output=True, text=True).stdout.strip()
+    lines = [line.rstrip() for line in printed.strip("\n").splitlines()]
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / f"{name}.txt").write_text(
+        "\n".join([*lines, f"(commit {commit}, {date.today():%d %B %Y})", ""]), encoding="utf-8"
+    )
+
+
+def main() -> int:
+    """Record one block, or fill all of them; the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.page", description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    page = PAGE.read_text(encoding="utf-8")
+    parser.add_argument("name", nargs="?", choices=blocks(page), help="of the block")
+    name = parser.parse_args().name
+    if name is not None:
+        printed = sys.stdin.read()
+        if not printed.strip():
+            parser.error(f"nothing was printed: {name} stays as it is")
+        record(name, printed)
+    PAGE.write_text(filled(page), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
