@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import textwrap
 
 from benchmarks.experiments.results import Table, rounded
 
@@ -44,7 +45,7 @@ def summary(lines: list[str]) -> str:
                 scale * float(middle)
             )
         elif "farthest corner" in line or "live node has answered" in line:
-            said.append(line)
+            said += textwrap.wrap(line, 100)
     solvers = list(dict.fromkeys(solver for row in rows.values() for solver in row))
     cells = [
         (f"{of}: {name}", *(row.get(solver, "") for solver in solvers))

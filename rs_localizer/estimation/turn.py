@@ -8,7 +8,7 @@ whole cosines and sines, so that ``y`` is the motion without its vibration,
     e = M y + T k + S f + noise,      k ~ N(0, t^2 C)
 
 for some spectra ``C`` and sizes ``t``. Once the motion is taken out (Schur's complement, with
-``N = T^T W T`` and ``h = T^T W e`` beside it), each of them is a Cholesky factor away:
+``N = T^T W T`` and ``h = T^T W e`` beside it), each of them is one tridiagonal system away:
 
     log evidence = -log det(1 + t^2/n^2 L^T N L) / 2
                    - freedom / 2 log(1 - h^T L (n^2/t^2 + L^T N L)^-1 L^T h / rest)
@@ -203,30 +203,121 @@ class _Vibrating(NamedTuple):
     gain: float  # logarithm of the evidence of all, against none
 
 
-@kernel
-def _factored(matrix: Array, along: Array) -> tuple[float, float]:
-    """``h^T A^-1 h`` and half the log-determinant of a matrix that is not less than one (Cholesky).
+class _Tridiagonal(NamedTuple):
+    """``Q^T A Q`` of symmetric matrices A (s,n,n), by Householder's reflections."""
 
-    Rounding may make it less, where the motion mimics a column; overwritten.
+    diagonal: Array  # (s,n)
+    off: Array  # (s,n) beside it; the last is 0
+    axes: Array  # (s,n,n) rows: v of ``Q = (I - v_0 v_0^T) (I - v_1 v_1^T) ...``
+    along: Array  # (s,n) Q^T h
+
+
+@kernel
+def _reduce(matrix: Array, place: int, out: _Tridiagonal) -> None:
+    """Fill in one place; ``out.along`` holds h there. The matrix is overwritten."""
+    size = len(matrix)
+    out.off[place] = 0.0
+    out.axes[place] = 0.0
+    for k in range(size - 1):
+        # Loops over slices from zero are what the compiler makes vectors of.
+        left, row, rest = size - k - 1, matrix[k, k + 1 :], matrix[k + 1 :, k + 1 :]
+        axis, along = out.axes[place, k, k + 1 :], out.along[place, k + 1 :]
+        length, head = 0.0, row[0]
+        for i in range(left):
+            length += row[i] * row[i]
+        length = math.copysign(math.sqrt(length), -head)  # the sign that avoids cancellation
+        out.diagonal[place, k], out.off[place, k] = matrix[k, k], length
+        half = length * (length - head)  # half of the squared length of the axis
+        if not half > 0.0:
+            continue
+        scale = 1.0 / math.sqrt(half)
+        for i in range(left):
+            axis[i] = row[i] * scale
+        axis[0] = (head - length) * scale
+        pulled = row  # it is not needed again
+        for i in range(left):
+            pulled[i] = 0.0
+        for i in range(left):
+            other, part = rest[i], axis[i]
+            for j in range(left):
+                pulled[j] += part * other[j]
+        own, shown = 0.0, 0.0
+        for i in range(left):
+            own += 0.5 * axis[i] * pulled[i]
+            shown += axis[i] * along[i]
+        for i in range(left):
+            pulled[i] -= own * axis[i]
+            along[i] -= shown * axis[i]
+        for i in range(left):
+            other, one, two = rest[i], axis[i], pulled[i]
+            for j in range(left):
+                other[j] -= one * pulled[j] + two * axis[j]
+    out.diagonal[place, size - 1] = matrix[size - 1, size - 1]
+
+
+@inlined
+def _back(axes: Array, half: Array) -> Array:
+    """``Q^T L^T`` (n,n) of a spectrum's root L and the axes (n,n) of its reflections."""
+    back, size = half.T.copy(), len(half)
+    pulled = np.empty(size)
+    for k in range(size - 1):
+        axis = axes[k]
+        pulled[:] = 0.0
+        for i in range(k + 1, size):
+            row, part = back[i], axis[i]
+            for j in range(size):
+                pulled[j] += part * row[j]
+        for i in range(k + 1, size):
+            row, part = back[i], axis[i]
+            for j in range(size):
+                row[j] -= part * pulled[j]
+    return back
+
+
+@kernel
+def _solved(diagonal: Array, off: Array, along: Array, part: float, mean: Array) -> tuple[
+    float, float
+]:  # fmt: skip
+    """``h^T A^-1 h`` and half the log-determinant of ``A = I + part T``, T tridiagonal; ``mean``
+    becomes ``-part A^-1 h``.
+
+    No pivot is less than one but by rounding, where the motion mimics a column.
     """
-    size, squares, determinant = len(along), 0.0, 0.0
-    inner, inverse = np.empty(size), np.empty(size)
+    size, determinant, squares = len(diagonal), 0.0, 0.0
+    pivots, before, carried = np.empty(size), 0.0, 0.0
     for i in range(size):
-        row, diagonal, total = matrix[i], matrix[i, i], along[i]
-        for j in range(i):
-            other, rest = matrix[j], row[j]
-            for k in range(j):
-                rest -= row[k] * other[k]
-            rest *= inverse[j]
-            row[j] = rest
-            diagonal -= rest * rest
-            total -= rest * inner[j]
-        diagonal = max(diagonal, 1.0)
-        inverse[i] = 1.0 / math.sqrt(diagonal)
-        inner[i] = total * inverse[i]
-        squares += inner[i] * inner[i]
-        determinant += 0.5 * math.log(diagonal)
+        pivots[i] = max(1.0 + part * diagonal[i] - before * carried, 1.0)
+        mean[i] = along[i] - (carried * mean[i - 1] if i else 0.0)
+        squares += mean[i] ** 2 / pivots[i]
+        determinant += 0.5 * math.log(pivots[i])
+        before = part * off[i]
+        carried = before / pivots[i]
+    after = 0.0
+    for i in range(size - 1, -1, -1):
+        after = (mean[i] - part * off[i] * after) / pivots[i]
+        mean[i] = after
+    for i in range(size):
+        mean[i] *= -part
     return squares, determinant
+
+
+@kernel
+def _add_inverse(diagonal: Array, off: Array, part: float, weight: float, total: Array) -> None:
+    """Add ``weight (I + part T)^-1``, T tridiagonal, from its pivots from above and from below."""
+    size = len(diagonal)
+    below = np.empty(size + 1)
+    below[size] = 1.0
+    for i in range(size - 1, -1, -1):
+        below[i] = max(1.0 + part * diagonal[i] - (part * off[i]) ** 2 / below[i + 1], 1.0)
+    above = 0.0  # what the rows above take of a pivot
+    for i in range(size):
+        entry = weight / max(below[i] - above, 1.0)
+        above = (part * off[i]) ** 2 / max(1.0 + part * diagonal[i] - above, 1.0)
+        total[i, i] += entry
+        for j in range(i + 1, size):
+            entry *= -part * off[j - 1] / below[j]
+            total[i, j] += entry
+            total[j, i] += entry
 
 
 @kernel
@@ -235,6 +326,9 @@ def _integrate(
 ) -> _Vibrating:
     """Integrate over spectra and sizes.
 
+    Each spectrum is brought to tridiagonal form once, which costs as much as two or three of the
+    Cholesky factors that each size would need.
+
     Args:
         odds: (v,) logarithms, of none and each vibration before the frame.
         first: how many spectra are looked at.
@@ -242,19 +336,22 @@ def _integrate(
     likelihoods, factors = np.full(VIBRATIONS, -np.inf), len(FACTORS)
     likelihoods[0] = 0.0
     rest, variance = max(turned.rest, TINY), noise * noise
-    variances = np.empty(VIBRATIONS)
+    variances, means = np.empty(VIBRATIONS), np.empty((VIBRATIONS, TURNS))
     weights = np.full(VIBRATIONS, -np.inf)
+    form = _Tridiagonal(
+        np.empty((first, TURNS)), np.empty((first, TURNS)), np.empty((first, TURNS, TURNS)),
+        np.empty((first, TURNS)),
+    )  # fmt: skip
     for s in range(first):
         half = _HALVES[s]
-        own, along = half.T @ turned.own @ half, half.T @ turned.along
+        form.along[s] = half.T @ turned.along
+        _reduce(half.T @ turned.own @ half, s, form)
         for f in range(factors):
             place, part = 1 + s * factors + f, FACTORS[f] ** 2 / variance
-            matrix = part * own
-            for k in range(TURNS):
-                matrix[k, k] += 1.0
-            explained, determinant = _factored(matrix, along)
-            explained *= part
-            left = max(1.0 - explained / rest, _LEAST_LEFT)
+            explained, determinant = _solved(
+                form.diagonal[s], form.off[s], form.along[s], part, means[place]
+            )
+            left = max(1.0 - part * explained / rest, _LEAST_LEFT)
             variances[place] = rest * left / freedom
             likelihoods[place] = -determinant - 0.5 * freedom * math.log(left)
             weights[place] = likelihoods[place] + odds[place] + _OF_FACTORS[f]
@@ -265,23 +362,24 @@ def _integrate(
     turns, covariance = np.zeros(TURNS), np.zeros((TURNS, TURNS))
     mean_variance = 0.0
     for s in range(first):
-        half = _HALVES[s]
+        mean, spread, counts = np.zeros(TURNS), np.zeros((TURNS, TURNS)), False
         for f in range(factors):
-            place = 1 + s * factors + f
+            place, part = 1 + s * factors + f, FACTORS[f] ** 2 / variance
             weight = weights[place] / total
             if weight < _NO_PART:
                 continue
-            part = FACTORS[f] ** 2 / variance
-            matrix = part * (half.T @ turned.own @ half)
-            for k in range(TURNS):
-                matrix[k, k] += 1.0
-            spread = part * (half @ np.linalg.inv(matrix) @ half.T)
-            mean = -spread @ turned.along
-            turns += weight * mean
+            counts = True
             mean_variance += weight * variances[place]
-            covariance += weight * (
-                variances[place] * spread + mean.reshape(TURNS, 1) * mean.reshape(1, TURNS)
-            )
+            own = weight * variances[place] * part
+            _add_inverse(form.diagonal[s], form.off[s], part, own, spread)
+            for i in range(TURNS):
+                mean[i] += weight * means[place, i]
+                for j in range(TURNS):
+                    spread[i, j] += weight * means[place, i] * means[place, j]
+        if counts:
+            back = _back(form.axes[s], _HALVES[s])
+            turns += mean @ back
+            covariance += back.T @ spread @ back
     covariance -= turns.reshape(TURNS, 1) * turns.reshape(1, TURNS)
     return _Vibrating(likelihoods, turns, covariance, mean_variance, top + math.log(total))
 
