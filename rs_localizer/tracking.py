@@ -324,21 +324,26 @@ class Tracker:
     def _turned(self, time_ns: int, samples: ImuSamples | None) -> Estimate | None:
         """The motion after the last frame, turning as a gyroscope says; None where it does not."""
         track = self._track
-        if track is None or self._aid is None or not samples:
+        if track is None or self._aid is None or not self._aid.agreed or not samples:
             return None
-        span, last_ns = track.estimate.span, self._aid.last_ns(samples)
-        half_ns, seen_ns = round(0.5e9 * span), min(time_ns, last_ns)
+        span, half_ns = track.estimate.span, round(0.5e9 * track.estimate.span)
+        # The last frame's own rows are seen, too.
+        last_ns = max(self._aid.last_ns(samples), track.time_ns + half_ns)
+        seen_ns = min(time_ns, last_ns)
         # As if a frame had its last row there.
         middle_ns = min(time_ns, last_ns - half_ns)
-        before = self._before(middle_ns)
-        if before is None or not track.time_ns < middle_ns or time_ns > last_ns + half_ns:
+        if middle_ns < track.time_ns or time_ns > last_ns + half_ns:
             return None
         from rs_localizer.inertial.aiding import changed
 
-        known = self._aid.ahead(samples, middle_ns, before)
-        if known is None:
-            return None
-        there = known.of(track.estimate).at_time(1e-9 * (seen_ns - middle_ns))
+        last = track.estimate
+        if middle_ns > track.time_ns:
+            before = self._before(middle_ns)
+            known = None if before is None else self._aid.ahead(samples, middle_ns, before)
+            if known is None:
+                return None
+            last = known.of(last)
+        there = last.at_time(1e-9 * (seen_ns - middle_ns))
         if (unseen := 1e-9 * (time_ns - seen_ns)) > 0.0:
             there, variance = there.at_time(unseen), changed(samples, unseen)
             added = acceleration_covariance(self._beside_gyro(track), unseen, span)

@@ -193,13 +193,16 @@ class GyroscopeAid:
         """The last moment that samples cover, by the camera's clock."""
         return int(samples.times_ns[-1]) + round(1e9 * self.filter.errors.time_offset) - 1
 
+    @property
+    def agreed(self) -> bool:
+        """Agreement of the last frame with the gyroscope."""
+        return self._unused is None
+
     def ahead(self, samples: ImuSamples, middle_ns: int, last: Before) -> GyroPrediction | None:
         """Prediction of a moment after the last frame, as if it were a frame's.
 
-        None unless the last frame agreed with the gyroscope, and samples cover this one.
+        None unless samples cover it.
         """
-        if self._unused is not None:
-            return None
         errors = self.filter.errors
         turn = turning.turn_within(samples, middle_ns, self._readout_time, errors)
         between = turning.turn_between(samples, last.middle_ns, middle_ns, errors)

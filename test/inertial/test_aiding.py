@@ -68,3 +68,20 @@ def test_upside_down_is_dropped_with_its_angle(held):
     assert status.unused.reason == ImuReason.TURNED
     assert status.unused.detail in ("by 178 degrees", "by 179 degrees", "by 180 degrees")
     assert all(result for _, result in found)
+
+
+def test_behind_the_last_row_the_camera_turns_on(held):
+    """Readings of later than the middle row have not come: the frame's own rows say it."""
+    tracker = Tracker(Localizer(believed(held.frames.camera)), held.settings)
+    half = round(0.5e9 * Camera().readout_time)
+    off = []
+    for frame in range(60):
+        samples, middle = held.around(frame), held.frames.middle_ns(frame)
+        tracker.localize(middle, *held.frames.seen(frame, 1.0), imu=samples)
+        here = int(np.searchsorted(samples.times_ns, middle))
+        late = ImuSamples(samples.times_ns[:here], samples.angular_velocity[:here])
+        moved = [tracker.at(middle + half + 1_000_000, heard) for heard in (late, samples)]
+        if frame >= 20:
+            off.append(np.subtract(*(one.angular_velocity for one in moved)))
+    off = np.degrees(np.linalg.norm(off, axis=1)) / Camera().readout_time
+    assert np.median(off) < 1.0  # 4.8 deg/s where the motion of the frames so far is carried on
