@@ -115,7 +115,7 @@ def refusal(
             Reason.MODEL_ERROR,
             f"neighbouring rows share errors that no motion explains ({posterior.agreement:.1f} "
             f"standard deviations, {posterior.noise:.2g} px): the camera vibrates faster than its "
-            "rows can tell, or the scan direction is another one",
+            "rows can resolve, or the scan direction is another one",
         )
     if posterior.near_outliers:
         return Failure(
@@ -142,7 +142,7 @@ def refusal(
     if turn > _MOST_TURN:
         return Failure(
             Reason.IMPLAUSIBLE,
-            f"the camera would turn by {math.degrees(turn):.0f} deg per readout",
+            f"the camera would rotate by {math.degrees(turn):.0f} deg per readout",
         )
     travel = float(np.linalg.norm(state[STATE_LINEAR]))
     if travel > depth:
@@ -197,6 +197,6 @@ def uncertain(estimate: Estimate, most: float) -> Failure | None:
         return None
     return Failure(
         Reason.UNCERTAIN,
-        f"the points tell the orientation to {math.degrees(deviation):.1f} deg (one standard "
-        f"deviation), {math.degrees(most):.1f} deg are accepted",
+        f"the points determine the orientation to {math.degrees(deviation):.1f} deg (one "
+        f"standard deviation), {math.degrees(most):.1f} deg are accepted",
     )
