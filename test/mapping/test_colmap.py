@@ -55,9 +55,9 @@ def test_the_lens_is_the_same_for_colmap(model, D):
 
 def build(images: Path, folder: Path, count: int) -> structures.Structure:
     folder.mkdir()
-    rows = np.arange(count)
+    rows = {k: k for k in range(count)}
     silent = lambda *_: nullcontext(lambda count: None)  # noqa: E731
-    return build_structure(images, rows, rows, None, folder, Effort(), silent)
+    return build_structure(images, rows, None, folder, Effort(), silent)
 
 
 def test_a_process_that_dies_is_named(tmp_path, monkeypatch):

@@ -207,9 +207,9 @@ def build_map(inputs: Given, work: Workshop) -> Built:
 
 def _structure(inputs: Given, keyframes: IntArray, work: Workshop) -> Structure:
     """The first structure, of about the right size."""
+    stamps = {row: inputs.views[row].stamp_ns for row in keyframes.tolist()}
     structure = build_structure(
-        inputs.views[0].image.parent, keyframes, inputs.stamps_ns, inputs.camera, work.folder,
-        work.effort, work.stage,
+        inputs.views[0].image.parent, stamps, inputs.camera, work.folder, work.effort, work.stage,
     )  # fmt: skip
     total = len(keyframes)
     if structure.parts[0] < max(LEAST_VIEWS, _LEAST_PART * total):
@@ -243,7 +243,7 @@ def _refined(
     directions, given = likely_axes(camera.size, inputs.scan_direction), inputs.readout_time
     with work.stage("refine", 3 if given is not None else 3 * (1 + len(directions))) as step:
         return refine_with_shutter(
-            camera, observations, start, freedom, given, directions, lambda _: step(1)
+            camera, observations, start, freedom, (given, directions), lambda _: step(1)
         )
 
 

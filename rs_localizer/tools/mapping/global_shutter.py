@@ -53,8 +53,7 @@ def undo_shutter(
     camera: Camera,
     model: Model,
     stamps_ns: Mapping[str, int],
-    readout_time: float | None,
-    scan_direction: str | None,
+    shutter: tuple[float | None, str | None],
     lens: bool,
     done: Callable[[str], object] = lambda text: None,
 ) -> GlobalShutterModel:
@@ -64,8 +63,7 @@ def undo_shutter(
         camera: of all images; its shutter does not matter.
         model: points and who sees them.
         stamps_ns: of the images, by their names; no two are the same.
-        readout_time: s; None: estimated.
-        scan_direction: None: unknown.
+        shutter: readout time, s, None: estimated; and scan direction, None: unknown.
         lens: whether the lens is adjusted.
         done: called with each part of the work that is done.
 
@@ -82,9 +80,9 @@ def undo_shutter(
         raise MappingError(
             f"no image of the model shows {LEAST_KEYPOINTS} points that three images see"
         )
-    freedom, directions = colmap_freedom(some, near, lens), likely_axes(camera.size, scan_direction)
-    refined, shutter, check = refine_with_shutter(
-        camera, some, near, freedom, readout_time, directions, done
+    freedom, directions = colmap_freedom(some, near, lens), likely_axes(camera.size, shutter[1])
+    refined, found, check = refine_with_shutter(
+        camera, some, near, freedom, (shutter[0], directions), done
     )
     motion = ViewMotion(used, refined.times, refined)
     projected = motion.sights(seen.images, seen.landmarks, seen.pixels)
@@ -125,7 +123,7 @@ def undo_shutter(
         images=made,
         points=Points(model.ids[shown], points[shown] / scale, model.colors[shown], means[shown]),
         refined=refined,
-        shutter=shutter,
+        shutter=found,
         readout_check=check,
         keypoints=len(seen.landmarks),
         before=float(np.sqrt(np.mean(before**2))),

@@ -104,13 +104,16 @@ def fit_shutter(
 
 def refine_with_shutter(
     camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
-    given: float | None, directions: Sequence[ScanDirection], done: Callable[[str], object],
+    shutter: tuple[float | None, Sequence[ScanDirection]], done: Callable[[str], object],
 ) -> tuple[RefinedMap, ShutterFit | None, ReadoutCheck | None]:  # fmt: skip
     """The map refined with a given readout time (s) along the first direction, and its check.
 
     Else, or where the images contradict it, as of :func:`fit_shutter`.
+
+    Args:
+        shutter: the readout time, if one is given, and the directions.
     """
-    check = None
+    check, (given, directions) = None, shutter
     if given is not None:
         known = replace(camera, readout_time=given, scan_direction=directions[0])
         refined = refine(known, observations, start, freedom, done=done)

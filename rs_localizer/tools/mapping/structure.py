@@ -16,7 +16,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,15 +84,14 @@ def image_name(row: int) -> str:
 
 
 def build_structure(
-    images: Path, keyframes: IntArray, stamps_ns: IntArray, lens: Camera | None, folder: Path,
-    effort: Effort, stage: Stage,
+    images: Path, keyframes: Mapping[int, int], lens: Camera | None, folder: Path, effort: Effort,
+    stage: Stage,
 ) -> Structure:  # fmt: skip
     """Reconstruct the largest part of the keyframes that hangs together.
 
     Args:
         images: folder with the images of the keyframes, by :func:`image_name`.
-        keyframes: (k,) rows of the views.
-        stamps_ns: of all views.
+        keyframes: rows of the views, and their stamps, ns.
         lens: of all images, which is believed; None: COLMAP calibrates a simple radial camera.
         folder: for COLMAP's database and model; they stay.
         effort: threads and seed.
@@ -105,7 +104,7 @@ def build_structure(
     task = {
         "images": str(images),
         "folder": str(folder),
-        "names": [image_name(row) for row in keyframes.tolist()],
+        "names": [image_name(row) for row in keyframes],
         "pairs": pairs_of(len(keyframes)),
         "camera": None if lens is None else colmap_parameters(lens),
         "features": effort.features,
@@ -120,10 +119,11 @@ def build_structure(
     model = read_model(folder / SPARSE, folder / DATABASE)
     assert model.descriptors is not None
     names = sorted(model.images)
-    views = np.array([int(Path(name).stem) for name in names])
+    views = [int(Path(name).stem) for name in names]
+    stamps = np.array([keyframes[row] for row in views], np.int64)
     return Structure(
-        views,
-        *observed(model, names, stamps_ns[views]),
+        np.array(views, np.int64),
+        *observed(model, names, stamps),
         descriptors=model.descriptors.astype(np.float32),
         camera=lens or model.camera,
         parts=tuple(said["parts"]),
