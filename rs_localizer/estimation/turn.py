@@ -288,10 +288,11 @@ def _solved(diagonal: Array, off: Array, along: Array, part: float, mean: Array)
     for i in range(size):
         pivots[i] = max(1.0 + part * diagonal[i] - before * carried, 1.0)
         mean[i] = along[i] - (carried * mean[i - 1] if i else 0.0)
-        squares += mean[i] ** 2 / pivots[i]
-        determinant += 0.5 * math.log(pivots[i])
         before = part * off[i]
         carried = before / pivots[i]
+    for i in range(size):
+        squares += mean[i] ** 2 / pivots[i]
+        determinant += 0.5 * math.log(pivots[i])
     after = 0.0
     for i in range(size - 1, -1, -1):
         after = (mean[i] - part * off[i] * after) / pivots[i]
@@ -315,7 +316,7 @@ def _add_inverse(diagonal: Array, off: Array, part: float, weight: float, total:
         above = (part * off[i]) ** 2 / max(1.0 + part * diagonal[i] - above, 1.0)
         total[i, i] += entry
         for j in range(i + 1, size):
-            entry *= -part * off[j - 1] / below[j]
+            entry = -entry * part * off[j - 1] / below[j]
             total[i, j] += entry
             total[j, i] += entry
 

@@ -31,7 +31,7 @@ from rs_localizer.settings import build, load_params_file
 
 K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(320, 240, K)
-LENS = '{"width": 320, "height": 240, "fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5}'
+LENS = "1 PINHOLE 320 240 300 300 160 120\n"  # the first pixel's middle is at 0.5
 SQUARE, DEPTH = 0.03, 0.45
 TURN = Rotation.from_euler("YX", [25.0, -20.0], degrees=True).as_matrix()  # camera_from_print
 MARKERS = MarkerMap(wall("5x5_50", (2, 1), 0.07, 0.03), map_frame="hall")  # cells of 1 cm
@@ -73,7 +73,7 @@ def markers(x: float = 0.0) -> Any:
 
 @pytest.fixture
 def here(tmp_path) -> SimpleNamespace:
-    (tmp_path / "camera.json").write_text(LENS)
+    (tmp_path / "cameras.txt").write_text(LENS)
     write_marker_map(tmp_path / "map.yaml", MARKERS)
     # The third image cuts the board off, in the fifth there is none.
     images = [board(x=x) for x in (0.0, 0.01, 0.25, 0.02, 5.0, 0.03)]
@@ -83,7 +83,7 @@ def here(tmp_path) -> SimpleNamespace:
         path=tmp_path,
         out=tmp_path / "out",
         video=str(tmp_path / "board.mjpeg"),
-        calibration=("--calibration", str(tmp_path / "camera.json")),
+        calibration=("--calibration", str(tmp_path / "cameras.txt")),
         board=("--board", "6x4", "--square", str(SQUARE)),
         map=("--map", str(tmp_path / "map.yaml")),
     )
@@ -273,7 +273,7 @@ def test_a_video_has_its_own_times(here, capsys):
 
 
 def test_a_wrong_calibration_is_named(here, capsys):
-    (here.path / "camera.json").write_text(LENS.replace('"fy": 300', '"fy": 900'))
+    (here.path / "cameras.txt").write_text(LENS.replace("300 300", "300 900"))
     images = folder(here.path / "images", [board()] * 3)
     assert detect(here, images, *here.calibration, *here.board, "--rate", "30") == 0
     said = capsys.readouterr().out

@@ -42,7 +42,7 @@ if WORKING:
         RigCamera,
         from_recordings,
     )
-from rs_localizer.tools.mapping.refinement import RefinedMap, refine_rig
+    from rs_localizer.tools.mapping.refinement import RefinedMap, refine_rig
 
 _HOLD = 0.001  # m, of landmarks of known place: as a tape or a total station measures them
 _step = partial(print, "adjusted:", flush=True)
@@ -196,7 +196,7 @@ def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
     known = direction if readout or "scan_direction" in values else None
     earlier = replaced(replace(args, out=out), "images.txt")
     with atomic_directory(out, earlier) as built:
-        result = undo_shutter(camera, model, stamps, readout, known, args.intrinsics, _step)
+        result = undo_shutter(camera, model, stamps, (readout, known), args.intrinsics, _step)
         check_readout(result.readout_check)
         built.mkdir()
         write_model(built, result.camera, result.images, result.points)

@@ -133,7 +133,9 @@ def test_the_commands(tmp_path, capsys):
     table = tmp_path / "a.csv"
     words = ["--bench", "real", "--only", "slow", "tracked", "1px", "--frames", "2"]
     assert command.main(["run", "--out", str(table), *words]) == 0
-    assert "slow/1px/tracked" in capsys.readouterr().out
+    out, said = capsys.readouterr()
+    assert out.splitlines()[1].startswith("real ")
+    assert "slow/1px/tracked" in said
     (name,) = read(table)
     assert name == "real/slow/1px/tracked"
     assert command.main(["compare", str(table), str(table), "--all"]) == 0
