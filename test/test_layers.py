@@ -175,3 +175,16 @@ def test_no_function_takes_many_parameters():
         if len(parameters(function)) > MOST and not is_compiled(function)
     }
     assert found == INSTEAD_OF_KERNELS | BY_KEYWORDS
+
+
+def test_each_module_and_class_has_a_name_of_its_own():
+    """But for ``__init__``, ``__main__``, and the ``Options`` of each command."""
+    homes: dict[str, list[str]] = {}
+    for file in PACKAGE.rglob("*.py"):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        names = [node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+        for name in (*(name for name in names if name != "Options"), f"{file.stem}.py"):
+            homes.setdefault(name, []).append(str(file.relative_to(PACKAGE)))
+    excepted = ("__init__.py", "__main__.py")
+    shared = {name: of for name, of in homes.items() if len(of) > 1 and name not in excepted}
+    assert shared == {}
