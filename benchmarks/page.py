@@ -16,8 +16,8 @@ import sys
 from datetime import date
 from pathlib import Path
 
-PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
-RESULTS = Path(__file__).parent / "results"
+ROOT = Path(__file__).parents[1]
+PAGE, RESULTS = ROOT / "docs" / "benchmarks.md", ROOT / "benchmarks" / "results"
 _BLOCK = re.compile(r"^(<!-- ([\w-]+) -->\n```text\n).*?^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -30,22 +30,21 @@ def blocks(page: str) -> dict[str, str]:
 
 
 def filled(page: str, results: Path = RESULTS) -> str:
-    """The page with each block as its bench printed it.
-
-    Raises:
-        FileNotFoundError: when a block's bench has never run.
-    """
+    """The page with each block as its bench printed it; one whose bench never ran is empty."""
 
     def fill(found: re.Match[str]) -> str:
-        return f"{found[1]}{(results / f'{found[2]}.txt').read_text(encoding='utf-8')}```"
+        printed = results / f"{found[2]}.txt"
+        return f"{found[1]}{printed.read_text(encoding='utf-8') if printed.exists() else ''}```"
 
     return _BLOCK.sub(fill, page)
 
 
 def record(name: str, printed: str) -> None:
     """Keep what a bench has printed, with the commit that is checked out and the date."""
-    git = ["git", "-C", str(RESULTS.parent), "describe", "--always", "--dirty", "--abbrev=8"]
-    commit = subprocess.run(git, check=True, capture_output=True, text=True).stdout.strip()
+    git = ["git", "-C", str(ROOT)]
+    commit = subprocess.check_output([*git, "rev-parse", "--short=8", "HEAD"], text=True).strip()
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "*.py"], check=False)
+    commit += " and changes" if changed.returncode else ""
     lines = [line.rstrip() for line in printed.strip("\n").splitlines()]
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.txt").write_text(

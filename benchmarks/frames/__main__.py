@@ -39,8 +39,8 @@ _SHOWN = {
 }  # fmt: skip
 
 _TOGETHER = {
-    "localized": "localized", "pose@m": "poses", "twist@m": "twists", ">5s": "beyond_5",
-    "deg": "deg", "mm": "mm", "deg/s": "deg/s", "m/s": "m/s", "s_turn": "sharpness", "ms": "ms",
+    "localized": "found", "pose@m": "poses", "twist@m": "twists", ">5s": "beyond_5",
+    "deg": "deg", "mm": "mm", "deg/s": "deg/s", "m/s": "m/s", "s_turn": "sharp", "ms": "ms",
     "ms_95": "ms_95",
 }  # fmt: skip
 

@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
-from benchmarks.experiments.results import Table
+from benchmarks.experiments.results import Table, rounded
 from benchmarks.real import gyro, motion
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
@@ -60,9 +60,9 @@ def main(argv: Sequence[str]) -> None:
 
 
 _FIGURES = {
-    "jitter, median": "turn50", "jitter, 95 %": "turn95", "two sides inside, %": "inside",
-    "claimed over actual": "turn_claimed", "held-out corners": "held",
-    "turn rates inside, %": "twist_inside", "ms": "ms",
+    "jitter, median": "turn50", "jitter, 95 %": "turn95", "sides inside, %": "inside",
+    "claimed / actual": "turn_claimed", "held-out corners": "held",
+    "twists inside, %": "twist_inside", "ms": "ms",
 }  # fmt: skip
 
 
@@ -76,14 +76,12 @@ def together(rows: Mapping[str, Mapping[str, float]]) -> Table:
         known = [value for value in values if not math.isnan(value)]
         if not known:
             return ""
-        return f"{median(known):.3g} ({min(known):.2g}-{max(known):.2g})"
+        return f"{median(known):.3g} ({rounded(min(known))}-{rounded(max(known))})"
 
     localized = [f"{sum(row[f'{name}_localized'] for row in rows.values()):.0f}" for name in names]
     figures = [(head, *(cell(name, of) for name in names)) for head, of in _FIGURES.items()]
     images = sum(row["images"] for row in rows.values())
-    return Table(
-        (f"{len(rows)} videos, {images:.0f} images", *names), [("localized", *localized), *figures]
-    )
+    return Table((f"{images:.0f} images", *names), [("localized", *localized), *figures])
 
 
 def table(rows: Mapping[str, Mapping[str, float]]) -> Table:

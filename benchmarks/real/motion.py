@@ -293,7 +293,7 @@ def _percentiles(errors: Array) -> Array:
 
 def table(rows: dict[str, Row]) -> Table:
     """Errors, median and 95 %, and how many truths (%) lie inside the regions of 95 %."""
-    return Table(("", "poses", "deg", "mm", "deg/s", "m/s", "pose, twist inside"), [
+    return Table(("", "poses", "deg", "mm", "deg/s", "m/s", "inside"), [
         (
             name, row.localized,
             *(f"{rounded(a)}, {rounded(b)}" if np.isfinite(a) else "" for a, b in row.errors),
