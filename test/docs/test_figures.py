@@ -1,0 +1,49 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of docs/benchmarks.md are what the benches printed; those of README are among them."""
+
+import re
+
+import pages
+import pytest
+
+from benchmarks.page import PAGE, RESULTS, blocks, filled
+
+NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?")
+ROWS = [
+    row
+    for table in pages.tables("README.md")
+    if "rs_localizer" in table.columns
+    for row in table.rows
+]
+
+
+def test_every_block_is_what_its_bench_printed():
+    page = PAGE.read_text(encoding="utf-8")
+    assert filled(page) == page
+    assert set(blocks(page)) == {file.stem for file in RESULTS.glob("*.txt")}
+    widest = max(len(line) for text in blocks(page).values() for line in text.splitlines())
+    assert widest <= 100
+
+
+@pytest.mark.parametrize("row", ROWS, ids=[row[0][:40] for row in ROWS])
+def test_every_figure_of_readme_is_in_the_block_that_it_links_to(row):
+    named = re.search(r"\]\[(\w+)\]", row[0])
+    target = re.search(
+        rf"^\[{named[1]}\]: docs/benchmarks\.md#(\S+)$", pages.text("README.md"), re.M
+    )
+    printed = section(target[1])
+    known = [float(number) for text in blocks(printed).values() for number in NUMBER.findall(text)]
+    for number in NUMBER.findall(" ".join(row[1:])):
+        digits = len(number.partition(".")[2])
+        near = [x for value in known for x in (value, 100.0 * value)]
+        assert float(number) in {round(x, digits) for x in near}, number
+
+
+def section(anchor: str) -> str:
+    """The part of the page below a heading."""
+    for part in re.split(r"^(?=##+ )", PAGE.read_text(encoding="utf-8"), flags=re.M):
+        heading = re.sub(r"[^\w\- ]", "", part.partition("\n")[0].lstrip("# ").lower())
+        if heading.replace(" ", "-") == anchor:
+            return part
+    raise AssertionError(anchor)
