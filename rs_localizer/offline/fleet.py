@@ -18,15 +18,12 @@ import shutil
 import signal
 import socket
 import threading
-import time
 import uuid
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent import futures
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing.connection import wait
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, cast
 
@@ -43,7 +40,6 @@ SUMMARY = "summary.csv"
 _PACKAGE = Path(__file__).parents[1]
 # Scheduler that answers nothing for so long is none, s.
 _CONNECT_TIMEOUT = 5.0
-_SOON = 0.02  # s, until it is looked again whether workers have ended
 # What is printed can be told apart only while one task of a process prints.
 _PRINTING = threading.Lock()
 
@@ -203,37 +199,50 @@ def perform_all(tasks: Sequence[Task], scheduler: str | None, workers: int | Non
 
 def _perform_here(tasks: Sequence[Task], workers: int) -> Performed:
     """Outcomes of tasks, each in a process of its own: whatever ends it, the others go on."""
-    threads = ThreadPoolExecutor(workers)
-    waiting = {threads.submit(_perform_alone, task): task for task in tasks}
+    context = multiprocessing.get_context("spawn")  # a fork would share threads that stand still
+    waiting, running = deque(tasks), dict[Connection, tuple[Task, SpawnProcess]]()
     try:
-        for future in futures.as_completed(waiting):
-            yield waiting[future], future.result()
+        while waiting or running:
+            while waiting and len(running) < workers:
+                ours, theirs = context.Pipe(duplex=False)
+                process = context.Process(target=_perform_to, args=(theirs, waiting[0]))
+                process.start()
+                theirs.close()
+                running[ours] = waiting.popleft(), process
+            for ours in cast(list[Connection], wait(list(running))):
+                task, process = running[ours]
+                try:
+                    outcome = ours.recv()
+                    process.join()
+                except EOFError:
+                    process.join()
+                    outcome = Outcome(None, f"lost: its process {_ended(process.exitcode)}")
+                ours.close()
+                del running[ours]
+                yield task, outcome
     finally:
-        threads.shutdown(wait=False, cancel_futures=True)
-        while any(future.running() for future in waiting):
-            for process in multiprocessing.active_children():
-                process.kill()  # who is asked to end goes on with its recording for seconds
-            time.sleep(_SOON)
+        for _, process in running.values():
+            process.kill()  # who is asked to end goes on with its recording for seconds
+            process.join()
         _clear(tasks)
 
 
-def _perform_alone(task: Task) -> Outcome:
-    """Perform a task in a new process; a fork would share threads that stand still."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, context, _follow_parent) as pool:
-        try:
-            return pool.submit(perform, task).result()
-        except BrokenProcessPool:
-            return Outcome(None, "lost: its process was ended, as when memory runs out")
-
-
-def _follow_parent() -> None:
-    """End this process with the one that has started it, and not by a terminal's Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all hear it, one decides
+def _perform_to(asked: Connection, task: Task) -> None:
+    """Perform a task in a process of its own, which ends with the one that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's: all hear it, one decides
     parent = multiprocessing.parent_process()
     assert parent is not None
     end = functools.partial(wait, [parent.sentinel])
     threading.Thread(target=lambda: end() and os._exit(1), daemon=True).start()
+    asked.send(perform(task))
+
+
+def _ended(code: int | None) -> str:
+    """How a process came to its end, by its exit code."""
+    if code is None or code >= 0:
+        return f"ended with exit code {code}"
+    memory = ", as when memory runs out" if -code == signal.SIGKILL else ""
+    return f"was ended by {signal.Signals(-code).name}{memory}"
 
 
 def _perform_by_dask(tasks: Sequence[Task], scheduler: str) -> Performed:
@@ -257,13 +266,13 @@ def _perform_by_dask(tasks: Sequence[Task], scheduler: str) -> Performed:
 
     with client:
         # Not by what they are: a result that has been removed would be taken as done.
-        waiting = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
+        futures = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
         killed = []
-        for future in as_completed(list(waiting)):
+        for future in as_completed(list(futures)):
             if isinstance(end := ended(future), Outcome):
-                yield waiting[future], end
+                yield futures[future], end
             else:
-                killed.append(waiting[future])
+                killed.append(futures[future])
         # Dask blames all that waited at a worker for its end.
         for task in killed:
             end = ended(client.submit(perform, task, pure=False))

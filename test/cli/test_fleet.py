@@ -161,8 +161,9 @@ def test_a_recording_that_kills_its_process_does_not_stop_the_others(
     tasks += tasks_of([tmp_path / "another"], out, work.leave, "")
     outcomes = {task.recording.name: outcome for task, outcome in perform_all(tasks, None, workers)}
     assert outcomes["good"].figures == outcomes["fine"].figures == {"frames": 1}
-    lost = "lost: its process was ended, as when memory runs out"
-    assert outcomes["deadly"].reason == outcomes["another"].reason == lost
+    lost = "lost: its process was ended by SIGKILL, as when memory runs out"
+    assert outcomes["deadly"].reason == lost
+    assert outcomes["another"].reason == "lost: its process ended with exit code 7"
     assert sorted(path.name for path in out.iterdir()) == ["fine", "good"]
 
 
