@@ -5,11 +5,13 @@
 import numpy as np
 import pytest
 
+from rs_localizer.io.bags import BagError, BagWriter
 from rs_localizer.io.trajectories import (
     Trajectory,
     TrajectoryError,
     format_stamp,
     parse_stamp,
+    read_motions,
     read_tum,
     split_at_gaps,
     write_tum,
@@ -100,3 +102,57 @@ def test_split_only_at_gaps():
         [500],
     ]
     assert [len(part) for part in split_at_gaps(trajectory([7]))] == [1]
+
+
+def stamped(kind: str, seconds: int, first: list[float], second: list[float]):
+    """PoseStamped or TwistStamped of position and quaternion, or of rates and velocity."""
+    make = BagWriter.make
+    stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=0)
+    header = make("std_msgs/msg/Header", stamp=stamp, frame_id="map")
+    if kind == "TwistStamped":
+        parts = [
+            make("geometry_msgs/msg/Vector3", **dict(zip("xyz", values, strict=True)))
+            for values in (first, second)
+        ]
+        twist = make("geometry_msgs/msg/Twist", angular=parts[0], linear=parts[1])
+        return make("geometry_msgs/msg/TwistStamped", header=header, twist=twist)
+    point = make("geometry_msgs/msg/Point", **dict(zip("xyz", first, strict=True)))
+    turn = make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", second, strict=True)))
+    pose = make("geometry_msgs/msg/Pose", position=point, orientation=turn)
+    return make("geometry_msgs/msg/PoseStamped", header=header, pose=pose)
+
+
+def test_poses_and_twists_of_a_recording(tmp_path):
+    poses = [(3, [3.0, 0.0, 1.0]), (1, [1.0, 2.0, 4.0]), (2, [2.0, 1.0, 0.0])]
+    with BagWriter(tmp_path / "bag") as bag:
+        for seconds, position in poses:
+            bag.write("/pose", stamped("PoseStamped", seconds, position, [0, 0, 0.6, 0.8]), 0)
+            bag.write("/twist", stamped("TwistStamped", seconds, [0, 0, 0.1], position), 0)
+        bag.write("/other", stamped("PoseStamped", 9, [0, 0, 0], [0, 0, 0, 1]), 0)
+    with pytest.raises(
+        BagError, match=r"several .*PoseStamped; choose with -r pose:=; found /other"
+    ):
+        read_motions(tmp_path / "bag")
+    with pytest.raises(BagError, match=r"no .*PoseStamped on /twist; found /other, /pose"):
+        read_motions(tmp_path / "bag", "/twist")
+    found = read_motions(tmp_path / "bag", "/pose")
+    assert found.poses.stamps_ns.tolist() == [10**9, 2 * 10**9, 3 * 10**9]
+    assert found.poses.positions[0].tolist() == [1.0, 2.0, 4.0]
+    assert found.poses.quaternions[0].tolist() == [0.0, 0.0, 0.6, 0.8]
+    assert found.twists is not None
+    assert found.twists.angular[0].tolist() == [0.0, 0.0, 0.1]
+    assert found.twists.linear[2].tolist() == [3.0, 0.0, 1.0]
+
+
+def test_poses_of_a_file_and_of_a_recording_of_anything_else(tmp_path):
+    file = tmp_path / "poses.txt"
+    file.write_text(f"1 {POSE}\n2 {POSE}\n")
+    assert read_motions(file).twists is None
+    (tmp_path / "twists.txt").write_text("# nothing\n")
+    found = read_motions(tmp_path)
+    assert len(found.poses.stamps_ns) == 2
+    assert found.twists is None
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write("/twist", stamped("TwistStamped", 1, [0, 0, 0], [0, 0, 0]), 0)
+    with pytest.raises(BagError, match=r"no .*PoseStamped; found /twist"):
+        read_motions(tmp_path / "bag")

@@ -1,0 +1,161 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Estimates at other times, against differences of their poses and of estimates nearby."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core.gyro_rotation import GyroRotation
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.shake import FUNCTIONS
+from rs_localizer.core.types import Estimate, Failure
+
+SPAN = 0.03
+TAU = np.linspace(-0.8, 0.8, 33)
+RATES = 0.2 * np.column_stack([np.sin(4.0 * TAU), np.cos(3.0 * TAU), 0.4 + TAU])
+
+
+def turned(vector):
+    return Rotation.from_rotvec(vector).as_matrix()
+
+
+def some_estimate(shaken=0, gyroscope=False, speed=0.2, acceleration=0.3):
+    """An estimate with a random covariance; beside a gyroscope, with its rotation."""
+    rng = np.random.default_rng(3)
+    half = 1e-3 * rng.normal(size=(18 + 3 * shaken, 18 + 3 * shaken))
+    half[18:] *= 0.1  # vibration makes ten times as much of the angular velocity
+    shake = np.zeros((0, 3))
+    if shaken:
+        shake = np.zeros((FUNCTIONS, 3))
+        shake[:shaken] = 0.01 * rng.normal(size=(shaken, 3))
+    found = Estimate(
+        turned(rng.normal(size=3)), np.array([0.1, -0.2, 3.0]), *(speed * rng.normal(size=(2, 3))),
+        angular_acceleration=acceleration * rng.normal(size=3),
+        linear_acceleration=acceleration * rng.normal(size=3),
+        inliers=np.array([True, False, True]), residuals=np.array([3.0, np.nan, 4.0]),
+        joint_covariance=half @ half.T, global_shutter_inliers=0, iterations=0,
+        shake=shake[:shaken], span=SPAN, time_ns=10**12,
+    )  # fmt: skip
+    turn = GyroRotation.of(TAU, RATES, rate_noise=0.01)
+    return found.turned(turn, (0.0, math.inf)) if gyroscope else found
+
+
+def centre(pose):
+    return -pose[0].T @ pose[1]
+
+
+KINDS = [(0, False), (4, False), (0, True), (4, True)]
+
+
+@pytest.mark.parametrize(("shaken", "gyroscope"), KINDS)
+def test_velocities_are_the_derivatives_of_the_poses(shaken, gyroscope):
+    estimate, h = some_estimate(shaken, gyroscope), 1e-5
+    for tau in (-0.4, 0.0, 0.3):
+        before, now, after = (estimate.at(tau + step) for step in (-h, 0.0, h))
+        velocity = now[0] @ (centre(after) - centre(before)) / (2.0 * h)
+        np.testing.assert_allclose(estimate.linear_velocity_at(tau), velocity, atol=1e-7)
+        rate = Rotation.from_matrix(before[0] @ after[0].T).as_rotvec() / (2.0 * h)
+        np.testing.assert_allclose(estimate.angular_velocity_at(tau), rate, atol=1e-6)
+        later = estimate.at_time(SPAN * tau)
+        np.testing.assert_allclose(later.rotation, now[0], atol=1e-12)
+        np.testing.assert_allclose(later.position, centre(now), atol=1e-12)
+        np.testing.assert_allclose(later.angular_velocity, rate, atol=1e-6)
+        np.testing.assert_allclose(later.linear_velocity, velocity, atol=1e-7)
+        assert later.time_ns == estimate.time_ns + round(1e9 * SPAN * tau)
+    rows = np.array([-0.5, 0.1, 0.5])
+    for pose, tau in zip(zip(*estimate.at_rows(rows), strict=True), rows, strict=True):
+        np.testing.assert_allclose(pose[0], estimate.at(tau)[0], atol=1e-12)
+        np.testing.assert_allclose(pose[1], estimate.at(tau)[1], atol=1e-12)
+
+
+def nearby(estimate, step):
+    """The estimate that is off by a step (18 + 3 k,), as its class says what the numbers are."""
+    off, shaken = np.split(step, [18])
+    off = off.reshape(6, 3)
+    # Beside a gyroscope, the motion without its rotation is what has these errors.
+    rotation = turned(-off[0]) @ estimate.rotation
+    position = estimate.position + estimate.rotation.T @ off[1]
+    return replace(
+        estimate, rotation=rotation, translation=-rotation @ position,
+        angular_velocity=estimate.angular_velocity + off[2],
+        linear_velocity=estimate.linear_velocity + off[3],
+        angular_acceleration=estimate.angular_acceleration + off[4],
+        linear_acceleration=estimate.linear_acceleration + off[5],
+        shake=estimate.shake + shaken.reshape(-1, 3),
+    )  # fmt: skip
+
+
+def apart(one, other):
+    """Turn and way in the first one's axes, and differences of the velocities (12,)."""
+    return np.concatenate([
+        Rotation.from_matrix(one.rotation @ other.rotation.T).as_rotvec(),
+        one.rotation @ (other.position - one.position),
+        other.angular_velocity - one.angular_velocity,
+        other.linear_velocity - one.linear_velocity,
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("shaken", [0, 4])
+@pytest.mark.parametrize("tau", [-0.45, 0.2, 0.5])
+def test_the_covariance_of_then_is_that_of_estimates_nearby(shaken, tau):
+    """To first order in motion times vibration or acceleration: here 60 (400 without
+    vibration) deg/s, 600 deg/s^2.
+    """
+    speed = 0.03 if shaken else 0.2
+    estimate, h = some_estimate(shaken, speed=speed, acceleration=0.01), 1e-6
+    size = len(estimate.joint_covariance)
+    columns = []
+    for step in h * np.eye(size):
+        moved = [nearby(estimate, sign * step).at_time(SPAN * tau) for sign in (-1.0, 1.0)]
+        columns.append(apart(*moved) / (2.0 * h))
+    jacobian = np.array(columns).T
+    expected = jacobian @ estimate.joint_covariance @ jacobian.T
+    found = estimate.at_time(SPAN * tau).covariance
+    sizes = np.sqrt(np.diagonal(expected))
+    assert np.abs((found - expected) / np.outer(sizes, sizes)).max() < 0.03
+
+
+def test_beyond_the_rows_vibration_goes_on_in_an_unknown_phase():
+    calm, shaken = some_estimate(), some_estimate(4)
+    for seconds in (0.03, 0.1):
+        assert np.all(calm.at_time(seconds).angular_velocity == calm.angular_velocity_at(
+            seconds / SPAN))  # fmt: skip
+        grown = [
+            np.trace(one.at_time(seconds).covariance[:3, :3]) - np.trace(one.covariance[:3, :3])
+            for one in (calm, shaken)
+        ]
+        assert grown[1] > grown[0]
+    aided = some_estimate(gyroscope=True)
+    rates = [np.trace(aided.at_time(s).covariance[6:9, 6:9]) for s in (0.0, 0.015, 0.04)]
+    assert rates[0] < rates[2]
+    assert rates[1] < rates[2]
+
+
+def test_the_gyroscope_is_taken_away_as_it_was_given():
+    found, plain = some_estimate(gyroscope=True), some_estimate()
+    alone = found.without_gyro()
+    np.testing.assert_allclose(alone.angular_velocity, plain.angular_velocity, atol=1e-15)
+    np.testing.assert_allclose(alone.angular_acceleration, plain.angular_acceleration, atol=1e-15)
+    assert plain.without_gyro() is plain
+
+
+def test_what_a_result_says_of_itself():
+    found = some_estimate()
+    assert found
+    assert found.residual_rms == math.sqrt(0.5 * (9.0 + 16.0))
+    assert "2 of 3 inliers" in repr(found)
+    deviation = math.sqrt(np.linalg.eigvalsh(found.joint_covariance[:3, :3])[-1])
+    assert found.orientation_deviation == pytest.approx(deviation)
+    with pytest.raises(ValueError, match="tau must lie between"):
+        found.at(3.0)
+    with pytest.raises(ValueError, match="needs finite seconds and a span"):
+        replace(found, span=0.0).at_time(0.01)
+    nothing = Failure(Reason.DEGENERATE, "a line")
+    assert not nothing
+    assert str(nothing) == "degenerate: a line"
+    with pytest.raises(AttributeError, match="there is no rotation, because there is no pose"):
+        _ = nothing.rotation
