@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from recorded import imu, tf, write_mp4
+from recorded import imu, tf
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.commands import main
@@ -259,17 +259,6 @@ def test_settings_are_passed_on(here):
     again = [*words, "-p", "scan_direction:=top_to_bottom", "--overwrite"]
     assert detect(here, here.video, *again) == 0
     assert settings(here)["scan_direction"] == "top_to_bottom"
-
-
-def test_a_video_has_its_own_times(here, capsys):
-    path = write_mp4(here.path / "a.mp4", [board(x=0.001 * k) for k in range(4)], 20.0)
-    words = [*here.calibration, *here.board, "-p", "readout_time:=0.06"]
-    assert detect(here, path, *words) == 0
-    stamps = [cloud.stamp_ns for cloud in clouds(here.out)]
-    assert stamps == [1_000_000_000 + 50_000_000 * k for k in range(4)]
-    said = capsys.readouterr().out
-    assert "presentation times of the video, 20 images/s on average; the first image at 1 " in said
-    assert "warning: the readout time of 60 ms is longer than the 50 ms from image to im" in said
 
 
 def test_a_wrong_calibration_is_named(here, capsys):

@@ -102,17 +102,3 @@ def test_make_and_check(tmp_path, capsys):
     pages = {"pages": [f"{out}.pdf"], "map": f"{out}.yaml", "corners": 24}
     assert json.loads(capsys.readouterr().out)["result"] == pages
     assert read_marker_map(f"{out}.yaml").markers[0].size == pytest.approx(0.05)
-
-
-def test_problems_of_a_map_are_named(tmp_path, capsys):
-    assert make(tmp_path / "wall", "--grid", "2x1", "--size", "0.05") == 0
-    path = tmp_path / "wall.yaml"
-    text = path.read_text()
-    path.write_text(text.replace("size: 0.05", "size: 50.0"))
-    capsys.readouterr()
-    assert main(["map", "info", str(path)]) == 1
-    text_of = "markers of 50 m: are sizes and positions, given in metres, in another unit?"
-    assert capsys.readouterr().err == f"rs_localizer map info: {path}: {text_of}\n"
-    path.write_text(text.replace("id: 1", "id: 0"))
-    assert main(["map", "info", str(path)]) == 1
-    assert "marker 4x4_50 0 is there twice" in capsys.readouterr().err

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recorded import CAMERA, READOUT_TIME, SHUTTER, flight, write_ros1
+from recorded import CAMERA, READOUT_TIME, SHUTTER, flight, tf, write_ros1
+from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli import replay_command
 from rs_localizer.cli.commands import main
 from rs_localizer.cli.replay_command import print_summary
-from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES, Localized
 from rs_localizer.io.trajectories import read_motions, read_tum, read_twists
 from rs_localizer.offline.results import Tally, figures
@@ -83,19 +84,32 @@ def test_what_comes_out(recording, tmp_path, capsys):
 
 
 def test_every_kind_of_recording_gives_the_same(recording, tmp_path):
+    """Of a camera that looks to the left from the front of a base; with the infos at the end."""
     inputs = [message for message in messages(recording) if not message[0].startswith("/truth")]
-    with BagWriter(tmp_path / "sqlite", "sqlite3") as bag:
-        for topic, stamp_ns, message in inputs:
-            bag.write(topic, message, stamp_ns)
-    one_file = next(recording.glob("*.mcap"))
-    bags = [recording, one_file, tmp_path / "sqlite", write_ros1(tmp_path / "old.bag", inputs)]
+    place = (0.5, 0.2, 0.9), Rotation.from_euler("x", -90.0, degrees=True)
+    mounting = ("/tf_static", START, tf("base_link", "camera_optical_frame", *place))
+    for name in STORAGES:
+        with BagWriter(tmp_path / name, name) as bag:
+            for topic, stamp_ns, message in (mounting, *sorted(inputs, key=lambda it: it[0][::-1])):
+                bag.write(topic, message, stamp_ns if topic != "/camera_info" else 2 * START)
+    # ROS 1 before tf2: another type, slashes before the names, and the mounting on /tf.
+    old = [
+        ("/tf", START + later, tf("/base_link", "/camera_optical_frame", *place, START + later))
+        for later in (-(10**9), 10**9)
+    ]
+    one_file = next((tmp_path / "mcap").glob("*.mcap"))
+    bags = [*(tmp_path / name for name in STORAGES), one_file]
+    bags.append(write_ros1(tmp_path / "old.bag", [*inputs, *old]))
     texts = []
     for i, bag in enumerate(bags):
         out = tmp_path / f"out{i}"
-        arguments = ["--out", str(out), *SHUTTER]
+        arguments = ["--out", str(out), "-p", "base_frame:=base_link", *SHUTTER]
         assert main(["replay", str(bag), *arguments]) == 0
         texts.append([(out / name).read_text() for name in ("poses.txt", "twists.txt")])
-    assert texts.count(texts[0]) == len(bags)
+    assert texts[:3] == 3 * texts[:1]
+    for one, other in zip(texts[0], texts[3], strict=True):
+        numbers = [np.loadtxt(text.splitlines()) for text in (one, other)]
+        np.testing.assert_allclose(*numbers, rtol=0.0, atol=1e-6)
 
 
 def test_poses_at_a_rate_of_their_own(recording, tmp_path):

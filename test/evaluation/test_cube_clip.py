@@ -2,20 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cube is drawn where its points are, each at its own row's pose; the clip can be played."""
 
-import io
-from dataclasses import replace
-
 import numpy as np
-from PIL import Image as Pillow
 
-from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.tools import cube_clip
-from rs_localizer.tools.simulation.simulated_frames import middle_stamp
 
 CAMERA = Camera(
     640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]),
@@ -46,28 +39,3 @@ def test_every_edge_is_drawn_where_the_rows_see_it():
     assert u.min() > seen[:, 0].min() - 5
     assert u.max() < seen[:, 0].max() + 5
     assert v.max() < seen[:, 1].max() + 5
-
-
-def test_a_pose_without_motion_puts_the_cube_off():
-    walls = cube_clip.Walls(read_tum(data.path(data.HAND_MOTION)))
-    stamps = [walls.stamps()[k] for k in (90, 60)]
-    state = walls.motion.state(middle_stamp(cube_clip.CAMERA, stamps[0]), np.zeros(1))
-    rotation, readout = state.rotations[0].T, cube_clip.CAMERA.readout_time
-    true = Motion(
-        rotation, -rotation @ state.positions[0],
-        readout * state.angular[0], readout * state.linear[0],
-    )  # fmt: skip
-    still = replace(true, angular_velocity=np.zeros(3), linear_velocity=np.zeros(3))
-    images = [np.full((480, 640), 200, np.uint8)] * 2
-    motions = {"p3p": [still, None], "ours": [true, true]}
-    animation, off = cube_clip.clip(walls, images, stamps, motions)
-    # The true motion is no constant velocity, and yet nearly one; in the second it is cut off.
-    assert off["ours"] < 0.5
-    assert off["p3p"] > 3.0
-    assert len(off["ours"]) == 1
-    assert walls.off(stamps[0], None) == np.inf
-    with Pillow.open(io.BytesIO(animation)) as played:
-        assert (played.info["duration"], played.info["loop"]) == (100, 0)
-        blue = np.asarray(played.convert("RGB")).astype(int)
-    assert played.size[0] == 2 * (cube_clip._WIDTH + 6)
-    assert (blue[..., 2] - blue[..., 0] > 60).any()

@@ -21,8 +21,7 @@ pytest.importorskip("telemetry_parser", reason="needs telemetry-parser (rs_local
 from recorded import field, insta360
 
 from rs_localizer.cli import image_input
-from rs_localizer.cli.commands import main, parse
-from rs_localizer.cli.map import build_command
+from rs_localizer.cli.commands import main
 from rs_localizer.io import telemetry as files
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
@@ -312,19 +311,6 @@ def test_where_the_gyroscope_says_nothing(video, telemetry, capsys, changes, wor
     with open_bag(out) as bag:
         assert "/imu" not in bag.topics
     assert not (out / "parameters.yaml").exists() or "--rate" in words
-
-
-def test_what_is_given_goes_before_what_a_video_says(video, telemetry, capsys):
-    telemetry()
-    out = detect(video, "-p", "readout_time:=0.03")
-    assert "readout time 20.50 ms (not used: 30.00 ms was given)" in capsys.readouterr().out
-    assert load_params_file(out / "parameters.yaml")["readout_time"] == 0.03
-
-
-def test_maps_take_the_readout_time_of_a_video(video, telemetry):
-    telemetry()
-    given = parse("map build", build_command, [str(video), "--out", "map"])[0]
-    assert build_command.shutter_of(given)[0] == pytest.approx(0.0205)
 
 
 def test_a_slower_accelerometer_is_read_at_the_times_of_the_gyroscope():

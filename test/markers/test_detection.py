@@ -276,21 +276,6 @@ def test_exchanged_columns_and_rows_are_tried():
     assert said == ["the asymmetric circle grid 4x5: its columns and rows are exchanged"]
 
 
-@pytest.mark.parametrize("name", ["5x5_250", "apriltag_36h11"])
-def test_markers_are_named_with_their_family(name):
-    prints = []
-    for x, id_ in ((-0.07, 3), (0.07, 17)):
-        marker = Marker.at(name, id_, 0.1, Pose(np.array([x, 0.0, 0.0])))
-        prints.append((pattern(family(name), id_), marker.corners))
-    # By the smallest family that has such ids: the small ones are the beginning of the large ones.
-    assert recognized(render(prints, look(4.0, 5.0))) == [f"{name.replace('250', '50')} 3, 17"]
-
-
-def test_the_size_of_a_chessboard():
-    image = render([(chessboard_cells(8, 6), rectangle(0.22, 0.165))], look(8.0))
-    assert recognized(image) == ["a chessboard of 7x5 inner corners"]
-
-
 FINE = 20  # drawn pixels per spacing
 
 

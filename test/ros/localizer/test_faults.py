@@ -351,14 +351,8 @@ class Fault:
 
 
 FAULTS = [
-    # Messages
-    Fault(
-        "truncated",
-        lambda world: [world.cloud(data=b"\0" * 100)],
-        "bad_cloud: the data are truncated",
-    ),
-    Fault("a million points", many, "", pose=True),
     # Work
+    Fault("a million points", many, "", pose=True),
     Fault("a frame that takes long", stuck, "worked on for"),
     Fault("a bug in the node", bug, r"internal_error: TypeError\('a bug'\) in fail"),
     # The graph

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from sensor_msgs.msg import Image
 
-from rs_localizer.pipeline.refusal import Refusal, Waiting
+from rs_localizer.pipeline.refusal import Waiting
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
 from rs_localizer.ros.node.worker import Need, Worker, wait_for_workers
@@ -38,13 +38,12 @@ class Fake:
         self.go_on = threading.Semaphore(0)
         self.published: list[str] = []
         self.done = threading.Semaphore(0)
-        self.errors: list[str] = []
         self.mounted: set[str] = set()
         self.awaited: set[str] = set()
         self.patience = 10.0
         self.refusals = Refusals(lambda text: None)
         self.statistics = Count(self.refusals, lambda text: (0, text))
-        self.worker: Worker[Fake, str] = Worker(self, self._publish, self.statistics, self._fail)
+        self.worker: Worker[Fake, str] = Worker(self, self._publish, self.statistics, pytest.fail)
 
     def send(self, frame: str, topic: str = "frames", patience: float = PATIENCE) -> None:
         need: Need[Fake] = Need(lambda frames, message: message in self.awaited, patience)
@@ -58,14 +57,8 @@ class Fake:
         before = self.settings
         assert self.go_on.acquire(timeout=PATIENCE)
         assert self.settings == before
-        if frame == "bug":
-            self.done.release()
-            raise TypeError("a bug")
         if frame.startswith("late"):
             return self._waiting(frame)
-        if frame == "dark":
-            self.done.release()
-            return Refusal("dark", "there is no light")
         return f"{frame} {self.settings}"
 
     def _waiting(self, frame: str) -> Any:
@@ -76,10 +69,6 @@ class Fake:
 
     def _publish(self, frame: Any) -> None:
         self.published.append(frame)
-        self.done.release()
-
-    def _fail(self, text: str) -> None:
-        self.errors.append(text)
         self.done.release()
 
 
