@@ -128,32 +128,15 @@ COMMAND = "import sys; sys.argv[1:] = ['--version']; from rs_localizer.__main__ 
 NODE = "from rs_localizer.ros.main import main; main(['--version'])"
 
 
-def threads(program: str, **variables: str) -> list[int]:
-    """Of each OpenBLAS after a program has begun."""
+@pytest.mark.parametrize(
+    ("program", "variables"),
+    [(COMMAND, {}), (NODE, {}), (COMMAND, {"OPENBLAS_NUM_THREADS": "2"})],  # nor does a user
+)
+def test_one_thread_whose_bits_nobody_changes(program, variables):
     inherited = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
     done = subprocess.run(
-        [sys.executable, "-c", program + ASK],
-        env=inherited | variables,
-        text=True,
-        capture_output=True,
-        timeout=120,
-        check=True,
-    )
-    return [int(word) for word in done.stdout.split("\n")[-2].split()]
-
-
-@pytest.fixture(scope="module")
-def many() -> list[int]:
-    found = threads("")
-    if not found or max(found) < 2:
-        pytest.skip("no OpenBLAS with threads here")
-    return found
-
-
-@pytest.mark.parametrize("program", [COMMAND, NODE])
-def test_one_thread(program, many):
-    assert threads(program) == [1] * len(many)
-
-
-def test_a_user_does_not_change_the_bits_of_poses(many):
-    assert threads(COMMAND, OPENBLAS_NUM_THREADS="2") == [1] * len(many)
+        [sys.executable, "-c", program + ASK], env=inherited | variables, text=True,
+        capture_output=True, timeout=120, check=True,
+    )  # fmt: skip
+    found = done.stdout.split("\n")[-2].split()
+    assert found == ["1"] * len(found)
