@@ -103,6 +103,7 @@ class Robot:
         self._node = f"{namespace}/rs_localizer"
         self.answers: dict[str, list[bytes]] = {name: [] for name in TYPES}
         self.values: dict[str, str] = {}  # of the diagnostics
+        self.states: list[str] = []  # by them: level and message
         self.odd: set[str] = set()  # what has ever been odd by them
         for name, kind in TYPES.items():
             peer.node.create_subscription(
@@ -119,6 +120,8 @@ class Robot:
         for status in message.status:
             if status.name.endswith(": localizer"):
                 self.values = {item.key: item.value for item in status.values}
+                level = ["OK", "WARN", "ERROR", "STALE"][status.level[0]]
+                self.states.append(f"{level}: {status.message}")
                 self.odd |= {name for name in self.values if name.startswith("Notice: ")}
 
     def connect(self) -> None:

@@ -1,45 +1,39 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fault matrix: what is wrong, what the node says of it, and that it localizes afterwards.
+"""What only a live node can have wrong: what it says of it, and that it localizes afterwards.
 
-A fault is a row of :data:`FAULTS`: those that only a live node can have. What single messages
-have wrong is tested in ``test/io`` and ``test/pipeline``, what a worker does with frames in
-``test/ros/node``.
+What single messages have wrong is tested in ``test/io`` and ``test/pipeline``, what a worker does
+with frames in ``test/ros/node``.
 """
 
 import array
-import contextlib
 import re
 import threading
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, TransformStamped
-from rcl_interfaces.srv import SetParametersAtomically
+from geometry_msgs.msg import TransformStamped
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
+from sensor_msgs.msg import PointCloud2, PointField
 
 from benchmarks.simulation.keypoints import map_rows, random_descriptors
+from rs_localizer.io.bags import typestore
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.outputs import TYPES
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.managed import spin
 
-from .robot import READOUT_TIME, inputs, record, tf2_ros
+from ..conftest import Peer  # noqa: TID252 - Python has a package "test"
+from .robot import READOUT_TIME, Robot, inputs, record, tf2_ros
 
 PATIENCE = 20.0  # s, of a machine that is busy
 CLOSE = 0.05  # m: the poses are right
@@ -48,17 +42,16 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DESCRIPTORS = random_descriptors(5000, np.random.default_rng(9))  # of the landmarks, by number
 
 
-class World:
-    """A live node in a thread, a peer that talks to it over DDS, and what the node has said.
+class World(Robot):
+    """A live node in a thread, a robot that talks to it over DDS, and all that the node has said.
 
     Args:
         bag: to be written: a flight without noise.
     """
 
     def __init__(self, bag: Path) -> None:
-        self.truth = record(bag, noise=0.0, outliers=0.0)  # positions, of the frames
-        infos, self.clouds = zip(*inputs(bag), strict=True)
-        self.camera_info = infos[0]
+        self.truth = record(bag, noise=0.0, outliers=0.0)[0]  # position of the first frame
+        (self.camera_info, *_), self.clouds = zip(*inputs(bag), strict=True)
         self.context = Context()
         rclpy.init(context=self.context)
         self.node = LocalizerNode(
@@ -72,33 +65,25 @@ class World:
             notice(*texts),
         )
         assert self.node.trigger_configure().name == self.node.trigger_activate().name == "SUCCESS"
-        self.peer = Node("peer", context=self.context)
-        self.heard: list[PoseStamped] = []
-        self.diagnoses: list[str] = []
-        create = self.peer.create_publisher
-        self._publishers = {
-            "camera_info": create(CameraInfo, "camera_info", 10),
-            "correspondences": create(PointCloud2, "correspondences", 10),
-            "keypoints": create(PointCloud2, "keypoints", 10),
-            "map_points": create(PointCloud2, "map_points", LATCHED),
-        }
-        self.peer.create_subscription(PoseStamped, "rs_localizer/pose", self.heard.append, 100)
-        self.peer.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(self.peer)
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=spin, args=(self.node, self._stopped.is_set))
         self._thread.start()
+        super().__init__(Peer())
+        create = self.peer.node.create_publisher
+        self.publishers["/keypoints"] = create(PointCloud2, "/keypoints", 10)
+        self.publishers["/map_points"] = create(PointCloud2, "/map_points", LATCHED)
         self.stamp = SECOND
-        self.wait(self.connected)
+        self.connect()
 
-    # -- what faults need --------------------------------------------------------------------
-
-    def cloud(self, **changes: Any) -> PointCloud2:
-        """A good frame, later than the last, with fields changed."""
+    def cloud(self, table: np.ndarray | None = None) -> PointCloud2:
+        """A good frame, later than the last, perhaps with other rows."""
         good = self.clouds[0]
-        fields = {name: getattr(good, name) for name in good.get_fields_and_field_types()}
-        message = PointCloud2(**(fields | changes))
+        message = PointCloud2(
+            **{name: getattr(good, name) for name in good.get_fields_and_field_types()}
+        )
+        if table is not None:
+            message.width, message.row_step = len(table), table.nbytes
+            message.data = array.array("B", table.tobytes())
         self.stamp += SECOND // 30
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.stamp, SECOND)
         return message
@@ -110,101 +95,56 @@ class World:
         columns = [(item.name, kinds[item.datatype]) for item in cloud.fields]
         return np.frombuffer(bytes(cloud.data), columns).copy()
 
-    def cloud_of(self, table: np.ndarray) -> PointCloud2:
-        """A frame with these rows."""
-        return self.cloud(
-            width=len(table), row_step=table.nbytes, data=array.array("B", table.tobytes())
-        )
-
-    def connected(self) -> bool:
-        counts = [each.get_subscription_count() for each in self._publishers.values()]
-        return min(counts) > 0 and self.peer.count_publishers("rs_localizer/pose") > 0
-
-    def send(self, *messages: Any) -> None:
-        """Each a camera_info or correspondences, or a pair of a topic and its message."""
-        for message in messages:
-            if isinstance(message, tuple):
-                topic, message = message
-            else:
-                topic = "camera_info" if isinstance(message, CameraInfo) else "correspondences"
-            self._publishers[topic].publish(message)
-
-    def poses(self, *messages: Any, within: float = PATIENCE) -> bool:
+    def poses(self, topic: str, message: Any, within: float = PATIENCE) -> bool:
         """Send; whether a pose comes."""
-        before = len(self.heard)
-        self.send(*messages)
-        return self.until(lambda: len(self.heard) > before, within)
-
-    def set(self, **values: object) -> str:
-        """Set parameters at once: the reason of a refusal, else nothing."""
-        parameters = [
-            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
-        ]
-        request = SetParametersAtomically.Request(parameters=parameters)
-        name = "rs_localizer/set_parameters_atomically"
-        client = self.peer.create_client(SetParametersAtomically, name)
-        assert client.wait_for_service(PATIENCE)
-        future = client.call_async(request)
-        assert self.until(future.done)
-        self.peer.destroy_client(client)
-        return str(future.result().result.reason)
-
-    def diagnosis(self, text: str) -> bool:
-        """Whether this comes up in the diagnostics."""
-        del self.diagnoses[:-1]
-        return self.until(lambda: any(re.search(text, item) for item in self.diagnoses))
-
-    def until(self, condition: Callable[[], Any], within: float = PATIENCE) -> bool:
-        deadline = time.monotonic() + within
-        while not condition():
-            if time.monotonic() > deadline:
-                return False
-            self._executor.spin_once(timeout_sec=0.005)
-        return True
+        before = len(self.answers["pose"])
+        self.publishers[topic].publish(message)
+        return bool(self.peer.spin_until(lambda: len(self.answers["pose"]) > before, within))
 
     def wait(self, condition: Callable[[], Any]) -> None:
-        assert self.until(condition)
+        assert self.peer.spin_until(condition, PATIENCE), self.said
 
-    # ----------------------------------------------------------------------------------------
+    def diagnosis(self, state: str) -> None:
+        """Wait until the diagnostics say this."""
+        del self.states[:-1]
+        self.wait(lambda: any(re.search(state, text) for text in self.states))
 
     def localizes(self) -> bool:
         """Whether a good frame is answered, and with the true position."""
         for _ in range(20):  # any of them may be lost while the node follows a publisher's quality
-            if self.poses(self.camera_info, self.cloud(), within=1.0):
-                found = self.heard[-1].pose.position
-                error = np.array([found.x, found.y, found.z]) - self.truth[0]
+            self.publishers["/camera_info"].publish(self.camera_info)
+            if self.poses("/correspondences", self.cloud(), within=1.0):
+                answer = typestore().deserialize_cdr(self.answers["pose"][-1], TYPES["pose"])
+                found = answer.pose.position
+                error = np.array([found.x, found.y, found.z]) - self.truth
                 return bool(np.linalg.norm(error) < CLOSE)
         return False
-
-    def _take(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            values = [f"{item.key} = {item.value}" for item in status.values]
-            level = ["OK", "WARN", "ERROR", "STALE"][status.level[0]]
-            self.diagnoses.append("\n".join([f"{level}: {status.message}", *values]))
 
     def close(self) -> None:
         self._stopped.set()
         self._thread.join()
-        self._executor.shutdown()
         self.node.destroy_node()
-        self.peer.destroy_node()
+        self.peer.close()
         rclpy.shutdown(context=self.context)
 
 
-def many(world: World) -> str:
-    """A million points, each with its own noise.
+@pytest.fixture(scope="module")
+def one_world(tmp_path_factory) -> Iterator[World]:
+    world = World(tmp_path_factory.mktemp("bags") / "flight")
+    yield world
+    world.close()
 
-    Noise that ten thousand share would be taken for acceleration: with so many no prior counts.
-    """
-    table = np.resize(world.table(), 1_000_000)
-    rng = np.random.default_rng(3)
-    for name in "uv":
-        table[name] += rng.normal(0.0, 0.5, len(table))
-    before = len(world.heard)
-    hand_over(world, "camera_info", world.camera_info)
-    hand_over(world, "correspondences", world.cloud_of(table))
-    world.wait(lambda: len(world.heard) > before)
-    return ""
+
+@pytest.fixture
+def world(one_world, request) -> Iterator[World]:
+    """The same for all, which has to localize whatever has been done to it."""
+    assert one_world.localizes()
+    seen = len(one_world.said)
+    yield one_world
+    before = len(one_world.said)
+    assert one_world.localizes(), one_world.said[before:]
+    internal = [text for text in one_world.said[seen:] if text.startswith("internal_error")]
+    assert len(internal) == (request.function is test_a_bug_in_the_node)
 
 
 def hand_over(world: World, topic: str, message: Any) -> None:
@@ -213,11 +153,20 @@ def hand_over(world: World, topic: str, message: Any) -> None:
     subscription.callback(serialize_message(message) if subscription.raw else message)
 
 
-# What happens to a node while it works.
+def test_a_million_points(world):
+    """Each with its own noise: what ten thousand share would be taken for acceleration."""
+    table = np.resize(world.table(), 1_000_000)
+    rng = np.random.default_rng(3)
+    for name in "uv":
+        table[name] += rng.normal(0.0, 0.5, len(table))
+    before = len(world.answers["pose"])
+    hand_over(world, "camera_info", world.camera_info)
+    hand_over(world, "correspondences", world.cloud(table))
+    world.wait(lambda: len(world.answers["pose"]) > before)
 
 
-def stuck(world: World) -> str:
-    """Diagnostics and parameters go on while a frame takes long."""
+def test_a_frame_that_takes_long(world):
+    """Diagnostics and parameters go on."""
     started, go_on = threading.Event(), threading.Event()
     frames = world.node._localizer
     localize = frames.localize
@@ -230,15 +179,13 @@ def stuck(world: World) -> str:
 
     frames.localize = wait
     while not started.wait(0.1):
-        world.send(world.cloud())
-    assert world.set(min_inliers=13) == ""
-    assert world.set(min_inliers=12) == ""
-    assert world.diagnosis(r"WARN: a frame has been worked on for \d")
+        world.publishers["/correspondences"].publish(world.cloud())
+    assert world.set("min_inliers", 13) == world.set("min_inliers", 12) == (True, "")
+    world.diagnosis(r"WARN: a frame has been worked on for \d")
     go_on.set()
-    return "a frame has been worked on for 1 s"
 
 
-def bug(world: World) -> Any:
+def test_a_bug_in_the_node(world):
     frames = world.node._localizer
 
     def fail(message: Any) -> Any:
@@ -246,149 +193,66 @@ def bug(world: World) -> Any:
         raise TypeError("a bug")
 
     frames.localize = fail
-    return [world.cloud()]
+    while not world.peer.spin_until(lambda: "localize" not in vars(frames), 2.0):
+        world.publishers["/correspondences"].publish(world.cloud())
+    world.wait(lambda: "internal_error: TypeError('a bug') in fail" in world.said[-1])
 
 
-def simulated_time(world: World) -> str:
+def test_simulated_time(world):
     """Without a clock time stands still at zero; with one it may run backwards."""
-    assert world.set(use_sim_time=True) == ""
-    assert world.poses(world.cloud())
-    before = len(world.diagnoses)
-    world.wait(lambda: len(world.diagnoses) >= before + 2)
-    clock = world.peer.create_publisher(Clock, "/clock", 10)
+    assert world.set("use_sim_time", True) == (True, "")
+    assert world.poses("/correspondences", world.cloud())
+    before = len(world.states)
+    world.wait(lambda: len(world.states) >= before + 2)
+    clock = world.peer.node.create_publisher(Clock, "/clock", 10)
+    world.wait(clock.get_subscription_count)
     for second in (100, 50, 200):
         message = Clock()
         message.clock.sec = second
-        world.wait(clock.get_subscription_count)
         clock.publish(message)
-        world.wait(
-            lambda second=second: world.node.get_clock().now().nanoseconds == second * SECOND
-        )
-        assert world.poses(world.cloud())
-    world.peer.destroy_publisher(clock)
-    assert world.set(use_sim_time=False) == ""
-    return "diagnostics go on"
+        now = world.node.get_clock().now
+        world.wait(lambda now=now, second=second: now().nanoseconds == second * SECOND)
+        assert world.poses("/correspondences", world.cloud())
+    world.peer.node.destroy_publisher(clock)
+    assert world.set("use_sim_time", False) == (True, "")
 
 
-def silence(world: World) -> str:
-    """No frame for some seconds, though there is a publisher."""
-    assert world.diagnosis("STALE: no frame has come for [2-9] s; /correspondences: it has 1 pub")
-    assert world.diagnosis("Topic /correspondences = silent for .*1 publisher, but no message")
-    return "STALE: no frame has come"
+def test_no_frame_for_some_seconds(world):
+    """Though there is a publisher."""
+    world.diagnosis("STALE: no frame has come for [2-9] s; /correspondences: it has 1 pub")
+    topic = world.values["Topic /correspondences"]
+    assert re.search("^silent for .*1 publisher, but no message", topic)
 
 
-def map_message(world: World) -> Any:
+def test_a_map_that_comes_late(world):
     """What all frames of the recording show, with a descriptor for each number."""
+
+    def keypoints() -> Any:
+        table = world.table()
+        rows = np.zeros(len(table), [("u", "<f4"), ("v", "<f4"), ("descriptor", "u1", (32,))])
+        rows["u"], rows["v"], rows["descriptor"] = table["u"], table["v"], DESCRIPTORS[table["id"]]
+        world.stamp += SECOND // 30
+        return make_cloud(make_message, world.stamp, "camera", rows)
+
     tables = [np.unique(world.table(k)[["id", "x", "y", "z"]]) for k in range(len(world.clouds))]
     table = np.unique(np.concatenate(tables))
     points = np.stack([table[name].astype(np.float64) for name in "xyz"], axis=1)
     shown = Map(points, table["id"].astype(np.int64), DESCRIPTORS[table["id"]], "map")
-    return "map_points", make_cloud(make_message, 0, "map", map_rows(shown))
+    assert not world.poses("/keypoints", keypoints(), within=0.3)
+    world.publishers["/map_points"].publish(make_cloud(make_message, 0, "map", map_rows(shown)))
+    world.wait(lambda: world.poses("/keypoints", keypoints(), within=0.3))
 
 
-def keypoints(world: World) -> Any:
-    """Those of a good frame."""
-    table = world.table()
-    rows = np.zeros(len(table), [("u", "<f4"), ("v", "<f4"), ("descriptor", "u1", (32,))])
-    rows["u"], rows["v"], rows["descriptor"] = table["u"], table["v"], DESCRIPTORS[table["id"]]
-    world.stamp += SECOND // 30
-    return "keypoints", make_cloud(make_message, world.stamp, "camera", rows)
-
-
-def late_map(world: World) -> str:
-    assert not world.poses(keypoints(world), within=0.3)
-    world.send(map_message(world))
-    world.wait(lambda: world.poses(keypoints(world), within=0.3))
-    return "localized since the map came"
-
-
-class Static:
-    """Says on /tf_static where a frame is, as long as it is open."""
-
-    def __init__(self, world: World, tf2: Any, parent: str, child: str, x: float) -> None:
-        self._world = world
-        item = TransformStamped(child_frame_id=child)
-        item.header.frame_id, item.transform.translation.x = parent, x
-        self._broadcaster = tf2.StaticTransformBroadcaster(world.peer)
-        self._broadcaster.sendTransform(item)
-
-    def close(self) -> None:
-        self._world.peer.destroy_publisher(self._broadcaster.pub_tf)
-
-
-def second_parent(world: World) -> str:
-    """The camera hangs on something already."""
+def test_the_camera_has_a_parent(world):
+    """It hangs on something already."""
     before = len(world.said)
-    with (
-        tf2_ros() as tf2,
-        contextlib.closing(
-            Static(world, tf2, "camera_link", world.camera_info.header.frame_id, 0.0)
-        ),
-    ):
-        assert world.set(publish_tf="map_to_camera") == ""
-        world.wait(
-            lambda: (
-                world.localizes() and any("already has parent" in t for t in world.said[before:])
-            )
-        )
-    assert world.set(publish_tf="none") == ""
-    return "; ".join(world.said[before:])
-
-
-@dataclass(frozen=True)
-class Fault:
-    """A row: what is done to the node, and a pattern of what it has to say.
-
-    Messages that are returned are sent until the node has said it (best effort may lose one). A
-    text that is returned is what the node has answered. With ``pose`` it is to be localized all
-    the same.
-    """
-
-    name: str
-    do: Callable[[World], Any]
-    says: str
-    pose: bool = False
-
-
-FAULTS = [
-    # Work
-    Fault("a million points", many, "", pose=True),
-    Fault("a frame that takes long", stuck, "worked on for"),
-    Fault("a bug in the node", bug, r"internal_error: TypeError\('a bug'\) in fail"),
-    # The graph
-    Fault("simulated time, no clock", simulated_time, "diagnostics go on"),
-    Fault("frames stop", silence, "no frame has come"),
-    Fault("a map that comes late", late_map, "localized since the map came"),
-    Fault("the camera has a parent", second_parent, "not_broadcast: .* has parent", pose=True),
-]
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory) -> Iterator[World]:
-    """The faults share one."""
-    world = World(tmp_path_factory.mktemp("bags") / "flight")
-    yield world
-    world.close()
-
-
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_fault(world, fault):
-    seen, poses = len(world.said), len(world.heard)
-    result = fault.do(world)
-    answers = [result] if isinstance(result, str) else []
-
-    def done() -> bool:
-        if fault.pose and len(world.heard) == poses:
-            return False
-        return any(re.search(fault.says, text) for text in ["", *answers, *world.said[seen:]])
-
-    for _ in range(20):
-        if not isinstance(result, str):
-            world.send(*result)
-        if world.until(done, PATIENCE if isinstance(result, str) else 2.0):
-            break
-    assert done(), world.said[seen:]
-    before = len(world.said)
-    assert world.localizes(), world.said[before:]
-    internal = [text for text in world.said[seen:] if text.startswith("internal_error")]
-    assert len(internal) == (fault.do is bug)
+    item = TransformStamped(child_frame_id=world.camera_info.header.frame_id)
+    item.header.frame_id = "camera_link"
+    with tf2_ros() as tf2:
+        hung = tf2.StaticTransformBroadcaster(world.peer.node)
+        hung.sendTransform(item)
+        assert world.set("publish_tf", "map_to_camera") == (True, "")
+        said = re.compile("not_broadcast: .* already has parent")
+        world.wait(lambda: world.localizes() and any(map(said.search, world.said[before:])))
+        world.peer.node.destroy_publisher(hung.pub_tf)
+    assert world.set("publish_tf", "none") == (True, "")
