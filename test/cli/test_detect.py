@@ -27,48 +27,37 @@ from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.offline import detect as detecting
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.marker_detector import FrameDetector, correspondences
-from rs_localizer.settings import build, load_params_file
+from rs_localizer.settings import load_params_file
 
-K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
+from ..markers.prints import (  # noqa: TID252 - Python has a package "test"
+    K,
+    chessboard_cells,
+    rectangle,
+    render,
+)
+
 CAMERA = Camera(320, 240, K)
 LENS = "1 PINHOLE 320 240 300 300 160 120\n"  # the first pixel's middle is at 0.5
 SQUARE, DEPTH = 0.03, 0.45
 TURN = Rotation.from_euler("YX", [25.0, -20.0], degrees=True).as_matrix()  # camera_from_print
-MARKERS = MarkerMap(wall("5x5_50", (2, 1), 0.07, 0.03), map_frame="hall")  # cells of 1 cm
-PIXELS, FINE = 20, 4  # of a cell as drawn, and of an image before it is shrunk
+MARKERS = MarkerMap(wall("5x5_50", (2, 1), 0.07, 0.03), map_frame="hall")
 
 
-def render(cells: Any, size: float, x: float = 0.0) -> Any:
-    """A print of cells (true: white), m; its middle is before the camera, or x m beside it."""
-    drawn = np.pad(np.where(cells, 230, 20).astype(np.uint8), 1, constant_values=230)
-    drawn = np.kron(drawn, np.ones((PIXELS, PIXELS), np.uint8))
-    scale, (height, width) = size / PIXELS, drawn.shape
-    metres = np.array([[scale, 0, -scale * (width - 1) / 2],
-                       [0, scale, -scale * (height - 1) / 2], [0, 0, 1]])  # fmt: skip
-    to_image = K @ np.column_stack([TURN[:, :2], [x, 0.0, DEPTH]]) @ metres
-    half = (FINE - 1) / 2
-    fine = np.array([[FINE, 0, half], [0, FINE, half], [0, 0, 1.0]])
-    large = cv2.warpPerspective(drawn, fine @ to_image, (320 * FINE, 240 * FINE), borderValue=230)
-    small = cv2.resize(large, (320, 240), interpolation=cv2.INTER_AREA)
-    return cv2.GaussianBlur(small, (0, 0), 0.5)
+def seen(prints: Any, x: float) -> Any:
+    """Prints whose middle is before the camera, or x m beside it; of the map y is up."""
+    return render(prints, (TURN @ np.diag([1.0, -1.0, -1.0]), np.array([x, 0.0, DEPTH])))
 
 
 def board(columns: int = 6, rows: int = 4, x: float = 0.0) -> Any:
     """A chessboard by its inner corners."""
-    v, u = np.mgrid[: rows + 1, : columns + 1]
-    return render((u + v) % 2 == 1, SQUARE, x)
-
-
-def first_corner(columns: int, rows: int) -> Any:
-    """Where it is in the camera."""
-    return np.array([0.0, 0.0, DEPTH]) - TURN @ [*np.array([columns - 1, rows - 1]) * SQUARE / 2, 0]
+    width, height = columns + 1, rows + 1
+    outline = rectangle(SQUARE * width, SQUARE * height)
+    return seen([(chessboard_cells(width, height), outline)], x)
 
 
 def markers(x: float = 0.0) -> Any:
-    """Both markers of the map, in one print."""
-    cells = np.ones((7, 17), bool)
-    cells[:, :7], cells[:, 10:] = (pattern(m.family, m.id) for m in MARKERS.markers)
-    return render(cells, 0.01, x)
+    """Both markers of the map."""
+    return seen([(pattern(m.family, m.id), m.corners) for m in MARKERS.markers], x)
 
 
 @pytest.fixture
@@ -242,25 +231,6 @@ def test_what_is_seen_instead_is_named(here, monkeypatch, capsys):
     assert not here.out.exists()
 
 
-def test_settings_are_passed_on(here):
-    """The scan direction, and what else calibrate found, not the readout time alone."""
-    file = here.path / "shutter.yaml"
-    file.write_text(
-        "/**:\n  ros__parameters:\n    readout_time: 0.011\n    readout_time_deviation: 0.0002\n"
-        "    scan_direction: bottom_to_top\n    imu.time_offset: 0.004\n"
-    )
-    words = [*here.calibration, *here.board, "--rate", "20", "--params", str(file)]
-    assert detect(here, here.video, *words, "-p", "stamp_offset:=0.002") == 0
-    config = build(settings(here))
-    assert (config.readout_time, config.readout_time_deviation) == (0.011, 0.0002)
-    assert (config.scan_direction, config.stamp_offset) == ("bottom_to_top", 0.002)
-    assert config.imu.time_offset == 0.004
-    # A single one counts more.
-    again = [*words, "-p", "scan_direction:=top_to_bottom", "--overwrite"]
-    assert detect(here, here.video, *again) == 0
-    assert settings(here)["scan_direction"] == "top_to_bottom"
-
-
 def test_a_wrong_calibration_is_named(here, capsys):
     (here.path / "cameras.txt").write_text(LENS.replace("300 300", "300 900"))
     images = folder(here.path / "images", [board()] * 3)
@@ -301,5 +271,6 @@ def test_transforms_and_imu_of_a_bag_are_kept(here, own_calibration, capsys):
     words = ["-p", "base_frame:=base_link", "-p", "readout_time:=0.02", "--out", str(poses)]
     assert main(["replay", str(here.out), *words]) == 0
     found = read_motions(poses).poses.positions
-    expected = -TURN.T @ (first_corner(6, 4) + 2.0 * np.eye(3)[2])
+    first_corner = np.array([0.0, 0.0, DEPTH]) - TURN @ [2.5 * SQUARE, 1.5 * SQUARE, 0.0]
+    expected = -TURN.T @ (first_corner + 2.0 * np.eye(3)[2])
     np.testing.assert_allclose(np.median(found, axis=0), expected, atol=0.05)

@@ -82,43 +82,6 @@ def bearings(frame: SimulatedFrame) -> Array:
     return np.asarray(local[:, :2] / local[:, 2:])
 
 
-def test_truth_is_the_motion_at_the_middle_row():
-    t = np.arange(0.0, 2.0, 1 / 120)
-    quaternions = np.stack([np.sin(t), np.cos(2 * t), np.sin(1.5 * t), 2 + np.cos(t)], axis=1)
-    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    positions = 0.3 * np.stack([np.sin(3 * t), np.cos(2 * t), t], axis=1)
-    motion = RecordedMotion(Trajectory((t * 1e9).astype(np.int64), positions, quaternions))
-    for frame in frames(motion=motion)[5:50:15]:
-        assert frame.middle_ns == frame.stamp_ns + 15_000_000
-        # Whose velocities test_true_motion compares with differences.
-        middle, truth = motion.state(frame.stamp_ns, np.array([0.015])), frame.motion
-        np.testing.assert_allclose(truth.rotation, middle.rotations[0].T, atol=1e-9)
-        centre = -truth.rotation.T @ truth.translation
-        np.testing.assert_allclose(centre, middle.positions[0], atol=1e-9)
-        # Per readout: what the camera would do in 0.03 s, in its own axes.
-        np.testing.assert_allclose(truth.linear_velocity, 0.03 * middle.linear[0], atol=1e-9)
-        np.testing.assert_allclose(truth.angular_velocity, 0.03 * middle.angular[0], atol=1e-9)
-        np.testing.assert_allclose(
-            frame.first_row.rotations[0], motion.state(frame.stamp_ns, np.zeros(1)).rotations[0]
-        )
-
-
-def test_noise_has_the_ordered_size_in_both_coordinates():
-    noisy = frames(FrameSettings(points=100, noise=1.5, outliers=0.0))
-    differences = []
-    for frame in noisy:
-        # The same points again without noise: their ids are now their places in the list.
-        (exact,) = simulate_frames(
-            camera(), MOTION, frame.points, CLEAN, stamps_ns=[frame.stamp_ns]
-        )
-        differences.append(frame.pixels - exact.pixels[np.argsort(exact.ids)])
-    noise = np.concatenate(differences)
-    assert len(noise) == 100 * len(noisy)
-    np.testing.assert_allclose(noise.std(axis=0), 1.5, rtol=0.05)
-    np.testing.assert_allclose(noise.mean(axis=0), 0.0, atol=0.1)
-    assert abs(np.corrcoef(noise.T)[0, 1]) < 0.06
-
-
 def test_no_frame_touches_a_gap():
     t = np.arange(0.0, 3.0, 1 / 120)
     t = t[((t < 1.0) | (t > 1.4)) & ((t < 2.0) | (t > 2.05))]
