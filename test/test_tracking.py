@@ -24,11 +24,12 @@ WALL = np.column_stack([np.random.default_rng(1).uniform(-3, 3, (400, 2)), np.fu
 
 
 class Hand:
-    """A swaying camera in SI: map_from_camera at t seconds."""
+    """A swaying camera in SI: map_from_camera at t seconds, or at times (n,)."""
 
     def pose(self, t):
-        turn = 0.25 * np.array([np.sin(2.1 * t), np.sin(2.9 * t + 1), np.sin(1.7 * t + 2)])
-        place = 0.3 * np.array([np.sin(1.3 * t), np.sin(2.3 * t + 2), np.sin(1.1 * t + 1)])
+        t = np.asarray(t)[..., None]
+        turn = 0.25 * np.sin(np.array([2.1, 2.9, 1.7]) * t + np.array([0.0, 1.0, 2.0]))
+        place = 0.3 * np.sin(np.array([1.3, 2.3, 1.1]) * t + np.array([0.0, 2.0, 1.0]))
         return Rotation.from_rotvec(turn).as_matrix(), place
 
     def motion(self, t):
@@ -50,9 +51,9 @@ class Hand:
         rng = np.random.default_rng(round(t * 1e4))
 
         def poses_at(tau):
-            pairs = [self.pose(t + x * READOUT) for x in tau]
-            rotations = np.array([r.T for r, _ in pairs])
-            return rotations, -np.einsum("nij,nj->ni", rotations, np.array([p for _, p in pairs]))
+            rotations, places = self.pose(t + tau * READOUT)
+            rotations = np.ascontiguousarray(np.swapaxes(rotations, 1, 2))
+            return rotations, -np.einsum("nij,nj->ni", rotations, places)
 
         pixels, _ = project_rolling(CAMERA, poses_at, points)
         seen = np.flatnonzero(CAMERA.inside(pixels))
@@ -351,9 +352,8 @@ class Shaken(Hand):
 
     def pose(self, t):
         rotation, place = super().pose(t)
-        return rotation @ Rotation.from_rotvec(
-            np.sin(self.rate * t) * self.swing
-        ).as_matrix(), place
+        swung = np.sin(self.rate * np.asarray(t))[..., None] * self.swing
+        return rotation @ Rotation.from_rotvec(swung).as_matrix(), place
 
 
 def test_turn_rates_of_a_shaken_camera_are_covered():

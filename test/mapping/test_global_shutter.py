@@ -75,7 +75,10 @@ def distances(points: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.linalg.norm(through(points, truth)(points) - truth, axis=1)
 
 
-@pytest.mark.parametrize("shutter", [("-p", f"readout_time:={READOUT}"), ()])  # or estimated
+@pytest.mark.parametrize(
+    "shutter",
+    [("-p", f"readout_time:={READOUT}"), pytest.param((), marks=pytest.mark.bench)],  # estimated
+)
 def test_the_model_is_that_of_a_global_shutter(scene, model, shutter, tmp_path, capsys):
     out = tmp_path / "out"
     words = ["map", "refine", "--colmap", str(model), str(out), "--rate", "30"]

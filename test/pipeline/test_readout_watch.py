@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from benchmarks.data import GLOBAL_SHUTTER_TAGS
 from benchmarks.independent.rotations import logarithm
@@ -119,44 +118,6 @@ def test_a_robot_that_drives_slowly_is_not_doubted(seed):
     for k, frame in enumerate(simulate_frames(CAMERA, motion, world, seen, seed=seed)):
         assert frames.localize(cloud_of(frame.stamp_ns + 10**18, frame.points, frame.pixels))
         assert frames.readout_watch.trusted, k
-
-
-@pytest.mark.parametrize(("curl", "rate", "told"), [(0.0, 0.3, 0.015), (0.001, 0.05, 0.03)])
-def test_poses_do_not_go_to_and_fro_between_trust_and_doubt(curl, rate, told):
-    """Boards of paper, flat and curled by 1 mm, say little of the shutter: 15 ms."""
-    x, y = (
-        part.ravel() for part in np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.06, 0.06, 6))
-    )
-    flat = np.column_stack([x, y, 0.0 * x])
-    paper = np.column_stack([x, y, curl * (x / 0.1) ** 2])
-    rng, trusted = np.random.default_rng(0), []
-    frames = FrameLocalizer(NodeConfig(readout_time=told, map_deviation=2e-4))
-    frames.calibrate(CALIBRATION)
-    for k in range(45):
-        stamp, pixels = k / 30.0, np.zeros((len(x), 2))
-        for _ in range(4):  # a point is where its row sees it
-            t = stamp + 0.015 * pixels[:, 1] / 479.0
-            turns = [
-                0.3 + rate * np.sin(2.1 * t) / 2.1,
-                0.25 + rate * np.cos(1.7 * t) / 1.7,
-                0.1 + 0 * t,
-            ]
-            places = Rotation.from_rotvec(np.column_stack(turns)).apply(paper)
-            places += np.column_stack([0.01 * np.sin(t), 0.01 * np.cos(1.3 * t), 0.4 + 0 * t])
-            pixels = (places @ CAMERA.K.T)[:, :2] / places[:, 2:]
-        pixels = pixels + rng.normal(0.0, 0.15, pixels.shape)
-        assert frames.localize(cloud_of(10**9 + round(1e9 * stamp), flat, pixels))
-        trusted.append(frames.readout_watch.trusted)
-    changes = np.count_nonzero(np.diff(trusted))
-    assert changes <= (0 if curl == 0.0 else 1)
-
-
-def test_the_right_one_is_confirmed():
-    seen = Watched(readout_time=READOUT)
-    assert (seen.notices, seen.watch.fault, seen.watch.far_off) == ([], "", False)
-    found = seen.watch.measured
-    assert found is not None
-    assert abs(found.readout_time - READOUT) < 4.0 * found.deviation
 
 
 def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm():
