@@ -83,7 +83,7 @@ def camera_settings(values: Mapping[str, Any]) -> dict[str, Setting]:
 
 def _cameras(values: Mapping[str, Any]) -> list[str]:
     """The names of cameras; none where they are no names, which is refused elsewhere."""
-    given = _as_tuple(values.get("cameras", NO_NAMES))
+    given = as_tuple(values.get("cameras", NO_NAMES))
     return (
         [name for name in given if isinstance(name, str) and name] if type(given) is tuple else []
     )
@@ -157,11 +157,11 @@ def _build(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
             chosen[item.name] = _build(default, values, f"{prefix}{item.name}.")
         else:
             value = values.get(prefix + item.name, default)
-            chosen[item.name] = _as_tuple(value) if isinstance(default, tuple) else value
+            chosen[item.name] = as_tuple(value) if isinstance(default, tuple) else value
     return type(config)(**chosen)
 
 
-def _as_tuple(value: Any) -> Any:
+def as_tuple(value: Any) -> Any:
     """Tuple of what ROS and YAML have as a list or an array; anything else as it is."""
     return tuple(value) if isinstance(value, (list, array)) else value
 
@@ -228,7 +228,7 @@ def _checked(name: str, value: Any, where: str, kind: Kind) -> Any:
         raise SettingsError(f"{where}: {unknown(name, kind) or f'{name!r} is not a setting'}")
     default = settings(kind)[known].default
     if isinstance(default, tuple):
-        return _as_tuple(value)
+        return as_tuple(value)
     if isinstance(value, str) and isinstance(default, float):
         # ROS reads 1e-3 as a number, PyYAML as text.
         with contextlib.suppress(ValueError):

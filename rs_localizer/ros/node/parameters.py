@@ -21,6 +21,7 @@ from rs_localizer.settings import (
     Config,
     Kind,
     Setting,
+    as_tuple,
     build,
     camera_settings,
     camera_values,
@@ -56,7 +57,8 @@ def _of_camera_file(node: Node, kind: Kind) -> dict[str, Any]:
     return {
         name: value
         for name, value in values.items()
-        if name not in given or (name in known and given[name].value == known[name].default)
+        if name not in given
+        or (name in known and as_tuple(given[name].value) == known[name].default)
     }
 
 

@@ -98,30 +98,25 @@ def test_bad_values_at_start(context, assignment, text):
 
 
 @pytest.mark.parametrize("way", ["--params-file", "camera_file"])
-def test_a_file_of_a_camera_is_a_params_file_too(context, tmp_path, way):
+def test_a_file_of_a_camera_or_of_a_rig_is_a_params_file_too(context, tmp_path, way):
     """Its lens is no parameter; the file of all defaults does not take back what it says."""
     file, shipped = tmp_path / "camera.yaml", Path("config/rs_localizer.yaml").absolute()
     K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
-    values = {"readout_time": 0.021, "min_inliers": 9}
-    write_camera_file(file, values, lens_parameters(Camera(640, 480, K)))
-    words = ["-r", "__node:=rs_localizer", "--params-file", str(shipped)]
-    words += [way, str(file)] if way != "camera_file" else ["-p", f"camera_file:={file}"]
-    made = Recorder(context, *words, "-p", "min_inliers:=11")
-    assert (made.config.readout_time, made.config.min_inliers) == (0.021, 11)
-    assert parameters.unknown_names(made.node, NodeConfig) == []
-    made.node.destroy_node()
-
-
-@pytest.mark.parametrize("way", ["--params-file", "camera_file"])
-def test_so_is_that_of_a_rig(context, tmp_path, way):
-    file, K = tmp_path / "rig.yaml", np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0, 0, 1]])
     cameras = {name: Camera(640, 480, K, readout_time=0.02) for name in ("a", "b")}
     parts = RigParts(cameras, dict.fromkeys(cameras, (np.eye(3), np.zeros(3))), {"b": 0.01})
-    write_camera_file(file, node_parameters(parts), mounted_lenses(parts))
-    words = [way, str(file)] if way != "camera_file" else ["-p", f"camera_file:={file}"]
-    made = Recorder(context, "-r", "__node:=rs_localizer", *words)
-    assert made.config.cameras == ("a", "b")
-    own = made.config.of_cameras["b"]
+    one = {"readout_time": 0.021, "min_inliers": 9}
+    words = ["-r", "__node:=rs_localizer", "--params-file", str(shipped)]
+    words += [way, str(file)] if way != "camera_file" else ["-p", f"camera_file:={file}"]
+    configs = []
+    for values, lens in (
+        (one, lens_parameters(cameras["a"])), (node_parameters(parts), mounted_lenses(parts))
+    ):  # fmt: skip
+        write_camera_file(file, values, lens)
+        made = Recorder(context, *words, "-p", "min_inliers:=11")
+        assert parameters.unknown_names(made.node, NodeConfig) == []
+        configs.append(made.config)
+        made.node.destroy_node()
+    assert (configs[0].readout_time, configs[0].min_inliers) == (0.021, 11)
+    assert configs[1].cameras == ("a", "b")
+    own = configs[1].of_cameras["b"]
     assert (own.readout_time, own.stamp_offset) == (0.02, 0.01)
-    assert parameters.unknown_names(made.node, NodeConfig) == []
-    made.node.destroy_node()
