@@ -61,6 +61,11 @@ class Piece:
     def name(self) -> str:
         return str(self.arguments[0])
 
+    @property
+    def installed(self) -> Path:
+        """The file of the sources that is joined from where the package is."""
+        return ROOT.joinpath(*self.arguments[0][1:])
+
 
 class Fake(ModuleType):
     def __getattr__(self, name: str) -> Any:
@@ -81,23 +86,6 @@ def pieces(item: Any) -> list[Piece]:
     return [piece for part in item for piece in pieces(part)]
 
 
-def text_of(default: Any) -> str:
-    """Of an argument that is not given; files are those of the sources."""
-    return str(ROOT.joinpath(*default.name_of_file)) if isinstance(default, Shared) else default
-
-
-class Shared(Piece):
-    """A file that the package installs."""
-
-    @property
-    def name_of_file(self) -> list[str]:
-        return self.arguments[0][1:]
-
-
-class FakeSubstitutions(Fake):
-    PathJoinSubstitution = staticmethod(lambda path: Shared("PathJoinSubstitution", (path,), {}))
-
-
 Describe = Callable[..., list[Piece]]
 
 
@@ -105,22 +93,16 @@ Describe = Callable[..., list[Piece]]
 def describe(monkeypatch) -> Describe:
     """All of a launch file when these arguments are given."""
     for name in (
-        *("launch", "launch.actions", "launch.conditions", "launch_ros", "launch_ros.actions"),
-        *("launch_ros.substitutions", "launch_ros.parameter_descriptions"),
+        *("launch", "launch.actions", "launch.conditions", "launch.substitutions", "launch_ros"),
+        *("launch_ros.actions", "launch_ros.substitutions", "launch_ros.parameter_descriptions"),
     ):
         monkeypatch.setitem(sys.modules, name, Fake(name))
-    name = "launch.substitutions"
-    monkeypatch.setitem(sys.modules, name, FakeSubstitutions(name))
     monkeypatch.delitem(sys.modules, "rs_localizer.ros.launching", raising=False)
 
     def describe(file: str, **given: str) -> list[Piece]:
         code = runpy.run_path(str(ROOT / "launch" / file))
         found = pieces(code["generate_launch_description"]())
-        defaults = {
-            piece.name: text_of(piece.options["default_value"])
-            for piece in found
-            if piece.kind == "DeclareLaunchArgument"
-        }
+        defaults = declared(found)
         assert given.keys() <= defaults.keys()
         context = SimpleNamespace(launch_configurations=defaults | given)
         for piece in list(found):
@@ -132,8 +114,14 @@ def describe(monkeypatch) -> Describe:
     sys.modules.pop("rs_localizer.ros.launching", None)
 
 
-def declared(description: list[Piece]) -> set[str]:
-    return {piece.name for piece in description if piece.kind == "DeclareLaunchArgument"}
+def declared(description: list[Piece]) -> dict[str, str]:
+    """Arguments of a launch file, and what they are when none is given."""
+    values = {
+        piece.name: piece.options["default_value"]
+        for piece in description
+        if piece.kind == "DeclareLaunchArgument"
+    }
+    return {k: str(v.installed) if isinstance(v, Piece) else v for k, v in values.items()}
 
 
 def node(description: list[Piece], executable: str) -> Piece:
@@ -161,10 +149,9 @@ DETECTORS = {"markers.launch.py": DetectorConfig, "features.launch.py": FeatureC
 @pytest.mark.parametrize("file", [path.name for path in (ROOT / "launch").glob("*.launch.py")])
 def test_arguments_and_files_exist(describe, file):
     description = describe(file, **MAP.get(file, {}))
-    shared = [piece.name_of_file for piece in description if isinstance(piece, Shared)]
+    shared = [piece.installed for piece in description if piece.kind == "PathJoinSubstitution"]
     assert shared
-    for path in shared:
-        assert ROOT.joinpath(*path).is_file()
+    assert all(path.is_file() for path in shared)
     for piece in description:
         if piece.kind == "Node" and piece.options["package"] == "rs_localizer":
             assert (
@@ -186,7 +173,7 @@ def test_every_setting_can_be_given(describe, file):
     names = {name for name in settings() if "." not in name}
     if file in DETECTORS:
         names |= set(settings(DETECTORS[file]))
-    assert names | {"use_sim_time"} <= declared(describe(file, **MAP.get(file, {})))
+    assert names | {"use_sim_time"} <= declared(describe(file, **MAP.get(file, {}))).keys()
     given = {
         "readout_time": "2e-2", "seed": "3", "tracking": "False", "map_frame": "1",
         "use_sim_time": "true", "scan_direction": "bottom_to_top",
