@@ -45,8 +45,7 @@ python := $(VENV)/bin/python
 demo: $(ready)
 	@$(python) -m rs_localizer demo --out $(OUT)
 
-# Kernels that two processes compile at once may round differently, and tests compare bits. Of
-# four processes one or two often wait, for nodes that have to hear of each other. Threads of BLAS
+# Of four processes one or two often wait, for nodes that have to hear of each other. Threads of BLAS
 # would wait for each other, too, and spin: 119 s of the processor instead of 26 in one file.
 test: $(ready)
 	@$(MAKE) --no-print-directory --jobs 2 lint warm collect

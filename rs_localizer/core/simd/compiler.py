@@ -41,6 +41,8 @@ sys.path[:] = asked.recv()
 from rs_localizer.core.simd.compiler import serve
 serve(asked)
 """
+# Numba goes through sets of names, by whose order the same sources would round differently.
+_SAME_CODE = {"PYTHONHASHSEED": "0"}
 # s without a request after which the process ends; the next one starts it again.
 _IDLE = 20.0
 # kB from which a fork is replaced: what is Numba's own is compiled again in each, and one for all
@@ -123,7 +125,7 @@ class _Compiler:
         if self._child is None:
             self._child = subprocess.Popen(
                 [sys.executable, "-c", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL, env=os.environ | _SAME_CODE,
             )  # fmt: skip
             assert self._child.stdin is not None
             assert self._child.stdout is not None

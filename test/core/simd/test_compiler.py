@@ -3,6 +3,7 @@
 """Kernels come from a process that compiles them, once; and nobody has to wait."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -63,8 +64,8 @@ while True:
 def start(tmp_path):
     """Starts a program whose cache is empty at first."""
 
-    def start(program: str) -> subprocess.Popen[str]:
-        environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    def start(program: str, cache: str = "cache", **more: str) -> subprocess.Popen[str]:
+        environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / cache)} | more
         environment.pop("NUMBA_CACHE_DIR", None)
         return subprocess.Popen(
             [sys.executable, "-W", "error", "-c", program], env=environment, text=True,
@@ -89,6 +90,21 @@ def test_who_has_it_compiled_and_who_loads_it_have_the_same_bits(start, tmp_path
     assert ["1 _exp_many", bits, "asked a process: True"] in both
     assert len(list((tmp_path / "cache").rglob("*_exp_many*.nbc"))) == 1
     assert said(start(FIRST)) == [bits, "asked a process: False"]
+
+
+def test_a_kernel_is_the_same_code_wherever_it_is_compiled(start, tmp_path):
+    """Numba goes through sets of names, whose order is another in each process."""
+    ended = [start(LONG, cache, PYTHONHASHSEED=cache) for cache in ("1", "3")]
+    assert [said(process) for process in ended] == [["begins"]] * 2
+    one, other = (kernels(tmp_path / cache) for cache in ("1", "3"))
+    assert one == other
+    assert "_exp_many" in " ".join(one)
+
+
+def kernels(cache: Path) -> dict[str, bytes]:
+    """Kernels of a cache without what differs from process to process: where functions lie."""
+    files = cache.rglob("*.nbc")
+    return {file.name: re.sub(rb"0x[0-9a-f]+", b"", file.read_bytes()[4:]) for file in files}
 
 
 def test_who_must_not_wait_is_told_until_it_is_there(start):
