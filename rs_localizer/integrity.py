@@ -24,6 +24,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import TURN
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
+from rs_localizer.estimation.residuals import likeness
 
 NAMES = (
     "share", "together", "apart", "persists", "spread", "filled", "count", "innovation", "searched",
@@ -52,13 +53,9 @@ def _together(points: Array, kept: BoolArray) -> float:
     count, share = len(points), float(np.mean(kept)) if len(points) else 1.0
     if count <= 2 * _NEIGHBOURS or not 0.0 < share < 1.0:
         return 0.0
-    points = points - points.mean(axis=0)
-    squares = np.einsum("ni,ni->n", points, points)
-    far = squares[:, None] + squares - 2.0 * points @ points.T
-    np.fill_diagonal(far, np.inf)
-    near = np.argpartition(far, _NEIGHBOURS, axis=1)[:, :_NEIGHBOURS]
-    off = kept.astype(float) - share
-    alike = float(np.mean(off[:, None] * off[near])) / (share * (1.0 - share))  # Moran's I
+    alike = likeness(points, kept.astype(np.float64) - share, _NEIGHBOURS) / (
+        share * (1.0 - share)
+    )  # Moran's I
     expected, deviation = -1.0 / (count - 1.0), math.sqrt(1.5 / (count * _NEIGHBOURS))
     return min(max((alike - expected) / deviation, -3.0), 15.0)
 
@@ -67,8 +64,14 @@ def _spread(kept: Array, seen: Array) -> float:
     """Logarithm of the part of the points' area in the image that the inliers take."""
     if len(kept) < 3:
         return -3.0
-    areas = [math.sqrt(max(np.linalg.det(np.cov(each.T)), 1e-6)) for each in (kept, seen)]
+    areas = [math.sqrt(max(_determinant(each), 1e-6)) for each in (kept, seen)]
     return min(max(math.log(areas[0] / areas[1]), -3.0), 1.0)
+
+
+def _determinant(pixels: Array) -> float:
+    """Determinant of the covariance of pixels (n,2)."""
+    x, y = (pixels - pixels.mean(axis=0)).T
+    return float((x @ x) * (y @ y) - (x @ y) ** 2) / (len(pixels) - 1) ** 2
 
 
 def _innovation(estimate: Estimate, prior: Prior) -> float:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, localizer_config
 from rs_localizer.core.arrays import Array, instance
+from rs_localizer.core.bearings import seen_at
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
@@ -359,7 +360,7 @@ class Localizer:
             for _ in range(_LOOKS):
                 at_rows = found.at_rows(exposure.row_time(place, shown[own]))
                 local = np.einsum("nij,nj->ni", at_rows[0], landmarks[own]) + at_rows[1]
-                shown[own] = exposure.cameras[place].project(local @ axes.T + moved)
+                shown[own] = seen_at(exposure.cameras[place], local @ axes.T + moved)
             first += count
         errors: Array = np.linalg.norm(shown - seen, axis=1)
         return errors

@@ -20,10 +20,9 @@ from dataclasses import replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, step_between
+from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.motion_window import MotionWindow, motion_of
-from rs_localizer.estimation.prior import state_in
+from rs_localizer.estimation.motion_window import MotionWindow, errors_ahead
 
 # Horizons, as parts of the longest one: at 30 Hz and 0.1 s, one, two and three images.
 _KNOTS = np.array([1.0, 2.0, 3.0]) / 3.0
@@ -53,7 +52,8 @@ class PredictionErrors:
         self._factors = np.ones((len(_KNOTS), 4))
         self._told = np.zeros(len(_KNOTS))  # images that tell of each
         self._least = _LEAST
-        self._past: list[tuple[MotionWindow, Array]] = []
+        # When each of the last images was, the motion until then, and the shaking about it.
+        self._past: list[tuple[int, MotionWindow, Array]] = []
 
     def add(self, found: Estimate, window: MotionWindow, swing: Array) -> None:
         """Compare what was predicted for an image, and predict from it.
@@ -65,23 +65,21 @@ class PredictionErrors:
         """
         if self._longest <= 0.0:
             return
-        now, origin = state_in(found, np.zeros(3)), np.zeros(3)
         self._least = _LEAST if found.turn is None else _LEAST_UNLEARNT
-        own = _blocks(found.joint_covariance)
-        apart = math.inf  # s since the newest of the past
-        kept = [each for each in self._past if 0.0 < _apart(each[0], found) <= 1.2 * self._longest]
-        for before, its_swing in kept:
-            apart = _apart(before, found)
-            motion, covariance = motion_of(before.after(found.time_ns), found.span)
-            step = step_between(state_in(motion, origin), now)[:MOTION_PARAMETERS].reshape(4, 3)
-            known = np.linalg.inv(_blocks(covariance + its_swing))
-            second = own + step[:, :, None] * step[:, None, :]
-            self._learn(apart, np.einsum("kij,kji->k", known, second) / 3.0)
+        apart, kept = math.inf, []  # s since the newest of the past
+        for past in self._past:
+            seconds = 1e-9 * (found.time_ns - past[0])
+            if 0.0 < seconds <= 1.2 * self._longest:
+                apart = seconds
+                kept.append(past)
+                self._learn(apart, errors_ahead(past[1], found, past[2]))
         if apart > 0.45 * _KNOTS[0] * self._longest:
-            kept.append((window, swing))
+            kept.append((found.time_ns, window, swing))
         self._past = kept
 
     def _learn(self, seconds: float, ratios: Array) -> None:
+        if not np.isfinite(ratios).all():  # rounding errors are all that is left of a covariance
+            return
         place = np.clip(seconds / self._longest, _KNOTS[0], _KNOTS[-1])
         for k, weight in enumerate(np.maximum(1.0 - np.abs(place - _KNOTS) / _KNOTS[0], 0.0)):
             if weight > 0.0:
@@ -100,15 +98,3 @@ class PredictionErrors:
         scale[:MOTION_PARAMETERS] = np.repeat(np.sqrt(_FEW * np.maximum(factors, self._least)), 3)
         covariance = predicted.joint_covariance * np.outer(scale, scale)
         return replace(predicted, joint_covariance=covariance)
-
-
-def _apart(before: MotionWindow, found: Estimate) -> float:
-    """Seconds from the last image of a window to a later one."""
-    return 1e-9 * (found.time_ns - before.newest.time_ns)
-
-
-def _blocks(covariance: Array) -> Array:
-    """(4,3,3) of turn, place, angular and linear velocity."""
-    places = np.arange(MOTION_PARAMETERS).reshape(4, 3)
-    blocks: Array = covariance[places[:, :, None], places[:, None, :]]
-    return blocks

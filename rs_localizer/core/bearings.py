@@ -40,6 +40,22 @@ def bearings(camera: Camera, pixels: Array) -> tuple[Array, Array]:
     return rays, by_ray
 
 
+def projected(camera: Camera, rays: Array) -> tuple[Array, Array]:
+    """Raw pixels (n,2) and derivatives by rays (n,2) as :meth:`Camera.distort`, to rounding."""
+    lens = pinhole(camera)
+    return camera.distort(rays) if lens is None else _projected(rays, *lens)
+
+
+def seen_at(camera: Camera, points: Array) -> Array:
+    """Raw pixels (n,2) of points (n,3) as :meth:`Camera.project`, to rounding."""
+    lens = pinhole(camera)
+    if lens is None:
+        return camera.project(points)
+    depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
+    pixels: Array = _projected(points[:, :2] / depth[:, None], *lens)[0]
+    return pixels
+
+
 @lru_cache(64)  # of the cameras of a rig, and lenses that are tried
 def pinhole(camera: Camera) -> tuple[Array, Array, Array] | None:
     """Focal lengths (2,), centre (2,) in delivered pixels, and coefficients (12,) of a pinhole."""
@@ -130,6 +146,36 @@ def _bearings(
             xx, xy, yx, yy = by_ray[i, 0, 0], by_ray[i, 0, 1], by_ray[i, 1, 0], by_ray[i, 1, 1]
             lost[i] = not (steps[6 * LANES + lane] < _SAME and xx > 0.0 and xx * yy > xy * yx)
     return rays, by_ray, lost
+
+
+@kernel
+def _projected(rays: Array, focal: Array, centre: Array, lens: Array) -> tuple[Array, Array]:
+    """Pixels (n,2), and their derivatives (n,2,2) by the rays."""
+    k1, k2, p1, p2, k3, k4 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
+    k5, k6, s1, s2, s3, s4 = lens[6], lens[7], lens[8], lens[9], lens[10], lens[11]
+    count = len(rays)
+    pixels, by_ray = np.empty((count, 2)), np.empty((count, 2, 2))
+    for i in range(count):
+        x, y = rays[i, 0], rays[i, 1]
+        square = x * x + y * y
+        below = 1.0 / (1.0 + square * (k4 + square * (k5 + square * k6)))
+        radial = (1.0 + square * (k1 + square * (k2 + square * k3))) * below
+        # Derivatives by the square.
+        slope = k1 + square * (2.0 * k2 + 3.0 * square * k3)
+        slope -= radial * (k4 + square * (2.0 * k5 + 3.0 * square * k6))
+        rate = 2.0 * slope * below
+        prism_x, prism_y = s1 + 2.0 * square * s2, s3 + 2.0 * square * s4
+        across = x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
+        down = y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
+        pixels[i, 0] = centre[0] + focal[0] * (across + square * (s1 + square * s2))
+        pixels[i, 1] = centre[1] + focal[1] * (down + square * (s3 + square * s4))
+        both = rate * x * y + 2.0 * (p1 * x + p2 * y)
+        own = radial + 2.0 * p1 * y + 2.0 * p2 * x
+        by_ray[i, 0, 0] = focal[0] * (own + rate * x * x + 4.0 * p2 * x + 2.0 * x * prism_x)
+        by_ray[i, 0, 1] = focal[0] * (both + 2.0 * y * prism_x)
+        by_ray[i, 1, 0] = focal[1] * (both + 2.0 * x * prism_y)
+        by_ray[i, 1, 1] = focal[1] * (own + rate * y * y + 4.0 * p1 * y + 2.0 * y * prism_y)
+    return pixels, by_ray
 
 
 @kernel

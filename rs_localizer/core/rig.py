@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray, instance
-from rs_localizer.core.bearings import bearings
+from rs_localizer.core.bearings import bearings, projected
 from rs_localizer.core.camera import Camera, numbers
 from rs_localizer.core.types import Estimate
 
@@ -236,7 +236,7 @@ class Side(NamedTuple):
     def pixel_jacobian(self, rays: Array) -> Array:
         """Derivatives (n,2,2) of the raw pixel by rays (n,2) of this side."""
         if self.axes is None:
-            return self.camera.pixel_jacobian(rays)
+            return projected(self.camera, rays)[1]
         camera = self.camera
         by_bearing = camera.law.see(self.towards(rays), camera.K, camera.D).by_ray
         by_ray: Array = by_bearing @ self.axes[:2].T / np.array(camera.binning)[:, None]

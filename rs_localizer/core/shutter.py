@@ -56,10 +56,7 @@ class Motion:
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
         """Rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
-        tau = np.asarray(tau, float)[:, None]
-        turns = so3.exp_many(-self.angle_at(tau))
-        moved = self.translation - self.way_at(tau)
-        return turns @ self.rotation, np.einsum("nij,nj->ni", turns, moved)
+        return _at_rows(numbers_of(self), np.ascontiguousarray(tau, np.float64))
 
     def angle_at(self, tau: Any) -> Array:
         """Rotation vector (3,) of the turn from the middle row to ``tau``."""
@@ -101,6 +98,31 @@ def motion_of(numbers: Numbers) -> Motion:
     """The motion that a kernel gave."""
     *velocities, change, acceleration = numbers
     return Motion(*velocities, angular_acceleration=change, linear_acceleration=acceleration)
+
+
+@kernel
+def _at_rows(motion: Numbers, tau: Array) -> tuple[Array, Array]:
+    """Rotations (n,3,3) and translations (n,3) at row times (n,)."""
+    rotation, translation, angular, linear, change, acceleration = motion
+    rotations, translations = np.empty((len(tau), 3, 3)), np.empty((len(tau), 3))
+    angle = np.empty(3)
+    for i in range(len(tau)):
+        time, half = tau[i], 0.5 * tau[i] * tau[i]
+        for k in range(3):
+            angle[k] = -(time * angular[k] + half * change[k])
+        turn = so3.exp(angle)
+        for row in range(3):
+            moved = 0.0
+            for k in range(3):
+                way = time * linear[k] + half * acceleration[k]
+                moved += turn[row, k] * (translation[k] - way)
+            translations[i, row] = moved
+            for column in range(3):
+                turned = 0.0
+                for k in range(3):
+                    turned += turn[row, k] * rotation[k, column]
+                rotations[i, row, column] = turned
+    return rotations, translations
 
 
 @kernel

@@ -513,6 +513,50 @@ def predicted_estimate(nearest: Estimate, gaussian: Gaussian, swing: Array) -> E
     )
 
 
+def errors_ahead(window: MotionWindow, found: Estimate, swing: Array) -> Array:
+    """Squared errors (4,) over those claimed of the motion that a window predicts for an image.
+
+    Of turn, place, angular and linear velocity; 1 is as claimed, NaN without a covariance.
+
+    Args:
+        window: of the images until one before it.
+        found: its estimate, with the time.
+        swing: (18,18) covariance of the shaking about the predicted motion, per readout.
+    """
+    newest = window.newest
+    ratios: Array = _errors_ahead(
+        newest.state, newest.covariance, 1e-9 * (found.time_ns - newest.time_ns),
+        window.deviations, window.readout_share, _per_second(found.span), swing,
+        state_in(found, np.zeros(3)), np.ascontiguousarray(found.joint_covariance),
+    )  # fmt: skip
+    return ratios
+
+
+@kernel
+def _errors_ahead(
+    state: Array, covariance: Array, seconds: float, deviations: Array, readout_share: float,
+    units: Array, swing: Array, found: Array, joint: Array,
+) -> Array:  # fmt: skip
+    later, spread, _ = _predicted(state, covariance, seconds, deviations, readout_share)
+    for k in range(6, PARAMETERS):
+        later[6 + k] /= units[k]
+    step, ratios, block = step_between(later, found), np.zeros(4), np.empty((3, 3))
+    for part in range(4):
+        first = 3 * part
+        for i in range(3):
+            for j in range(3):
+                row, column = first + i, first + j
+                claimed = spread[row, column] / (units[row] * units[column])
+                block[i, j] = claimed + swing[row, column]
+        known = inverted(block)
+        for i in range(3):
+            for j in range(3):
+                row, column = first + i, first + j
+                second = joint[row, column] + step[row] * step[column]
+                ratios[part] += known[i, j] * second / 3.0
+    return ratios
+
+
 def warm_up() -> None:
     """Compile the kernels, or load them from the cache."""
     still = np.concatenate([np.eye(3).ravel(), np.zeros(STATE_SIZE - 9)])
@@ -521,5 +565,8 @@ def warm_up() -> None:
     sample = MotionSample(10**7, still, unit, np.zeros(PARAMETERS), np.zeros((PARAMETERS, 1)))
     window = MotionWindow.begin(start, Acceleration(1.0, 1.0)).joined(sample)
     window.before(1)
-    window.after(2 * 10**7)
+    later = window.after(2 * 10**7)
+    _errors_ahead(
+        still, unit, 0.01, window.deviations, 0.0, _per_second(0.01), unit, later.state, unit
+    )
     _told_by_points(unit, 0.5 * unit)

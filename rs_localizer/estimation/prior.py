@@ -57,14 +57,29 @@ def check_motion(motion: Motion) -> None:
                 f"the prior motion's {name} must be of shape {shape}, "
                 f"got {np.shape(getattr(motion, name))}"
             )
-    for name, part in zip(names, numbers_of(motion), strict=True):
-        if not math.isfinite(np.vdot(part, part)):
+    numbers = numbers_of(motion)
+    for name, part in zip(names, numbers, strict=True):
+        if not _is_finite(part.reshape(-1)):
             raise ValueError(f"the prior motion's {name} is not finite: {getattr(motion, name)}")
-    rotation = np.asarray(motion.rotation, float)
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if off > _ROUNDING or np.linalg.det(rotation) < 0.0:
-        found = rotation.tolist()
+    if not _is_rotation(numbers[0]):
+        found = numbers[0].tolist()
         raise ValueError(f"the prior motion's rotation is not orthonormal: {found}")
+
+
+@kernel
+def _is_finite(numbers: Array) -> bool:
+    """True if the squares of numbers (n,) have a finite sum."""
+    total = 0.0
+    for number in numbers:
+        total += number * number
+    return bool(np.isfinite(total))
+
+
+@kernel
+def _is_rotation(matrix: Array) -> bool:
+    """True if a matrix (3,3) is orthonormal, to rounding, and no mirror."""
+    off = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(off <= _ROUNDING and np.linalg.det(matrix) > 0.0)
 
 
 def check_covariance(covariance: Array) -> None:

@@ -495,3 +495,25 @@ def linearized(data: Array, count: int, state: Array, shake: Array) -> Lines:
                 image[i, row] = lines[(2 * _LINE + row) * LANES + lane]
             tau[i] = lines[(2 * _LINE + 2) * LANES + lane]
     return Lines(errors, by_motion, by_turn, tau, image)
+
+
+@kernel
+def likeness(points: Array, numbers: Array, neighbours: int) -> float:
+    """Mean product of numbers (n,) of points (n,3), and of so many nearest neighbours of each."""
+    count, total = len(points), 0.0
+    far, near = np.empty(neighbours), np.empty(neighbours)
+    for i in range(count):
+        far[:] = np.inf
+        for j in range(count):
+            square = 0.0
+            for axis in range(3):
+                square += (points[i, axis] - points[j, axis]) ** 2
+            if j == i or not square < far[neighbours - 1]:
+                continue
+            place = neighbours - 1
+            while place > 0 and square < far[place - 1]:
+                far[place], near[place] = far[place - 1], near[place - 1]
+                place -= 1
+            far[place], near[place] = square, numbers[j]
+        total += numbers[i] * near.sum()
+    return total / (count * neighbours)

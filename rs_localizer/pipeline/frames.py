@@ -364,7 +364,9 @@ class FrameLocalizer:
 
     def _expect(self, time_ns: int, map_frame: str) -> None:
         """Tell the tracker what others know of the pose at a time, if it knows nothing itself."""
-        if not self.calibrations or self._tracker.prediction(time_ns) is not None:
+        if not (self.calibrations and self._pose_prior.given):
+            return
+        if self._tracker.prediction(time_ns) is not None:
             return
         prior = self._pose_prior.prior(
             time_ns, map_frame, self.camera_frame, self._config, self.transforms

@@ -80,11 +80,12 @@ class PosePrior:
 
     def __init__(self, notice: Notify) -> None:
         self._notice = notice
-        self._given: GivenPose | None = None
+        self.given: GivenPose | None = None
+        """What waits for a frame."""
         self._expected: Prior | None = None
 
     def take(self, given: GivenPose) -> None:
-        self._given = given
+        self.given = given
 
     def prior(
         self,
@@ -96,7 +97,7 @@ class PosePrior:
     ) -> Prior | None:
         """Prior of the camera's motion at a time; None: nothing was given."""
         self._expected = None
-        given = self._given
+        given = self.given
         if given is None:
             return None
         seconds = abs(time_ns - given.stamp_ns) * 1e-9 if given.stamp_ns else 0.0
@@ -113,14 +114,14 @@ class PosePrior:
             )
         except TransformError as error:
             self._notice(Notice.PRIOR_REFUSED, f"the given pose is not used: {error}")
-            self._given = None
+            self.given = None
             return None
         self._expected = _of_camera(given, body_from_camera, seconds, config)
         return self._expected
 
     def judge(self, result: Estimate) -> None:
         """Be done with it, now that a frame has a pose."""
-        given, expected = self._given, self._expected
+        given, expected = self.given, self._expected
         if given is None or expected is None:
             return
         assert expected.motion is not None
@@ -137,7 +138,7 @@ class PosePrior:
             )
         self._expected = None
         if not given.lasts:
-            self._given = None
+            self.given = None
 
 
 def _of_camera(

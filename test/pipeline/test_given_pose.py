@@ -94,7 +94,7 @@ def test_a_click_counts_once_and_a_filter_again_and_again(body, lasts):
     )  # fmt: skip
     prior.judge(at_it)
     assert notices == []
-    assert (prior._given is not None) == lasts
+    assert (prior.given is not None) == lasts
     _, notices, prior = asked(given(body=body))
     at_it.position = np.add(at_it.position, [0.0, 0.0, 5.0])
     prior.judge(at_it)
