@@ -17,6 +17,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import MOVE, TURN, step_between
 from rs_localizer.core.types import Failure
 from rs_localizer.estimation.mirror import is_plane
@@ -207,14 +208,26 @@ def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> i
     some = some[:: len(some) // _MANY + 1]
     if len(some) <= _SAMPLE:
         return len(some)
-    places = observed.assumed.focal_length * observed.observations.rays[some]
-    apart = np.hypot(*(places[:, None] - places).T)
-    np.fill_diagonal(apart, np.inf)
-    nearest = apart.argmin(axis=0)
-    distance = np.hypot(*(lines.errors[some] - lines.errors[some[nearest]]).T)
-    rough = GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
-    alike = distance < rough + _STRETCH * apart[nearest, np.arange(len(some))]
-    return int(np.count_nonzero(alike)) * (int(np.count_nonzero(rest)) // len(some))
+    focal = observed.assumed.focal_length
+    places, rough = focal * observed.observations.rays[some], GLOBAL_SHUTTER_SCALE * focal
+    alike = _as_nearest(places, lines.errors[some], rough)
+    return alike * (int(np.count_nonzero(rest)) // len(some))
+
+
+@kernel
+def _as_nearest(places: Array, errors: Array, rough: float) -> int:
+    """How many of the errors (n,2) of places (n,2) are those of the nearest one, about."""
+    count, alike = len(places), 0
+    for i in range(count):
+        nearest, apart = 0, np.inf
+        for j in range(count):
+            distance = math.hypot(places[i, 0] - places[j, 0], places[i, 1] - places[j, 1])
+            if j != i and distance < apart:
+                nearest, apart = j, distance
+        off = math.hypot(errors[i, 0] - errors[nearest, 0], errors[i, 1] - errors[nearest, 1])
+        if off < rough + _STRETCH * apart:
+            alike += 1
+    return alike
 
 
 def _surprise(total: int, size: int, chance: float) -> float:

@@ -224,7 +224,8 @@ class MotionWindow:
             start.time_ns,
             *_back(
                 start.state, start.covariance, start.shifts, solved.predicted[0],
-                solved.predictions[0], solved.transports[0], solved.smoothed[0],
+                solved.predictions[0], inverted(solved.predictions[0]), solved.transports[0],
+                solved.smoothed[0],
                 solved.smoothed_covariances[0], solved.smoothed_shifts[0],
             ),
         )  # fmt: skip
@@ -304,10 +305,14 @@ def _noise(seconds: float, deviations: Array) -> Array:
 @kernel
 def _back(
     state: Array, covariance: Array, shifts: Array, predicted: Array, prediction: Array,
-    transport: Array, smoothed: Array, smoothed_covariance: Array, smoothed_shifts: Array,
+    known: Array, transport: Array, smoothed: Array, smoothed_covariance: Array,
+    smoothed_shifts: Array,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """A filtered motion with what the next sample's smoothed one tells of it."""
-    gain = covariance @ transport.T @ inverted(prediction)
+    """A filtered motion with what the next sample's smoothed one tells of it.
+
+    ``known``: (18,18) inverse of the prediction's covariance.
+    """
+    gain = covariance @ transport.T @ known
     back = apply_step(state, gain @ step_between(predicted, smoothed))
     spread = covariance + gain @ (smoothed_covariance - prediction) @ gain.T
     moved = shifts + gain @ (smoothed_shifts - transport @ shifts)
@@ -325,13 +330,15 @@ def _solve(
     square = (count, PARAMETERS, PARAMETERS)
     predicted, filtered = np.empty((count, STATE_SIZE)), np.empty((count, STATE_SIZE))
     predictions, transports, covariances = np.empty(square), np.empty(square), np.empty(square)
+    knowns = np.empty(square)  # inverses of the predictions
     shifts = np.empty((count, PARAMETERS, width))
     state, covariance, shift, time = start, start_covariance, start_shifts, 0.0
     for k in range(count):
         predicted[k], predictions[k], transports[k] = _predicted(
             state, covariance, times[k] - time, deviations, readout_share
         )
-        known = inverted(predictions[k])
+        known = knowns[k]
+        known[:] = inverted(predictions[k])
         covariances[k] = inverted(informations[k] + known)
         right = gradients[k] + known @ step_between(states[k], predicted[k])
         filtered[k] = apply_step(states[k], covariances[k] @ right)
@@ -341,7 +348,7 @@ def _solve(
     smoothed_shifts, scores = shifts.copy(), np.zeros((4, 3))
     weight, block, unit = 1.0, np.empty((3, 3)), np.empty((3, 3))
     for k in range(count - 1, -1, -1):
-        known = inverted(predictions[k])
+        known = knowns[k]
         pulled = known @ step_between(predicted[k], smoothed[k])
         spread = known - known @ smoothed_covariances[k] @ known
         unit[:] = singer(times[k] - (times[k - 1] if k > 0 else 0.0))
@@ -365,7 +372,7 @@ def _solve(
         if k > 0:
             smoothed[k - 1], smoothed_covariances[k - 1], smoothed_shifts[k - 1] = _back(
                 filtered[k - 1], covariances[k - 1], shifts[k - 1], predicted[k], predictions[k],
-                transports[k], smoothed[k], smoothed_covariances[k], smoothed_shifts[k],
+                knowns[k], transports[k], smoothed[k], smoothed_covariances[k], smoothed_shifts[k],
             )  # fmt: skip
     return (
         predicted, predictions, transports, filtered, covariances, shifts, smoothed,

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.core.bearings import bearings
+from rs_localizer.core.bearings import bearings, projected, seen_at
 from rs_localizer.core.camera import Camera, Roi
 
 K = np.array([[500.0, 0.0, 321.0], [0.0, 510.0, 238.0], [0.0, 0.0, 1.0]])
@@ -91,6 +91,12 @@ def test_kernels_of_many_pixels_give_the_same(model, D, part):
     raw = pixels(203) / lens.binning
     for ours, theirs in zip(bearings(lens, raw), lens.rays_and_jacobian(raw), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-7, atol=1e-9)
+    rays = lens.rays(raw)
+    for ours, theirs in zip(projected(lens, rays), lens.distort(rays), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-9)
+    points = np.column_stack([2.0 * rays, np.full(len(rays), 2.0)])
+    points[7] *= -1.0
+    np.testing.assert_allclose(seen_at(lens, points), lens.project(points), rtol=1e-10, atol=1e-9)
 
 
 def test_what_has_no_bearing_has_none_and_harms_no_neighbour():

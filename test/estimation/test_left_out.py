@@ -12,6 +12,7 @@ import pytest
 import rs_localizer as rsl
 from benchmarks.gross import deviations, frame
 from rs_localizer.core.shutter import project_rolling
+from rs_localizer.estimation.left_out import _as_nearest
 
 ZERO, BENT = np.zeros(3), np.array([-0.4, 0.0, 0.0, 0.0])
 
@@ -116,3 +117,14 @@ def test_a_board_before_a_bent_lens_is_told_of_no_focal_length():
         shown = camera.inside(pixels)
         result = rsl.Localizer(camera, map_deviation=0.0003).localize(places[shown], pixels[shown])
         assert result or "focal length of" not in result.detail
+
+
+def test_neighbours_are_alike_by_their_distance():
+    random = np.random.default_rng(0)
+    places, errors = 300.0 * random.random((50, 2)), 30.0 * random.normal(size=(50, 2))
+    apart = np.linalg.norm(places[:, None] - places, axis=2) + np.diag(np.full(50, np.inf))
+    nearest = apart.argmin(axis=1)
+    off = np.linalg.norm(errors - errors[nearest], axis=1)
+    expected = np.count_nonzero(off < 10.0 + 0.5 * apart.min(axis=1))
+    assert 0 < expected < 50
+    assert _as_nearest(places, errors, 10.0) == expected

@@ -15,9 +15,11 @@ from rs_localizer.estimation.motion_window import (
     Gaussian,
     MotionSample,
     MotionWindow,
+    errors_ahead,
+    motion_of,
     sample_of,
 )
-from rs_localizer.estimation.prior import Prior, motion_terms, with_motion
+from rs_localizer.estimation.prior import Prior, motion_terms, state_in, with_motion
 from rs_localizer.estimation.refine import apply_step
 
 FADING, PERIOD = 0.03, 1.0 / 30.0  # s
@@ -246,3 +248,23 @@ def test_points_tell_what_the_posterior_knows_beside_its_prior():
     np.testing.assert_allclose(
         sample.gradient / UNITS / scale, left / scale, atol=1e-2 * np.abs(left / scale).max()
     )
+
+
+def test_errors_ahead_are_squared_steps_over_what_was_claimed():
+    random = np.random.default_rng(3)
+    start = Gaussian(0, apply_step(STILL, SMALL * random.normal(size=18)), WIDE, np.zeros((18, 1)))
+    window = MotionWindow.begin(start, Acceleration(10.0, 4.0), readout_share=0.01)
+    later = motion_of(window.after(40_000_000), SPAN)
+    spread = random.normal(size=(18, 18)) * SMALL
+    joint, swing = spread @ spread.T, np.diag(np.linspace(1e-9, 1e-7, 18))
+    state = apply_step(state_in(later[0], np.zeros(3)), SMALL * random.normal(size=18))
+    found = Estimate(
+        state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18], np.ones(0, bool),
+        np.zeros(0), 0, 0, joint_covariance=joint, time_ns=40_000_000, span=SPAN,
+    )  # fmt: skip
+    step, claimed = step_between(state_in(later[0], np.zeros(3)), state), later[1] + swing
+    expected = []
+    for own in (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)):
+        second = joint[own, own] + np.outer(step[own], step[own])
+        expected.append(np.trace(np.linalg.solve(claimed[own, own], second)) / 3.0)
+    np.testing.assert_allclose(errors_ahead(window, found, swing), expected, rtol=1e-9)

@@ -64,3 +64,12 @@ def test_points_behind_the_camera_are_outliers_and_disturb_nothing(scene):
         scene.pack(camera, points[1:], measured[1:]), state, 3.0, 0.0, 2, without, slope
     )
     np.testing.assert_allclose(information, without, rtol=1e-9, atol=1e-6)
+
+
+def test_likeness_is_the_mean_over_nearest_neighbours():
+    random = np.random.default_rng(0)
+    points, numbers = random.normal(size=(90, 3)), random.normal(size=90)
+    far = np.linalg.norm(points[:, None] - points, axis=2)
+    nearest = np.argsort(far, axis=1)[:, 1:5]  # the first is the point itself
+    expected = np.mean(numbers[:, None] * numbers[nearest])
+    assert residuals.likeness(points, numbers, 4) == pytest.approx(expected, abs=1e-14)

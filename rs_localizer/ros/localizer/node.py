@@ -312,8 +312,8 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized]):
                 if frames.config.publish_tf == PublishTf.MAP_TO_ODOM:
                     self._broadcaster.publish(frame, frames.config)
             map_view.show(frame.map_frame, frames.map_points)
-            corners = frames.view_corners
-            if corners is not None and camera_view.get_subscription_count():
+            watched = camera_view.get_subscription_count() > 0
+            if watched and (corners := frames.view_corners) is not None:
                 camera_view.publish(MarkerArray(markers=[camera_marker(frame, corners)]))
             if math.isfinite(frame.estimate.integrity):
                 integrity.publish(Float64(data=frame.estimate.integrity))
