@@ -260,7 +260,7 @@ def test_errors_ahead_are_squared_steps_over_what_was_claimed():
     state = apply_step(state_in(later[0], np.zeros(3)), SMALL * random.normal(size=18))
     found = Estimate(
         state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18], np.ones(0, bool),
-        np.zeros(0), 0, 0, joint_covariance=joint, time_ns=40_000_000, span=SPAN,
+        np.zeros(0), joint, 0, 0, time_ns=40_000_000, span=SPAN,
     )  # fmt: skip
     step, claimed = step_between(state_in(later[0], np.zeros(3)), state), later[1] + swing
     expected = []
