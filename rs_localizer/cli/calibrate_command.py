@@ -86,7 +86,6 @@ class Options(TargetOptions, ImageOptions):
         "also the lens alone, for ROS drivers (of a rig, FILE_NAME for each)", "FILE"
     )
     overwrite: bool = option("replace an earlier result", default=False)
-    plot: Path | None = option("directory for pictures", "DIR")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,10 +187,6 @@ def _calibrated(
         print("\n".join(verdict.of_lens(found)))
     if source.imu is not None:
         print("\n".join(verdict.of_imu(found, source.imu, config.stamp_offset)))
-    if args.plot is not None:
-        from rs_localizer.tools.calibration_plots import save_plots
-
-        save_plots(camera, found, args.plot)
     return found
 
 
@@ -377,13 +372,11 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
         print(f"{name}:")
         axis = config.of_cameras.get(name, config).scan_direction
         of_camera = replace(config, scan_direction=axis)
-        plots = None if args.plot is None else args.plot / name
-        of_args = replace(own.args, plot=plots)
-        source = _read(of_args, of_camera)
+        source = _read(own.args, of_camera)
         intrinsics |= source.new_lens
         maps += [] if source.map is None else [source.map]
         camera = _without_k3(replace(source.camera, scan_direction=axis))
-        recordings[name] = Recording(camera, _calibrated(of_args, source, camera, config))
+        recordings[name] = Recording(camera, _calibrated(own.args, source, camera, config))
     refusals = {name: verdict.refusal(each.calibration) for name, each in recordings.items()}
     refusals = {name: text for name, text in refusals.items() if text}
     if refusals:

@@ -42,15 +42,6 @@ from rs_localizer.tools.readout_belief import (
     examine,
 )
 
-
-def likelihood(camera: Camera, result: CameraCalibration, count: int = 9) -> tuple[Array, Array]:
-    """Readout times (count,) within four deviations, and what they cost more than the best."""
-    observations = within(result.posed.observations, result.fit.state.spline)
-    values = result.readout_time + np.linspace(-4.0, 4.0, count) * result.formal_deviation
-    costs = np.array([cost_at(camera, observations, result.fit, float(value)) for value in values])
-    return values, costs - result.fit.cost
-
-
 # Parts of the recording that are calibrated on their own: three at least, for two that agree may do
 # so by chance, and more of a longer one.
 _BLOCK_SECONDS, _LEAST_BLOCKS, _MOST_BLOCKS = 3.0, 3, 8
