@@ -220,6 +220,8 @@ def as_fisheye(lens: Camera, pixels: Array) -> Camera:
         ValueError: when no such lens exists.
     """
     rays = lens.rays(pixels)
+    seen = np.isfinite(rays).all(axis=1)  # a polynomial shows nothing beyond its fold
+    rays, pixels = rays[seen], pixels[seen]
     numbers = np.r_[lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2], np.zeros(4)]
     for _ in range(_POSE_STEPS):
         fisheye = _equidistant(lens.size, numbers)
