@@ -225,8 +225,10 @@ def as_fisheye(lens: Camera, pixels: Array) -> Camera:
     numbers = np.r_[lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2], np.zeros(4)]
     for _ in range(_POSE_STEPS):
         fisheye = _equidistant(lens.size, numbers)
-        off = (pixels - fisheye.distort(rays)[0]).ravel()
-        numbers = numbers + np.linalg.lstsq(_by_lens(fisheye, rays), off, rcond=None)[0]
+        off, by_lens = (pixels - fisheye.distort(rays)[0]).ravel(), _by_lens(fisheye, rays)
+        if not (np.isfinite(off).all() and np.isfinite(by_lens).all()):
+            raise ValueError("no equidistant lens is like this one")
+        numbers = numbers + np.linalg.lstsq(by_lens, off, rcond=None)[0]
     return _equidistant(lens.size, numbers)
 
 

@@ -192,3 +192,11 @@ def test_a_fisheye_is_begun_by_a_polynomial_that_does_not_show_the_corners(capfd
     rays = lens.rays(pixels[shown])
     assert np.abs(found.distort(rays)[0] - pixels[shown]).max() < 5.0
     assert capfd.readouterr().err == ""  # where LAPACK says that numbers are none
+
+
+def test_what_no_fisheye_is_like_is_refused(capfd):
+    K = np.array([[142.6, 0.0, 357.5], [0.0, 150.1, 958.3], [0.0, 0.0, 1.0]])
+    lens = replace(CAMERA, K=K, D=np.zeros(5))  # as a bad first one of a real video
+    with pytest.raises(ValueError, match="no equidistant lens"):
+        as_fisheye(lens, np.random.default_rng(0).uniform([100, 420], [600, 850], (200, 2)))
+    assert capfd.readouterr().err == ""
