@@ -198,5 +198,5 @@ def test_what_no_fisheye_is_like_is_refused(capfd):
     K = np.array([[142.6, 0.0, 357.5], [0.0, 150.1, 958.3], [0.0, 0.0, 1.0]])
     lens = replace(CAMERA, K=K, D=np.zeros(5))  # as a bad first one of a real video
     with pytest.raises(ValueError, match="no equidistant lens"):
-        as_fisheye(lens, np.random.default_rng(0).uniform([100, 420], [600, 850], (200, 2)))
+        as_fisheye(lens, np.random.default_rng(0).uniform([120, 422], [300, 560], (237, 2)))
     assert capfd.readouterr().err == ""
