@@ -27,7 +27,7 @@ from rs_localizer.estimation import motion_model, motion_window, observations, r
 from rs_localizer.estimation.acceptance import refusal, speeding, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
-from rs_localizer.estimation.left_out import LeftOut, left_out
+from rs_localizer.estimation.left_out import LeftOut, as_nearest, left_out
 from rs_localizer.estimation.mirror import is_plane
 from rs_localizer.estimation.observations import (
     NEAREST,
@@ -52,6 +52,7 @@ from rs_localizer.estimation.prior import (
     with_motion,
 )
 from rs_localizer.estimation.ransac import Candidate, generator
+from rs_localizer.estimation.residuals import likeness
 from rs_localizer.estimation.result import estimate_of
 from rs_localizer.estimation.searching import MotionSearch
 from rs_localizer.solvers.table import find_solver, start_solver
@@ -163,6 +164,8 @@ class Localizer:
         self.localize(points, pixels)
         pivot_of(np.eye(18))  # by a tracker
         is_plane(np.zeros((4, 3)), np.ones(4, np.bool_))  # where points are left out
+        as_nearest(np.zeros((2, 2)), np.zeros((2, 2)), 0.0)
+        likeness(np.zeros((2, 3)), np.zeros(2), 1)  # of inliers, for integrity
         # And with one that shakes, rows to and fro.
         swing = 2.0 * self.config.inlier_threshold * np.sin(12.0 * self.camera.row_time(pixels))
         self.localize(points, pixels + np.outer(swing, self.camera.row_time_gradient[::-1] != 0.0))

@@ -9,10 +9,13 @@ from pathlib import Path
 # In a process of its own: what other tests have compiled in this one is no longer missing.
 LATE = """
 import gc
+import numpy as np
 from numba.core.registry import CPUDispatcher
 from rs_localizer.config import NodeConfig
 from benchmarks.frames.conditions import conditions
 from benchmarks.frames.judged import judge
+from rs_localizer.core import so3
+from rs_localizer.inertial.buffer import ReadingBuffer, Readings
 from rs_localizer.pipeline.frames import FrameLocalizer
 
 def compiled():
@@ -20,7 +23,13 @@ def compiled():
     return {(k.__module__, k.__name__, str(s)) for k in ours for s in k.signatures}
 
 FrameLocalizer(NodeConfig()).warm_up_rest()
+FrameLocalizer(NodeConfig(readout_time=0.02)).warm_up_imu()
+so3.exp_many(np.zeros((1, 3)))  # of the simulation
 before = compiled()
+readings = ReadingBuffer()
+for k in range(9):
+    readings.add(k * 2_000_000, "imu", np.ones(3))
+assert isinstance(readings.between(4_000_000, 8_000_000), Readings)
 for condition in [one for one in conditions() if one.bench not in ("axis", "boards")][::6]:
     judge(condition, 1, 3, {})
 after = compiled()

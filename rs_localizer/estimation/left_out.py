@@ -210,12 +210,12 @@ def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> i
         return len(some)
     focal = observed.assumed.focal_length
     places, rough = focal * observed.observations.rays[some], GLOBAL_SHUTTER_SCALE * focal
-    alike = _as_nearest(places, lines.errors[some], rough)
+    alike = as_nearest(places, lines.errors[some], rough)
     return alike * (int(np.count_nonzero(rest)) // len(some))
 
 
 @kernel
-def _as_nearest(places: Array, errors: Array, rough: float) -> int:
+def as_nearest(places: Array, errors: Array, rough: float) -> int:
     """How many of the errors (n,2) of places (n,2) are those of the nearest one, about."""
     count, alike = len(places), 0
     for i in range(count):

@@ -27,7 +27,7 @@ from rs_localizer.core.simd import compiler
 from rs_localizer.core.simd.jit import NotCompiled, at_once, cache_directory, digest, make_folder
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.inertial.gyroscope_noise import InertialSettings
-from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.samples import ImuSamples, span_of
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 from rs_localizer.tracking import Tracker
@@ -80,6 +80,8 @@ def plain_frames(
         samples = None if inertial is None else ImuSamples(times, rates)
         with contextlib.nullcontext() if patient or k == 0 else at_once():
             try:
+                if inertial is not None:  # as they are taken from a buffer
+                    span_of(times, time_ns, time_ns + 1)
                 _publish(tracker.localize(time_ns, points, each, scores, imu=samples))
             except NotCompiled:
                 return

@@ -12,7 +12,7 @@ import pytest
 import rs_localizer as rsl
 from benchmarks.gross import deviations, frame
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.estimation.left_out import _as_nearest
+from rs_localizer.estimation.left_out import as_nearest
 
 ZERO, BENT = np.zeros(3), np.array([-0.4, 0.0, 0.0, 0.0])
 
@@ -127,4 +127,4 @@ def test_neighbours_are_alike_by_their_distance():
     off = np.linalg.norm(errors - errors[nearest], axis=1)
     expected = np.count_nonzero(off < 10.0 + 0.5 * apart.min(axis=1))
     assert 0 < expected < 50
-    assert _as_nearest(places, errors, 10.0) == expected
+    assert as_nearest(places, errors, 10.0) == expected
