@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scales import Scales
 from rs_localizer.core.shake import FUNCTIONS, shake_at, shake_basis, within_rows
 from rs_localizer.core.shutter import Motion, carried, numbers_of
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, TURN
 
 # Readouts within which accelerations fade by exp(-1): they stay what they are.
@@ -78,6 +79,19 @@ class Estimate(Motion):
         """Covariance (12,12) of pose and velocities at tau = 0."""
         own = self.joint_covariance[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
         return own + self.calibration_covariance + self.undetected_covariance
+
+    def by_others(self, joint_covariance: Array, **fields: Any) -> Self:
+        """The estimate with what other frames tell of it: fields, and a covariance of its own.
+
+        What arcs take from the old covariance, by what it ties to them, the new one may not have:
+        of what is beside it stays what widens any.
+        """
+        scale = np.sqrt(np.diag(self.joint_covariance)[:MOTION_PARAMETERS])
+        scale[scale == 0.0] = 1.0
+        undetected = _widening(np.ascontiguousarray(self.undetected_covariance), scale)
+        return replace(
+            self, joint_covariance=joint_covariance, undetected_covariance=undetected, **fields
+        )
 
     @property
     def orientation_deviation(self) -> float:
@@ -242,6 +256,15 @@ class Estimate(Motion):
             f"{self.residual_rms:.3g} px rms, {turn:.3g} deg and "
             f"{np.linalg.norm(self.linear_velocity):.3g} m per readout)"
         )
+
+
+@kernel
+def _widening(added: Array, scale: Array) -> Array:
+    """The positive semidefinite part of a symmetric matrix (n,n); ``scale``: (n,) its units."""
+    units = np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(added / units)
+    part: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T * units
+    return part
 
 
 def beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:

@@ -486,8 +486,8 @@ def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
     joint = joint + gain @ (spread - covariance) @ gain.T
     units = 1.0 / _per_second(estimate.span)
     shifts = gain[:MOTION_PARAMETERS] @ (units[:, None] * gaussian.shifts)
-    return replace(
-        estimate,
+    return estimate.by_others(
+        0.5 * (joint + joint.T),
         rotation=rotation_of(state).copy(),
         translation=state[STATE_TRANSLATION],
         angular_velocity=state[STATE_ANGULAR],
@@ -495,7 +495,6 @@ def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
         angular_acceleration=state[STATE_ANGULAR_ACCELERATION],
         linear_acceleration=state[STATE_LINEAR_ACCELERATION],
         shake=estimate.shake + step[PARAMETERS:].reshape(-1, 3),
-        joint_covariance=0.5 * (joint + joint.T),
         calibration_covariance=shifts @ shifts.T,
     )
 
@@ -509,10 +508,9 @@ def predicted_estimate(nearest: Estimate, gaussian: Gaussian, swing: Array) -> E
     motion, covariance = motion_of(gaussian, nearest.span)
     units = 1.0 / _per_second(nearest.span)
     shifts = (units[:, None] * gaussian.shifts)[:MOTION_PARAMETERS]
-    return replace(
-        nearest,
+    return nearest.by_others(
+        covariance + swing,
         **{each.name: getattr(motion, each.name) for each in fields(Motion)},
-        joint_covariance=covariance + swing,
         calibration_covariance=shifts @ shifts.T,
         shake=np.zeros((0, 3)),
         turn=None,

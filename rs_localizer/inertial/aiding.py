@@ -83,10 +83,9 @@ class GyroPrediction:
         numbers = {each.name: getattr(motion, each.name) for each in fields(Motion)}
         numbers["angular_velocity"] = motion.angular_velocity + turn.rate
         numbers["angular_acceleration"] = motion.angular_acceleration + turn.change
-        return replace(
-            last, **numbers, joint_covariance=self.predicted.covariance, shake=np.zeros((0, 3)),
-            turn=turn,
-        )  # fmt: skip
+        return last.by_others(
+            self.predicted.covariance, **numbers, shake=np.zeros((0, 3)), turn=turn
+        )
 
 
 class GyroscopeAid:

@@ -159,3 +159,24 @@ def test_what_a_result_says_of_itself():
     assert str(nothing) == "degenerate: a line"
     with pytest.raises(AttributeError, match="there is no rotation, because there is no pose"):
         _ = nothing.rotation
+
+
+def test_a_covariance_of_others_is_one_beside_arcs_that_the_old_one_was_tied_to():
+    """Poses before a plane, tracked, were published with variances below zero."""
+    estimate = some_estimate()
+    own = estimate.joint_covariance[:12, :12]
+    half = np.linalg.cholesky(own)
+    tied = np.diag([-0.9, *np.zeros(10), 2.0])
+    beside = half @ tied @ half.T
+    arched = replace(estimate, undetected_covariance=beside)
+    assert np.linalg.eigvalsh(arched.covariance).min() > 0.0
+    better = 0.01 * estimate.joint_covariance
+    naive = replace(arched, joint_covariance=better)
+    assert np.linalg.eigvalsh(naive.covariance).min() < 0.0
+    found = arched.by_others(better, time_ns=5)
+    assert found.time_ns == 5
+    widened = found.covariance - better[:12, :12]
+    assert np.linalg.eigvalsh(widened).min() > -1e-15
+    assert np.linalg.eigvalsh(found.covariance - naive.covariance).min() > -1e-15
+    sure = replace(estimate, undetected_covariance=0.5 * own).by_others(better)
+    np.testing.assert_allclose(sure.undetected_covariance, 0.5 * own, atol=1e-18)
