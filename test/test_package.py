@@ -110,19 +110,38 @@ def test_declared_commands_can_be_imported(wheel):
         assert callable(EntryPoint(name, value, "console_scripts").load()), value
 
 
-def test_only_ros_imports_ros():
+def ros_modules() -> list[str]:
     """What package.xml names of ROS, by the names that one imports."""
-    depends = [item.name for item in parse_package(str(ROOT / "package.xml")).exec_depends]
-    names = {MODULES.get(name, name) for name in depends if not name.startswith("python3-")}
-    assert {"rclpy", "sensor_msgs", "tf2_ros", "launch"} <= names
-    package = ROOT / "rs_localizer"
-    wrong = {
-        (path.relative_to(package).as_posix(), name)
-        for path in package.rglob("*.py")
-        for name in re.findall(r"^ *(?:import|from) (\w+)", path.read_text(), re.MULTILINE)
-        if name in names and path.relative_to(package).parts[0] != "ros"
-    }
-    assert wrong == set()
+    depends = [d.name for d in parse_package(str(ROOT / "package.xml")).exec_depends]
+    return [MODULES.get(name, name) for name in depends if not name.startswith("python3-")]
+
+
+def lint(modules: list[str], path: str) -> str:
+    """Ruff's findings in a file at `path` that imports modules."""
+    pytest.importorskip("ruff", reason="Ruff is no package of Ubuntu")
+    ruff = [sys.executable, "-m", "ruff", "check", "--output-format=concise", "--select=TID251"]
+    found = subprocess.run(
+        [*ruff, "--stdin-filename", path, "-"],
+        input="".join(f"import {module}\n" for module in modules),
+        cwd=ROOT,
+        text=True,
+        capture_output=True,
+        check=False,
+    )
+    assert found.returncode in (0, 1), found.stderr
+    return found.stdout
+
+
+@pytest.mark.parametrize(
+    "path",
+    [f"{folder}/x.py" for folder in ("rs_localizer", "rs_localizer/cli", "benchmarks", "test")],
+)
+def test_ros_is_refused_outside_its_place(path):
+    modules = [*ros_modules(), "rclpy.node", "sensor_msgs.msg"]
+    assert {"rclpy", "sensor_msgs", "tf2_ros", "launch"} <= set(modules)
+    lines = lint(modules, path).splitlines()
+    refused = {int(line.split(":")[1]) for line in lines if "TID251" in line}
+    assert [module for k, module in enumerate(modules, 1) if k not in refused] == []
 
 
 DOCKERFILE = ROOT / "packaging" / "docker" / "Dockerfile"

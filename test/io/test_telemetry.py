@@ -112,29 +112,8 @@ def test_numbers_that_no_gyroscope_gives():
         interpreted(readings(gyroscope=some + 1e5))
 
 
-@pytest.mark.parametrize(
-    ("values", "readout", "stabilizer"),
-    [
-        ({"frame_readout_time": "soon"}, None, ""),
-        # GoPro: SROT, EISE, EISA.
-        ({"0x53524f54": 8.744, "0x45495345": "N", "0x45495341": "N/A"}, 0.008744, ""),
-        ({"0x45495345": "Y"}, None, "electronic stabilization"),
-        ({"0x45495345": "Y", "0x45495341": "HS HLevel"}, None, "HS HLevel"),
-    ],
-)
-def test_what_else_a_video_says(values, readout, stabilizer):
-    found = interpreted(readings(values=values))
-    assert found.readout_time == (None if readout is None else pytest.approx(readout))
-    assert found.stabilizer == stabilizer
-
-
-def test_tracks_are_looked_for_far_from_both_ends(tmp_path):
-    """As of half an hour of a GoPro's MP4: boxes of sizes and names."""
-    track = bytes(2**19) + b"gpmd" + bytes(2**19)
-    boxes = ((b"ftyp", b"mp41"), (b"mdat", bytes(2**19)), (b"moov", track))
-    path = tmp_path / "GX010001.MP4"
-    path.write_bytes(b"".join(struct.pack(">I4s", 8 + len(of), kind) + of for kind, of in boxes))
-    assert has_telemetry(path)
+def test_a_readout_time_of_another_type():
+    assert interpreted(readings(values={"frame_readout_time": "soon"})).readout_time is None
 
 
 def dji(tags: list[Any], samples: Any = list) -> Telemetry | None:
@@ -188,6 +167,77 @@ def test_a_file_of_insta360(tmp_path):
     # The library has x up, as in test_readings_are_in_the_axes_of_the_camera.
     np.testing.assert_allclose(found.rates[0], [0.0, -0.5, -0.1], atol=1e-9)
     np.testing.assert_allclose(found.forces[0], [0.0, -9.80665, 0.0], atol=1e-3)
+
+
+def box(kind: str, *parts: bytes) -> bytes:
+    """A box of MP4."""
+    return struct.pack(">I4s", 8 + sum(map(len, parts)), kind.encode()) + b"".join(parts)
+
+
+def klv(key: str, kind: str, values: Any, width: int = 1) -> bytes:
+    """An item of GPMF: what it is, its type, the size of a value, how many, the values."""
+    kinds = {"L": ">u4", "f": ">f4", "s": ">i2"}
+    data = values.encode() if kind == "c" else np.asarray(values, kinds[kind]).tobytes()
+    size = width * (1 if kind == "c" else np.dtype(kinds[kind]).itemsize)
+    head = key.encode() + struct.pack(">cBH", kind.encode(), size, len(data) // size)
+    return head + data + bytes(-len(data) % 4)
+
+
+def nest(key: str, *items: bytes) -> bytes:
+    data = b"".join(items)
+    return key.encode() + struct.pack(">BBH", 0, 1, len(data)) + data
+
+
+def of_gopro(payloads: list[bytes], *settings: bytes, padding: int = 0) -> bytes:
+    """An MP4 with a track of GPMF, a payload a second, and the settings of the camera."""
+    count, first = len(payloads), box("ftyp", b"mp41")
+    places = len(first) + 8 + np.cumsum([0, *map(len, payloads)])[:-1]
+    length = struct.pack(">4I", 0, 0, 1000, 1001 * count)
+    tables = box(
+        "stbl",
+        box("stsd", struct.pack(">2I", 0, 1), box("gpmd", bytes(7), b"\1")),
+        box("stts", struct.pack(">4I", 0, 1, count, 1001)),
+        box("stsc", struct.pack(">5I", 0, 1, 1, 1, 1)),
+        box("stsz", struct.pack(f">{3 + count}I", 0, 0, count, *map(len, payloads))),
+        box("stco", struct.pack(f">{2 + count}I", 0, count, *places.tolist())),
+    )
+    track = box(
+        "trak",
+        box("tkhd", struct.pack(">6I", 15, 0, 0, 1, 0, 1001 * count), bytes(60)),
+        box("mdia", box("mdhd", bytes(4), length, bytes(4)),
+            box("hdlr", bytes(8), b"meta", bytes(12), b"GoPro MET\0"), box("minf", tables)),
+    )  # fmt: skip
+    about = box("udta", box("GPMF", nest("DEVC", klv("DVID", "L", 1), *settings)))
+    content = box("mvhd", bytes(4), length, bytes(80)), about, box("free", bytes(padding)), track
+    return first + box("mdat", *payloads) + box("moov", *content, box("free", bytes(padding)))
+
+
+def test_a_file_of_gopro(tmp_path):
+    """As GPMF's documentation has it: up, right to left, forward to back; a HERO7's readout times
+    stand in a stream of their own.
+    """
+    rates, forces = np.tile([500, 0, 100], (200, 1)), np.tile([4096, 0, 0], (200, 1))
+    payload = nest(
+        "DEVC", klv("DVID", "L", 1), klv("DVNM", "c", "Hero7 Black"),
+        nest("STRM", klv("SIUN", "c", "m/s2"), klv("SCAL", "s", 418), klv("ACCL", "s", forces, 3)),
+        nest("STRM", klv("SIUN", "c", "rad/s"), klv("SCAL", "s", 1000), klv("GYRO", "s", rates, 3)),
+        nest("STRM", klv("STNM", "c", "Sensor read out time"), klv("SROT", "f", [8.744] * 30)),
+    )  # fmt: skip
+    settings = klv("MINF", "c", "HERO7 Black"), klv("VFOV", "c", "W"), klv("EISE", "c", "N")
+    path = tmp_path / "GX010001.MP4"
+    # As of half an hour: what the track is called is far from both ends.
+    path.write_bytes(of_gopro(3 * [payload], *settings, padding=2**19))
+    assert has_telemetry(path)
+    found = read_telemetry(path)
+    assert (found.camera, found.stabilizer) == ("GoPro HERO7 Black", "")
+    assert found.readout_time == pytest.approx(0.008744)
+    assert found.rate == pytest.approx(200.0, rel=2e-3)
+    np.testing.assert_allclose(found.rates, np.tile([0.0, -0.5, -0.1], (600, 1)), atol=1e-6)
+    np.testing.assert_allclose(found.forces[0], [0.0, -4096 / 418, 0.0], atol=1e-6)
+    path.write_bytes(of_gopro([payload], *settings[:2], klv("EISE", "c", "Y"), padding=0))
+    read_telemetry.cache_clear()
+    stabilized = read_telemetry(path)
+    assert stabilized.stabilizer == "electronic stabilization"
 
 
 @pytest.fixture
