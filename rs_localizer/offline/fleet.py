@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from rs_localizer.io.atomic_files import atomic_files, write_errors
 
@@ -246,8 +246,8 @@ def _ended(code: int | None) -> str:
 
 
 def _perform_by_dask(tasks: Sequence[Task], scheduler: str) -> Performed:
-    """Outcomes of tasks by a cluster; the next run does what was lost with its worker."""
-    from distributed import Client, as_completed
+    """Outcomes of tasks by a cluster; one that was lost with its worker is tried again, alone."""
+    from distributed import Client, Future, KilledWorker, as_completed
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
     try:
@@ -256,16 +256,32 @@ def _perform_by_dask(tasks: Sequence[Task], scheduler: str) -> Performed:
         reason = " ".join(str(error).split())
         raise ClusterError(f"no Dask scheduler answers at {scheduler}: {reason}") from error
 
+    def ended(future: Future[Any]) -> Outcome | KilledWorker:
+        try:
+            return cast(Outcome, future.result())
+        except KilledWorker as error:
+            return error
+        except Exception as error:  # with the scheduler, say
+            return _lost(error)
+
     with client:
         # Not by what they are: a result that has been removed would be taken as done.
         futures = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
+        killed = []
         for future in as_completed(list(futures)):
-            try:
-                outcome = cast(Outcome, future.result())
-            except Exception as error:  # a worker that was killed, or the scheduler
-                outcome = Outcome(None, f"lost: {' '.join(str(error).split())[:200]}")
-                _clear([futures[future]])
-            yield futures[future], outcome
+            if isinstance(end := ended(future), Outcome):
+                yield futures[future], end
+            else:
+                killed.append(futures[future])
+        # Dask blames all that waited at a worker for its end.
+        for task in killed:
+            end = ended(client.submit(perform, task, pure=False))
+            _clear([task])
+            yield task, end if isinstance(end, Outcome) else _lost(end)
+
+
+def _lost(error: Exception) -> Outcome:
+    return Outcome(None, f"lost: {' '.join(str(error).split())[:200]}")
 
 
 def refuse_others(tasks: Sequence[Task]) -> None:

@@ -13,8 +13,10 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -163,6 +165,42 @@ def test_a_recording_that_kills_its_process_does_not_stop_the_others(
     assert sorted(path.name for path in out.iterdir()) == ["fine", "good"]
 
 
+def test_one_that_kills_the_workers_of_dask_takes_no_other_with_it(tmp_path, monkeypatch):
+    """Dask blames all that waited at a worker; killed ones leave what they have begun."""
+    distributed = pytest.importorskip("distributed", reason="needs Dask")
+    monkeypatch.setattr(fleet, "perform", _killed_or_done)
+    out = tmp_path / "out"
+    out.mkdir()
+    names = ("beside", "deadly", "good")
+    tasks = tasks_of([tmp_path / name for name in names], out, _make, "")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=":0"
+    ) as cluster:
+        outcomes = dict(perform_all(tasks, cluster.scheduler_address, None))
+    assert [outcomes[task].figures for task in tasks] == [{"frames": 1}, None, {"frames": 1}]
+    assert outcomes[tasks[1]].reason.startswith("lost: ")
+    assert sorted(path.name for path in out.iterdir()) == ["beside", "good"]
+    assert len(list(tmp_path.glob("deadly-*"))) == 2
+
+
+def _killed_or_done(task: Task) -> Outcome:
+    """As in a worker that a recording kills, each time or only beside another one."""
+    from distributed import KilledWorker
+
+    name, above = task.recording.name, task.recording.parent
+    if name == "deadly" or (name == "beside" and not list(above.glob("beside-*"))):
+        number = uuid.uuid4().hex
+        (task.folder.parent / f".unfinished-{task.identity[:16]}-{number}").mkdir()
+        (above / f"{name}-{number}").touch()
+        raise KilledWorker(name, SimpleNamespace(address="tcp://worker"), 3)
+    return perform(task)
+
+
+def _make(recording: Path, out: Path) -> dict[str, float | int | str]:
+    out.mkdir()
+    return {"frames": 1}
+
+
 def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(
     recordings, tmp_path, monkeypatch, capsys
 ):
@@ -190,31 +228,3 @@ def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(
     assert main(words) == 0
     assert f"{len(done)} of 3 recordings have been done before\n" in capsys.readouterr().out
     assert {row["reason"] for row in rows(out).values()} == {""}
-
-
-def test_workers_of_dask(tmp_path, monkeypatch):
-    distributed = pytest.importorskip("distributed", reason="needs Dask")
-    monkeypatch.setattr(fleet, "perform", _lost_or_done)
-    out = tmp_path / "out"
-    out.mkdir()
-    tasks = tasks_of([tmp_path / name for name in ("deadly", "good")], out, _make, "")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=":0"
-    ) as cluster:
-        outcomes = dict(perform_all(tasks, cluster.scheduler_address, None))
-    assert outcomes[tasks[0]].reason == "lost: its worker died"
-    assert outcomes[tasks[1]].figures == {"frames": 1}
-    assert [path.name for path in out.iterdir()] == ["good"]
-
-
-def _lost_or_done(task: Task) -> Outcome:
-    """As of a worker that a recording kills, which leaves what it has begun."""
-    if task.recording.name == "deadly":
-        (task.folder.parent / f".unfinished-{task.identity[:16]}-1").mkdir()
-        raise RuntimeError("its worker died")
-    return perform(task)
-
-
-def _make(recording: Path, out: Path) -> dict[str, float | int | str]:
-    out.mkdir()
-    return {"frames": 1}

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.clouds import (
@@ -93,6 +95,46 @@ def test_what_cannot_be_read_is_said(cloud, of_message, of_field, text):
     vars(cloud).update(of_message)
     with pytest.raises(MessageError, match=text):
         read_correspondences(cloud)
+
+
+LARGE = st.integers(0, 2**32 - 1)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    data=st.binary(max_size=300),
+    sizes=st.tuples(LARGE | st.integers(0, 12), LARGE | st.integers(0, 3)),
+    steps=st.tuples(LARGE | st.integers(0, 60), LARGE | st.integers(0, 300)),
+    big_endian=st.booleans(),
+    fields=st.just([(*field, 1) for field in PLAIN])
+    | st.lists(
+        st.tuples(
+            st.sampled_from(["x", "y", "z", "u", "v", "score", "id", "other"]),
+            LARGE | st.integers(0, 40),
+            st.integers(0, 9),
+            st.integers(0, 2),
+        ),
+        max_size=9,
+    ),
+)
+def test_nothing_that_is_sent_raises_another_error(data, sizes, steps, big_endian, fields):
+    message = SimpleNamespace(
+        header=SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="map"),
+        width=sizes[0],
+        height=sizes[1],
+        point_step=steps[0],
+        row_step=steps[1],
+        is_bigendian=big_endian,
+        fields=[SimpleNamespace(name=n, offset=o, datatype=t, count=c) for n, o, t, c in fields],
+        data=np.frombuffer(data, np.uint8),
+    )
+    try:
+        read = read_correspondences(message)
+    except MessageError:
+        return
+    assert len(read.points) + read.dropped == sizes[0] * sizes[1]
+    assert np.isfinite(read.points).all()
+    assert np.isfinite(read.pixels).all()
 
 
 @pytest.mark.parametrize("big_endian", [False, True])
