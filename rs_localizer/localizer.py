@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, localizer_config
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.bearings import seen_at
 from rs_localizer.core.camera import Camera
@@ -165,6 +166,7 @@ class Localizer:
         pivot_of(np.eye(18))  # by a tracker
         is_plane(np.zeros((4, 3)), np.ones(4, np.bool_))  # where points are left out
         as_nearest(np.zeros((2, 2)), np.zeros((2, 2)), 0.0)
+        so3.exp_many(np.zeros((1, 3)))  # of rows that shake
         likeness(np.zeros((2, 3)), np.zeros(2), 1)  # of inliers, for integrity
         # And with one that shakes, rows to and fro.
         swing = 2.0 * self.config.inlier_threshold * np.sin(12.0 * self.camera.row_time(pixels))

@@ -14,7 +14,6 @@ from numba.core.registry import CPUDispatcher
 from rs_localizer.config import NodeConfig
 from benchmarks.frames.conditions import conditions
 from benchmarks.frames.judged import judge
-from rs_localizer.core import so3
 from rs_localizer.inertial.buffer import ReadingBuffer, Readings
 from rs_localizer.pipeline.frames import FrameLocalizer
 
@@ -24,7 +23,6 @@ def compiled():
 
 FrameLocalizer(NodeConfig()).warm_up_rest()
 FrameLocalizer(NodeConfig(readout_time=0.02)).warm_up_imu()
-so3.exp_many(np.zeros((1, 3)))  # of the simulation
 before = compiled()
 readings = ReadingBuffer()
 for k in range(9):

@@ -80,14 +80,15 @@ class Estimate(Motion):
         own = self.joint_covariance[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
         return own + self.calibration_covariance + self.undetected_covariance
 
-    def by_others(self, joint_covariance: Array, **fields: Any) -> Self:
+    def with_joint_covariance(self, joint_covariance: Array, **fields: Any) -> Self:
         """The estimate with what other frames tell of it: fields, and a covariance of its own.
 
         What arcs take from the old covariance, by what it ties to them, the new one may not have:
         of what is beside it stays what widens any.
         """
-        scale = np.sqrt(np.diag(self.joint_covariance)[:MOTION_PARAMETERS])
-        scale[scale == 0.0] = 1.0
+        variances = np.diag(self.joint_covariance)[:MOTION_PARAMETERS]
+        known = (variances > 0.0) & (variances < np.inf)
+        scale = np.sqrt(np.where(known, variances, 1.0))
         undetected = _widening(np.ascontiguousarray(self.undetected_covariance), scale)
         return replace(
             self, joint_covariance=joint_covariance, undetected_covariance=undetected, **fields

@@ -486,7 +486,7 @@ def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
     joint = joint + gain @ (spread - covariance) @ gain.T
     units = 1.0 / _per_second(estimate.span)
     shifts = gain[:MOTION_PARAMETERS] @ (units[:, None] * gaussian.shifts)
-    return estimate.by_others(
+    return estimate.with_joint_covariance(
         0.5 * (joint + joint.T),
         rotation=rotation_of(state).copy(),
         translation=state[STATE_TRANSLATION],
@@ -508,7 +508,7 @@ def predicted_estimate(nearest: Estimate, gaussian: Gaussian, swing: Array) -> E
     motion, covariance = motion_of(gaussian, nearest.span)
     units = 1.0 / _per_second(nearest.span)
     shifts = (units[:, None] * gaussian.shifts)[:MOTION_PARAMETERS]
-    return nearest.by_others(
+    return nearest.with_joint_covariance(
         covariance + swing,
         **{each.name: getattr(motion, each.name) for each in fields(Motion)},
         calibration_covariance=shifts @ shifts.T,

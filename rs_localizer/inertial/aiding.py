@@ -83,7 +83,7 @@ class GyroPrediction:
         numbers = {each.name: getattr(motion, each.name) for each in fields(Motion)}
         numbers["angular_velocity"] = motion.angular_velocity + turn.rate
         numbers["angular_acceleration"] = motion.angular_acceleration + turn.change
-        return last.by_others(
+        return last.with_joint_covariance(
             self.predicted.covariance, **numbers, shake=np.zeros((0, 3)), turn=turn
         )
 

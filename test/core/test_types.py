@@ -173,10 +173,10 @@ def test_a_covariance_of_others_is_one_beside_arcs_that_the_old_one_was_tied_to(
     better = 0.01 * estimate.joint_covariance
     naive = replace(arched, joint_covariance=better)
     assert np.linalg.eigvalsh(naive.covariance).min() < 0.0
-    found = arched.by_others(better, time_ns=5)
+    found = arched.with_joint_covariance(better, time_ns=5)
     assert found.time_ns == 5
     widened = found.covariance - better[:12, :12]
     assert np.linalg.eigvalsh(widened).min() > -1e-15
     assert np.linalg.eigvalsh(found.covariance - naive.covariance).min() > -1e-15
-    sure = replace(estimate, undetected_covariance=0.5 * own).by_others(better)
+    sure = replace(estimate, undetected_covariance=0.5 * own).with_joint_covariance(better)
     np.testing.assert_allclose(sure.undetected_covariance, 0.5 * own, atol=1e-18)
