@@ -175,7 +175,7 @@ def _of_markers(args: Options) -> tuple[Mapping[str, float], Look]:
 
 
 def _of_features(args: Options) -> tuple[Mapping[str, float], Look]:
-    for name in ("map", "board", "pattern", "square"):
+    for name in ("map", "board", "square"):
         if getattr(args, name) is not None:
             raise UsageError(f"--{name} is for markers; give it or --features")
     most = args.max_keypoints or FeatureConfig().max_keypoints

@@ -19,13 +19,8 @@ if WORKING:
     from rs_localizer.markers.map_files import read_marker_map
     from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.markers.poses import Pose
-    from rs_localizer.markers.prints import Board, Chessboard, CircleGrid
+    from rs_localizer.markers.prints import Chessboard
 
-_CHESSBOARD, _CIRCLES, _ASYMMETRIC = "chessboard", "circles", "asymmetric_circles"
-_INVERTED = "inverted_"
-_PATTERNS = [
-    inverted + kind for inverted in ("", _INVERTED) for kind in (_CHESSBOARD, _CIRCLES, _ASYMMETRIC)
-]
 # A board on its own is the map: its first corner is the origin, x along the rows, y from row to
 # row, z away from the viewer.
 _BOARD_AXES = np.diag([1.0, -1.0, -1.0])
@@ -36,15 +31,9 @@ class TargetOptions:
     """what to look for: a map of markers, or one board."""
 
     map: Path | None = option("marker map; also that of keypoints, where they are read", "FILE")
-    board: str | None = option(
-        "instead: inner corners (or circles) along a row x rows of a board", "6x4"
-    )
-    pattern: str | None = option(
-        f"of the board; inverted: white on black (default: {_CHESSBOARD})", choices=_PATTERNS
-    )
+    board: str | None = option("instead: inner corners along a row x rows of a chessboard", "6x4")
     square: float | None = option(
-        "side of its squares in metres, or distance of its rows of circles", "M",
-        limits=(0.0, math.inf), above=True,
+        "side of its squares in metres", "M", limits=(0.0, math.inf), above=True,
     )  # fmt: skip
 
 
@@ -65,20 +54,14 @@ def find_map(args: TargetOptions) -> MarkerMap:
     if (args.map is None) == (args.board is None):
         raise UsageError("give either --map or --board")
     if args.map is not None:
-        for name in ("square", "pattern"):
-            if getattr(args, name) is not None:
-                raise UsageError(f"--{name} goes with --board")
+        if args.square is not None:
+            raise UsageError("--square goes with --board")
         return read_checked_map(args.map)
     if args.board is None or args.square is None:
         raise UsageError("--board needs --square")
     columns, rows = read_counts(args.board, "--board")
-    pattern = args.pattern or _CHESSBOARD
-    inverted, kind = pattern.startswith(_INVERTED), pattern.removeprefix(_INVERTED)
     try:
-        if kind == _CHESSBOARD:
-            board: Board = Chessboard(columns, rows, args.square, inverted=inverted)
-        else:
-            board = CircleGrid(columns, rows, args.square, kind == _ASYMMETRIC, inverted)
+        board = Chessboard(columns, rows, args.square)
     except ValueError as error:
         raise UsageError(f"--board: {error}") from error
     # The first corner to the origin.

@@ -1,11 +1,10 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Chessboards, ChArUco boards and grids of circles in images, by OpenCV's own detectors."""
+"""Chessboards and ChArUco boards in images, by OpenCV's own detectors."""
 
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.dictionaries import Gray
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.prints import Charuco, Chessboard, CircleGrid
+from rs_localizer.markers.prints import Charuco, Chessboard
 
 # Half the window of the sub-pixel search, as a share of the smallest distance between corners:
 # the next corner must stay outside, and more of the edges inside means less noise.
@@ -35,9 +34,6 @@ _SMALLEST_SEARCH = 16
 _REFINE_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
 # The size of a chessboard is looked at in one of so many images, until so many have shown it.
 _EVERY, _SIZES = 10, 9
-# Circles between this many pixels and this share of the image are looked for: OpenCV's own upper
-# limit of 5000 px is soon passed by a board that fills the image of a large sensor.
-_LEAST_AREA, _LARGEST_SHARE = 12.0, 0.02
 
 
 def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = None) -> Array | None:
@@ -50,7 +46,6 @@ def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = Non
     Returns:
         None when the whole board is not seen.
     """
-    image = _black_on_white(image, board)
     small, scale = _shrunk(image)
     if min(small.shape) < _SMALLEST_SEARCH:
         return None
@@ -130,7 +125,7 @@ class BoardSizes:
         if self._board is None or self._images <= self._next or len(self._sizes) >= _SIZES:
             return
         self._next = self._images + _EVERY
-        small, _ = _shrunk(_black_on_white(image, self._board))
+        small, _ = _shrunk(image)
         if min(small.shape) < _SMALLEST_SEARCH:
             return
         flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -254,11 +249,6 @@ def charuco_fault(board: Charuco, ids: NDArray[np.int64], quads: Array) -> str |
     return None
 
 
-def _black_on_white(image: Gray, board: Chessboard | CircleGrid) -> Gray:
-    """Black on white, as OpenCV wants it."""
-    return np.asarray(cv2.bitwise_not(image), np.uint8) if board.inverted else image
-
-
 def _shrunk(image: Gray) -> tuple[Gray, int]:
     """An image in which a board is found soon, and by what whole number it is smaller."""
     height, width = image.shape
@@ -337,34 +327,3 @@ def _starts_black(grid: Array, image: Gray) -> bool:
     second = grid[0:2, 1:3].mean(axis=(0, 1))
     (x, y), (u, v) = np.rint(first).astype(int), np.rint(second).astype(int)
     return bool(image[y, x] < image[v, u])
-
-
-def find_circles(image: Gray, grid: CircleGrid, previous: Array | None = None) -> Array | None:
-    """Pixels (n,2) of the centres of a grid in the order of ``grid.points``.
-
-    A symmetric one looks the same turned by half (a square one by a quarter, too): then the order
-    is the one that is closest to the ``previous`` centres; without them, the one that reads as text
-    does. Seen at an angle, the middle of a circle's image is not quite that of the circle: the
-    larger the circles and the nearer the board, the farther off.
-
-    Returns:
-        None when the whole grid is not seen.
-    """
-    image = _black_on_white(image, grid)
-    kind = cv2.CALIB_CB_ASYMMETRIC_GRID if grid.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
-    complete, centres = cv2.findCirclesGrid(
-        image, (grid.columns, grid.rows), flags=kind, blobDetector=_blobs(image)
-    )
-    if not complete:
-        return None
-    pixels = np.asarray(centres, np.float64).reshape(-1, 2)
-    if grid.asymmetric:
-        return pixels
-    return ordered(pixels.reshape(grid.rows, grid.columns, 2), previous)
-
-
-def _blobs(image: Gray) -> Any:
-    opencv: Any = cv2  # whose type stubs lack these
-    wanted = opencv.SimpleBlobDetector_Params()
-    wanted.minArea, wanted.maxArea = _LEAST_AREA, max(5000.0, _LARGEST_SHARE * image.size)
-    return opencv.SimpleBlobDetector_create(wanted)

@@ -5,8 +5,7 @@
 The node and the offline command run this one class, so the same images give the same corners.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -14,17 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.markers.boards import (
-    charuco_fault,
-    find_charuco,
-    find_chessboard,
-    find_circles,
-)
+from rs_localizer.markers.boards import charuco_fault, find_charuco, find_chessboard
 from rs_localizer.markers.dictionaries import DictionaryError, Gray, MarkerFinder
 from rs_localizer.markers.edges import refine
 from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid
+from rs_localizer.markers.prints import Board, Charuco, Chessboard
 
 IntArray = NDArray[np.int64]
 
@@ -190,10 +184,7 @@ class MarkerDetector:
             return find_charuco(image, board, item.ids[own], item.quads[own])
         if not 0 <= stamp_ns - self._last_board_ns <= _LONGEST_LOSS_NS:
             self._last_board = None
-        if isinstance(board, Chessboard):
-            corners = find_chessboard(image, board, self._last_board)
-        else:
-            corners = find_circles(image, board, self._last_board)
+        corners = find_chessboard(image, board, self._last_board)
         if corners is None:
             return np.empty(0, np.int64), np.empty((0, 2))
         self._last_board, self._last_board_ns = corners, stamp_ns
@@ -265,11 +256,8 @@ _LEAST_CORNERS = 12
 _MOST_IDS = 6
 
 
-def recognized(image: Gray, boards: Iterable[Board] = ()) -> list[str]:
+def recognized(image: Gray) -> list[str]:
     """The markers, by family, and the board that an image shows; most certain first.
-
-    A board is named after it was found: a chessboard of any size, and each of ``boards`` with
-    columns and rows exchanged.
 
     Takes seconds in a large image: all families are tried. Of several that read the same
     quadrilateral, that with the most bits counts, for it is the least likely to be chance.
@@ -293,11 +281,6 @@ def recognized(image: Gray, boards: Iterable[Board] = ()) -> list[str]:
     size = chessboard_size(image)
     if size is not None and find_chessboard(image, Chessboard(*size, 1.0)) is not None:
         said.append(f"a chessboard of {size[0]}x{size[1]} inner corners")
-    for board in boards:
-        if isinstance(board, CircleGrid) and board.columns != board.rows:
-            turned = replace(board, columns=board.rows, rows=board.columns, shape=None)
-            if find_circles(image, turned) is not None:
-                said.append(f"the {turned.name}: its columns and rows are exchanged")
     return said
 
 

@@ -11,18 +11,16 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.markers.detection import Detections
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.prints import CircleGrid
 
 # A marker this many times larger than the median has its size in another unit, and so have all of
-# them if they are larger than any that is printed (m); so have squares and circles of boards.
+# them if they are larger than any that is printed (m); so have squares of boards.
 _OTHER_UNIT, _LARGEST, _LARGEST_SQUARE = 20.0, 5.0, 2.0
 
 
 def other_units(marker_map: MarkerMap) -> Iterator[str]:
     """Signs of sizes that are not in metres, as sentences."""
     for board in marker_map.boards:
-        large = board.spacing if isinstance(board, CircleGrid) else board.square
-        if large > _LARGEST_SQUARE:
+        if (large := board.square) > _LARGEST_SQUARE:
             yield (
                 f"{board.name} with {large:g} m from corner to corner: sizes are in metres; "
                 f"{1e-3 * large:g} would be {large:g} mm"

@@ -30,7 +30,7 @@ from rs_localizer.io.yaml_text import file_faults, load_yaml
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation, rotation_of_quaternion
-from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid, Marker
+from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
 
 USUAL_FAMILY = FAMILIES["apriltag_36h11"]
 """Family of files of other programs that do not say it."""
@@ -49,9 +49,7 @@ _TAG_FROM_PRINT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 # A pose stands for corners that it gives to within this share of a side; of a size that is given
 # beside the corners; and of the sizes of a field, which does not say them.
 _SAME, _SIZE_TOLERANCE, _SAME_SIZE = 1e-9, 0.05, 1e-3
-_CHESSBOARD, _CIRCLES, _ASYMMETRIC, _CHARUCO = _BOARDS = (
-    "chessboard", "circles", "asymmetric_circles", "charuco",
-)  # fmt: skip
+_CHESSBOARD, _CHARUCO = _BOARDS = "chessboard", "charuco"
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +127,7 @@ def _board(entry: _Entry) -> Board:
         if kind not in _BOARDS:
             raise ValueError(f"type must be one of {', '.join(_BOARDS)}")
         counts = entry.take("columns", int), entry.take("rows", int)
-        spacing = float(entry.take("spacing" if "circles" in kind else "square", _NUMBER))
+        square = float(entry.take("square", _NUMBER))
         given = {
             "pose": _pose(entry),
             "shape": entry.take("shape", list, None),
@@ -139,12 +137,9 @@ def _board(entry: _Entry) -> Board:
             marker, name = float(entry.take("marker", _NUMBER)), entry.take("family", str)
             own = entry.take("first_id", int, 0), entry.take("legacy", bool, False)
             entry.finish()
-            return Charuco(*counts, spacing, marker, family(name), *own, **given)
-        given["inverted"] = entry.take("inverted", bool, False)
+            return Charuco(*counts, square, marker, family(name), *own, **given)
         entry.finish()
-        if kind == _CHESSBOARD:
-            return Chessboard(*counts, spacing, **given)
-        return CircleGrid(*counts, spacing, kind == _ASYMMETRIC, **given)
+        return Chessboard(*counts, square, **given)
 
 
 def _pose(entry: _Entry) -> Pose:
@@ -168,13 +163,9 @@ def _kalibr_target(entry: _Entry) -> MarkerMap:
             ])))
             for k in range(columns * rows)
         ))  # fmt: skip
-    if kind not in ("checkerboard", "circlegrid"):
-        raise ValueError(f"target_type must be aprilgrid, checkerboard or circlegrid, not {kind!r}")
+    if kind != "checkerboard":
+        raise ValueError(f"target_type must be aprilgrid or checkerboard, not {kind!r}")
     counts = entry.take("targetCols", int), entry.take("targetRows", int)
-    if kind == "circlegrid":
-        asymmetric = entry.take("asymmetricGrid", bool, False)
-        spacing = float(entry.take("spacingMeters", _NUMBER))
-        return MarkerMap(boards=(CircleGrid(*counts, spacing, asymmetric),))
     square, other = (float(entry.take(f"{of}SpacingMeters", _NUMBER)) for of in ("row", "col"))
     if square != other:
         raise ValueError(f"squares must be as high as wide, found {square:g} and {other:g} m")
@@ -221,7 +212,7 @@ def _bundle(file: _Entry, name: str, unsaid: Unsaid) -> Iterator[Marker]:
 _EXPLANATION = """\
 # Where prints are, in the frame map_frame; all lengths in metres.
 #   size: side of the black square of a marker, without the white rim around it
-#   square, spacing: of a board: side of its squares; from row to row of its circles
+#   square: of a board: side of its squares
 #   position: of the middle of the print, x y z in map_frame
 #   quaternion: x y z w (not w x y z), of length 1; turns the print's axes into those of the map.
 #     Axes of a print: x to the right, y up, z out of the paper toward who looks at it.
@@ -323,15 +314,10 @@ def _board_entry(board: Board) -> dict[str, Any]:
             "square": float(board.square), "marker": float(board.marker),
             "family": board.family.name, "first_id": board.first_id, "legacy": board.legacy,
         }  # fmt: skip
-    elif isinstance(board, Chessboard):
-        kind, own = _CHESSBOARD, {"square": float(board.square)}
     else:
-        kind = _ASYMMETRIC if board.asymmetric else _CIRCLES
-        own = {"spacing": float(board.spacing)}
+        kind, own = _CHESSBOARD, {"square": float(board.square)}
     entry: dict[str, Any] = {"type": kind, "columns": board.columns, "rows": board.rows}
     entry |= own | _pose_entry(board.pose)
-    if not isinstance(board, Charuco) and board.inverted:
-        entry["inverted"] = True
     if board.shape is not None:
         entry["shape"] = [_rounded(row) for row in np.round(board.shape, 7)]
     if board.deviation is not None:

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Prints that can be seen: single markers, and boards of squares or circles, in the map frame.
+"""Prints that can be seen: single markers, and boards of squares, in the map frame.
 
 The frame of a print has its origin in the middle (of the black square of a marker, of the whole
 pattern of squares of a board), x to the right, y up, and z out of the paper toward the viewer.
@@ -141,7 +141,6 @@ class Chessboard(_Board):
     """
 
     square: float  # m
-    inverted: bool = False  # white squares on black, with black paper around them
 
     def __post_init__(self) -> None:
         self._check((3, 3), "a board needs 3x3 inner corners", "square")  # OpenCV's own limit
@@ -152,38 +151,7 @@ class Chessboard(_Board):
 
     @property
     def name(self) -> str:
-        return f"{'inverted ' if self.inverted else ''}chessboard {self.columns}x{self.rows}"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CircleGrid(_Board):
-    """A grid of circles by their centres, of which ``columns`` are in a row.
-
-    In an asymmetric one, every second row is shifted by half the distance of neighbours in a row,
-    which is twice the spacing (OpenCV's pattern): so it is known how it lies. A symmetric one looks
-    the same turned by half.
-    """
-
-    spacing: float  # m: from row to row
-    asymmetric: bool = False
-    inverted: bool = False  # white circles on black
-
-    def __post_init__(self) -> None:
-        self._check((2, 3), "a grid needs 2x3 circles", "spacing")
-
-    @property
-    def flat(self) -> Array:
-        if not self.asymmetric:
-            return _grid(self.columns, self.rows, self.spacing)
-        row, column = np.mgrid[: self.rows, : self.columns].astype(np.float64)
-        x = 2.0 * column + row % 2.0 - 0.5 * (2 * self.columns - 1)
-        flat = np.stack([x, 0.5 * (self.rows - 1) - row, np.zeros_like(x)], axis=-1)
-        return np.asarray(flat.reshape(-1, 3) * self.spacing)
-
-    @property
-    def name(self) -> str:
-        kind = f"{'inverted ' if self.inverted else ''}{'asymmetric ' if self.asymmetric else ''}"
-        return f"{kind}circle grid {self.columns}x{self.rows}"
+        return f"chessboard {self.columns}x{self.rows}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,7 +210,7 @@ class Charuco(_Board):
         return f"charuco {self.columns}x{self.rows} of {self.family.name}"
 
 
-Board = Chessboard | CircleGrid | Charuco
+Board = Chessboard | Charuco
 
 
 def _grid(columns: int, rows: int, spacing: float) -> Array:

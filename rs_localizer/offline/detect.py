@@ -189,7 +189,7 @@ class _MarkerTally:
 
     def instead(self) -> list[str]:
         """Other targets in images that show nothing of the map."""
-        shown = [recognized(image.pixels, self._map.boards) for image in self._empty]
+        shown = [recognized(image.pixels) for image in self._empty]
         # Images of one pattern show other ones of its markers.
         names = Counter(_kind(name) for of_image in shown for name in of_image)
         first = {_kind(name): name for of_image in reversed(shown) for name in of_image}

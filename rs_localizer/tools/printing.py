@@ -15,7 +15,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Board, Chessboard, CircleGrid, Marker
+from rs_localizer.markers.prints import Board, Chessboard, Marker
 
 # Upright, in mm.
 PAGES = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
@@ -109,12 +109,10 @@ def _marker(marker: Marker) -> Array:
 
 def _board(board: Board) -> tuple[Array, str]:
     """Rectangles of a board, and what it is."""
-    if isinstance(board, CircleGrid):
-        raise PrintError(f"a {board.name} can be detected, but not printed from here")
     square, label = board.square * _MM, f"{board.name}, squares {board.square * _MM:g} mm"
     if isinstance(board, Chessboard):
         places = np.indices((board.rows + 1, board.columns + 1)).sum(axis=0)
-        return _rectangles(places % 2 != board.inverted, square), label
+        return _rectangles(places % 2 == 1, square), label
     white = np.zeros((board.rows, board.columns), bool)
     white[tuple(np.transpose(board.cells)[::-1])] = True
     black, side = [_rectangles(white, square)], board.marker * _MM

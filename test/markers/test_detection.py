@@ -16,7 +16,7 @@ from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Charuco, Chessboard, CircleGrid, Marker
+from rs_localizer.markers.prints import Charuco, Chessboard, Marker
 
 from .prints import chessboard_cells, look, project, rectangle, render
 
@@ -267,54 +267,6 @@ def test_an_aprilgrid_of_kalibr(tmp_path):
     np.testing.assert_allclose(found.pixels, project(found.points, seen), atol=0.5)
     (said,) = recognized(image)  # and no chessboard
     assert said.startswith("apriltag_36h11_border2 ")
-
-
-def test_exchanged_columns_and_rows_are_tried():
-    true = CircleGrid(4, 5, 0.03, asymmetric=True)
-    image = render([(drawn(true), rectangle(8 * 0.03, 5 * 0.03))], look(distance=0.5))
-    said = recognized(image, (replace(true, columns=5, rows=4),))
-    assert said == ["the asymmetric circle grid 4x5: its columns and rows are exchanged"]
-
-
-FINE = 20  # drawn pixels per spacing
-
-
-def drawn(grid: CircleGrid) -> Any:
-    """White paper of the grid's extent with black discs, by its definition in OpenCV's manual."""
-    wide = 2 if grid.asymmetric else 1
-    y, x = np.mgrid[: FINE * grid.rows, : FINE * wide * grid.columns] + 0.5
-    paper = np.ones(x.shape, bool)
-    for row in range(grid.rows):
-        for column in range(grid.columns):
-            shift = row % 2 if grid.asymmetric else 0
-            u, v = FINE * (wide * column + shift + 0.5), FINE * (row + 0.5)
-            paper &= (x - u) ** 2 + (y - v) ** 2 > (0.35 * FINE) ** 2
-    return paper != grid.inverted
-
-
-@pytest.mark.parametrize(
-    ("columns", "rows", "asymmetric", "inverted"),
-    [(5, 4, False, False), (5, 4, False, True), (4, 5, True, False), (4, 4, True, True)],
-)
-def test_centres_are_where_they_were_drawn(columns, rows, asymmetric, inverted):
-    grid = CircleGrid(columns, rows, 0.03, asymmetric, inverted)
-    width, height = (2 * columns if asymmetric else columns) * 0.03, rows * 0.03
-    detector = MarkerDetector(MarkerMap(boards=(grid,)))
-    pose = look(5.0, 10.0, distance=0.4)
-    black_on_white = drawn(grid) != inverted
-    image = render([(black_on_white, rectangle(width, height))], pose)
-    if inverted:  # black paper around it
-        image = 255 - image
-    seen = detector.detect(image)
-    assert seen.ids.tolist() == list(range(columns * rows))
-    np.testing.assert_allclose(seen.points, grid.points)
-    np.testing.assert_allclose(seen.pixels, project(grid.points, pose), atol=0.4)
-
-
-def test_an_inverted_chessboard():
-    board, pose = Chessboard(6, 4, 0.03, inverted=True), look(10.0)
-    (seen,) = detect_board(board, 255 - board_image(6, 4, pose))
-    np.testing.assert_allclose(seen.pixels, project(board.points, pose), atol=0.15)
 
 
 def square(left: float, top: float, side: float, blur: float = 0.0) -> np.ndarray:
