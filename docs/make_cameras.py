@@ -24,9 +24,7 @@ _INDEX = """\
 
 What others say, of modes that may not be yours: `rs_localizer calibrate` measures yours in ten
 seconds ([calibration.md](../calibration.md)), and `rs_localizer readout NAME` prints this table. As
-JSON: [{json}]({json}), in seconds from the first to the last row, with `odm` (OpenDroneMap's
-`--rolling-shutter-readout`) and `gyroflow` (`frame_readout_time`) in ms of all rows, and `kalibr`
-(`lineDelay`) in seconds from row to row.
+JSON: [{json}]({json}), in seconds from the first to the last row.
 
 | camera | modes | ms |
 |---|---|---|

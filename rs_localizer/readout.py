@@ -1,18 +1,12 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Published readout times of cameras, and how their conventions become ours.
-
-Ours: ``readout_time`` runs from the first row to the last, ``height - 1`` line times;
-``stamp_offset`` from the stamp to the middle of the first row's exposure.
-"""
+"""Published readout times of cameras: from the first row to the last, ``height - 1`` line times."""
 
 from __future__ import annotations
 
 import csv
 import difflib
-import re
 from dataclasses import asdict, dataclass
-from enum import StrEnum
 
 from rs_localizer import data
 
@@ -97,69 +91,13 @@ def find_readout(name: str, mode: str = "") -> list[Known]:
 
 
 def as_json(entry: Known) -> dict[str, object]:
-    """An entry, and what other programs take, by identifiers with units.
-
-    Those of ``odm`` (OpenDroneMap's ``--rolling-shutter-readout``) and ``gyroflow``
-    (``frame_readout_time``) count all rows; that of ``kalibr`` (``lineDelay``) is from row to row,
-    None for a mode that does not say how many there are.
-    """
-    size = re.match(r"\d+x(\d+)", entry.mode)
-    line = None if size is None else entry.median / (int(size[1]) - 1)
-    whole = 1e3 * (entry.median + (line or 0.0))
+    """An entry by identifiers with units."""
     values: dict[str, object] = {
         f"{key}_s" if isinstance(value, float) else key: value
         for key, value in asdict(entry).items()
-    }
-    values |= {"upper_bound": entry.upper_bound, "kalibr_line_delay_s": line}
-    values |= {"odm_readout_ms": whole, "gyroflow_readout_ms": whole}
+    } | {"upper_bound": entry.upper_bound}
     return {k: float(f"{v:.6g}") if isinstance(v, float) else v for k, v in values.items()}
 
 
 def _has(text: str, words: str) -> bool:
     return all(word in text.lower() for word in words.lower().split())
-
-
-def from_line_time(line_time: float, rows: int) -> float:
-    """``readout_time`` (s) of a sensor that takes ``line_time`` (s) from row to row."""
-    return line_time * (_checked_rows(rows) - 1)
-
-
-def from_all_rows(duration: float, rows: int) -> float:
-    """``readout_time`` (s) of a duration that counts every row, as Android's skew does."""
-    return duration * (_checked_rows(rows) - 1) / rows
-
-
-class StampAt(StrEnum):
-    """Part of a row's exposure that a stamp stands for."""
-
-    START = "start"
-    MIDDLE = "middle"
-    END = "end"
-
-
-def stamp_offset(
-    at: StampAt, exposure: float, *, middle_row: bool = False, readout_time: float | None = None
-) -> float:
-    """``stamp_offset`` (s) of a driver whose stamps are those of one moment of one row.
-
-    Args:
-        at: the moment within the exposure.
-        exposure: s.
-        middle_row: the row is the middle one, else the first.
-        readout_time: s, needed for the middle row.
-
-    Raises:
-        ValueError: for a negative exposure, or the middle row without a readout time.
-    """
-    if not exposure >= 0.0:
-        raise ValueError(f"the exposure must be 0 s or more, got {exposure}")
-    if middle_row and readout_time is None:
-        raise ValueError("stamps of the middle row need the readout time")
-    to_middle = {StampAt.START: 0.5, StampAt.MIDDLE: 0.0, StampAt.END: -0.5}[StampAt(at)]
-    return to_middle * exposure - (0.5 * (readout_time or 0.0) if middle_row else 0.0)
-
-
-def _checked_rows(rows: int) -> int:
-    if rows < 2:
-        raise ValueError(f"a rolling shutter has 2 rows or more, got {rows}")
-    return rows

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The table of readout times, and the conventions."""
+"""The table of readout times."""
 
 import json
 import re
@@ -10,15 +10,7 @@ from pathlib import Path
 import pytest
 
 from rs_localizer.cli.commands import main
-from rs_localizer.readout import (
-    COMMON,
-    StampAt,
-    find_readout,
-    from_all_rows,
-    from_line_time,
-    known_cameras,
-    stamp_offset,
-)
+from rs_localizer.readout import COMMON, find_readout, known_cameras
 
 
 def test_every_row_of_the_table_makes_sense():
@@ -49,7 +41,7 @@ def test_a_camera_is_found_by_words_and_all_of_its_modes_are_told():
     assert [known.mode for known in modes] == ["1640x1232", "1920x1080", "3280x2464"]
     (one,) = find_readout("imx219", "1920x1080")
     # The line time of the driver's own numbers.
-    assert one.median == pytest.approx(from_line_time(3448 / 182.4e6, 1080), rel=2e-3)
+    assert one.median == pytest.approx(1079 * 3448 / 182.4e6, rel=2e-3)
 
 
 def test_an_unknown_camera_or_mode_is_said_with_what_there_is():
@@ -59,26 +51,13 @@ def test_an_unknown_camera_or_mode_is_said_with_what_there_is():
         find_readout("imx219", "8000x4000")
 
 
-def test_conventions():
-    assert from_all_rows(0.024, 480) == pytest.approx(from_line_time(0.024 / 480, 480))
-    assert stamp_offset(StampAt.START, 0.01) == 0.005
-    assert stamp_offset(StampAt.END, 0.01) == -0.005
-    assert stamp_offset(StampAt.MIDDLE, 0.01) == 0.0
-    assert stamp_offset(StampAt.END, 0.01, middle_row=True, readout_time=0.02) == -0.015
-    with pytest.raises(ValueError, match="need the readout time"):
-        stamp_offset(StampAt.MIDDLE, 0.01, middle_row=True)
-    with pytest.raises(ValueError, match="2 rows"):
-        from_line_time(1e-5, 1)
-
-
 def test_every_camera_has_a_page_and_the_json_the_whole_table(tmp_path):
     docs = Path(__file__).parents[1] / "docs"
     made = runpy.run_path(str(docs / "make_cameras.py"))
     made["write"](tmp_path)
     table = known_cameras()
     told = json.loads((tmp_path / made["JSON"]).read_text())
-    times = {"median_s", "low_s", "high_s", "kalibr_line_delay_s"}
-    times |= {"odm_readout_ms", "gyroflow_readout_ms"}
+    times = {"median_s", "low_s", "high_s"}
     assert {*told[0]} == times | {"name", "mode", "number", "source", "upper_bound"}
     medians = {(row["name"], row["mode"]): row["median_s"] for row in told}
     assert medians == pytest.approx({(known.name, known.mode): known.median for known in table})

@@ -85,10 +85,6 @@ CHECKS: dict[str, list[Callable[[Any], None]]] = {
         lambda it: _near([it.result.time, it.result.span], [0.0175, 0.035], 1e-12),
         lambda it: _near(np.linalg.norm(it.state.angular_velocity), 1.0, 0.02),
     ],
-    "docs/calibration.md": [
-        lambda it: _near(it.from_line_time(18.9e-6, rows=1080), 1079 * 18.9e-6, 1e-12),
-        lambda it: _near(it.from_all_rows(0.0238, rows=1080), 0.0238 * 1079 / 1080, 1e-12),
-    ],
 }
 
 
