@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 
 from benchmarks.simulation.imu import ImuBagWriter, ImuSettings, Lever, shaken, simulate_imu
 from benchmarks.simulation.keypoints import keypoint_rows, random_descriptors
-from benchmarks.simulation.rig import camera_stamps, rig_parameters, simulate_rig, write_rig_frame
+from benchmarks.simulation.rig import (
+    camera_stamps,
+    make_mounts,
+    rig_parameters,
+    simulate_rig,
+    write_rig_frame,
+)
 from rs_localizer.cli import simulate_command as simulate
 from rs_localizer.cli.options import Parser, add_options, option, read
 from rs_localizer.core.arrays import Array
@@ -33,7 +39,7 @@ from rs_localizer.io.recording import (
     PARAMETERS,
     make_camera_info,
 )
-from rs_localizer.io.rigs import make_mounts, read_camchain
+from rs_localizer.io.rigs import read_camchain
 from rs_localizer.io.topics import TF_STATIC
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.settings import write_parameters

@@ -23,7 +23,8 @@ from rs_localizer.io.recording import (
     make_correspondences,
     make_image,
 )
-from rs_localizer.io.rigs import RIG_FRAME, RigParts, node_parameters, optical_frame
+from rs_localizer.io.rigs import RigParts, node_parameters
+from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.tools.simulation.renderer import FORMAT, RenderedFrame
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, frame_stamps
 from rs_localizer.tools.simulation.simulated_recording import write_truth
@@ -35,6 +36,25 @@ _RATE_ERROR = 5e-5
 _CLOCK_STREAM = 28
 
 Frame = SimulatedFrame | RenderedFrame
+
+RIG_FRAME = "rig"
+
+
+def optical_frame(name: str) -> str:
+    """The frame of a camera of a rig."""
+    return f"{name}_optical_frame"
+
+
+def make_mounts(parts: RigParts) -> Any:
+    """A tf2_msgs/TFMessage that says where the cameras are on the rig."""
+    transforms = [
+        make_transform(
+            make_message, 0, RIG_FRAME, optical_frame(name),
+            Transform(*parts.camera_from_rig[name]).inverse(),
+        )
+        for name in parts.cameras
+    ]  # fmt: skip
+    return make_message("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -69,9 +69,9 @@ class Options(TargetOptions, ImageOptions):
     )  # fmt: skip
     rig: bool = option(
         "the recordings are those of cameras on one body, one each, or one bag has topics of "
-        "several, or one video several lenses (.insv): find where the cameras are, and their "
-        "clocks, too; the first one's axes and clock are the rig's. Cameras are named as their "
-        "files, or as their topics begin; so are the lenses of --camera", default=False,
+        "several: find where the cameras are, and their clocks, too; the first one's axes and "
+        "clock are the rig's. Cameras are named as their files, or as their topics begin; so are "
+        "the lenses of --camera", default=False,
     )  # fmt: skip
     intrinsics: bool = option("find the lens as well", default=False)
     imu: bool = option(
@@ -403,7 +403,7 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
         transforms = partial(rigs.write_static_transforms, parts=parts, frames=frames)
         writers = Writers({_beside(args, _TRANSFORMS): transforms})
         _write_files(args, values, rigs.mounted_lenses(parts), parts.cameras, writers, comments)
-        print(f"next: {_next_of_rig(args)}")
+        print(f"next: {shlex.join(['ros2', 'launch', str(_beside(args, _TRANSFORMS))])}")
     if refusals:
         raise ValueError(
             "not observable: " + "; ".join(f"{name}: {text}" for name, text in refusals.items())
@@ -446,10 +446,3 @@ def _parts(
     base = config.of_cameras.get(next(iter(rig)), config).stamp_offset
     offsets = {name: base + own.offset for name, own in mounts.items()}
     return RigParts(cameras, poses, offsets)
-
-
-def _next_of_rig(args: Options) -> str:
-    """The command that goes on: poses of a video of several lenses, or TF for a live rig."""
-    if len(args.recordings) > 1 or is_bag(args.recording) or args.map is None:
-        return shlex.join(["ros2", "launch", str(_beside(args, _TRANSFORMS))])
-    return _next(args, True, args.map)

@@ -26,8 +26,7 @@ from rs_localizer.cli.marker_map import TargetOptions, find_map
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.cli.rig_input import cameras_of
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
-from rs_localizer.io.bags import BagWriter, is_bag
-from rs_localizer.io.image_clock import DEFAULT_START_NS
+from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.settings import build, settings, write_parameters
 
@@ -36,8 +35,6 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer.io.atomic_files import atomic_directory
-    from rs_localizer.io.rigs import make_mounts, read_camchain
-    from rs_localizer.io.topics import TF_STATIC
     from rs_localizer.offline import detect as offline
     from rs_localizer.offline.detect import Extraction, record, record_features
     from rs_localizer.offline.fleet import Figures
@@ -93,9 +90,6 @@ def detect(args: Options) -> Figures:
             if settings.of_cameras:
                 rig = cameras_of(args, [args.recording], settings)
                 cameras = {name: own.args for name, own in rig.items()}
-                if args.calibration is not None and not is_bag(args.recording):
-                    mounts = make_mounts(read_camchain(args.calibration))
-                    bag.write(TF_STATIC, mounts, DEFAULT_START_NS)
             for name, own in cameras.items():
                 of = settings.of_cameras.get(name, settings)
                 with (

@@ -25,11 +25,10 @@ if WORKING:
     from rs_localizer.core.camera import Camera
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
     from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_telemetry
-    from rs_localizer.io.video import count_lenses, has_times
+    from rs_localizer.io.video import has_times
     from rs_localizer.offline.image_sources import (
         IMAGE_TYPES,
         INFO_TYPE,
-        LENSES,
         Carried,
         Shot,
         find_topic,
@@ -114,11 +113,6 @@ def tell_telemetry(args: ImageOptions, used: float | None = None) -> None:
     """
     path = args.recording
     settings = None if used is not None else build(shutter_values(args))
-    is_rig = settings is not None and bool(settings.of_cameras)
-    if path.suffix == ".insv" and importlib.util.find_spec("av") is not None:
-        names = LENSES[: count_lenses(path)]
-        if len(names) > 1 and used is None and not is_rig:
-            print(f"note: of {', '.join(names)} the first one is used; calibrate --rig takes all")
     if not _has_telemetry(path):
         return
     if not _can_read():
@@ -134,7 +128,7 @@ def tell_telemetry(args: ImageOptions, used: float | None = None) -> None:
             "and readout time are not used"
         )
         return
-    said = [f"gyroscope at {telemetry.rate:.0f} Hz" + (" (not used of a rig)" if is_rig else "")]
+    said = [f"gyroscope at {telemetry.rate:.0f} Hz"]
     if telemetry.readout_time is not None:
         said.append(f"readout time {1e3 * telemetry.readout_time:.2f} ms")
         how, ours = ("measured", used) if settings is None else ("given", settings.readout_time)
@@ -195,15 +189,13 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
         return
     if args.remaps:
         raise UsageError("-r names topics of a bag")
-    lens = args.lens
-    telemetry = telemetry_of(path) if lens is None and calibrated else None
+    telemetry = telemetry_of(path) if calibrated else None
     if camera is None and calibrated:
-        file = "FILE of calibrate --rig" if lens is not None else ""
-        raise UsageError(f"a video or folder has no camera_info: give --camera {file}".rstrip())
+        raise UsageError("a video or folder has no camera_info: give --camera")
     if path.is_dir():
         source = _of_folder(path, camera, args.rate)
     else:
-        source = _of_video(path, camera, args.rate, lens)
+        source = _of_video(path, camera, args.rate)
     if telemetry is not None and source.clock is not None:
         source = replace(source, shots=with_telemetry(source.shots, telemetry, source.clock))
     yield source
@@ -226,13 +218,10 @@ def _of_folder(path: Path, camera: Camera | None, rate: float | None) -> Source:
     return Source(from_files(files, camera, clock), len(files), clock)
 
 
-def _of_video(path: Path, camera: Camera | None, rate: float | None, lens: int | None) -> Source:
-    """The images of one of its lenses, if it has several; their zero is that of the first one."""
-    if lens is not None and rate is not None:
-        raise UsageError("--rate is for one camera: leave it out with cameras")
+def _of_video(path: Path, camera: Camera | None, rate: float | None) -> Source:
     if rate is None and not has_times(path):
         raise UsageError(
             "this video has no presentation times: give --rate; the readout time scales with it"
         )
     clock = ImageClock(rate)
-    return Source(from_video(path, camera, clock, lens), None, clock)
+    return Source(from_video(path, camera, clock), None, clock)

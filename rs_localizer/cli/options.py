@@ -96,9 +96,8 @@ class TopicOptions:
         list,
         flag="-r",
     )
-    # No options: what is read, of one of several cameras, and which lens of a video it is.
+    # No option: what is read, of one of several cameras.
     recording: Path = Path()
-    lens: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

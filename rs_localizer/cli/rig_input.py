@@ -23,8 +23,6 @@ if WORKING:
     from rs_localizer.io.bags import is_bag, open_bag
     from rs_localizer.io.rigs import read_camchain
     from rs_localizer.io.transforms import Transform
-    from rs_localizer.io.video import count_lenses
-    from rs_localizer.offline.image_sources import LENSES
     from rs_localizer.offline.recordings import camera_topics, optical_frame, transform_between
     from rs_localizer.tools.adjust.variables import Extrinsics, MountPrior
     from rs_localizer.tools.rig_mounts import DETERMINED
@@ -57,7 +55,7 @@ def cameras_of(args: T, recordings: Sequence[Path], config: NodeConfig) -> dict[
         frames = [f"{name}_optical_frame" for name in names]
     else:
         (path,) = recordings
-        names, topics, frames = _in_one_file(path, config.cameras if config.of_cameras else None)
+        names, topics, frames = _in_one_bag(path, config.cameras if config.of_cameras else None)
     if len(set(names)) < max(len(names), 2) or not all(name[:1].isalpha() for name in names):
         raise UsageError(
             f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
@@ -74,30 +72,21 @@ def cameras_of(args: T, recordings: Sequence[Path], config: NodeConfig) -> dict[
     return cameras
 
 
-def _in_one_file(
+def _in_one_bag(
     path: Path, given: Sequence[str] | None
 ) -> tuple[list[str], list[dict[str, Any]], list[str]]:
-    """Names of the cameras of a bag or of the lenses of a video, where each is, and its frame."""
-    if is_bag(path):
-        with open_bag(path) as bag:
-            by_name = camera_topics(bag, given)
-            frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
-        topics = [
-            {"recording": path, "remaps": [f"{name}:={topic}" for name, topic in own.items()]}
-            for own in by_name.values()
-        ]
-        return list(by_name), topics, frames
-    lenses = () if path.is_dir() or not path.exists() else LENSES[: count_lenses(path)]
-    if len(lenses) < 2:
-        raise UsageError(
-            f"--rig needs the recordings of several cameras, one bag or a video of several lenses; "
-            f"{path}"
-        )
-    names = list(given or lenses)
-    if missing := [name for name in names if name not in lenses]:
-        raise UsageError(f"cameras: {path} is of {', '.join(lenses)}, not of {', '.join(missing)}")
-    places = [{"recording": path, "lens": lenses.index(name)} for name in names]
-    return names, places, [""] * len(names)
+    """Names of the cameras of a bag, the topics of each, and its frame."""
+    check_there([path])
+    if not is_bag(path):
+        raise UsageError(f"--rig needs the recordings of several cameras, or one bag; got {path}")
+    with open_bag(path) as bag:
+        by_name = camera_topics(bag, given)
+        frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
+    topics = [
+        {"recording": path, "remaps": [f"{name}:={topic}" for name, topic in own.items()]}
+        for own in by_name.values()
+    ]
+    return list(by_name), topics, frames
 
 
 def mounting_lines(name: str, first: str, mounted: Extrinsics, deviations: Array) -> list[str]:

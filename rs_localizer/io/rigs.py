@@ -29,7 +29,6 @@ import yaml
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_files import (
     calibration_faults,
     kalibr_camera,
@@ -37,10 +36,9 @@ from rs_localizer.io.camera_files import (
     lens_camera,
     lens_parameters,
 )
-from rs_localizer.io.transforms import Transform, make_transform
+from rs_localizer.io.transforms import Transform
 from rs_localizer.io.yaml_text import LENS, flat, load_yaml, parameter_blocks
 
-RIG_FRAME = "rig"
 _CHAIN, _IMU, _SHIFT = "T_cn_cnm1", "T_cam_imu", "timeshift_cam_imu"
 _MOUNT = "camera_from_rig"
 _SHUTTER = ("readout_time", "scan_direction")
@@ -166,11 +164,6 @@ def _rigid(name: str, values: Any) -> Array:
     return matrix
 
 
-def optical_frame(name: str) -> str:
-    """The frame of a camera of a rig that nobody has named."""
-    return f"{name}_optical_frame"
-
-
 def node_parameters(parts: RigParts) -> dict[str, Any]:
     """The node's parameters for a rig, but for where its cameras are, which TF says."""
     own: dict[str, Any] = {}
@@ -180,18 +173,6 @@ def node_parameters(parts: RigParts) -> dict[str, Any]:
         if (offset := parts.time_offset.get(name, 0.0)) != 0.0:
             own[f"{name}.stamp_offset"] = offset
     return {"cameras": list(parts.cameras), **own}
-
-
-def make_mounts(parts: RigParts) -> Any:
-    """A tf2_msgs/TFMessage that says where the cameras are on the rig."""
-    transforms = [
-        make_transform(
-            make_message, 0, RIG_FRAME, optical_frame(name),
-            Transform(*parts.camera_from_rig[name]).inverse(),
-        )
-        for name in parts.cameras
-    ]  # fmt: skip
-    return make_message("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 
 def write_static_transforms(path: Path, parts: RigParts, frames: Mapping[str, str]) -> None:

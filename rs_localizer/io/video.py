@@ -42,15 +42,13 @@ class Video:
 
     Args:
         path: of the video.
-        lens: of :func:`count_lenses`, from 0 on; None: the first stream of images.
 
     Raises:
         VideoError: when the file is missing, or, as it is read, holds no image.
-        ImportError: with a lens, without PyAV.
     """
 
-    def __init__(self, path: Path | str, lens: int | None = None) -> None:
-        self.path, self._lens = Path(path), lens
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
         self.claimed, self.read = 0, 0  # images by the container (0: it does not say), and read
         self.lasts, self.until = 0.0, 0.0  # s, by the container (0: ...), and of the last image
         self.damaged = 0  # packets that could not be decoded
@@ -60,10 +58,7 @@ class Video:
     def __iter__(self) -> Iterator[VideoImage]:
         with self.path.open("rb") as file:
             timed = file.read(len(_JPEG_START)) != _JPEG_START
-        if self._lens is not None or find_spec("av") is not None:
-            images = self._by_pyav()
-        else:
-            images = self._by_opencv()
+        images = self._by_opencv() if find_spec("av") is None else self._by_pyav()
         for image in images:
             self.read += 1
             self.until = max(self.until, image.seconds or 0.0)
@@ -94,11 +89,7 @@ class Video:
 
     def _by_pyav(self) -> Iterator[VideoImage]:
         with _container(self.path) as container:
-            lenses = _lenses(container)
-            lens = self._lens or 0
-            if lens >= len(lenses):
-                raise VideoError(f"{self.path} is of {len(lenses)} lenses, no number {lens + 1}")
-            stream = lenses[lens]
+            stream = _stream(container)
             stream.thread_type = "AUTO"
             timed = not container.format.flags & _NO_TIMES
             # Matroska has no count, but says how long it lasts, of all streams.
@@ -154,17 +145,6 @@ _NO_TIMES = 0x0080
 _UNCOUNTED, _NEAR, _UNTIMED = 1, 3.0, 2.0
 
 
-def count_lenses(path: Path) -> int:
-    """Number of cameras that filmed into one file: its streams of one size, as in .insv.
-
-    Raises:
-        VideoError: when it cannot be read.
-        ImportError: without PyAV.
-    """
-    with _container(path) as container:
-        return len(_lenses(container))
-
-
 @contextlib.contextmanager
 def _container(path: Path) -> Iterator[Any]:
     import av
@@ -178,16 +158,12 @@ def _container(path: Path) -> Iterator[Any]:
         raise VideoError(f"{path} cannot be read: {error}") from error
 
 
-def _lenses(container: Any) -> list[Any]:
-    """The streams of images that have a decoder, and the size of the first one."""
-    streams = [
-        s for s in container.streams.video
-        if s.codec_context is not None and 0 < s.width * s.height <= _MOST_PIXELS
-    ]  # fmt: skip
-    if not streams:
-        raise VideoError(f"{container.name} has no stream of images that can be decoded")
-    size = streams[0].width, streams[0].height
-    return [stream for stream in streams if (stream.width, stream.height) == size]
+def _stream(container: Any) -> Any:
+    """The first stream of images that has a decoder."""
+    for stream in container.streams.video:
+        if stream.codec_context is not None and 0 < stream.width * stream.height <= _MOST_PIXELS:
+            return stream
+    raise VideoError(f"{container.name} has no stream of images that can be decoded")
 
 
 def has_times(path: Path | str) -> bool:

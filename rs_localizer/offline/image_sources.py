@@ -18,7 +18,6 @@ from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.imu import make_reading
 from rs_localizer.io.messages import make_header, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
-from rs_localizer.io.rigs import optical_frame
 from rs_localizer.io.telemetry import Telemetry
 from rs_localizer.io.topics import IMU
 from rs_localizer.io.video import Video
@@ -30,9 +29,6 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 SUFFIXES = (".jpg", ".jpeg", ".png")
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".mjpeg", ".mjpg", ".m4v", ".h264", ".ts",
            ".insv")  # fmt: skip
-
-LENSES = tuple(f"lens{k}" for k in range(1, 10))
-"""Names of the cameras that filmed into one file, in the order of their streams."""
 
 # Names of image files that are a time since 1970, of 2001 to 2038: by the number of their digits
 # in s (with a fraction, as TUM's), ms, us, or, as EuRoC's, in ns, which may also be of 1973 on.
@@ -66,16 +62,13 @@ class Carried:
     message: Any
 
 
-def from_video(
-    path: Path, camera: Camera | None, clock: ImageClock, lens: int | None = None
-) -> Iterator[Shot]:
-    """The images of a video, or of one of its lenses.
+def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator[Shot]:
+    """The images of a video.
 
     Raises:
         ValueError: when it cannot be read, or has no times and the clock no rate.
     """
-    frame = CAMERA_FRAME if lens is None else optical_frame(LENSES[lens])
-    video = Video(path, lens)
+    video, frame = Video(path), CAMERA_FRAME
     for jpeg, gray, seconds in video:
         now = clock.relative(None if seconds is None else round(1e9 * seconds))
         if now is None:

@@ -4,10 +4,8 @@
 that is the test's own (rays through a distorted lens, three by three in a pixel, row by row).
 """
 
-import argparse
 import re
 import shlex
-from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -17,14 +15,11 @@ from recorded import add_telemetry, write_mp4
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.commands import main
-from rs_localizer.cli.marker_map import find_map
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import read_calibration, write_calibration
-from rs_localizer.io.rigs import RigParts, read_camchain, write_camchain
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.io.video import count_lenses
-from rs_localizer.markers.map_files import read_marker_map, write_marker_map
-from rs_localizer.settings import build, load_params_file
+from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.settings import load_params_file
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 320, 240, 290.0, (161.5, 117.0)
 K1, K2 = -0.12, 0.05
@@ -34,10 +29,6 @@ LENS = Camera(
 )
 COLUMNS, ROWS, SQUARE = 9, 6, 0.03  # inner corners, m
 BOARD = ("--board", f"{COLUMNS}x{ROWS}", "--square", str(SQUARE))
-AXES, ORIGIN = np.eye(3), np.zeros(3)
-# A second lens: upside down, 1 cm to the right, 7 ms later.
-TURN = Rotation.from_euler("zyx", [180.0, 2.0, -1.0], degrees=True).as_matrix()
-PLACE, LATER = np.array([0.01, 0.002, -0.004]), 0.007
 WITHIN = (np.arange(3) + 0.5) / 3.0 - 0.5  # of a pixel
 
 
@@ -70,14 +61,9 @@ def pose(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (around * Rotation.from_rotvec(pace * shake)).as_matrix(), centre
 
 
-def expose(
-    stamp: float, through: np.ndarray, turn: np.ndarray = AXES, place: np.ndarray = ORIGIN
-) -> np.ndarray:
-    """The image (HEIGHT, WIDTH) whose first row is exposed at ``stamp``, of a camera that is
-    mounted to that of :func:`pose`: its axes are the columns of ``turn``, its centre is ``place``.
-    """
+def expose(stamp: float, through: np.ndarray) -> np.ndarray:
+    """The image (HEIGHT, WIDTH) whose first row is exposed at ``stamp``."""
     rotations, centres = pose(stamp + READOUT * np.arange(HEIGHT) / (HEIGHT - 1))
-    rotations, centres = rotations @ turn, centres + rotations @ place
     image = np.empty((HEIGHT, WIDTH), np.uint8)
     for row in range(HEIGHT):
         turned = through[row].reshape(-1, 3) @ rotations[row].T.astype(np.float32)
@@ -166,62 +152,3 @@ def test_a_video_with_a_gyroscope(film, tmp_path, capsys):
     assert "TF, or the axes of a video, agrees with the rotation to 0." in said
     assert main([*words, "--rate", "30"]) == 2
     assert "this one has none that is known" in capsys.readouterr().err
-
-
-@pytest.fixture(scope="module")
-def two_lenses(film, tmp_path_factory) -> Path:
-    """The film, and what a second lens saw of it, as two streams of one file."""
-    av = pytest.importorskip("av", reason="needs PyAV (rs_localizer[video])")
-    path, through = tmp_path_factory.mktemp("lenses") / "VID_1.insv", rays()
-    with av.open(str(path), "w", format="mp4") as container:
-        streams = [container.add_stream("mpeg4", rate=1000) for _ in range(2)]
-        for stream in streams:
-            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-            stream.bit_rate, stream.time_base = 40_000_000, Fraction(1, 1000)
-        for k, file in enumerate(sorted(film.iterdir())):
-            at = round(1000 * k / RATE)
-            other = expose(k / RATE + LATER, through, TURN, PLACE)
-            images = [(cv2.imread(str(file), 0), at), (other, at + round(1000 * LATER))]
-            for stream, (image, time) in zip(streams, images, strict=True):
-                frame = av.VideoFrame.from_ndarray(image, format="gray").reformat(format="yuv420p")
-                frame.pts, frame.time_base = time, Fraction(1, 1000)
-                container.mux(stream.encode(frame))
-        for stream in streams:
-            container.mux(stream.encode())
-    return path
-
-
-def test_two_lenses_in_one_file_are_a_rig(two_lenses, tmp_path, capsys):
-    assert count_lenses(two_lenses) == 2
-    board = argparse.Namespace(map=None, board=f"{COLUMNS}x{ROWS}", square=SQUARE, pattern=None)
-    write_marker_map(tmp_path / "board.yaml", find_map(board))
-    out = tmp_path / "rig.yaml"
-    names = ("lens1", "lens2")
-    chain = RigParts(dict.fromkeys(names, LENS), dict.fromkeys(names, (AXES, ORIGIN)), {})
-    write_camchain(tmp_path / "lenses.yaml", chain)
-    words = ["--map", str(tmp_path / "board.yaml"), "--calibration", str(tmp_path / "lenses.yaml")]
-    words += ["--out", str(out)]
-    assert main(["calibrate", "--rig", str(two_lenses), *words]) == 0
-    (line,) = [row for row in capsys.readouterr().out.splitlines() if row.startswith("next: ")]
-    config, parts = build(load_params_file(out)), read_camchain(out)
-    assert config.cameras == ("lens1", "lens2")
-    for own in config.of_cameras.values():
-        assert own.readout_time == pytest.approx(READOUT, abs=1e-3)
-        assert own.scan_direction == "top_to_bottom"
-    # The streams have one clock, and the second one begins later by it.
-    assert parts.time_offset["lens2"] == pytest.approx(0.0, abs=1e-3)
-    rotation, translation = parts.camera_from_rig["lens2"]
-    assert Rotation.from_matrix(rotation @ TURN).magnitude() < np.radians(1.0)
-    assert -rotation.T @ translation == pytest.approx(PLACE, abs=3e-3)
-
-    command, *words = shlex.split(line.removeprefix("next: "))
-    assert command == "rs_localizer"
-    assert main(words) == 0
-    poses = read_tum(tmp_path / "rig_poses" / "poses.txt")
-    assert len(poses.positions) > 0.9 * SECONDS * RATE
-    # The rig is the first lens; the video's images begin at 1 s.
-    times = 1e-9 * np.array(poses.stamps_ns) - 1.0
-    corner = np.array([(COLUMNS - 1) / 2, (ROWS - 1) / 2, 0.0]) * SQUARE
-    truth = pose(times)[1] + corner
-    errors = np.linalg.norm(poses.positions - truth, axis=1)
-    assert np.median(errors) < 1e-3

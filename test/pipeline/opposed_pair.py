@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks.simulation.rig import (
     RigFrame,
     camera_stamps,
+    make_mounts,
     rig_parameters,
     simulate_rig,
     write_rig_frame,
@@ -19,7 +20,7 @@ from benchmarks.simulation.rig import (
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
-from rs_localizer.io.rigs import RigParts, make_mounts
+from rs_localizer.io.rigs import RigParts
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import write_parameters
 from rs_localizer.tools.simulation.scene import room

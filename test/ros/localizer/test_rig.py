@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from benchmarks.simulation.rig import RIG_FRAME, optical_frame
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.outputs import TYPES
-from rs_localizer.io.rigs import RIG_FRAME, optical_frame
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.ros.node.conversion import copy_message, message_class
 
