@@ -55,11 +55,6 @@ distortion_coefficients: !!opencv-matrix
    dt: d
    data: [ 0.1, 0., 0., 0. ]
 """
-_XML = b"""<?xml version="1.0"?>
-<opencv_storage><image_width>640</image_width><image_height>480</image_height>
-<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
-<data>500. 0. 319.5 0. 500. 239.5 0. 0. 1.</data></camera_matrix></opencv_storage>
-"""
 _KALIBR = b"""cam0:
   camera_model: pinhole
   intrinsics: [500.0, 500.0, 319.5, 239.5]
@@ -79,7 +74,7 @@ _PHOTONVISION = b"""{"resolution": {"width": 640.0, "height": 480.0}, "cameraInt
 _GYROFLOW = b"""{"calib_dimension": {"w": 640, "h": 480}, "fisheye_params": {"camera_matrix":
 [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], "distortion_coeffs": [0.1, 0, 0, 0]},
 "distortion_model": "opencv_fisheye", "frame_readout_time": 9.6}"""
-CALIBRATIONS = (_ROS, _OPENCV, _XML, _KALIBR, _COLMAP, _JSON, _PHOTONVISION, _GYROFLOW)
+CALIBRATIONS = (_ROS, _OPENCV, _KALIBR, _COLMAP, _JSON, _PHOTONVISION, _GYROFLOW)
 """Of every program whose files are read."""
 
 _COUNT = 5

@@ -14,7 +14,6 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -66,7 +65,7 @@ _PROGRAMS = (
 _WIDTH = ("image_width", "image_Width", "width", "w")
 _HEIGHT = ("image_height", "image_Height", "height", "h")
 CALIBRATION_KINDS = (
-    "calibration file of ROS' camera_calibration, OpenCV (YAML, XML), Kalibr (camchain), COLMAP "
+    "calibration file of ROS' camera_calibration, OpenCV (YAML, JSON), Kalibr (camchain), COLMAP "
     "(cameras.txt), PhotonVision, Gyroflow, or JSON with K, D, width and height"
 )
 # Who writes FILE#cam1 means a camera in a file; a name of a file may hold the sign, too.
@@ -89,7 +88,7 @@ def read_calibration(path: Path | str) -> Camera:
     path, chosen = Path(path), None
     if (match := _CHOICE.fullmatch(str(path))) is not None and not path.exists():
         path, chosen = Path(match[1]), match[2]
-    with calibration_faults(path, "YAML, JSON or XML", "not a usable calibration"):
+    with calibration_faults(path, "YAML or JSON", "not a usable calibration"):
         camera = _camera(path.read_text(encoding="utf-8-sig"), chosen)
         x, y = camera.K[:2, 2]
         if not (0.0 < x < camera.width and 0.0 < y < camera.height):
@@ -161,31 +160,8 @@ _TAG = re.compile(r"!!opencv[-_a-z]*")
 def _load_tree(text: str) -> Any:
     """Mappings, lists and plain values of a file's text; YamlError for any other."""
     if text.lstrip()[:1] == "<":
-        return _load_xml(text)
+        raise YamlError("it is XML, which OpenCV's FileStorage writes as .yaml or .json, too")
     return load_yaml(_TAG.sub("", _DIRECTIVE.sub("", text)))
-
-
-def _load_xml(text: str) -> Any:
-    # XML may define names that stand for ever longer text; OpenCV defines none.
-    if "<!ENTITY" in text:
-        raise YamlError("the XML defines entities")
-    try:
-        return {item.tag: _xml_value(item) for item in ElementTree.fromstring(text)}
-    except RecursionError:
-        raise YamlError("the XML nests too deep") from None
-    except (ElementTree.ParseError, ValueError) as error:
-        raise YamlError(f"the XML cannot be read: {error}") from error
-
-
-def _xml_value(item: ElementTree.Element) -> Any:
-    if len(item):
-        return {part.tag: _xml_value(part) for part in item}
-    words = (item.text or "").split()
-    try:
-        values: list[Any] = [float(word) for word in words]
-    except ValueError:
-        values = words
-    return values[0] if len(values) == 1 and item.tag != "data" else values
 
 
 def _at(tree: dict[str, Any], paths: tuple[str, ...]) -> Iterator[Any]:

@@ -16,7 +16,6 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rs_localizer.io.bags import BagError, BagWriter, make_message, open_bag
-from rs_localizer.io.camera_files import CalibrationError, read_calibration
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum
@@ -55,12 +54,6 @@ def test_damaged_packed_text(tmp_path):
     (tmp_path / "a.gz").write_bytes(data)
     with pytest.raises(TrajectoryError, match="cannot be read as text"):
         read_tum(tmp_path / "a.gz")
-
-
-def test_deep_xml(tmp_path):
-    (tmp_path / "a.xml").write_text("<a>" * 50_000 + "</a>" * 50_000)
-    with pytest.raises(CalibrationError, match="nests too deep"):
-        read_calibration(tmp_path / "a.xml")
 
 
 def test_a_view_in_the_place_of_descriptors(tmp_path):
