@@ -263,13 +263,6 @@ class PublishTf(StrEnum):
     MAP_TO_ODOM = "map_to_odom"
 
 
-class OrientationCovariance(StrEnum):
-    """Convention of the covariances of published orientations."""
-
-    FIXED_AXES = "fixed_axes"
-    ROLL_PITCH_YAW = "roll_pitch_yaw"
-
-
 class MatchBy(StrEnum):
     """Basis of the comparison of keypoints with landmarks."""
 
@@ -473,11 +466,6 @@ class NodeConfig(LocalizerConfig):
     )
     two_d_mode: bool = setting(
         False, "Of map_to_odom, z, roll and pitch are zero, for robots on a floor"
-    )
-    orientation_covariance: str = setting(
-        OrientationCovariance.FIXED_AXES,
-        "Convention of the orientation covariance; fixed_axes: rotations about the map's axes "
-        "(REP-103); roll_pitch_yaw: these angles, as robot_localization reads them",
     )
     transform_tolerance: float = setting(
         0.2,

@@ -79,7 +79,7 @@ ANY_CALIBRATION = Calibration(
 # made. All others start the track afresh.
 _BESIDE = frozenset({
     "readout_time_deviation", "estimate_readout_time", "pose_time", "max_points", "base_frame",
-    "odom_frame", "publish_tf", "tf_rate", "hold", "two_d_mode", "orientation_covariance",
+    "odom_frame", "publish_tf", "tf_rate", "hold", "two_d_mode",
     "transform_tolerance", "map_file", "map_frame", "marker_map", "matching", "autostart",
     "output_rate", "camera_file",
 })  # fmt: skip

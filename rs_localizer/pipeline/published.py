@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rs_localizer.config import NodeConfig, OrientationCovariance, PublishTf
+from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Reason
@@ -113,34 +113,6 @@ def _propagate(jacobian: Array, covariance: Array) -> Array:
     return 0.5 * (result + result.T)  # rounding must not cost the symmetry
 
 
-# A body that looks straight up or down has no yaw.
-_LEAST_COSINE = 0.02
-
-
-def about_angles(pose: BodyPose) -> BodyPose:
-    """The pose with the covariance of x, y, z, roll, pitch and yaw.
-
-    REP-103 means small rotations about the fixed axes of the map; an extended Kalman filter whose
-    state has roll, pitch and yaw (robot_localization) takes the numbers for errors of these angles.
-    With ``R = Rz(yaw) Ry(pitch) Rx(roll)`` a small rotation about the fixed axes is
-
-        theta = E (d_roll, d_pitch, d_yaw),   E = [Rz Ry x, Rz y, z]
-
-    Within a degree of looking straight up or down, where the angles do not say how a body is
-    turned, it is the pose as it came.
-    """
-    x_axis = pose.rotation[:, 0]  # Rz Ry x
-    level = float(np.hypot(x_axis[0], x_axis[1]))  # cosine of the pitch
-    if level < _LEAST_COSINE:
-        return pose
-    left = np.array([-x_axis[1], x_axis[0], 0.0]) / level  # Rz y
-    axes = np.column_stack([x_axis, left, [0.0, 0.0, 1.0]])
-    jacobian: Array = np.eye(6)
-    jacobian[_ANGULAR, _ANGULAR] = np.linalg.inv(axes)
-    covariance = jacobian @ pose.covariance @ jacobian.T
-    return replace(pose, covariance=0.5 * (covariance + covariance.T))
-
-
 @dataclass(frozen=True, slots=True)
 class ReadoutKnown:
     """Knowledge of the readout time; by default, as it is set."""
@@ -204,16 +176,7 @@ def of_camera(
 def of_body(
     localized: Localized, config: NodeConfig, transforms: Transforms
 ) -> Localized | Refusal:
-    """The same of ``base_frame``, from that of the camera, with the covariance that is wanted."""
-    body = _mounted(localized, config, transforms)
-    if body and config.orientation_covariance == OrientationCovariance.ROLL_PITCH_YAW:
-        return replace(body, pose=about_angles(body.pose))
-    return body
-
-
-def _mounted(
-    localized: Localized, config: NodeConfig, transforms: Transforms
-) -> Localized | Refusal:
+    """The same of ``base_frame``, from that of the camera."""
     base = config.base_frame
     if base in ("", localized.body_frame):
         return localized
