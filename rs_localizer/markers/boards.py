@@ -128,8 +128,7 @@ class BoardSizes:
         small, _ = _shrunk(image)
         if min(small.shape) < _SMALLEST_SEARCH:
             return
-        flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
-        complete, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
+        complete, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER)
         if complete and meta is not None:
             rows, columns = sorted(meta.shape)
             own = sorted((self._board.columns, self._board.rows))

@@ -6,9 +6,7 @@ The node and the offline command run this one class, so the same images give the
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,9 +14,9 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.markers.boards import charuco_fault, find_charuco, find_chessboard
 from rs_localizer.markers.dictionaries import DictionaryError, Gray, MarkerFinder
 from rs_localizer.markers.edges import refine
-from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family
+from rs_localizer.markers.families import Family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.prints import Board, Charuco, Chessboard
+from rs_localizer.markers.prints import Board, Charuco
 
 IntArray = NDArray[np.int64]
 
@@ -247,79 +245,3 @@ def _spacings(pixels: Array) -> Array:
     np.fill_diagonal(apart, np.inf)
     nearest = apart.min(axis=1)
     return np.where(np.isfinite(nearest), nearest, 0.0)
-
-
-# Quadrilaterals are the same whose middles are nearer than this, in sides.
-_SAME = 0.5
-# Noise looks like a board of 3x3.
-_LEAST_CORNERS = 12
-_MOST_IDS = 6
-
-
-def recognized(image: Gray) -> list[str]:
-    """The markers, by family, and the board that an image shows; most certain first.
-
-    Takes seconds in a large image: all families are tried. Of several that read the same
-    quadrilateral, that with the most bits counts, for it is the least likely to be chance.
-    """
-    taken: list[Array] = []
-    said = []
-    for finder in _all_finders():
-        ids, quads = finder.find(image)
-        large = _sides(quads) >= LEAST_SIDE
-        ids, quads = ids[large], quads[large]
-        exact = refine(image, quads.copy(), finder.family.cells).all(axis=1)
-        named: set[int] = set()
-        for id_, quad in zip(ids[exact].tolist(), quads[exact], strict=True):
-            if not any(_same(quad, other) for other in taken):
-                taken.append(quad)
-                named.add(id_)
-        if named:
-            listed = ", ".join(map(str, sorted(named)[:_MOST_IDS]))
-            more = ", ..." if len(named) > _MOST_IDS else ""
-            said.append(f"{_smallest(finder.family, max(named)).name} {listed}{more}")
-    size = chessboard_size(image)
-    if size is not None and find_chessboard(image, Chessboard(*size, 1.0)) is not None:
-        said.append(f"a chessboard of {size[0]}x{size[1]} inner corners")
-    return said
-
-
-def chessboard_size(image: Gray) -> tuple[int, int] | None:
-    """Inner corners, the larger number first, of a chessboard that an image shows."""
-    try:
-        complete, corners, meta = cv2.findChessboardCornersSBWithMeta(
-            image, (3, 3), cv2.CALIB_CB_LARGER
-        )
-    except cv2.error:
-        return None
-    if not complete or len(corners) < _LEAST_CORNERS:
-        return None
-    rows, columns = sorted(np.asarray(meta).shape[:2])
-    return columns, rows
-
-
-@lru_cache(maxsize=1)
-def _all_finders() -> tuple[MarkerFinder, ...]:
-    """One of each kind of family that this OpenCV knows: its largest; most bits first."""
-    largest: dict[str, Family] = {}
-    for family in FAMILIES.values():
-        if family.kind not in largest or family.count > largest[family.kind].count:
-            largest[family.kind] = family
-    finders = []
-    for family in sorted(largest.values(), key=lambda family: -family.bits):
-        try:
-            finders.append(MarkerFinder(family))
-        except DictionaryError:
-            continue
-    return tuple(finders)
-
-
-def _smallest(family: Family, last_id: int) -> Family:
-    """The smallest family of the same kind that has an id."""
-    alike = (f for f in FAMILIES.values() if f.kind == family.kind and f.count > last_id)
-    return min(alike, key=lambda f: f.count)
-
-
-def _same(quad: Array, other: Array) -> bool:
-    apart = np.linalg.norm(quad.mean(axis=0) - other.mean(axis=0))
-    return bool(apart < _SAME * _sides(other[None])[0])

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -27,7 +26,7 @@ from rs_localizer.io.recording import (
     KEYPOINTS_TOPIC,
 )
 from rs_localizer.localizer import Localizer
-from rs_localizer.markers.detection import recognized
+from rs_localizer.markers.boards import BoardSizes
 from rs_localizer.markers.map_check import MapCheck, Predict, still_residual
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
@@ -37,9 +36,7 @@ from rs_localizer.pipeline.refusal import Refusal
 
 # Fewer corners than this say nothing about how well a pose fits.
 _LEAST_CORNERS = 6
-# Of these, the last few are looked at for anything else: seconds each.
-_RECOGNIZED = 4
-# Fewer than this share of the images with anything of the map are a reason to look.
+# Fewer than this share of the images with anything of the map are a reason to tell.
 _FEW = 0.3
 # So many images without anything of the map are no chance: a few seconds of a video.
 _PATIENCE = 64
@@ -146,22 +143,18 @@ class _MarkerTally:
         self._others: Counter[str] = Counter()
         self._faults: Counter[str] = Counter()
         self._residuals: list[float] = []
-        self._empty: list[Image] = []  # some that show nothing
-        self._empties = 0
+        self._sizes = BoardSizes(marker_map)
         self._check = MapCheck(marker_map, _RollingFit())
 
     def add(self, camera: Camera, detected: Detected) -> None:
         detections = detected.detections
         self._others.update(detections.unknown)
         self._faults.update(detections.faults)
+        self._sizes.look(detected.image.pixels, len(detections.ids) > 0)
         if len(detections.ids):
             self._found.counts.append(len(detections.ids))
             self._residuals.append(static_residual(camera, detected))
             self._check.add(camera, detections)
-            return
-        self._empties += 1
-        if self._empties.bit_count() == 1:  # the 1st, 2nd, 4th, 8th ...
-            self._empty = [*self._empty[1 - _RECOGNIZED :], detected.image]
 
     @property
     def are_few(self) -> bool:
@@ -180,21 +173,8 @@ class _MarkerTally:
         if self._others:
             names = ", ".join(name for name, _ in self._others.most_common(5))
             return f"{text}; they show {names}, which the map does not have"
-        boards = self.instead()
-        if boards:
-            return f"{text}; {'others' if self._found.counts else 'they'} show {'; '.join(boards)}"
-        if self._empty:
-            text += "; nor any other marker or chessboard that OpenCV knows"
-        return text
-
-    def instead(self) -> list[str]:
-        """Other targets in images that show nothing of the map."""
-        shown = [recognized(image.pixels) for image in self._empty]
-        # Images of one pattern show other ones of its markers.
-        names = Counter(_kind(name) for of_image in shown for name in of_image)
-        first = {_kind(name): name for of_image in reversed(shown) for name in of_image}
-        # What one of several shows may be chance.
-        return [first[kind] for kind, n in names.most_common(4) if 2 * n >= len(self._empty)]
+        fault = self._sizes.fault()
+        return f"{text}; {fault}" if fault else text
 
     def recorded(self) -> Extraction:
         known = [value for value in self._residuals if np.isfinite(value)]
@@ -204,17 +184,12 @@ class _MarkerTally:
                 f"even the stillest images leave {least:.1f} px rms: the calibration can hardly be "
                 "of this camera in this mode, or the map (sizes, positions) is wrong"
             )
-        if self.are_few and (names := self.instead()):
-            faults.append(f"images that show nothing of the map show {'; '.join(names)}")
+        if fault := self._sizes.fault():
+            faults.append(fault)
         self._found.faults = tuple(faults)
         if known:
             self._found.residual = float(np.median(known))
         return self._found
-
-
-def _kind(name: str) -> str:
-    """Name of what was recognized, without the numbers of its markers."""
-    return re.sub(r" \d[\d, .]*$", "", name)
 
 
 class _RollingFit:

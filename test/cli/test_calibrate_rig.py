@@ -99,7 +99,7 @@ def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["video.mp4"], "--rig needs the recordings of several cameras, one bag or a video"),
+        (["video.mp4"], "--rig needs the recordings of several cameras, or one bag"),
         (["a/cam.mp4", "b/cam.mp4"], "cameras need different names"),
         (["1.mp4", "b.mp4"], "names that begin with a letter: 1, b"),
         (["a.mp4", "b.mp4", "--imu"], "--imu is for one camera"),

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.markers.detection import MarkerDetector, recognized
+from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.edges import refine
 from rs_localizer.markers.families import FAMILIES, Family, family
@@ -265,8 +265,6 @@ def test_an_aprilgrid_of_kalibr(tmp_path):
     found = MarkerDetector(target).detect(image)
     assert len(found.ids) >= 22
     np.testing.assert_allclose(found.pixels, project(found.points, seen), atol=0.5)
-    (said,) = recognized(image)  # and no chessboard
-    assert said.startswith("apriltag_36h11_border2 ")
 
 
 def square(left: float, top: float, side: float, blur: float = 0.0) -> np.ndarray:
