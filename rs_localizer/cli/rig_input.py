@@ -76,7 +76,6 @@ def _in_one_bag(
     path: Path, given: Sequence[str] | None
 ) -> tuple[list[str], list[dict[str, Any]], list[str]]:
     """Names of the cameras of a bag, the topics of each, and its frame."""
-    check_there([path])
     if not is_bag(path):
         raise UsageError(f"--rig needs the recordings of several cameras, or one bag; got {path}")
     with open_bag(path) as bag:
