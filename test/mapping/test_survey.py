@@ -101,23 +101,31 @@ def test_markers_that_disagree_about_metres_are_named_with_the_sizes_that_fit(sp
         assert float(given) == pytest.approx(sizes[int(id_)], rel=1e-3)
 
 
-def test_sizes_stay_as_given_when_a_marker_is_left_out(spotted, monkeypatch):
-    """A first guess that takes marker 1 for larger, as one that does not fit may make it."""
-    rng, turned = np.random.default_rng(2), []
+@pytest.mark.parametrize("seed", [2, 7])
+def test_sizes_stay_as_given_when_a_marker_is_left_out(spotted, seed):
+    """Nor is another size found for it, with which some more of its corners would fit."""
+    rng, turned = np.random.default_rng(seed), []
     for one in spotted:  # an id that is used twice, the other one a quarter turn away
         quads = one.quads.copy()
         if rng.random() < 0.5:
             quads[one.markers == 4] = np.roll(quads[one.markers == 4], 1, axis=1)
         turned.append(replace(one, quads=quads))
-    guesses = iter([{1: 0.2}, {}])
-    monkeypatch.setattr(
-        "rs_localizer.tools.mapping.unknown_markers._growth", lambda _: next(guesses)
-    )
     found = survey([Filmed(camera(), spotted=turned)], MARKERS)
     assert [marker.id for marker in found.misfits] == [4]
     assert [marker.id for marker in found.markers] == [0, 1, 2, 3]
     assert all(marker.size == pytest.approx(SIZE) for marker in found.markers)
-    assert next(guesses, None) is None
+
+
+def test_a_readout_time_of_which_the_seconds_disagree_is_known_less(spotted, poses, monkeypatch):
+    monkeypatch.setattr("scenes.READOUT", 1.02 * READOUT)
+    slower = spot(np.random.default_rng(1), poses, SIZE, STAMPS)
+    alike, mixed = (
+        survey([Filmed(camera(0.0), spotted=images)], MARKERS).cameras[0]
+        for images in (spotted, spotted[:45] + slower[45:])
+    )
+    assert alike.readout_time == pytest.approx(READOUT, abs=4.0 * alike.readout_time_deviation)
+    assert mixed.readout_time_deviation > 3.0 * alike.readout_time_deviation
+    assert READOUT < mixed.readout_time < 1.02 * READOUT
 
 
 def turned_over(chained: Chained, marker: int) -> Chained:

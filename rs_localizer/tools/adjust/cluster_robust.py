@@ -27,6 +27,8 @@ SECONDS = 1.0
 # As if so many numbers had been found known as well as independent errors let them: what few
 # seconds say is chance.
 _DOUBT = 4.0
+# A second that tells less than this part of a number says nothing of it.
+_LEAST_TOLD = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,35 @@ def _pull(problem: Problem, fitted: Fit) -> Pull:
             share = own.T @ own if own.shape[0] > own.shape[1] else own @ own.T
             expected += float(np.trace(share) - np.sum(share**2))
     return Pull(total, expected)
+
+
+def by_seconds(problem: Problem, fitted: Fit, number: int) -> tuple[Array, Array]:
+    """How far each second by itself would move one number of the border, all else following.
+
+    Of one number few seconds say more than one factor of all: a motion that the spline does not
+    follow pulls at the readout time, and hardly at places.
+
+    Args:
+        problem: whose minimum it is.
+
+    Returns:
+        and the deviations of these steps (s,), both in those of the number for noise of 1.
+    """
+    at = problem.groups.motion + number
+    unit = np.zeros((problem.groups.kept, 1))
+    unit[at] = 1.0
+    following = fitted.factored.kept(unit)
+    following /= np.sqrt(following[at])
+    every = problem.keypoint_rows(fitted.state, fitted.deviation)
+    own = np.concatenate([rows.times(slice(None), following).reshape(-1, 2) for rows in every])
+    errors = np.concatenate([rows.errors for rows in every])
+    times = np.concatenate([view.observations.times for view in problem.views])
+    second = np.unique(np.floor(times / SECONDS), return_inverse=True)[1]
+    pulls, shares = (np.bincount(second, np.sum(own * of, axis=1)) for of in (errors, own))
+    told = shares > _LEAST_TOLD
+    of_errors = steepness(fitted.squared_errors[fitted.inliers], fitted.deviation)
+    steps = -of_errors * pulls[told] / shares[told]
+    return steps, np.sqrt(fitted.inflation / shares[told])
 
 
 def _seconds(times: Array) -> list[tuple[int, int]]:

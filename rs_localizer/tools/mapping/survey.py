@@ -21,16 +21,16 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.tools.adjust.bodies import BODY, PLACE, SIZED
-from rs_localizer.tools.adjust.cluster_robust import cluster_robust
+from rs_localizer.tools.adjust.cluster_robust import by_seconds, cluster_robust
 from rs_localizer.tools.adjust.fit import Fit, solve
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.adjust.spline import Spline
-from rs_localizer.tools.adjust.system import System, Undetermined
+from rs_localizer.tools.adjust.system import Factored, System, Undetermined
 from rs_localizer.tools.adjust.variables import (
     EXTRINSICS,
     CameraView,
@@ -53,7 +53,7 @@ from rs_localizer.tools.mapping.unknown_markers import (
     Spotted,
     chain,
 )
-from rs_localizer.tools.readout_belief import ReadoutCheck
+from rs_localizer.tools.readout_belief import ReadoutCheck, disagreement
 
 # Steps of Gauss and Newton, and the noise of each by what it is.
 _NOISES = (10.0,) * 6 + (1.0,) * 4
@@ -188,12 +188,14 @@ def _at_the_origin(state: Unknowns, landmarks: Array) -> Unknowns:
     return replace(state, spline=back.moved(state.spline)).with_landmarks(moved)
 
 
-# Relative deviation of sizes until they are found to agree: as good as nothing is known of them.
+# Relative deviation of a size of which nothing is known.
 _ANY_SIZE = 0.5
-# Sizes are wrong beyond this and so many of their own deviations (printers stretch by up to three
-# parts in a thousand, rulers are read to half a millimetre); beyond the last one, a first guess
-# needs another size.
-_SIZES_DIFFER, _SIGMAS, _WRONG_SIZE = 0.015, 6.0, 0.1
+# A size is wrong beyond this and so many of its own deviations (printers stretch by up to three
+# parts in a thousand, rulers are read to half a millimetre).
+_SIZES_DIFFER, _SIGMAS = 0.015, 6.0
+# The least noise (px) from far off on, where a wrong size makes no outliers, to the last one; and
+# rounds at each, until sizes change by less than a part.
+_FROM_FAR, _MOST_ROUNDS, _SAME_SIZE = (5.0, 1.0, 0.2), 5, 0.005
 _LEAST_IMAGES = 5
 # Images that show a marker: fewer say hardly anything of it.
 _LEAST_SIGHTS = 3
@@ -301,18 +303,14 @@ def _check(images: list[Spotted], markers: Sequence[Marker], origin: int | None)
 
 def _adjusted(
     filmed: Sequence[Filmed], times: Sequence[Array], frames: Sequence[RigImages],
-    said: Sequence[Marker], chained: Chained,
+    markers: Sequence[Marker], chained: Chained,
 ) -> Survey | list[int]:  # fmt: skip
-    """The survey, or the markers that do not fit the others.
-
-    Args:
-        said: the markers with the sizes that they are said to have.
-    """
-    markers = chained.sized
+    """The survey, or the markers that do not fit the others."""
     posed = [frames[k] for k in chained.frames]
     shown = [sorted(image for frame in posed for camera, image in frame.images if camera == place)
              for place in range(len(filmed))]  # fmt: skip
     own = _often(filmed, shown, chained)
+    sizes, guessed = (np.array([of[m].size for m in own]) for of in (markers, chained.sized))
     spline = _first_motion(filmed, times, posed, chained)
     seen = []
     for one, images, own_times in zip(filmed, shown, times, strict=True):
@@ -320,26 +318,15 @@ def _adjusted(
         seen.append(found.subset(spline.layout.inside(found.times)))
     given = Adjustable(filmed, seen)
     freedom = Freedom(
-        sizes=_ANY_SIZE,
         angular_velocity=ANGULAR_VELOCITY,
         linear_velocity=LINEAR_VELOCITY,
         least_noise=_LEAST_NOISE,
     )
-    fitted = given.fit_roughly(given.start(spline), freedom)
-    own_said = [said[m] for m in own]
-    if _wrong_sizes(fitted, own_said):  # or the readout time is wrong, or a marker turned over
-        start = _of_size(fitted.state, [markers[m] for m in own])
-        asked = given.fit_roughly(start, replace(freedom, sizes=0.0), True)
-        asked = _right_side_up(given, asked)[0]
-        asked = given.fit_roughly(asked.state, freedom, True)
-        if listed := _wrong_sizes(asked, own_said):
-            raise ValueError(
-                f"{len(listed)} of {len(own)} markers disagree with the others about metres; these "
-                f"sizes would fit: {', '.join(listed)}: measure them, and give --size ID:M for "
-                "those that differ"
-            )
-    freedom = replace(freedom, sizes=0.0)
-    fitted = given.fit_roughly(_of_size(given.start(spline), own_said), freedom)
+    start = given.start(spline)
+    grown = _grown(given, start, freedom, np.log(guessed / sizes))
+    if grown.any():
+        raise ValueError(_wrong_sizes([markers[m] for m in own], grown))
+    fitted = given.fit_roughly(start, freedom)
     calmer = acceleration_prior(fitted.state, freedom)
     if calmer is not None:
         fitted = given.fit(fitted.state, calmer, fitted.deviation)
@@ -419,48 +406,109 @@ def _less_noise(given: Adjustable, fitted: Fit) -> Fit:
 
 def _covariance(fitted: Fit, order: list[int]) -> Array:
     """Covariance of markers (6 m, 6 m) in an order whose first is the origin, number 0."""
-    columns = _columns(fitted, np.array(order[1:]), BODY).ravel()
+    shared = len(fitted.border_covariance) - BODY * (len(fitted.state.landmarks) // 4 - 1)
+    places = np.array(order[1:])[:, None] - 1
+    columns = (shared + BODY * places + np.arange(BODY)).ravel()
     covariance = np.zeros((BODY * len(order),) * 2)
     covariance[BODY:, BODY:] = fitted.border_covariance[np.ix_(columns, columns)]
     return covariance
 
 
-def _columns(fitted: Fit, markers: IntArray, width: int) -> IntArray:
-    """The numbers (m,width) of markers (m,) in the border."""
-    shared = len(fitted.border_covariance) - width * (len(fitted.state.landmarks) // 4 - 1)
-    return np.asarray(shared + width * (markers - 1)[:, None] + np.arange(width), np.int64)
+def _grown(given: Adjustable, start: Unknowns, freedom: Freedom, grown: Array) -> Array:
+    """Logarithms (m,) of how much larger markers are than said, of those that certainly are.
+
+    All sizes free at once would drift along a chain of markers by what errors have in common, which
+    costs each of them next to nothing. So most are held, and one at a time is let go; and readout
+    times are free, lest a wrong one is taken for sizes.
+
+    Args:
+        start: with sizes as they are said to be.
+        grown: (m,) a first guess.
+    """
+    far = replace(freedom, least_noise=_FROM_FAR[0])
+    fitted = given.fit_roughly(_resized(start, grown), far, True)
+    for noise in (*_FROM_FAR, _LEAST_NOISE):
+        for _ in range(_MOST_ROUNDS):
+            if grown.any():
+                fitted = _right_side_up(given, fitted)[0]
+            own = replace(freedom, least_noise=noise)
+            fitted = given.fit(fitted.state, own, fitted.deviation, True)
+            more = _least_growth(given, fitted, grown) - grown
+            grown = grown + more
+            fitted = replace(fitted, state=_resized(fitted.state, more))
+            if np.abs(more).max() < _SAME_SIZE:
+                break
+    shown = np.concatenate([each.points for each in given.seen]) // 4
+    share = np.bincount(shown, fitted.inliers, len(grown)) / np.bincount(shown)
+    grown = np.where(share < _LEAST_FIT, 0.0, grown)  # no size explains those
+    # By the costs, too: weights of Tukey's estimator hide what speaks against a size.
+    for k in np.argsort(np.abs(grown))[np.count_nonzero(grown == 0.0) :].tolist():
+        less = np.where(np.arange(len(grown)) == k, 0.0, grown)
+        plain = given.fit(_resized(fitted.state, less - grown), freedom, fitted.deviation, True)
+        if not _cheaper(given, fitted, plain):
+            fitted, grown = plain, less
+    if grown.any() and not _cheaper(given, fitted, given.fit_roughly(start, freedom, True)):
+        grown = np.zeros(len(grown))
+    return grown
 
 
-def _sizes(state: Unknowns) -> Array:
-    """Sides of the markers (m,), m."""
-    corners = state.landmarks.reshape(-1, 4, 3)
-    sides = np.linalg.norm(np.roll(corners, 1, axis=1) - corners, axis=2)
-    return np.asarray(sides.mean(axis=1))
+def _cheaper(given: Adjustable, sized: Fit, plain: Fit) -> bool:
+    """True where a size more certainly lowers the cost."""
+    problem = given.problem(plain.state, plain.freedom, True)
+    gain = problem.system(plain.state, sized.deviation).cost - sized.cost
+    return bool(gain > _SIGMAS**2 * cluster_robust(problem, plain).inflation)
 
 
-def _of_size(state: Unknowns, said: Sequence[Marker]) -> Unknowns:
-    """With markers as large as they are said to be."""
+def _least_growth(given: Adjustable, fitted: Fit, grown: Array) -> Array:
+    """The same of the few markers that lower the cost most.
+
+    One by one the size is freed that lowers the cost most (orthogonal matching pursuit; Pati et
+    al., Asilomar 1993), while it does so certainly.
+
+    Args:
+        grown: (m,) the same of the fit.
+    """
+    noise = cluster_robust(given.problem(fitted.state, fitted.freedom, True), fitted).inflation
+    problem = given.problem(fitted.state, replace(fitted.freedom, sizes=_ANY_SIZE), True)
+    factored = Factored(problem.system(fitted.state, fitted.deviation))
+    columns = problem.place("points") + SIZED * np.arange(len(grown) - 1) + BODY
+    information = np.linalg.inv(factored.border_covariance()[np.ix_(columns, columns)])
+    # A larger origin is the same as all others smaller.
+    others = np.vstack([np.full(len(columns), -1.0), np.eye(len(columns))])
+    slope = -others @ information @ factored.step()[problem.groups.motion :][columns]
+    information = others @ information @ others.T
+    slope -= information @ grown
+    found, chosen, single = np.zeros(len(grown)), list[int](), np.diag(information)
+    while len(chosen) < len(grown) // 2:
+        off = -(slope + information @ found) / single
+        gains = np.where(np.abs(off) > _SIZES_DIFFER, single * off**2, 0.0)
+        gains[chosen] = 0.0
+        if gains.max() < _SIGMAS**2 * noise:
+            break
+        chosen.append(int(np.argmax(gains)))
+        found[chosen] = -np.linalg.solve(information[np.ix_(chosen, chosen)], slope[chosen])
+    return found
+
+
+def _resized(state: Unknowns, grown: Array) -> Unknowns:
+    """With markers larger by factors of these logarithms (m,)."""
     corners = state.landmarks.reshape(-1, 4, 3)
     middles = corners.mean(axis=1, keepdims=True)
-    share = np.array([one.size for one in said]) / _sizes(state)
-    return state.with_landmarks(
-        (middles + share[:, None, None] * (corners - middles)).reshape(-1, 3)
-    )
+    larger = middles + np.exp(grown)[:, None, None] * (corners - middles)
+    return state.with_landmarks(larger.reshape(-1, 3))
 
 
-def _wrong_sizes(fitted: Fit, said: Sequence[Marker]) -> list[str]:
-    """Markers that disagree with most about metres, and the sizes that would fit."""
-    sizes, found = np.array([one.size for one in said]), _sizes(fitted.state)
-    columns = _columns(fitted, np.arange(1, len(said)), SIZED)[:, -1]
-    errors = np.r_[0.0, np.sqrt(np.diag(fitted.border_covariance)[columns])]
-    grown = np.log(found / sizes)
-    known = errors < _WRONG_SIZE / _SIGMAS
-    apart = grown - np.median(grown[known])
-    wrong = known & (np.abs(apart) > np.maximum(_SIZES_DIFFER, _SIGMAS * errors))
-    return [
-        f"{said[k].name} {sizes[k] * np.exp(apart[k]):.4f} m (given {sizes[k]:.4g})"
-        for k in np.flatnonzero(wrong).tolist()
+def _wrong_sizes(said: Sequence[Marker], grown: Array) -> str:
+    """Sentence about markers that disagree with most, and the sizes that would fit."""
+    listed = [
+        f"{said[k].name} {said[k].size * np.exp(grown[k]):.4f} m (given {said[k].size:.4g})"
+        for k in np.flatnonzero(grown).tolist()
     ]
+    return (
+        f"{len(listed)} of {len(said)} markers disagree with the others about metres; these "
+        f"sizes would fit: {', '.join(listed)}: measure them, and give --size ID:M for "
+        "those that differ"
+    )
 
 
 def _fitting(
@@ -518,7 +566,9 @@ def _cameras(given: Adjustable, fitted: Fit) -> Iterator[Adjusted]:
     for place, one in enumerate(given.filmed):
         state, wanted = ((fit.state, *fit.state.others)[place] for fit in (fitted, asked))
         known = one.camera.readout_time > 0.0
-        deviation = math.sqrt(asked.border_covariance[(free.place("readout", place),) * 2])
+        at = free.place("readout", place)
+        apart = disagreement(*by_seconds(free, asked, at))
+        deviation = apart * math.sqrt(asked.border_covariance[at, at])
         deviations = np.zeros(EXTRINSICS)
         if one.mounting is not None:
             at = problem.place("mount", place)

@@ -181,7 +181,8 @@ def _growth(views: Sequence[_FrameView]) -> dict[int, float]:
 
     The camera's way about a marker of the wrong size is too long or too short by that: two markers
     of one image are at the same place beside each other whatever the way, which tells the ratio of
-    both. Least absolute deviations over all pairs.
+    both. Least absolute deviations over all pairs, and of sizes from those that are said: along a
+    chain of pairs, ratios alone drift.
     """
     ways: dict[tuple[int, int], list[tuple[Array, Array]]] = {}
     for view in views:
@@ -201,10 +202,12 @@ def _growth(views: Sequence[_FrameView]) -> dict[int, float]:
     numbers = sorted({marker for row in rows for marker in row[:2]})
     if not numbers:
         return {}
-    design, ratios = np.zeros((len(rows), len(numbers))), np.array([row[2] for row in rows])
+    said = np.eye(len(numbers))
+    design = np.concatenate([np.zeros((len(rows), len(numbers))), said])
+    ratios = np.array([row[2] for row in rows] + [0.0] * len(numbers))
     for k, (a, b, _) in enumerate(rows):
         design[k, numbers.index(a)], design[k, numbers.index(b)] = -1.0, 1.0
-    found, weights = np.zeros(len(numbers)), np.ones(len(rows))
+    found, weights = np.zeros(len(numbers)), np.ones(len(ratios))
     for _ in range(_SIZE_ROUNDS):
         root = np.sqrt(weights)
         found = np.linalg.lstsq(design * root[:, None], ratios * root, rcond=None)[0]
