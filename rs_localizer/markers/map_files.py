@@ -15,8 +15,6 @@ right, y up, z toward the viewer; corners go from the top left one clockwise, fr
 from __future__ import annotations
 
 import contextlib
-import json
-import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,12 +32,12 @@ from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
 
 USUAL_FAMILY = FAMILIES["apriltag_36h11"]
 """Family of files of other programs that do not say it."""
-OWN, WPILIB, BUNDLES, _KALIBR = "rs_localizer", "wpilib", "apriltag_ros", "kalibr"
-FORMATS = (OWN, WPILIB, BUNDLES)
-"""Formats that are written; Kalibr's targets are read, too."""
+OWN, _WPILIB, _BUNDLES, _KALIBR = "rs_localizer", "wpilib", "apriltag_ros", "kalibr"
+FORMATS = (OWN, _WPILIB, _BUNDLES, _KALIBR)
+"""Formats that are read; our own alone is written."""
 _KEYS = {
-    OWN: ("markers", "boards", "map_frame"), WPILIB: ("tags",),
-    BUNDLES: ("tag_bundles", "standalone_tags"), _KALIBR: ("target_type",),
+    OWN: ("markers", "boards", "map_frame"), _WPILIB: ("tags",),
+    _BUNDLES: ("tag_bundles", "standalone_tags"), _KALIBR: ("target_type",),
 }  # fmt: skip
 SUFFIXES = (".yaml", ".yml", ".json")
 # A parameter of apriltag_ros, which reads it beside the bundles; WPILib passes over it.
@@ -47,8 +45,8 @@ _TAG_FAMILY = "tag_family"
 # Tag of WPILib from print: to the right is y, up z, out of the print x.
 _TAG_FROM_PRINT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 # A pose stands for corners that it gives to within this share of a side; of a size that is given
-# beside the corners; and of the sizes of a field, which does not say them.
-_SAME, _SIZE_TOLERANCE, _SAME_SIZE = 1e-9, 0.05, 1e-3
+# beside the corners.
+_SAME, _SIZE_TOLERANCE = 1e-9, 0.05
 _CHESSBOARD, _CHARUCO = _BOARDS = "chessboard", "charuco"
 
 
@@ -87,7 +85,7 @@ def read_any(path: Path, unsaid: Unsaid | None = None) -> tuple[MarkerMap, str]:
             return (_own if name == OWN else _kalibr_target)(file), OWN
         unsaid = unsaid or Unsaid()
         kind = unsaid.family or family(file.take(_TAG_FAMILY, str, USUAL_FAMILY.name))
-        markers = (_wpilib if name == WPILIB else _bundle)(file, kind.name, unsaid)
+        markers = (_wpilib if name == _WPILIB else _bundle)(file, kind.name, unsaid)
         return MarkerMap(tuple(markers)), name
     except ValueError as error:
         raise MarkerMapError(f"{path}: {error}") from error
@@ -227,61 +225,6 @@ _EXPLANATION = """\
 # Measure what was put up, write it here, and check it: rs_localizer map info FILE;
 # rs_localizer detect names a marker that is not where this file has it.
 """
-
-
-def write_any(path: Path, marker_map: MarkerMap, name: str) -> None:
-    """Write a marker map in one of :data:`FORMATS`.
-
-    Raises:
-        MarkerMapError: when the format cannot hold the map.
-    """
-    if name == OWN:
-        write_marker_map(path, marker_map)
-        return
-    what = "a field of WPILib" if name == WPILIB else name
-    if marker_map.boards:
-        raise MarkerMapError(f"{what} cannot hold boards: {marker_map.boards[0].name}")
-    kinds = sorted({marker.family.kind for marker in marker_map.markers})
-    if len(kinds) > 1:
-        raise MarkerMapError(f"{what} holds markers of one family, found {' and '.join(kinds)}")
-    largest = max((marker.family for marker in marker_map.markers), key=lambda of: of.count)
-    # AprilTag's own names, where there is one.
-    tree = {_TAG_FAMILY: re.sub(r"^apriltag_", "tag", largest.name)}
-    if name == WPILIB:
-        text = json.dumps(tree | _field(marker_map), indent=1) + "\n"
-    else:
-        text = _yaml(tree | _one_bundle(marker_map), 160)
-    path.write_text(text, encoding="utf-8")
-
-
-def _field(marker_map: MarkerMap) -> dict[str, Any]:
-    """A field of WPILib; as large as its tags need, from the origin on."""
-    sizes = sorted(marker.size for marker in marker_map.markers)
-    if sizes[-1] > sizes[0] * (1.0 + _SAME_SIZE):
-        raise MarkerMapError(
-            f"a field of WPILib holds tags of one size, found {sizes[0]:g} to {sizes[-1]:g} m"
-        )
-    tags = []
-    for marker in marker_map.markers:
-        turn = quaternion_of_rotation(marker.pose.rotation @ _TAG_FROM_PRINT.T)
-        pose = {
-            "translation": _named("xyz", marker.pose.position),
-            "rotation": {"quaternion": _named("WXYZ", np.roll(turn, 1))},
-        }
-        tags.append({"ID": marker.id, "pose": pose})
-    length, width = np.round(np.maximum(marker_map.points.max(axis=0), 0.0)[:2], 6).tolist()
-    return {"tags": tags, "field": {"length": length, "width": width}}
-
-
-def _one_bundle(marker_map: MarkerMap) -> dict[str, Any]:
-    layout = [
-        {"id": marker.id, "size": _rounded([marker.size])[0]}
-        | _named("xyz", marker.pose.position)
-        | _named(("qx", "qy", "qz", "qw"), quaternion_of_rotation(marker.pose.rotation))
-        for marker in marker_map.markers
-    ]
-    bundle = {"name": marker_map.map_frame, "layout": layout}
-    return {"standalone_tags": [], "tag_bundles": [bundle]}
 
 
 def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:

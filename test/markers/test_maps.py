@@ -12,15 +12,11 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core import so3
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.map_files import (
-    FORMATS,
-    OWN,
     Unsaid,
     read_any,
     read_marker_map,
-    write_any,
     write_marker_map,
 )
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError, wall
@@ -224,37 +220,22 @@ def test_bundles_of_apriltag_ros(tmp_path):
         read_any(as_file(tmp_path, two))
 
 
-def some_map(family: str = "apriltag_36h11") -> MarkerMap:
-    rng = np.random.default_rng(0)
-    markers = []
-    for number in range(5):
-        pose = Pose(rng.uniform(0.0, 3.0, 3), so3.exp(rng.normal(0.0, 1.0, 3)))
-        markers.append(Marker.at(family, number, SIZE, pose))
-    return MarkerMap(tuple(markers))
-
-
-@pytest.mark.parametrize("name", FORMATS)
-@pytest.mark.parametrize("family", ["apriltag_25h9", "4x4_50"])
-def test_there_and_back(tmp_path, name, family):
-    path = tmp_path / ("map.json" if name == "wpilib" else "map.yaml")
-    write_any(path, some_map(family), name)
-    found, kind = read_any(path, Unsaid(size=SIZE))
-    assert kind == name
-    np.testing.assert_allclose(found.points, some_map(family).points, atol=1e-9)
-    assert {marker.family.name for marker in found.markers} == {family}
-    if name != OWN:  # what the user says goes first
-        found, _ = read_any(path, Unsaid(FAMILIES["5x5_100"], SIZE))
-        assert found.markers[0].family.name == "5x5_100"
-        path.write_text(path.read_text().replace("tag25h9", "tag9h9").replace("4x4_50", "4x4_5"))
-        with pytest.raises(MarkerMapError, match=r"unknown family '(tag9h9|4x4_5)'"):
-            read_any(path, Unsaid(size=SIZE))
+def test_what_the_user_says_of_the_family_goes_first(tmp_path):
+    named = BUNDLE + "tag_family: tag25h9\n"
+    (first, _) = read_any(as_file(tmp_path, named))[0].markers
+    assert first.family.name == "apriltag_25h9"
+    said, _ = read_any(as_file(tmp_path, named), Unsaid(FAMILIES["5x5_100"]))
+    assert said.markers[0].family.name == "5x5_100"
+    with pytest.raises(MarkerMapError, match="unknown family 'tag9h9'"):
+        read_any(as_file(tmp_path, named.replace("tag25h9", "tag9h9")))
 
 
 def test_deviations_of_a_survey_are_kept(tmp_path):
     known = np.array([0.001, 0.002, 0.0031, 0.01, 0.02, 0.03])
-    marker = replace(some_map().markers[0], deviations=known)
+    pose = Pose(np.array([0.5, 1.0, 2.0]), TURN.as_matrix())
+    marker = replace(Marker.at("36h11", 0, SIZE, pose), deviations=known)
     path = tmp_path / "map.yaml"
-    write_any(path, MarkerMap((marker,)), OWN)
+    write_marker_map(path, MarkerMap((marker,)))
     (found,) = read_any(path)[0].markers
     np.testing.assert_allclose(found.deviations, known)
     broken = path.read_text().replace("rotation_deviation: [0.01", "rotation_deviation: [-0.01")

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``rs_localizer map align``: scale, direction of gravity, origin and format of a map."""
+"""``rs_localizer map align``: scale, direction of gravity and origin of a map; its own format."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rs_localizer.cli import WORKING, refuse_existing, write_all
 from rs_localizer.cli.map import info_command
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.io.maps.files import SUFFIX, write_npz
-from rs_localizer.markers.map_files import FORMATS, OWN, SUFFIXES, write_any
+from rs_localizer.markers.map_files import write_marker_map
 
 if WORKING:
     import numpy as np
@@ -21,15 +21,12 @@ if WORKING:
     from rs_localizer.io.maps.landmarks import Map, make_map
     from rs_localizer.tools.mapping.align import alignment, moved
 
-_OUTPUTS = (SUFFIX, *SUFFIXES)
+_OUTPUTS = (SUFFIX, ".yaml", ".yml")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(info_command.Options):
     out: Path = argument(f"ends in {', '.join(_OUTPUTS)}", "OUT")
-    to: str | None = option(
-        "of markers (default: .json is of wpilib, .yaml our own)", choices=list(FORMATS)
-    )
     overwrite: bool = option("replace OUT", default=False)
     scale: float | None = option("factor", "FACTOR", limits=(0.0, math.inf), above=True)
     distance: tuple[float, float, float] | None = option(
@@ -45,11 +42,8 @@ class Options(info_command.Options):
 
 def run(options: Options) -> info_command.Figures:
     suffix = options.out.suffix
-    usual = "wpilib" if suffix == ".json" else OWN
     if suffix not in _OUTPUTS:
         raise UsageError(f"OUT must end in {' or '.join(_OUTPUTS)}, got {options.out}")
-    if options.to and (suffix == SUFFIX or (options.to == "wpilib") != (usual == "wpilib")):
-        raise UsageError(f"{options.to} is written to {'.json' if suffix != '.json' else '.yaml'}")
     for one, other in (("scale", "distance"), ("up", "floor")):
         if getattr(options, one) and getattr(options, other):
             raise UsageError(f"give one of --{one}, --{other}")
@@ -70,7 +64,7 @@ def run(options: Options) -> info_command.Figures:
         if isinstance(any_map, Map):
             write_npz(part, any_map)
         elif suffix != SUFFIX:
-            write_any(part, any_map, options.to or usual)
+            write_marker_map(part, any_map)
         else:  # corners, with ids of ``detect``: rows of its points
             ids = np.arange(len(any_map.points))
             write_npz(part, make_map(any_map.points, ids, None, any_map.map_frame))
