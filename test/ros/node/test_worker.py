@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from sensor_msgs.msg import Image
 
 from rs_localizer.pipeline.refusal import Waiting
 from rs_localizer.ros.node.refusals import Refusals
@@ -19,10 +18,7 @@ PATIENCE = 10.0  # s, of a machine that is busy
 
 
 class Count(Statistics[str]):
-    """Frames are plain text here, without stamps."""
-
-    def received(self, topic: str, message: Any) -> None:
-        super().received(topic, Image())
+    """Frames are plain text here."""
 
     def answered(self, result: str, received: float) -> None:
         assert received <= time.monotonic()
@@ -42,7 +38,7 @@ class Fake:
         self.awaited: set[str] = set()
         self.patience = 10.0
         self.refusals = Refusals(lambda text: None)
-        self.statistics = Count(self.refusals, lambda text: (0, text))
+        self.statistics = Count(self.refusals, lambda text: text)
         self.worker: Worker[Fake, str] = Worker(self, self._publish, self.statistics, pytest.fail)
 
     def send(self, frame: str, topic: str = "frames", patience: float = PATIENCE) -> None:
