@@ -51,7 +51,7 @@ if WORKING:
         prepare,
         replay,
     )
-    from rs_localizer.offline.results import Tally, at_rate, figures, write_frame
+    from rs_localizer.offline.results import Tally, figures, write_frame
     from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.pipeline.refusal import explained
     from rs_localizer.settings import build
@@ -89,9 +89,8 @@ class Options(ImageOptions, FleetOptions):
         default=False,
     )
     pose_rate: float | None = option(
-        "poses of the motion, by the frames until then, or with --smooth by all "
-        "(default: one for each image)", "HZ",
-        limits=(0.0, math.inf), above=True,
+        "with --smooth: poses of the motion so many times a second (default: one for each image)",
+        "HZ", limits=(0.0, math.inf), above=True,
     )  # fmt: skip
     parquet: Path | None = option(
         "also write one table of all recordings, a row a frame: poses, twists, covariances, why "
@@ -101,6 +100,8 @@ class Options(ImageOptions, FleetOptions):
 
 def run(options: Options) -> Figures | None:
     _check_place(options)
+    if options.pose_rate is not None and not options.smooth:
+        raise UsageError("--pose-rate goes with --smooth")
     if len(options.recordings) > 1 or options.workers or options.scheduler:
         _replay_all(options)
         return None
@@ -312,8 +313,6 @@ def _replay(
             frames = (
                 (frame.input_stamp_ns, frame) for part in parts for frame in tally.smooth(part)
             )
-        elif options.pose_rate is not None:
-            frames = at_rate(frames, localizer, options.pose_rate)
         for recorded_ns, frame in frames:
             tally.not_sent += not write_frame(writer, frame, localizer, recorded_ns)
             tally.track.add(frame)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -201,22 +200,3 @@ def figures(tally: Tally) -> Figures:
         "readout_time_seen_ms": 1e3 * readout_time,
         "readout_time_seen_deviation_ms": 1e3 * deviation,
     }
-
-
-def at_rate(
-    frames: Iterable[tuple[int, Localized]], localizer: FrameLocalizer, rate: float
-) -> Iterator[tuple[int, Localized]]:
-    """The motion so many times a second until each frame; frames where it is not known."""
-    step_ns = max(round(1e9 / rate), 1)
-    last_ns: int | None = None
-    for recorded_ns, frame in frames:
-        now_ns = frame.input_stamp_ns
-        if not localizer.predicts:
-            yield recorded_ns, frame
-        elif last_ns is not None:
-            # A longer gap ends the track.
-            begin = max(last_ns, now_ns - 10**9) // step_ns + 1
-            for time_ns in range(begin * step_ns, now_ns + 1, step_ns):
-                if found := localizer.at(time_ns):
-                    yield time_ns, found
-        last_ns = now_ns

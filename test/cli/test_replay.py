@@ -112,23 +112,6 @@ def test_every_kind_of_recording_gives_the_same(recording, tmp_path):
         np.testing.assert_allclose(*numbers, rtol=0.0, atol=1e-6)
 
 
-def test_poses_at_a_rate_of_their_own(recording, tmp_path):
-    """Between images as the camera moved: every 5 ms from the first image to the last."""
-    out = tmp_path / "out"
-    assert main(["replay", str(recording), "--pose-rate", "200", "--out", str(out), *SHUTTER]) == 0
-    poses = read_tum(out / "poses.txt")
-    truth = read_motions(recording, "/truth/pose", "/truth/twist").poses
-    first, last = truth.stamps_ns[0], truth.stamps_ns[-2]
-    grid = np.arange(first // 5_000_000 + 1, last // 5_000_000 + 1) * 5_000_000
-    assert set(poses.stamps_ns) <= set(grid)
-    assert len(poses) > 0.9 * len(grid) > 2 * FRAMES
-    for axis in range(3):
-        expected = np.interp(
-            poses.stamps_ns - first, truth.stamps_ns - first, truth.positions[:, axis]
-        )
-        np.testing.assert_allclose(poses.positions[:, axis], expected, atol=0.06)
-
-
 def test_settings_of_a_file_and_of_the_command_line(recording, tmp_path):
     file = tmp_path / "params.yaml"
     file.write_text(
