@@ -11,7 +11,7 @@ keypoints do not tell; and their squares are the sum of as many numbers only as 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,14 +23,13 @@ from rs_localizer.core.rig import Rig
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 from rs_localizer.core.types import Estimate
-from rs_localizer.inertial.gyroscope_noise import SCALE_DEVIATION
 from rs_localizer.inertial.turning import MOST_ROUGH
 from rs_localizer.tools.adjust.fit import Fit, cheaper, solve
 from rs_localizer.tools.adjust.motion import acceleration_rows
 from rs_localizer.tools.adjust.observe import ImagePoints, collect
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.reprojection import LIMIT
-from rs_localizer.tools.adjust.spline import LONGEST_SPACING, States, first_spline, refined
+from rs_localizer.tools.adjust.spline import LONGEST_SPACING, first_spline, refined
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.variables import (
     CameraView,
@@ -87,108 +86,6 @@ Parts = list[tuple[Camera, SplineKeypoints]]
 _ALIKE, _ROUNDS = 0.05, 6
 
 
-# The gyroscopes' rates are taken at these steps (s), and what is slower than some 3 Hz is left to
-# the knots (a Gaussian's deviation, s): with 16, 50 and 100 ms smoothed orientations were off by
-# 0.042, 0.041, 0.041 deg and rates by 1.24, 1.15, 1.11 deg/s (tum_vi_room5 from 20 s on, 6 s,
-# 0.3 deg at 60 Hz); the longer it is, the more a wrong scale of the gyroscope counts.
-_STEP, _SLOW = 0.001, 0.05
-# Of the first images, which do not know the offset of the IMU's stamps as well as the others do
-# (standard deviations by the median), the rates are left out.
-_MOST_DELAY = 3.0
-# Rates may be missing for so long (s), a quarter of a period of 50 Hz, and in so much of the time.
-_LONGEST_LACK, _MOST_LACKING = 0.005, 0.2
-# Turns that move image points by less than this part of their noise are not worth it.
-_LEAST_SHARE = 0.2
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FastTurn:
-    """The fast part of a camera's turn, as gyroscopes know it, beside which the motion is smooth.
-
-    ``rotation = smooth_rotation turn(t)``: of the rates ``w`` and the slow ones ``s`` among them
-    ``turn' = turn [w]x - [s]x turn``.
-    """
-
-    # Cubic splines, of the times (m,) and the order of a derivative.
-    turns: Callable[..., Array]  # (m,3) rotation vectors
-    rates: Callable[..., Array]  # (m,6) rad/s: all, and the slow ones
-    covered: BoolArray  # (f,) frames whose rates it has
-    vibrates: bool  # most of these frames turn in a way that no smooth motion follows
-    times: Array  # (f,) s, of the frames' middle rows
-    delays: Array  # (f,) s, standard deviations of their rates' times
-    rate_noise: float  # rad/s, of a rate at one moment
-    turn_noise: float  # rad, that it leaves in the turn
-
-    def rotations(self, times: Array) -> Array:
-        """Turns (m,3,3) at times (m,): from the camera's axes to those of the smooth motion."""
-        rotations: Array = so3.exp_many(np.ascontiguousarray(self.turns(times)))
-        return rotations
-
-    def angular(self, times: Array, rotations: Array, smooth: Array) -> Array:
-        """Body rates (m,3), rad/s, of the camera beside those of the smooth motion."""
-        rates = self.rates(times)
-        beside: Array = np.einsum("nji,nj->ni", rotations, smooth - rates[:, 3:]) + rates[:, :3]
-        return beside
-
-    def variances(self, times: Array) -> tuple[Array, Array]:
-        """Variances (m,3) of turn (rad^2) and rate (rad^2/s^2) by what gyroscopes are off by."""
-        turn, rate, change = (self.turns(times, order) for order in (0, 1, 2))
-        delay = np.interp(times, self.times, self.delays)[:, None]
-        return (
-            (delay * rate) ** 2 + (SCALE_DEVIATION * turn) ** 2 + self.turn_noise**2,
-            (delay * change) ** 2 + (SCALE_DEVIATION * rate) ** 2 + self.rate_noise**2,
-        )
-
-
-def fast_turn(times: Array, estimates: list[Estimate], readout_time: float) -> FastTurn | None:
-    """The fast part of the turns that gyroscopes know at times (f,), s, of frames' middle rows.
-
-    None: too few of the frames have one, or frames lie too far apart.
-    """
-    # These take a third of a second, which programs that smooth nothing do not wait for.
-    from scipy.interpolate import CubicSpline
-    from scipy.ndimage import gaussian_filter1d
-
-    grid = np.arange(times[0] - readout_time, times[-1] + readout_time, _STEP)
-    nearest = np.clip(np.searchsorted(0.5 * (times[1:] + times[:-1]), grid), 0, len(times) - 1)
-    tau = (grid - times[nearest]) / readout_time
-    rates = np.full((len(grid), 3), np.nan)
-    delays = np.array([np.inf if one.turn is None else one.turn.delay for one in estimates])
-    covered = delays <= _MOST_DELAY * np.median(delays)
-    known = [(k, one.turn) for k, one in enumerate(estimates) if covered[k] and one.turn]
-    edges = np.searchsorted(nearest, np.arange(len(times) + 1))
-    for k, turn in known:
-        own = np.arange(edges[k], edges[k + 1])
-        own = own[(tau[own] >= turn.tau[0]) & (tau[own] <= turn.tau[-1])]
-        rates[own] = turn.at_rows(tau[own])[1] / readout_time
-    there = np.flatnonzero(np.isfinite(rates[:, 0]))
-    if len(there) < 2:
-        return None
-    lacks = np.diff(there) * _STEP
-    if lacks[lacks > _LONGEST_LACK].sum() > _MOST_LACKING * (grid[-1] - grid[0]):
-        return None
-    rates = np.column_stack([np.interp(grid, grid[there], rates[there, k]) for k in range(3)])
-    slow = gaussian_filter1d(rates, _SLOW / _STEP, axis=0, mode="nearest")
-    middles = [so3.exp_many(0.5 * _STEP * (r[1:] + r[:-1])) for r in (rates, slow)]
-    turns = np.empty((len(grid), 3, 3))
-    turns[0] = np.eye(3)
-    for k, (fast, back) in enumerate(zip(middles[0], middles[1], strict=True)):
-        turns[k + 1] = back.T @ turns[k] @ fast
-    vectors = np.array([so3.log(turn) for turn in turns])
-    noise = np.median([turn.rate_noise for _, turn in known])
-    period = readout_time * np.median([np.median(np.diff(turn.tau)) for _, turn in known])
-    return FastTurn(
-        CubicSpline(grid, vectors),
-        CubicSpline(grid, np.hstack([rates, slow])),
-        covered,
-        bool(np.median([turn.roughness for _, turn in known]) > MOST_ROUGH),
-        times[covered],
-        readout_time * delays[covered],
-        float(noise / readout_time),
-        float(noise / readout_time * np.sqrt(period * _SLOW)),
-    )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Sampled:
     """The motion at m times."""
@@ -208,7 +105,6 @@ class Smoothed:
     times: Array  # (f,) s since then, of the images' middle rows
     # (f,) images that shake faster than the motion: their own estimates are better.
     shaken: BoolArray
-    fast: FastTurn | None = None  # beside which the fit is
 
     def sample(self, stamps_ns: IntArray) -> Sampled:
         """The camera's motion at times (m,) in ns."""
@@ -234,35 +130,22 @@ class Smoothed:
         after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
         return self.times[after] - self.times[after - 1]
 
-    def _states(self, times: Array) -> tuple[States, Array]:
-        """Motion of the camera at times (m,), and turns (m,3,3) beside which it is smooth."""
-        states = self.fit.state.spline.states(times)
-        if self.fast is None:
-            return states, np.broadcast_to(np.eye(3), states.rotations.shape)
-        turns = self.fast.rotations(times)
-        angular = self.fast.angular(times, turns, states.angular)
-        return states._replace(rotations=states.rotations @ turns, angular=angular), turns
-
     def _in_camera(self, times: Array) -> Array:
         """Covariances (m,12,12) in the order and the axes of ``Estimate.covariance``, SI."""
-        states, turns = self._states(times)
-        back, beside = np.swapaxes(states.rotations, 1, 2), np.swapaxes(turns, 1, 2)
+        states = self.fit.state.spline.states(times)
+        back = np.swapaxes(states.rotations, 1, 2)
         velocities = np.einsum("nij,nj->ni", back, states.linear)
         to_camera = np.zeros((len(times), 12, 12))
-        to_camera[:, :3, :3] = to_camera[:, 6:9, 6:9] = beside
+        to_camera[:, :3, :3] = to_camera[:, 6:9, 6:9] = np.eye(3)
         to_camera[:, 3:6, 3:6] = to_camera[:, 9:, 9:] = back
-        to_camera[:, 9:, :3] = so3.hat(velocities) @ beside
+        to_camera[:, 9:, :3] = so3.hat(velocities)
         covariances: Array = (
             to_camera @ self.fit.state_covariances(times) @ np.swapaxes(to_camera, 1, 2)
         )
-        if self.fast is not None:
-            for first, added in zip((0, 6), self.fast.variances(times), strict=True):
-                at = np.arange(first, first + 3)
-                covariances[:, at, at] += added
         return covariances
 
     def _estimates(self, times: Array, covariances: Array) -> list[Estimate]:
-        states, _ = self._states(times)
+        states = self.fit.state.spline.states(times)
         scale = np.repeat([1.0, self.readout_time], 6)
         empty = np.zeros(0)
         # At a moment of its own nothing asks for accelerations.
@@ -326,31 +209,15 @@ def smooth(rig: Rig, frames: list[PosedFrame]) -> Smoothed:
     rotations = np.array([one.rotation.T for one in estimates])
     positions = np.array([one.position for one in estimates])
     parts, mounted = _parts(rig, frames, start_ns)
-    fast = fast_turn(times, estimates, readout_time) if len(rig.cameras) == 1 else None
-    if fast is not None:
-        ((camera, seen),) = parts
-        turned = _turned_pixels(camera, seen, fast, readout_time)
-        moved = float(np.median(np.hypot(*(turned - seen.pixels).T)))
-        if moved < _LEAST_SHARE * np.median([one.residual_rms for one in estimates]):
-            fast = None
-        else:
-            parts = [(camera, replace(seen, pixels=turned))]
-            rotations = rotations @ np.swapaxes(fast.rotations(times), 1, 2)
     longest = max(readout_time, *(one.span for one in estimates))
     spline = first_spline(times, rotations, positions, spacing, longest)
-    parts = [
-        (one, of.subset(spline.layout.inside(of.times) & np.isfinite(of.pixels[:, 0])))
-        for one, of in parts
-    ]
+    parts = [(one, of.subset(spline.layout.inside(of.times))) for one, of in parts]
     start = rig_state(spline, ((*part, one) for part, one in zip(parts, mounted, strict=True)))
     best = _best(parts, start, fading)
     shaken = _shaken(best, parts, rig.focal_length, estimates)
-    counted = shaken if fast is None else shaken[fast.covered]
-    if counted.mean() > _MOST_SHAKEN:
+    if shaken.mean() > _MOST_SHAKEN:
         shaken[:] = True
-    elif fast is not None and fast.vibrates:  # few images beside each other may look smooth
-        shaken |= ~fast.covered
-    return Smoothed(best, readout_time, start_ns, times, shaken, fast)
+    return Smoothed(best, readout_time, start_ns, times, shaken)
 
 
 def _parts(rig: Rig, frames: list[PosedFrame], start_ns: int) -> tuple[Parts, list[Extrinsics]]:
@@ -399,15 +266,6 @@ def _best(parts: Parts, start: Unknowns, fading: float) -> Fit:
     return finer if cheaper(finer, fitted, float(more)) else fitted
 
 
-def _turned_pixels(
-    camera: Camera, observations: SplineKeypoints, fast: FastTurn, readout_time: float
-) -> Array:
-    """Pixels (n,2) as they would be without the fast turn; NaN where no image point is."""
-    rays = np.column_stack([camera.rays(observations.pixels), np.ones(len(observations.pixels))])
-    turns = fast.rotations(observations.times + readout_time * observations.row_times)
-    return camera.project(np.einsum("nij,nj->ni", turns, rays))
-
-
 def _shaken(fitted: Fit, parts: Parts, focal_length: float, estimates: list[Estimate]) -> BoolArray:
     """Which images (f,) shake in a way that the motion does not follow, by their keypoints."""
     frames = np.concatenate([seen.frames for _, seen in parts])
@@ -420,7 +278,9 @@ def _shaken(fitted: Fit, parts: Parts, focal_length: float, estimates: list[Esti
     freedom = np.maximum(1.0 - PARAMETERS / np.maximum(2 * count, 1), 0.1)
     limit = np.maximum(_SHAKEN**2, 1.0 + _SHAKEN_SIGMAS / np.sqrt(np.maximum(count, 1)))
     shaken = (count > 0) & (off > limit * own / freedom)
-    return np.asarray(shaken | _turns_in_frame(focal_length, estimates), np.bool_)
+    # Or their gyroscopes know it.
+    rough = [one.turn is not None and one.turn.roughness > MOST_ROUGH for one in estimates]
+    return np.asarray(shaken | rough | _turns_in_frame(focal_length, estimates), np.bool_)
 
 
 def _turns_in_frame(focal_length: float, estimates: list[Estimate]) -> BoolArray:

@@ -8,10 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
-from benchmarks.frames.judged import of_pose, of_twist
 from benchmarks.simulation.__main__ import record
 from rs_localizer.cli.commands import main
 from rs_localizer.config import NodeConfig
@@ -19,7 +16,6 @@ from rs_localizer.core import so3
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.trajectories import Motions, read_motions
 from rs_localizer.offline.replay import find_topics, find_transforms, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.tools import smoothed
@@ -74,8 +70,8 @@ def test_windows_say_what_one_piece_says(
         assert squared < 0.5**2
 
 
-def test_a_vibrating_camera_is_smoothed_beside_what_its_gyroscope_knows(tmp_path: Path) -> None:
-    """0.3 deg at 60 Hz: knots follow none of it, and ruined all poses, sure of them."""
+def test_frames_of_a_vibrating_camera_keep_their_own_poses(tmp_path: Path) -> None:
+    """0.3 deg at 60 Hz: knots follow none of it, and would ruin all poses, sure of them."""
     path = tmp_path / "shaken"
     words = "--trajectory tum_vi_room5 --start 20 --duration 3 --points 80 --outliers 0"
     shaking = "--vibration 0.3 60 --imu --seed 4".split()
@@ -86,30 +82,5 @@ def test_a_vibrating_camera_is_smoothed_beside_what_its_gyroscope_knows(tmp_path
         frames = [frame for a in replay(bag, topics, localizer) if (frame := a.result)]
         stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
     (part,) = smooth_frames(localizer, frames, stamps, None)
-    assert part.shaken < 15  # those before the offset of the stamps is known
-    assert len(part.frames) == len(frames) == 90
-    truth = read_motions(path, "/truth/pose", "/truth/twist")
-    before, after = errors(frames, truth), errors(part.frames, truth)
-    for k, most in ((0, 0.9), (1, 0.95), (3, 0.65)):  # position, orientation, velocity
-        assert np.median(after[:, k]) < most * np.median(before[:, k])
-    # Of 113 deg/s of shaking; 1.1 to 5.9 of seeds 1 to 9, by what the offset is off (7 to 125 us).
-    assert np.median(after[:, 4]) < 2.5
-    for k in (2, 5):
-        assert np.mean(after[:, k] < chi2.ppf(0.95, 6)) > 0.85
-        assert after[:, k].max() < 3.0 * before[:, k].max()
-
-
-def errors(frames: list[Localized], truth: Motions) -> np.ndarray:
-    """Position, orientation, squared error of the pose by its covariance; the same of twists."""
-    assert truth.twists is not None
-    rows = truth.poses.stamps_ns.tolist()
-    rotations = Rotation.from_quat(truth.poses.quaternions).as_matrix()
-    found = []
-    for frame in frames:
-        row = rows.index(frame.stamp_ns)
-        twists = truth.twists.angular[row], truth.twists.linear[row]
-        true = rotations[row], truth.poses.positions[row], *twists
-        pose, _, _, degrees, millimetres = of_pose(frame.pose, true)
-        twist, _, _, angular, linear = of_twist(frame.twist, true)
-        found.append((1e-3 * millimetres, degrees, pose, linear, angular, twist))
-    return np.array(found)
+    assert part.shaken == len(part.frames) == len(frames) == 90
+    assert all(one is other for one, other in zip(part.frames, frames, strict=True))
