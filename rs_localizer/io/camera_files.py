@@ -342,6 +342,28 @@ def kalibr_camera(tree: dict[str, Any]) -> Camera:
     return Camera(width, height, matrix, D, _KALIBR_LENSES[name])
 
 
+def kalibr_fields(camera: Camera) -> dict[str, Any]:
+    """Entries of Kalibr's camchain for a camera's lens.
+
+    Raises:
+        ValueError: for a lens that it has no name for, or a binned or cropped image.
+    """
+    model, D = DistortionModel(camera.distortion_model), camera.D.tolist()
+    if camera.roi is not None or camera.binning != (1, 1):
+        raise ValueError("a camchain knows neither binning nor regions of the sensor")
+    names = {lens: name for name, lens in _KALIBR_LENSES.items() if name != "none"}
+    if model not in names or (model == DistortionModel.PLUMB_BOB and any(D[4:])):
+        raise ValueError(f"Kalibr has no lens {model} with {len(D)} coefficients")
+    intrinsics = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]]
+    return {
+        "camera_model": "pinhole",
+        "intrinsics": [float(value) for value in intrinsics],
+        "distortion_model": names[model] if D else "none",
+        "distortion_coeffs": D[:4],
+        "resolution": [camera.width, camera.height],
+    }
+
+
 def lens_parameters(camera: Camera) -> dict[str, Any]:
     """``lens`` of a ROS params file, for :func:`read_calibration`; nodes pass over it."""
     return {
