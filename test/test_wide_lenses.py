@@ -1,14 +1,15 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A lens of more than 180 degrees, from points all around to poses, against pixels of their own.
+"""Lenses of more than 180 degrees, from points all around to poses, against pixels of their own.
 
-The pixels are those of the paper's formula along a motion of constant velocities, found row by
+The pixels are those of the papers' formulas along a motion of constant velocities, found row by
 row: nothing of the package has a part in them.
 """
 
 import math
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -28,14 +29,33 @@ def kannala_brandt(points, k1, k2, k3, k4):
     return radius[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)])
 
 
-D = [0.01, -0.004, 0.002, -3e-4]
+def double_sphere(points, xi, alpha):
+    """Equation 40 of Usenko, Demmel, Cremers (2018)."""
+    z = xi * np.linalg.norm(points, axis=1) + points[:, 2]
+    across = np.hypot(points[:, 0], points[:, 1])
+    return points[:, :2] / (alpha * np.hypot(across, z) + (1.0 - alpha) * z)[:, None]
 
 
-def frame(rng, count, noise):
+def extended_unified(points, alpha, beta):
+    """Equation 12 of Khomutenko, Garcia, Martinet (2016)."""
+    across = beta * (points[:, 0] ** 2 + points[:, 1] ** 2)
+    rho = np.sqrt(across + points[:, 2] ** 2)
+    return points[:, :2] / (alpha * rho + (1.0 - alpha) * points[:, 2])[:, None]
+
+
+LENSES = {
+    "equidistant": (kannala_brandt, [0.01, -0.004, 0.002, -3e-4]),
+    "ds": (double_sphere, [-0.2, 0.59]),
+    "eucm": (extended_unified, [0.63, 1.05]),
+}
+
+
+def frame(rng, lens, count, noise, least=0.0):
     """Points (n,3) in the map, their pixels (n,2), and the true motion at the middle row."""
+    see, D = LENSES[lens]
     rotation, position = Rotation.random(random_state=rng), rng.uniform(-2.0, 2.0, 3)
     turn, speed = (of * rng.normal(size=3) / math.sqrt(3.0) for of in (1.2, 0.5))
-    angle = np.arccos(rng.uniform(math.cos(WIDEST), 1.0, count))
+    angle = np.arccos(rng.uniform(math.cos(WIDEST), math.cos(least), count))
     azimuth = rng.uniform(-math.pi, math.pi, count)
     across = np.sin(angle)
     unit = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), np.cos(angle)])
@@ -44,10 +64,7 @@ def frame(rng, count, noise):
     for _ in range(20):
         time = READOUT * (row / (SIZE - 1) - 0.5)
         body = rotation.inv().apply(points - position) - time[:, None] * speed
-        pixels = (
-            FOCAL * kannala_brandt(Rotation.from_rotvec(-time[:, None] * turn).apply(body), *D)
-            + 399.5
-        )
+        pixels = FOCAL * see(Rotation.from_rotvec(-time[:, None] * turn).apply(body), *D) + 399.5
         row = pixels[:, 1]
     pixels = pixels + noise * rng.normal(size=pixels.shape)
     shown = np.all((pixels > -0.5) & (pixels < SIZE - 0.5), axis=1)
@@ -65,13 +82,17 @@ def errors(result, motion):
     ])  # fmt: skip
 
 
-def test_points_beyond_90_degrees_are_as_good_as_others():
+def camera(lens):
+    return rsl.Camera(SIZE, SIZE, K, LENSES[lens][1], lens, readout_time=READOUT)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_points_beyond_90_degrees_are_as_good_as_others(lens):
     rng = np.random.default_rng(7)
     exact = rsl.LocalizerConfig(calibration=CalibrationErrors(0.0, 0.0, 0.0))
-    camera = rsl.Camera(SIZE, SIZE, K, D, "equidistant", readout_time=READOUT)
-    localizer, squares, used = rsl.Localizer(camera, exact), [], []
+    localizer, squares, used = rsl.Localizer(camera(lens), exact), [], []
     for _ in range(15):
-        points, pixels, motion, angle = frame(rng, 150, 0.5)
+        points, pixels, motion, angle = frame(rng, lens, 150, 0.5)
         wrong = rng.uniform(size=len(pixels)) < 0.2
         pixels[wrong] = rng.uniform(0.0, SIZE - 1.0, (wrong.sum(), 2))
         result = localizer.localize(points, pixels)

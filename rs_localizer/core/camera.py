@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 
 from rs_localizer.core import lens_laws
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.double_sphere import DOUBLE_SPHERE
 from rs_localizer.core.equidistant import EQUIDISTANT
+from rs_localizer.core.eucm import EUCM
 from rs_localizer.core.lens_laws import LensLaw, Sphere
 from rs_localizer.core.scanning import ScanDirection
 
@@ -59,7 +61,7 @@ def choice(name: str, kind: type[E], value: Any) -> E:
 
 
 class DistortionModel(StrEnum):
-    """THE list of lenses: names in CameraInfo, and their laws."""
+    """THE list of lenses: names in CameraInfo (the last two: Kalibr's), and their laws."""
 
     law: LensLaw
 
@@ -73,6 +75,8 @@ class DistortionModel(StrEnum):
     PLUMB_BOB = "plumb_bob", lens_laws.PLUMB_BOB
     RATIONAL_POLYNOMIAL = "rational_polynomial", lens_laws.RATIONAL_POLYNOMIAL
     EQUIDISTANT = "equidistant", EQUIDISTANT
+    EUCM = "eucm", EUCM
+    DOUBLE_SPHERE = "ds", DOUBLE_SPHERE
 
 
 _LONGEST_READOUT = 1.0  # s: more than any camera takes for a picture of a moving world
@@ -123,9 +127,10 @@ class Camera:
     Args:
         width, height: size of the full sensor image to which K belongs, pixels.
         K: (3,3) intrinsic matrix without skew.
-        D: distortion coefficients in OpenCV's order (empty or None: none).
-        distortion_model: ``plumb_bob``, ``rational_polynomial`` or ``equidistant``; see
-            :class:`DistortionModel`.
+        D: distortion coefficients in OpenCV's order (empty or None: none); alpha, beta of
+            ``eucm``, xi, alpha of ``ds``.
+        distortion_model: ``plumb_bob``, ``rational_polynomial``, ``equidistant``, ``eucm`` or
+            ``ds``; see :class:`DistortionModel`.
         readout_time: s from the first to the last row of the full sensor; 0 = unknown.
         scan_direction: see :class:`ScanDirection`.
         binning: sensor pixels per delivered pixel, (x, y).
@@ -183,6 +188,11 @@ class Camera:
             )
         if not np.all(np.isfinite(D)):
             raise ValueError(f"D must be finite, got {D.tolist()}")
+        for value, (low, high) in zip(D, model.law.limits or (), strict=False):
+            if not low <= value <= high:
+                raise ValueError(
+                    f"D of {model} must lie within {model.law.limits}, got {D.tolist()}"
+                )
         direction = choice("scan_direction", ScanDirection, self.scan_direction)
         if min(self.width, self.height) < 2:
             raise ValueError(f"the image must be at least 2x2, got {self.width}x{self.height}")

@@ -56,6 +56,8 @@ def with_lens(camera: Camera, coefficients: Array) -> Camera:
     changes *= _scales_of(camera)
     count = _distorting(camera)
     distortion[:count] += changes[:count]
+    if (limits := _law_of(camera).limits) is not None:
+        distortion = np.clip(distortion, *np.transpose(limits))
     K[(0, 1, 0, 1), (0, 1, 2, 2)] += changes[count:]
     return replace(camera, K=K, D=distortion, distortion_model=_model_of(camera))
 
@@ -93,5 +95,11 @@ def _scales_of(camera: Camera) -> Array:
     """Changes of OpenCV's parameters by one of the coefficients (k,)."""
     corner = corner_of(camera)
     focal = np.diag(camera.K)[:2]
+    law = _law_of(camera)
+    if law.limits is not None:
+        edge = np.array([[corner, 0.0]])
+        outwards = law.project(edge, camera.K, camera.D).by_coefficients[0, 0] / focal[0]
+        moves = np.divide(corner, outwards, out=np.zeros_like(outwards), where=outwards != 0.0)
+        return np.concatenate([moves, focal, corner * focal])
     powers = [1.0 if order is None else 2.0 * (order + 1) for order in _law_of(camera).correctable]
     return np.concatenate([corner ** -np.array(powers), focal, corner * focal])

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lens laws: where a bearing falls on the sensor, and back.
 
-Those of sensor_msgs/CameraInfo are here and in :mod:`rs_localizer.core.equidistant`. A new law is
-a file with its own :class:`LensLaw`, and a row in
+Those of sensor_msgs/CameraInfo are here and in :mod:`rs_localizer.core.equidistant`;
+:mod:`rs_localizer.core.eucm` and :mod:`rs_localizer.core.double_sphere` have Kalibr's names. A new
+law is a file with its own :class:`LensLaw`, and a row in
 :class:`rs_localizer.core.camera.DistortionModel`; all else reads what stands here.
 """
 
@@ -74,6 +75,9 @@ class LensLaw(NamedTuple):
     undistort: Callable[[Array, Array, Array], Array]
     is_polynomial: bool = False  # OpenCV's pinhole polynomials, which core.bearings inverts
     sphere: Sphere | None = None  # of a lens that may see more than the half space before it
+    # Between which each coefficient lies; None: anywhere. The coefficients of such a law act at all
+    # powers of the radius at once: one of 1 moves the corner by its distance from the centre.
+    limits: tuple[tuple[float, float], ...] | None = None
 
     def see(self, towards: Array, K: Array, D: Array) -> Projection:
         """Projection of rays (n,2) or bearings (n,3): ``by_ray`` is (n,2,2) or (n,2,3)."""
@@ -114,17 +118,36 @@ def _undistort(pixels: Array, K: Array, D: Array) -> Array:
     return np.asarray(rays[:, 0], np.float64)
 
 
+def onto_sensor(bearings: Array, below: Array, by_bearing: Array, by_coefficients: Array) -> Seen:
+    """``x, y`` of bearings (n,3) divided by a number each.
+
+    Args:
+        below: (n,) the numbers.
+        by_bearing, by_coefficients: (n,3) and (n,d), their derivatives.
+    """
+    places = bearings[:, :2] / below[:, None]
+    shrink = -places[:, :, None] / below[:, None, None]
+    seen = Seen(
+        places, shrink * by_bearing[:, None, :], shrink * by_coefficients[:, None, :]
+    )  # fmt: skip
+    for axis in range(2):
+        seen.by_bearing[:, axis, axis] += 1.0 / below
+    return seen
+
+
 def sphere_law(
     see: Callable[[Array, Array], Seen],
     look: Callable[[Array, Array], Array],
     coefficients: int,
+    limits: tuple[tuple[float, float], ...] | None = None,
 ) -> LensLaw:
     """The law of a lens that sees bearings (n,3) of any direction.
 
     Args:
         see: of bearings and D.
         look: bearings of places (n,2), in focal lengths from the centre, and D.
-        coefficients: how many it has; without any it is a pinhole.
+        coefficients: how many it has; without any it is a pinhole where it has no limits.
+        limits: of each.
     """
     sphere = Sphere(see, look)
 
@@ -138,8 +161,9 @@ def sphere_law(
         return np.asarray(bearings[:, :2] / ahead)
 
     # All coefficients act from the third power on: the lowest, and those that differ above it.
+    counts = (0, coefficients) if limits is None else (coefficients,)
     orders = tuple(range(coefficients))
-    return LensLaw((0, coefficients), orders, project, undistort, sphere=sphere)
+    return LensLaw(counts, orders, project, undistort, sphere=sphere, limits=limits)
 
 
 PLUMB_BOB = LensLaw(  # k1 k2 p1 p2 k3

@@ -33,6 +33,7 @@ _MODELS = {
     "fisheye": "equidistant", "opencv_fisheye": "equidistant",
     "radtan": "plumb_bob", "pinhole": "plumb_bob", "none": "plumb_bob",
     "opencv_standard": "plumb_bob", "lensmodel_opencv": "plumb_bob",
+    "double_sphere": str(DistortionModel.DOUBLE_SPHERE),
 }  # fmt: skip
 
 
@@ -303,12 +304,13 @@ def colmap_parameters(camera: Camera) -> dict[str, Any]:
     return {"model": model, "params": [values.get(name, 0.0) for name in names]}
 
 
-# Kalibr's names of lenses.
+# Kalibr's names of lenses, for pinholes; the others stand as camera_model.
 _KALIBR_LENSES = {
     "radtan": DistortionModel.PLUMB_BOB,
     "equidistant": DistortionModel.EQUIDISTANT,
     "none": DistortionModel.PLUMB_BOB,
 }
+_KALIBR_SPHERES = (str(DistortionModel.EUCM), str(DistortionModel.DOUBLE_SPHERE))
 
 
 def _is_kalibr(tree: Any) -> bool:
@@ -328,18 +330,20 @@ def kalibr_camera(tree: dict[str, Any]) -> Camera:
         ValueError, KeyError, TypeError: when something is missing or impossible.
     """
     kind, name = tree["camera_model"], tree.get("distortion_model", "none")
-    if kind != "pinhole":
+    if kind not in ("pinhole", *_KALIBR_SPHERES):
         raise ValueError(
-            f"camera_model must be pinhole, found {kind!r}: calibrate with pinhole-radtan, or "
-            "pinhole-equi for a wide lens"
+            f"camera_model must be pinhole, {' or '.join(_KALIBR_SPHERES)}, found {kind!r}: "
+            "calibrate with pinhole-radtan or, for a wide lens, pinhole-equi, eucm-none or ds-none"
         )
-    if name not in _KALIBR_LENSES:
-        known = ", ".join(_KALIBR_LENSES)
+    if name not in (_KALIBR_LENSES if kind == "pinhole" else ("none",)):
+        known = ", ".join(_KALIBR_LENSES) if kind == "pinhole" else f"none with {kind}"
         raise ValueError(f"distortion_model must be one of {known}; found {name!r}")
-    D = np.array([] if name == "none" else tree["distortion_coeffs"], np.float64)
+    # Coefficients of eucm and ds stand before the focal lengths.
+    *front, fx, fy, cx, cy = map(float, tree["intrinsics"])
+    D = np.array([*front, *([] if name == "none" else tree["distortion_coeffs"])], np.float64)
+    lens = _KALIBR_LENSES[name] if kind == "pinhole" else kind
     width, height = map(int, tree["resolution"])
-    matrix = pinhole_matrix(*map(float, tree["intrinsics"]))
-    return Camera(width, height, matrix, D, _KALIBR_LENSES[name])
+    return Camera(width, height, pinhole_matrix(fx, fy, cx, cy), D, lens)
 
 
 def kalibr_fields(camera: Camera) -> dict[str, Any]:
@@ -351,15 +355,17 @@ def kalibr_fields(camera: Camera) -> dict[str, Any]:
     model, D = DistortionModel(camera.distortion_model), camera.D.tolist()
     if camera.roi is not None or camera.binning != (1, 1):
         raise ValueError("a camchain knows neither binning nor regions of the sensor")
+    sphere = str(model) in _KALIBR_SPHERES
     names = {lens: name for name, lens in _KALIBR_LENSES.items() if name != "none"}
-    if model not in names or (model == DistortionModel.PLUMB_BOB and any(D[4:])):
+    if (model not in names and not sphere) or (model == DistortionModel.PLUMB_BOB and any(D[4:])):
         raise ValueError(f"Kalibr has no lens {model} with {len(D)} coefficients")
     intrinsics = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]]
+    plain = sphere or len(D) == 0
     return {
-        "camera_model": "pinhole",
-        "intrinsics": [float(value) for value in intrinsics],
-        "distortion_model": names[model] if D else "none",
-        "distortion_coeffs": D[:4],
+        "camera_model": str(model) if sphere else "pinhole",
+        "intrinsics": [float(value) for value in (*(D if sphere else ()), *intrinsics)],
+        "distortion_model": "none" if plain else names[model],
+        "distortion_coeffs": [] if plain else D[:4],
         "resolution": [camera.width, camera.height],
     }
 

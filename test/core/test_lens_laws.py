@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every lens law: derivatives are finite differences, and rays come back from their pixels.
 
-That which sees behind the image plane is compared with the formula of its paper, written out point
-by point; distortion that a calibration lacks, with Brown's and Kannala's.
+Those that see behind the image plane are compared with the formulas of their papers, written out
+point by point; distortion that a calibration lacks, with Brown's and Kannala's.
 """
 
 from __future__ import annotations
@@ -19,12 +19,18 @@ from rs_localizer.core.lens import by_lens, coefficients_of, corner_of, with_len
 K = np.array([[520.0, 0.0, 310.0], [0.0, 500.0, 250.0], [0.0, 0.0, 1.0]])
 RAYS = np.random.default_rng(3).uniform(-0.5, 0.5, (40, 2))
 STEP = 1e-6
-# Coefficients of a real lens of about 200 degrees, and the angle to the axis up to which it sees.
-WIDE, WIDEST = [0.01, -0.004, 0.002, -3e-4], 1.8
+# Coefficients of real lenses of about 200 degrees, and the angle to the axis up to which they see.
+WIDE = {
+    DistortionModel.EQUIDISTANT: ([0.01, -0.004, 0.002, -3e-4], 1.8),
+    DistortionModel.EUCM: ([0.63, 1.05], 1.9),
+    DistortionModel.DOUBLE_SPHERE: ([-0.2, 0.59], 1.9),
+}
 
 
 def coefficients(model: DistortionModel) -> np.ndarray:
-    """Small ones, as many as a law may have."""
+    """Small ones, as many as a law may have; of those with limits, some of a wide lens."""
+    if model.law.limits is not None:
+        return np.array(WIDE[model][0])
     return np.random.default_rng(4).uniform(-0.02, 0.02, max(model.law.counts))
 
 
@@ -64,11 +70,33 @@ def test_a_single_image_corrects_the_lowest_powers_only(model):
     assert all(order is None or order < 2 for order in orders)
 
 
+def khomutenko(x, y, z, alpha, beta):
+    """Equation 12 of the paper."""
+    rho = math.sqrt(z * z + beta * (x * x + y * y))
+    eta = (1.0 - alpha) * z + alpha * rho
+    return x / eta, y / eta
+
+
+def usenko(x, y, z, xi, alpha):
+    """Equation 40 of the paper."""
+    d1 = math.sqrt(x * x + y * y + z * z)
+    d2 = math.sqrt(x * x + y * y + (xi * d1 + z) ** 2)
+    below = alpha * d2 + (1.0 - alpha) * (xi * d1 + z)
+    return x / below, y / below
+
+
 def kannala(x, y, z, *k):
     """Equations 6 and 7 of the paper."""
     angle, azimuth = math.acos(z / math.sqrt(x * x + y * y + z * z)), math.atan2(y, x)
     radius = angle + sum(c * angle ** (2 * power + 3) for power, c in enumerate(k))
     return radius * math.cos(azimuth), radius * math.sin(azimuth)
+
+
+PAPERS = {
+    DistortionModel.EQUIDISTANT: kannala,
+    DistortionModel.EUCM: khomutenko,
+    DistortionModel.DOUBLE_SPHERE: usenko,
+}
 
 
 def directions(most, count=200):
@@ -80,10 +108,12 @@ def directions(most, count=200):
     return np.vstack([rng.uniform(0.2, 5.0, (count, 1)) * unit, [[0.0, 0.0, 2.0]]])
 
 
-def test_a_wide_lens_is_that_of_its_paper():
-    points = directions(WIDEST)
-    camera = Camera(640, 480, K, WIDE, "equidistant", binning=(2, 2), roi=Roi(20, 10, 400, 300))
-    places = np.array([kannala(*point, *WIDE) for point in points])
+@pytest.mark.parametrize("model", WIDE)
+def test_wide_lenses_are_those_of_their_papers(model):
+    D, most = WIDE[model]
+    points = directions(most)
+    camera = Camera(640, 480, K, D, model, binning=(2, 2), roi=Roi(20, 10, 400, 300))
+    places = np.array([PAPERS[model](*point, *D) for point in points])
     expected = (places * (520.0, 500.0) + (310.0, 250.0) - (20.0, 10.0)) / 2.0
     np.testing.assert_allclose(camera.project(points), expected, rtol=1e-12, atol=1e-9)
     assert (points[:, 2] < 0.0).sum() > 15  # behind the image plane
@@ -96,10 +126,26 @@ def test_a_wide_lens_is_that_of_its_paper():
     assert np.isnan(rays[points[:, 2] < 0.0]).all()
 
 
-def test_a_wide_lens_says_what_it_does_not_see():
-    camera = Camera(640, 480, K, WIDE, "equidistant")
+@pytest.mark.parametrize("model", WIDE)
+def test_wide_lenses_say_what_they_do_not_see(model):
+    camera = Camera(640, 480, K, WIDE[model][0], model)
     assert np.isnan(camera.project(np.array([[0.0, 1e-3, -1.0]]))).all()
     assert np.isnan(camera.bearings(np.array([[310.0, 1e5]]))).all()
+
+
+@pytest.mark.parametrize("model", [DistortionModel.EUCM, DistortionModel.DOUBLE_SPHERE])
+def test_closed_formulas_have_limits_and_corrections_keep_them(model):
+    D, _ = WIDE[model]
+    with pytest.raises(ValueError, match=f"D of {model} must lie within"):
+        Camera(640, 480, K, np.array(D) + 1.5, model)
+    camera = Camera(640, 480, K, D, model)
+    count = coefficients_of(camera)
+    # A coefficient of 1 moves the corner by its distance from the centre, outwards.
+    edge = np.array([[corner_of(camera), 0.0]])
+    moved = by_lens(camera, edge)[0, 0, :2]
+    np.testing.assert_allclose(moved, 520.0 * corner_of(camera), rtol=1e-9)
+    for size in (0.01, 10.0):
+        with_lens(camera, np.append([size, -2.0 * size], np.zeros(count - 2)))
 
 
 FOUND = np.array([-0.03, 0.01, 4e-4, -3e-4])
@@ -125,7 +171,7 @@ def test_fisheyes_have_powers_of_the_angle():
         640,
         480,
         square + K * [[0, 0, 1], [0, 0, 1], [0, 0, 0]],
-        WIDE,
+        WIDE["equidistant"][0],
         "equidistant",
     )
     assert coefficients_of(given) == 6

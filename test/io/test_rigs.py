@@ -24,18 +24,18 @@ CHAIN = """cam0:
   rostopic: /cam0/image_raw
 cam1:
   T_cn_cnm1: [[0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, -0.2], [0, 0, 0, 1]]
-  camera_model: pinhole
-  distortion_coeffs: [0.01, -0.02, 0.003, 0.001]
-  distortion_model: equidistant
-  intrinsics: [300.0, 301.0, 310.0, 230.0]
+  camera_model: ds
+  distortion_coeffs: []
+  distortion_model: none
+  intrinsics: [-0.2, 0.59, 300.0, 301.0, 310.0, 230.0]
   resolution: [640, 480]
   readout_time: 0.02
 cam2:
   T_cn_cnm1: [[-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.1], [0.0, 0.0, 1.0, 0.0], [0, 0, 0, 1]]
-  camera_model: pinhole
+  camera_model: eucm
   distortion_coeffs: []
   distortion_model: none
-  intrinsics: [280.0, 281.0, 311.0, 231.0]
+  intrinsics: [0.6, 1.1, 280.0, 281.0, 311.0, 231.0]
   resolution: [640, 480]
   readout_time: 0.03
   scan_direction: bottom_to_top
@@ -64,8 +64,8 @@ def test_transforms_of_a_camchain_lead_from_one_camera_to_the_next(tmp_path):
     np.testing.assert_allclose(seen(parts, "cam2", point), [2.0, 0.1, 1.0])
     first, second, third = parts.cameras.values()
     assert (str(first.distortion_model), first.readout_time) == ("plumb_bob", 0.0)
-    assert (str(second.distortion_model), second.readout_time) == ("equidistant", 0.02)
-    assert (second.D.tolist(), third.D.tolist()) == ([0.01, -0.02, 0.003, 0.001], [])
+    assert (str(second.distortion_model), second.readout_time) == ("ds", 0.02)
+    assert (second.D.tolist(), third.D.tolist()) == ([-0.2, 0.59], [0.6, 1.1])
     assert third.K.tolist() == [[280, 0, 311], [0, 281, 231], [0, 0, 1]]
     assert third.scan_direction == "bottom_to_top"
     np.testing.assert_array_equal(read_calibration(f"{tmp_path}/chain.yaml#cam2").D, third.D)
@@ -88,7 +88,8 @@ def rig():
     K = np.array([[400.0, 0.0, 320.0], [0.0, 402.0, 241.0], [0.0, 0.0, 1.0]])
     lenses = {
         "front": ("equidistant", [0.01, -0.02, 0.003, 0.0]),
-        "rear": ("equidistant", []),
+        "left": ("eucm", [0.6, 1.1]),
+        "rear": ("ds", [-0.2, 0.6]),
         "right": ("plumb_bob", [0.1, 0.02, 1e-3, -1e-3]),
         "up": ("plumb_bob", []),
     }
@@ -131,8 +132,8 @@ def test_a_written_camchain_comes_back(tmp_path):
         (CHAIN.replace("T_cn_cnm1", "T"), "no usable rig: cam1 has no 'T_cn_cnm1'"),
         (CHAIN.replace("[0.0, 1.0, 0.0, 0.0]", "[0.0, -1.0, 0.0, 0.0]"),
          "cam1: T_cn_cnm1 is no rigid transform"),
-        (CHAIN.replace("camera_model: pinhole", "camera_model: ds"),
-         "cam0: camera_model must be pinhole, found 'ds'"),
+        (CHAIN.replace("camera_model: ds", "camera_model: omni"),
+         "cam1: camera_model must be pinhole, eucm or ds, found 'omni'"),
         ("[1, 2]", "a camchain has a mapping for each camera"),
     ],
 )  # fmt: skip

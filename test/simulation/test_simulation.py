@@ -64,15 +64,15 @@ def test_points_that_a_lens_folds_back_are_not_seen():
 
 
 def test_a_wide_lens_shows_what_lies_behind_it():
-    """By equation 6 of Kannala and Brandt (2006), an angle for a radius."""
+    """By equation 12 of Khomutenko, Garcia, Martinet (2016)."""
     wide = [[160.0, 0.0, 319.5], [0.0, 164.0, 239.5], [0.0, 0.0, 1.0]]
-    lens = Camera(640, 480, wide, np.zeros(4), "equidistant")
+    lens = Camera(640, 480, wide, [0.63, 1.05], "eucm")
     behind = 0
     for frame in list(simulate_frames(lens, MOTION, MAP, CLEAN))[::10]:
         x, y, z = frame.motion.rotation @ frame.points.T + frame.motion.translation[:, None]
-        scale = np.arctan2(np.hypot(x, y), z) / np.hypot(x, y)
-        np.testing.assert_allclose(frame.pixels[:, 0], 160 * x * scale + 319.5, atol=1e-6)
-        np.testing.assert_allclose(frame.pixels[:, 1], 164 * y * scale + 239.5, atol=1e-6)
+        scale = 0.63 * np.sqrt(1.05 * (x**2 + y**2) + z**2) + 0.37 * z
+        np.testing.assert_allclose(frame.pixels[:, 0], 160 * x / scale + 319.5, atol=1e-6)
+        np.testing.assert_allclose(frame.pixels[:, 1], 164 * y / scale + 239.5, atol=1e-6)
         behind += np.count_nonzero(z < 0.0)
     assert behind > 10
 

@@ -114,7 +114,7 @@ def test_one_of_several_cameras(tmp_path):
         (ROS.replace("image_width", "breite"), r"not a usable calibration: no 'image_width'"),
         (ROS.replace("rational_polynomial", "fov"), r"distortion_model must be .* got 'fov'"),
         (ROS[: ROS.index("distortion_model")], r"no distortion coefficients: is it cut off"),
-        (KALIBR.replace("pinhole", "omni"), r"must be pinhole, found 'omni'"),
+        (KALIBR.replace("pinhole", "omni"), r"must be pinhole, eucm or ds, found 'omni'"),
         (COLMAP.format("FOV", "500 510 321 241 1"), r"model must be one of .* found FOV"),
         (JSON % '"width": 640', r"not a usable calibration: no 'image_height'"),
         (JSON % '"width": 300, "height": 480', r"principal point \(320.5, 240.5\) lies outside"),
