@@ -61,7 +61,6 @@ class ImuReason(StrEnum):
     NOT_TRACKING = "imu_not_tracking"
     DOUBTED = "imu_doubted"
     DISAGREES = "imu_disagrees"
-    TURNED = "imu_turned"
     COMPILING = "imu_compiling"
 
 

@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Watch over a gyroscope: it is believed as long as the camera agrees.
 
-One that contradicts it in many frames is dropped, until another offset of its stamps makes the two
-agree; or another rotation camera <- imu would, which is then said: the rotation that carries the
-gyroscope's turns into the camera's (Wahba, "A least squares estimate of satellite attitude", 1965;
-by the singular values of their correlation: Markley, 1988).
+One that contradicts it in many frames is dropped, until the two agree again, or another offset of
+its stamps makes them agree.
 """
 
 from __future__ import annotations
@@ -25,31 +23,9 @@ from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialStatus, Unused
 from rs_localizer.inertial.turning import turn_between
 
-# Turns that a rotation explains, as a part of their sum of squares that it leaves.
-_EXPLAINED = 0.1
-# Turns about one axis alone say nothing of the others: second singular value to the first.
-_LEAST_SPREAD = 0.02
-
-
-def turned_by(shown: Array, seen: Array) -> float | None:
-    """The angle (rad) between the axes of a gyroscope, as they are said to be, and the camera's.
-
-    None where no rotation carries turns that it has shown (n,3) into those that the camera has
-    seen (n,3), both rad, or where they do not tell it.
-    """
-    left, sizes, right = np.linalg.svd(seen.T @ shown)
-    if not sizes[1] > _LEAST_SPREAD * sizes[0]:
-        return None
-    sign = np.sign(np.linalg.det(left @ right))
-    rotation = np.ascontiguousarray(left * [1.0, 1.0, sign] @ right)
-    if np.sum((seen - shown @ rotation.T) ** 2) >= _EXPLAINED * np.sum(seen**2):
-        return None
-    return float(np.linalg.norm(so3.log(rotation)))
-
-
 # So many of the last frames that contradict the gyroscope are no chance.
 _WATCHED, _CONTRADICTIONS = 12, 6
-# Turns of the camera that are kept to find out why, and how often that is tried (frames).
+# Turns of the camera that are kept to see if they agree, and how often that is tried (frames).
 _KEPT, _TRY_EVERY = 90, 15
 _LONGEST_PAIR_NS = 200_000_000
 _MEMORY_NS = 4_000_000_000
@@ -60,7 +36,7 @@ _ALLOWED = 0.03
 
 
 class GyroscopeWatch:
-    """Drops a gyroscope that contradicts the camera, finds out why, and takes it up again."""
+    """Drops a gyroscope that contradicts the camera, and takes it up again."""
 
     def __init__(self, settings: InertialSettings, filter_: GyroscopeFilter) -> None:
         self._settings, self._filter = settings, filter_
@@ -120,7 +96,7 @@ class GyroscopeWatch:
         self._untried += 1
         if self._untried >= _TRY_EVERY:
             self._untried = 0
-            self._explain()
+            self._compare()
 
     def _follow(self, frame: Orientation) -> None:
         last, self._last = self._last, frame
@@ -130,8 +106,8 @@ class GyroscopeWatch:
         if np.linalg.norm(turn) > _TELLING * math.hypot(frame.deviation, last.deviation):
             self._turns.append((last.middle_ns, frame.middle_ns, turn))
 
-    def _explain(self) -> None:
-        """Take it up where the two agree, or say that the mounting does not."""
+    def _compare(self) -> None:
+        """Take it up where the two agree."""
         if not self._samples:
             return
         samples, errors = ImuSamples(*self.heard), self._filter.errors
@@ -143,13 +119,6 @@ class GyroscopeWatch:
         shown, seen = np.array(pairs).reshape(-1, 2, 3).transpose(1, 0, 2)
         if len(seen) and np.sum((seen - shown) ** 2) < _ALLOWED * np.sum(seen**2):
             self.take_up()
-            return
-        angle = turned_by(shown, seen) if len(seen) else None
-        self.dropped = (
-            Unused(ImuReason.DISAGREES)
-            if angle is None
-            else Unused(ImuReason.TURNED, f"by {math.degrees(angle):.0f} degrees")
-        )
 
     def take_up(self) -> None:
         """Believe it again."""

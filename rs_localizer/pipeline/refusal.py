@@ -166,10 +166,8 @@ IMU_REASONS: dict[str, Meaning] = {
         "if often: imu.gyroscope_noise, imu.time_offset",
     ),
     ImuReason.DISAGREES: Meaning(
-        "the gyroscope's rates are not the camera's", "one body? imu.time_offset, frame_id, units"
-    ),
-    ImuReason.TURNED: Meaning(
-        "the gyroscope's axes disagree with TF", "the transform of the frame_ids"
+        "the gyroscope's rates are not the camera's",
+        "one body? imu.time_offset, the transform of the frame_ids, units",
     ),
     ImuReason.COMPILING: Meaning(
         "kernels for an IMU are being compiled",

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples, mounting and gravity."""
+"""Gravity by an accelerometer."""
 
 import numpy as np
 import pytest
@@ -9,21 +9,9 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.inertial.gravity import STANDARD_GRAVITY, gravity_seen
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.turning import GyroscopeErrors
-from rs_localizer.inertial.watch import turned_by
 
 ERRORS = GyroscopeErrors(np.zeros(3), 0.0, 1e-8 * np.eye(4), 1e-4)
 TIMES = 10**12 + np.arange(400) * 2_500_000
-
-
-def test_the_mounting_is_found():
-    rng = np.random.default_rng(0)
-    shown = rng.normal(0.0, 0.05, (40, 3))
-    mounted = Rotation.from_rotvec([0.5, 1.2, -0.3])
-    found = turned_by(shown, mounted.apply(shown) + rng.normal(0.0, 1e-3, (40, 3)))
-    assert abs(found - mounted.magnitude()) < 0.01
-    assert turned_by(shown, rng.normal(0.0, 0.05, (40, 3))) is None
-    about_one_axis = np.outer(np.linspace(-1.0, 1.0, 20), [0.0, 0.0, 1.0])
-    assert turned_by(about_one_axis, about_one_axis) is None
 
 
 def test_gravity_of_a_camera_that_turns():
