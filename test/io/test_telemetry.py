@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("telemetry_parser", reason="needs telemetry-parser (rs_localizer[video])")
 
-from recorded import field, insta360
+from recorded import field
 
 from rs_localizer.cli import image_input
 from rs_localizer.cli.commands import main
@@ -147,97 +147,30 @@ def test_orientations_take_the_place_of_a_gyroscope():
     assert found.readout_time == pytest.approx(0.009)
 
 
-def test_a_file_of_insta360(tmp_path):
-    """Its trailer, written by hand as telemetry-parser's source describes it."""
-    size = 2560
-    pair = field(1, size) + field(2, size)
-    about = field(2, "Insta360 GO 3") + field(19, pair) + field(24, 1000) + field(25, 18.5)
-    about += field(27, pair + field(3, size) + field(4, size))
-    about += field(54, "1_2_2870_2870_1280_1290_0_0_0_0_0_0_0.05_-0.1_0.1_0_0_2560_2560_4_0")
-    readings = b"".join(
-        struct.pack("<Q6d", 1000 + 5 * k, 1.0, 0.0, 0.0, 0.5, 0.0, 0.1) for k in range(400)
-    )
-    path = tmp_path / "VID_1.insv"
-    path.write_bytes(bytes(5000) + insta360(readings, about))
-    assert has_telemetry(path)
-    found = read_telemetry(path)
-    assert found.camera == "Insta360 GO 3"
-    assert found.readout_time == pytest.approx(0.0185)
-    assert (found.rate, found.times[0]) == (pytest.approx(200.0), pytest.approx(0.0))
-    # The library has x up, as in test_readings_are_in_the_axes_of_the_camera.
-    np.testing.assert_allclose(found.rates[0], [0.0, -0.5, -0.1], atol=1e-9)
-    np.testing.assert_allclose(found.forces[0], [0.0, -9.80665, 0.0], atol=1e-3)
-
-
-def box(kind: str, *parts: bytes) -> bytes:
-    """A box of MP4."""
-    return struct.pack(">I4s", 8 + sum(map(len, parts)), kind.encode()) + b"".join(parts)
-
-
-def klv(key: str, kind: str, values: Any, width: int = 1) -> bytes:
-    """An item of GPMF: what it is, its type, the size of a value, how many, the values."""
-    kinds = {"L": ">u4", "f": ">f4", "s": ">i2"}
-    data = values.encode() if kind == "c" else np.asarray(values, kinds[kind]).tobytes()
-    size = width * (1 if kind == "c" else np.dtype(kinds[kind]).itemsize)
-    head = key.encode() + struct.pack(">cBH", kind.encode(), size, len(data) // size)
-    return head + data + bytes(-len(data) % 4)
-
-
-def nest(key: str, *items: bytes) -> bytes:
-    data = b"".join(items)
-    return key.encode() + struct.pack(">BBH", 0, 1, len(data)) + data
-
-
-def of_gopro(payloads: list[bytes], *settings: bytes, padding: int = 0) -> bytes:
-    """An MP4 with a track of GPMF, a payload a second, and the settings of the camera."""
-    count, first = len(payloads), box("ftyp", b"mp41")
-    places = len(first) + 8 + np.cumsum([0, *map(len, payloads)])[:-1]
-    length = struct.pack(">4I", 0, 0, 1000, 1001 * count)
-    tables = box(
-        "stbl",
-        box("stsd", struct.pack(">2I", 0, 1), box("gpmd", bytes(7), b"\1")),
-        box("stts", struct.pack(">4I", 0, 1, count, 1001)),
-        box("stsc", struct.pack(">5I", 0, 1, 1, 1, 1)),
-        box("stsz", struct.pack(f">{3 + count}I", 0, 0, count, *map(len, payloads))),
-        box("stco", struct.pack(f">{2 + count}I", 0, count, *places.tolist())),
-    )
-    track = box(
-        "trak",
-        box("tkhd", struct.pack(">6I", 15, 0, 0, 1, 0, 1001 * count), bytes(60)),
-        box("mdia", box("mdhd", bytes(4), length, bytes(4)),
-            box("hdlr", bytes(8), b"meta", bytes(12), b"GoPro MET\0"), box("minf", tables)),
-    )  # fmt: skip
-    about = box("udta", box("GPMF", nest("DEVC", klv("DVID", "L", 1), *settings)))
-    content = box("mvhd", bytes(4), length, bytes(80)), about, box("free", bytes(padding)), track
-    return first + box("mdat", *payloads) + box("moov", *content, box("free", bytes(padding)))
-
-
-def test_a_file_of_gopro(tmp_path):
-    """As GPMF's documentation has it: up, right to left, forward to back; a HERO7's readout times
-    stand in a stream of their own.
-    """
-    rates, forces = np.tile([500, 0, 100], (200, 1)), np.tile([4096, 0, 0], (200, 1))
-    payload = nest(
-        "DEVC", klv("DVID", "L", 1), klv("DVNM", "c", "Hero7 Black"),
-        nest("STRM", klv("SIUN", "c", "m/s2"), klv("SCAL", "s", 418), klv("ACCL", "s", forces, 3)),
-        nest("STRM", klv("SIUN", "c", "rad/s"), klv("SCAL", "s", 1000), klv("GYRO", "s", rates, 3)),
-        nest("STRM", klv("STNM", "c", "Sensor read out time"), klv("SROT", "f", [8.744] * 30)),
-    )  # fmt: skip
-    settings = klv("MINF", "c", "HERO7 Black"), klv("VFOV", "c", "W"), klv("EISE", "c", "N")
-    path = tmp_path / "GX010001.MP4"
-    # As of half an hour: what the track is called is far from both ends.
-    path.write_bytes(of_gopro(3 * [payload], *settings, padding=2**19))
-    assert has_telemetry(path)
-    found = read_telemetry(path)
-    assert (found.camera, found.stabilizer) == ("GoPro HERO7 Black", "")
+def test_what_a_gopro_says_of_its_images():
+    """By the names of GPMF's documentation: a HERO7's readout times are those of each image."""
+    said = {"0x53524f54": 8.744, "0x45495345": "Y", "0x45495341": "N/A"}
+    found = interpreted(readings(values=said))
     assert found.readout_time == pytest.approx(0.008744)
-    assert found.rate == pytest.approx(200.0, rel=2e-3)
-    np.testing.assert_allclose(found.rates, np.tile([0.0, -0.5, -0.1], (600, 1)), atol=1e-6)
-    np.testing.assert_allclose(found.forces[0], [0.0, -4096 / 418, 0.0], atol=1e-6)
-    path.write_bytes(of_gopro([payload], *settings[:2], klv("EISE", "c", "Y"), padding=0))
-    read_telemetry.cache_clear()
-    stabilized = read_telemetry(path)
-    assert stabilized.stabilizer == "electronic stabilization"
+    assert found.stabilizer == "electronic stabilization"
+    off = interpreted(readings(values=said | {"0x45495345": "N"}))
+    assert off.stabilizer == ""
+    high = interpreted(readings(values={"0x45495341": "HS HLevel"}))
+    assert high.stabilizer == "HS HLevel"
+
+
+def box(kind: bytes, content: bytes) -> bytes:
+    """A box of MP4."""
+    return struct.pack(">I4s", 8 + len(content), kind) + content
+
+
+def test_tracks_of_a_long_video_are_far_from_both_ends(tmp_path):
+    path = tmp_path / "GX010001.MP4"
+    far = bytes(2**19)
+    path.write_bytes(box(b"mdat", far) + box(b"moov", far + b"gpmd" + far))
+    assert has_telemetry(path)
+    path.write_bytes(box(b"mdat", far + b"gpmd" + far) + box(b"moov", far))
+    assert not has_telemetry(path)
 
 
 @pytest.fixture
