@@ -263,31 +263,15 @@ class PublishTf(StrEnum):
     MAP_TO_ODOM = "map_to_odom"
 
 
-class MatchBy(StrEnum):
-    """Basis of the comparison of keypoints with landmarks."""
-
-    AUTO = "auto"
-    DESCRIPTOR = "descriptor"
-    ID = "id"
-
-
 @dataclass(frozen=True, slots=True)
 class Matching:
     """How keypoints are matched with the landmarks of a map."""
 
-    by: str = setting(
-        MatchBy.AUTO,
-        "What keypoints and landmarks are compared by; auto: descriptors if both have them, "
-        "otherwise ids",
-    )
     ratio: float = setting(
         0.8,
         "A match by descriptor counts if its distance is below this part of the second-best "
         "landmark's; 1: always",
         (0.01, 1.0),
-    )
-    mutual: bool = setting(
-        True, "A match by descriptor counts if no other keypoint is nearer to the landmark"
     )
     gate: float = setting(
         20.0,

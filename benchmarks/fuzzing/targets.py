@@ -50,7 +50,7 @@ _ANCHORED_PARAMS = b"""
 rs_localizer:
   ros__parameters: *a
 """
-_ASSIGNMENTS = (b"readout_time:=0.03", b"matching.by:=id", b"tracking:=false", b"map_file:=''")
+_ASSIGNMENTS = (b"readout_time:=0.03", b"solver:=p3p", b"tracking:=false", b"map_file:=''")
 _TUM = b"# t x y z qx qy qz qw\n1.5 0 0 1 0 0 0 1\n2.5 1 0 1 0 0 0.6 0.8\n"
 _TWISTS = b"# t wx wy wz vx vy vz\n1.5 0 0 1 0 0 0\n2.5 1 0 1 0 0 0.6\n"
 _WPILIB = b"""{"tags": [{"ID": 1, "pose": {"translation": {"x": 1.0, "y": 0.0, "z": 1.5},

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.config import MatchBy, Matching
+from rs_localizer.config import Matching
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
@@ -64,14 +65,8 @@ class Visible:
 
 
 class Index:
-    """A search among the descriptors (n,d) that it was made of.
+    """A search among the descriptors (n,d) that it was made of."""
 
-    Costs are what one core of an AMD EPYC took, in ns: they only decide which search is made, and
-    that has to be the same in a replay.
-    """
-
-    pair_cost: float  # of a query and a landmark, in the search among all
-    candidate_cost: float  # of a landmark that is predicted near a query
     _rows: NDArray[Any]  # (n,w) as the kernels take them
     _search_within: Any
 
@@ -101,7 +96,6 @@ class _BinaryIndex(Index):
     _search_within = staticmethod(nearest_binary_within)
 
     def __init__(self, descriptors: Descriptors) -> None:
-        self.pair_cost, self.candidate_cost = 0.014 * descriptors.shape[1], 100.0
         self._rows = self._packed(descriptors)
         self._columns = np.ascontiguousarray(self._rows.T)
 
@@ -126,8 +120,6 @@ class _RealIndex(Index):
     _search_within = staticmethod(nearest_real_within)
 
     def __init__(self, descriptors: Descriptors) -> None:
-        width = descriptors.shape[1]
-        self.pair_cost, self.candidate_cost = 0.033 * width, 1.8 * width
         self._rows = self._packed(descriptors)
         with np.errstate(over="ignore"):
             self._squares = np.square(self._rows).sum(axis=1)
@@ -168,9 +160,6 @@ def make_index(descriptors: Descriptors, *, binary: bool) -> Index:
 
 # Standard deviations of the prediction within which the camera is looked for.
 _DEVIATIONS = 3.0
-# What one core of an AMD EPYC took, in ns: for a landmark, without and with a lens that bends, and
-# for a landmark in the rows of a keypoint.
-_PROJECTION_COST, _LENS_COST, _ROW_COST = 400.0, 1400.0, 1.8
 # Pixels along each border of the image that bound its bearings.
 _BORDER_PIXELS = 33
 
@@ -205,23 +194,6 @@ def find_view(camera: Camera, prior: Prior, points: Array, least_gate: float) ->
         return SearchView(near, float(least_gate))
     deviation = focal * _bearing_deviation(prior.covariance, float(np.median(depths[near])))
     return SearchView(near, float(min(max(least_gate, _DEVIATIONS * deviation), widest)))
-
-
-def search_cost(camera: Camera, view: SearchView, queries: int, candidate_cost: float) -> float:
-    """What it takes to project the view and to search near the predictions, in ns.
-
-    Args:
-        camera: of the image.
-        view: landmarks and gate.
-        queries: number of keypoints.
-        candidate_cost: ns for each landmark within the gate of a keypoint.
-    """
-    width, height = camera.size
-    projection = _PROJECTION_COST if len(camera.D) == 0 else _LENS_COST
-    rows = min(2.0 * view.gate / height, 1.0)
-    area = min(math.pi * view.gate**2 / (width * height), 1.0)
-    search = queries * (rows * _ROW_COST + area * candidate_cost)
-    return len(view.landmarks) * (projection + search)
 
 
 def predict(camera: Camera, prior: Prior, points: Array, view: SearchView) -> Visible:
@@ -279,10 +251,11 @@ def _bearing_deviation(covariance: Array, depth: float) -> float:
     return math.sqrt(turn + 0.25 * angular + (move + 0.25 * linear) / depth**2)
 
 
-# A prediction tells look-alikes apart: worth so much more than a search of all landmarks, in ns.
-_WORTH = 1e6
-# So many landmarks of a map tell how many of all are in view: to look at all takes milliseconds.
-_SAMPLED = 1000
+class MatchBy(StrEnum):
+    """Basis of the comparison of keypoints with landmarks."""
+
+    DESCRIPTOR = "descriptor"
+    ID = "id"
 
 
 class MatchError(ValueError):
@@ -311,8 +284,6 @@ class Matcher:
         if landmarks.ids is not None:
             self._order = np.argsort(landmarks.ids, kind="stable")
             self._sorted: Ids = landmarks.ids[self._order]
-        self._every = max(1, len(landmarks) // _SAMPLED)
-        self._some = np.ascontiguousarray(landmarks.points[:: self._every])
         self._index: Index | None = None
         if landmarks.descriptors is not None:
             binary = landmarks.descriptors.dtype == np.uint8
@@ -329,24 +300,24 @@ class Matcher:
 
         Args:
             keypoints: of one image.
-            settings: by what, and how strictly.
+            settings: how strictly.
             camera, prior: with a predicted motion, where the landmarks are looked for.
 
         Raises:
             MatchError: when keypoints and map have nothing in common to be compared by.
         """
-        if self.choose(keypoints, settings) == MatchBy.ID:
+        if self.choose(keypoints) == MatchBy.ID:
             return self._by_id(keypoints)
         assert keypoints.descriptors is not None
         chosen = _best(keypoints, settings.max_keypoints)
         queries, pixels = keypoints.descriptors[chosen], keypoints.pixels[chosen]
         if settings.gate > 0.0 and camera is not None and prior is not None:
-            matches, mutual = self._predicted(queries, pixels, settings, camera, prior)
+            matches, owners = self._predicted(queries, pixels, settings.gate, camera, prior)
         else:
-            matches, mutual = self._anywhere(queries, settings)
-        return _accepted(matches, mutual, chosen, settings.ratio)
+            matches, owners = self._anywhere(queries)
+        return _accepted(matches, owners, chosen, settings.ratio)
 
-    def choose(self, keypoints: Keypoints, settings: Matching) -> MatchBy:
+    def choose(self, keypoints: Keypoints) -> MatchBy:
         """By what they are compared; descriptors say more than the numbers of a tracker.
 
         Raises:
@@ -356,11 +327,10 @@ class Matcher:
             MatchBy.DESCRIPTOR: self._index is not None and keypoints.descriptors is not None,
             MatchBy.ID: self._order is not None and keypoints.ids is not None,
         }
-        wanted = [settings.by] if settings.by != MatchBy.AUTO else list(both)
-        by = next((MatchBy(by) for by in wanted if both[MatchBy(by)]), None)
+        by = next((by for by, possible in both.items() if possible), None)
         if by is None:
             raise MatchError(
-                f"keypoints and map cannot be compared by {' or '.join(wanted)}: the keypoints "
+                f"keypoints and map cannot be compared by {' or '.join(both)}: the keypoints "
                 f"have {_marks(keypoints.ids, keypoints.descriptors)}, the map has "
                 f"{_marks(self.map.ids, self.map.descriptors)}"
             )
@@ -386,13 +356,13 @@ class Matcher:
         scores = None if keypoints.scores is None else keypoints.scores[rows]
         return Matches(rows, self._order[places[rows]], scores, MatchBy.ID)
 
-    def _anywhere(self, queries: Descriptors, settings: Matching) -> tuple[Nearest, IntArray]:
+    def _anywhere(self, queries: Descriptors) -> tuple[Nearest, IntArray]:
         """The two nearest of all landmarks, and for each query its rival (q,)."""
         assert self._index is not None
         assert self.map.descriptors is not None
         nearest = self._index.nearest(queries)
         owners = np.arange(len(queries))
-        if settings.mutual and len(queries):
+        if len(queries):
             firsts = nearest.landmarks[:, 0]
             there = np.flatnonzero(firsts >= 0)
             # As the map's: its bytes are bits, those of keypoints may stand for numbers.
@@ -405,25 +375,15 @@ class Matcher:
         self,
         queries: Descriptors,
         pixels: Array,
-        settings: Matching,
+        gate: float,
         camera: Camera,
         prior: Prior,
     ) -> tuple[Nearest, IntArray]:
-        """The same among the landmarks that are predicted near each query.
-
-        Where so many are in view that this would take longer, among all.
-        """
+        """The same among the landmarks that are predicted near each query."""
         assert self._index is not None
-        some = find_view(camera, prior, self._some, settings.gate)
-        cost = search_cost(camera, some, len(queries), self._index.candidate_cost)
-        whole = len(queries) * len(self.map) * self._index.pair_cost
-        if self._every * cost > _WORTH + whole:
-            return self._anywhere(queries, settings)
-        view = find_view(camera, prior, self.map.points, settings.gate)
+        view = find_view(camera, prior, self.map.points, gate)
         visible = predict(camera, prior, self.map.points, view)
         nearest, owners = self._index.nearest_within(queries, pixels, visible)
-        if not settings.mutual:
-            return nearest, np.arange(len(queries))
         owner_of = np.full(len(self.map), -1, np.int64)
         owner_of[visible.landmarks] = owners
         return nearest, owner_of[nearest.landmarks[:, 0]]
@@ -489,10 +449,6 @@ def _accepted(nearest: Nearest, owners: IntArray, rows: IntArray, ratio: float) 
     with np.errstate(invalid="ignore"):  # infinite against infinite: nothing there
         good = (first < ratio * second) & (owners == np.arange(len(first)))
     queries = np.flatnonzero(good)
-    # Without the mutual check several may remain for one landmark: the nearest.
-    queries = queries[np.argsort(first[queries], kind="stable")]
-    _, firsts = np.unique(nearest.landmarks[queries, 0], return_index=True)
-    queries = np.sort(queries[firsts])
     scores = 1.0 - first[queries] / second[queries]
     return Matches(rows[queries], nearest.landmarks[queries, 0], scores, MatchBy.DESCRIPTOR)
 

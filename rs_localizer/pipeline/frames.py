@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rs_localizer import matching
-from rs_localizer.config import CameraSettings, Imu, ImuUse, MatchBy, NodeConfig, PoseTime
+from rs_localizer.config import CameraSettings, Imu, ImuUse, NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -418,7 +418,7 @@ class FrameLocalizer:
         by = self._landmarks.how(keypoints, self.config.matching)
         if isinstance(by, Refusal):
             return by
-        if by == MatchBy.DESCRIPTOR and self._config.matching.gate > 0.0:
+        if by == matching.MatchBy.DESCRIPTOR and self._config.matching.gate > 0.0:
             time_ns = self._middle_row_ns(keypoints.stamp_ns)
             if self.map is not None:
                 self._expect(time_ns, self.map.frame)

@@ -5,14 +5,14 @@
 from pathlib import Path
 
 from rs_localizer import matching
-from rs_localizer.config import MatchBy, Matching
+from rs_localizer.config import Matching
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.clouds import Correspondences, Keypoints
 from rs_localizer.io.maps.landmarks import Map, MapError
-from rs_localizer.matching import Matcher, MatchError
+from rs_localizer.matching import MatchBy, Matcher, MatchError
 from rs_localizer.pipeline.refusal import Notify, Refusal
 
 
@@ -55,7 +55,7 @@ class Landmarks:
                 Reason.NO_MAP, "no usable map has come yet, on map_points or as map_file"
             )
         try:
-            by = self._matcher.choose(keypoints, settings)
+            by = self._matcher.choose(keypoints)
         except MatchError as error:
             return Refusal(Reason.BAD_KEYPOINTS, str(error))
         if by == MatchBy.DESCRIPTOR and len(keypoints) > settings.max_keypoints:

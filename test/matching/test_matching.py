@@ -107,8 +107,8 @@ def test_the_ratio_test():
     matcher = Matcher(make_map(2, descriptors=bits(0, 20)))
     # Distances to the landmarks: 4 and 16, 9 and 11.
     given = keypoints(2, descriptors=bits(4, 9))
-    assert matched(matcher, given, mutual=False, ratio=0.8) == {0: 0}
-    assert matched(matcher, given, mutual=False, ratio=0.25) == {}
+    assert matched(matcher, given, ratio=0.8) == {0: 0}
+    assert matched(matcher, given, ratio=0.25) == {}
     found = matcher.match(given, Matching(ratio=0.8))
     assert found.scores.tolist() == [1.0 - 4 / 16]
 
@@ -118,6 +118,5 @@ def test_the_mutual_check_and_the_best_of_several():
     # Two keypoints like the first landmark; the second is the nearer one.
     given = keypoints(3, descriptors=bits(3, 2, 29))
     assert matched(matcher, given) == {1: 0, 2: 1}
-    assert matched(matcher, given, mutual=False) == {1: 0, 2: 1}
     # The same distance twice: the first.
     assert matched(matcher, keypoints(2, descriptors=bits(2, 2))) == {0: 0}

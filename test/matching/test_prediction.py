@@ -68,8 +68,7 @@ def are_seen(view: Camera, points: Any, pixels: Any) -> Any:
     return (z > 0.0) & (np.abs(view.rays(pixels) - np.c_[x / z, y / z]).max(axis=1) < 1e-3)
 
 
-@pytest.mark.parametrize("mutual", [True, False])
-def test_a_prediction_tells_apart_what_looks_the_same(points, mutual):
+def test_a_prediction_tells_apart_what_looks_the_same(points):
     """Only a hundred kinds of landmarks: by their looks alone none is recognized."""
     view = Camera(640, 480, K, readout_time=0.03)
     rng = np.random.default_rng(1)
@@ -80,7 +79,7 @@ def test_a_prediction_tells_apart_what_looks_the_same(points, mutual):
     given = Keypoints(0, seen, None, descriptors[shown], None, 0)
     matcher = Matcher(Map(points, None, descriptors, "map"))
     assert len(matcher.match(given, Matching())) == 0
-    found = matcher.match(given, Matching(gate=5.0, mutual=mutual), view, SURE)
+    found = matcher.match(given, Matching(gate=5.0), view, SURE)
     assert len(found) > 150
     assert np.mean(found.landmarks == shown[found.keypoints]) > 0.95
     assert len(set(found.landmarks.tolist())) == len(found)
