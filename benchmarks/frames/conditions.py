@@ -77,6 +77,7 @@ class Points:
     wrong: float = 0.0  # share, anywhere in the image
     tails: float = np.inf  # degrees of freedom of Student's t, of which ``noise`` is the scale
     shift: float = 0.0  # px, the same for all points of a recording
+    alike: tuple[float, float] = (0.0, 0.0)  # share that is shifted alike, px
     body: bool = False  # a third of the points is on another body that moves
     bent_map: float = 0.0  # m, rms of each coordinate, in long waves
     rough_map: float = 0.0  # m, each point alone
@@ -332,6 +333,14 @@ def _bad() -> Iterator[tuple[Any, ...]]:
         yield f"{scene}/shift {shift:g}px/{noise:g}px", HAND, SEEN[scene], noise, others
 
 
+def _alike() -> Iterator[tuple[Any, ...]]:
+    for (name, motion), share, shift in product(
+        (("rest", REST), ("hand", HAND)), (0.15, 0.25, 0.4), (3.0, 8.0, 15.0, 25.0)
+    ):
+        others = {"points": Points(alike=(share, shift))}
+        yield f"{name}/{share:.0%}/{shift:g}px", motion, Rich(), 0.5, others
+
+
 def _axis() -> Iterator[tuple[Any, ...]]:
     for (name, motion), noise, late in product(
         (("hand", HAND), ("slow", SLOW_HAND)), (0.3, 1.0), (False, True)
@@ -381,6 +390,6 @@ BENCHES: dict[str, Callable[[], Iterator[tuple[Any, ...]]]] = {
     "hand": _hand, "grid": _grid, "few": _few, "many": _many, "planes": _planes, "gyro": _gyro,
     "locks": _locks, "sine": _sine, "bands": _bands, "noise": _noise, "impacts": _impacts,
     "real": _real, "student": _student, "shared": _shared, "body": _body, "camera": _camera,
-    "map": _map, "bad": _bad, "axis": _axis, "global": _global, "boards": _boards,
+    "map": _map, "bad": _bad, "alike": _alike, "axis": _axis, "global": _global, "boards": _boards,
 }  # fmt: skip
 """By name, of which ``run --bench`` takes some."""

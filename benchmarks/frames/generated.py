@@ -169,6 +169,10 @@ class _Spoiler:
         if begin <= place < end:
             some = rng.permutation(len(pixels))[: round(_SHIFTED * len(pixels))]
             pixels[some] += shift * self._direction[recording]
+        share, shift = points.alike
+        if share:
+            some = rng.permutation(len(pixels))[: round(share * len(pixels))]
+            pixels[some] += shift * self._direction[recording]
         count = round(points.wrong * len(pixels))
         if count:
             far = np.array([frames.camera.width, frames.camera.height]) - 1.0 - _MARGIN

@@ -125,8 +125,9 @@ def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, A
     own = dict(condition.settings) | dict(settings)
     # As users are told: the final inliers may miss by twice the threshold, 3.5 deviations have to.
     own.setdefault("inlier_threshold", max(2.0, 2.0 * condition.noise))
-    # All keypoints off together are like a principal point that is off.
-    exact = condition.calibration == EXACT and not condition.points.shift
+    # Keypoints that are off together are like a principal point that is off.
+    together = condition.points.shift or any(condition.points.alike)
+    exact = condition.calibration == EXACT and not together
     config = configured(rsl.LocalizerConfig(), own, exact)
     variants = 1 if condition.calibration == EXACT else len(_DIRECTIONS)
     localizers = [rsl.Localizer(camera_of(condition, k), config) for k in range(variants)]

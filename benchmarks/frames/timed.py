@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import itertools
 import statistics
 import sys
 import time
@@ -18,11 +19,22 @@ import numpy as np
 from scipy.stats import binom
 
 import rs_localizer as rsl
-from benchmarks.frames.conditions import HAND, NARROW, REST, Condition, Points, moving, turning
+from benchmarks.frames.conditions import (
+    HAND,
+    NARROW,
+    REST,
+    Calibration,
+    Condition,
+    Motion,
+    Points,
+    Sequence,
+    moving,
+    turning,
+)
 from benchmarks.frames.generated import Frame, generate
 from benchmarks.frames.judged import camera_of, judge
 from benchmarks.independent.rotations import Array
-from benchmarks.independent.scenes import Rich, SmallPlane
+from benchmarks.independent.scenes import Rich, Scene, SmallPlane
 
 _SEED = 1
 # PoseLib's own limit is 100 000 samples: where few points fit a global shutter it takes them all.
@@ -50,7 +62,23 @@ CONDITIONS = (
     Condition("times", "5000 points, static", REST, Rich(5000), 0.5,
               points=_WRONG[0.3], camera=_CAMERA),
 )  # fmt: skip
-"""What is timed."""
+"""What is timed beside PoseLib."""
+
+_BAND = moving("any_vibration", degrees=(0.045, 0.045), hertz=(30.0, 150.0), tones=5)
+_FAULTS: tuple[tuple[str, Motion, Scene, dict[str, Any]], ...] = (
+    ("nothing", HAND, Rich(150), {}),
+    ("focal length 0.3 %", HAND, Rich(150), {"calibration": Calibration(focal=0.003)}),
+    ("3 % of the distortion", HAND, Rich(150), {"calibration": Calibration(distortion=0.03)}),
+    ("map by waves of 1 cm", HAND, Rich(150), {"points": Points(wrong=0.3, bent_map=0.01)}),
+    ("nothing, vibrates by 0.1 deg", _BAND, Rich(150), {}),
+    ("nothing, plane of 0.6 m, at rest", REST, _PLANE, {}),
+)
+IMPERFECT = tuple(
+    Condition("times", f"{name}{', tracked' * (length > 1)}", motion, scene, 0.5,
+              sequence=Sequence(length, (0, length)), **({"points": _WRONG[0.3]} | others))
+    for name, motion, scene, others in _FAULTS for length in (1, 20)
+)  # fmt: skip
+"""What is timed alone: hands before 150 points of which 30 % are wrong, and what is off."""
 
 
 def localizer_of(condition: Condition) -> rsl.Localizer:
@@ -62,27 +90,40 @@ def localizer_of(condition: Condition) -> rsl.Localizer:
 
 
 def times(options: argparse.Namespace) -> int:
-    """The command: CPU time of both in turns."""
+    """The command: CPU time of both in turns, and of frames under lenses and maps as real ones."""
     try:
         poselib: Any = importlib.import_module("poselib")
     except ImportError:
         poselib = None
         sys.stdout.write("PoseLib is not installed (pip install poselib): no ratios\n")
-    heads = ("ours, ms", "PoseLib, ms", "ratio")
-    sys.stdout.write(f"{'':32}" + "".join(f"{head:>13}" for head in heads) + "\n")
+    heads = ("median, ms", "mean", "95 %", "PoseLib", "ratio")
+    sys.stdout.write(f"{'':42}" + "".join(f"{head:>11}" for head in heads) + "\n")
     for condition in CONDITIONS:
         localizer = localizer_of(condition)
-        frames = list(generate(condition, options.frames, _SEED))
         methods: list[Callable[[Frame], object]] = [_ours(localizer)]
         if poselib is not None:
             methods.append(_poselib(poselib, localizer.camera))
-        spent = in_turns(methods, frames, options.rounds)
-        each = [1e3 * statistics.fmean(one) for one in spent]
-        figures = [each[0], *(each[1:] or [np.nan])]
-        cells = "".join(f"{figure:13.3f}" for figure in (*figures, figures[0] / figures[1]))
-        sys.stdout.write(f"{condition.name:32}{cells}\n")
-        sys.stdout.flush()
+        _timed(condition, methods, options)
+    for condition in IMPERFECT:
+        localizer = rsl.Localizer(camera_of(condition, 0))
+        tracks = condition.sequence.length > 1
+        _timed(condition, [_tracked(localizer, options.rounds) if tracks else _ours(localizer)],
+               options)  # fmt: skip
     return 0
+
+
+def _timed(
+    condition: Condition, methods: list[Callable[[Frame], object]], options: argparse.Namespace
+) -> None:
+    """Print a row: the first method, and its median over that of the second."""
+    frames = list(generate(condition, options.frames, _SEED))
+    ours, *theirs = (1e3 * np.array(one) for one in in_turns(methods, frames, options.rounds))
+    figures = [np.median(ours), np.mean(ours), np.quantile(ours, 0.95)]
+    for other in theirs:
+        figures += [np.median(other), figures[0] / np.median(other)]
+    cells = "".join(f"{figure:11.3f}" for figure in figures)
+    sys.stdout.write(f"{condition.name:42}{cells}\n")
+    sys.stdout.flush()
 
 
 _GATED = Condition("gate", "150 points, 30 % wrong, hand", HAND, Rich(150), 0.5,
@@ -128,6 +169,19 @@ def _opencv(K: Array) -> Callable[[Frame], object]:
 
 def _ours(localizer: rsl.Localizer) -> Callable[[Frame], object]:
     return lambda frame: localizer.localize(frame.points, frame.pixels)
+
+
+def _tracked(localizer: rsl.Localizer, rounds: int) -> Callable[[Frame], object]:
+    """Tracks of all frames, a tracker a round."""
+    turns = itertools.cycle([rsl.Tracker(localizer) for _ in range(rounds)])
+
+    def tracked(frame: Frame) -> object:
+        tracker = next(turns)
+        if frame.place == 0:
+            tracker.reset()
+        return tracker.localize(frame.middle_ns, frame.points, frame.pixels)
+
+    return tracked
 
 
 def _poselib(poselib: Any, camera: rsl.Camera) -> Callable[[Frame], object]:
