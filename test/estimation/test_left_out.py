@@ -87,6 +87,19 @@ def test_two_fifths_of_the_matches_that_are_shifted_alike_are_left_out():
         assert np.abs(result.rotation - rotation).max() < 0.01
 
 
+@pytest.mark.parametrize("seed", [11, 16, 21, 27, 48])
+def test_no_motion_between_two_groups_is_found(seed):
+    """Scored at four thresholds, one that misses either group by half of their distance is."""
+    random = np.random.default_rng(seed)
+    camera, points, pixels, rotation = frame("volume", "right", random)
+    some = random.permutation(len(points))[: 2 * len(points) // 5]
+    pixels[some] += (8.0, 0.0)
+    result = rsl.Localizer(camera).localize(points, pixels)
+    assert result
+    assert not result.inliers[some].any()
+    assert np.abs(result.rotation - rotation).max() < 0.01
+
+
 def test_a_fast_camera_may_leave_out_a_few_points_that_lie_near():
     """As a phone in a car, whose matches come from tracks."""
     random = np.random.default_rng(3)
