@@ -16,11 +16,11 @@ from rs_localizer.ros.node.statistics import Told
 from rs_localizer.settings import FEATURES_NAME
 
 
-def tell(extracted: Extracted) -> Told:
-    """Words on an image."""
+def tell(extracted: Extracted) -> tuple[int, Told]:
+    """Stamp of an image (ns), and what the statistics keep of it."""
     count = len(extracted.features)
     text = f"{count or 'no'} keypoints in the last image"
-    return Told(State.DETECTING, text, {"Keypoints": str(count)})
+    return extracted.image.stamp_ns, Told(State.DETECTING, text, {"Keypoints": str(count)})
 
 
 class FeatureDetectorNode(ImageNode[FeatureConfig, Extracted]):

@@ -91,7 +91,7 @@ class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
         self,
         name: str,
         kind: Any,  # class of its settings, which mypy cannot follow to the base class
-        tell: Callable[[Result], Told],
+        tell: Callable[[Result], tuple[int, Told]],
         **options: Any,
     ) -> None:
         self._outputs: ImageOutputs[Result] | None = None

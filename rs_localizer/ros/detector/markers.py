@@ -20,8 +20,8 @@ from rs_localizer.ros.node.views import MapView
 from rs_localizer.settings import DETECTOR_NAME
 
 
-def tell(detected: Detected) -> Told:
-    """Words on an image."""
+def tell(detected: Detected) -> tuple[int, Told]:
+    """Stamp of an image (ns), and what the statistics keep of it."""
     detections = detected.detections
     markers = sum(int(item.mapped.sum()) for item in detections.markers)
     boards, corners = len(detections.boards), len(detections.ids)
@@ -35,7 +35,7 @@ def tell(detected: Detected) -> Told:
         "Corners": str(corners),
         "Markers not in the map": str(len(detections.unknown)),
     }
-    return Told(State.DETECTING, text, values)
+    return detected.image.stamp_ns, Told(State.DETECTING, text, values)
 
 
 class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):

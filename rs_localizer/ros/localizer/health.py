@@ -27,8 +27,8 @@ from rs_localizer.ros.node.statistics import Summary, Told
 from rs_localizer.ros.node.subscriptions import Silence
 
 
-def tell(frame: Localized) -> Told:
-    """Words on a frame."""
+def tell(frame: Localized) -> tuple[int, Told]:
+    """The stamp of the input (ns), and what is told."""
     estimate = frame.estimate
     residuals = estimate.residuals[estimate.inliers]
     points, inliers = len(estimate.inliers), len(residuals)
@@ -49,7 +49,7 @@ def tell(frame: Localized) -> Told:
         }
     state = State.TRACKING if estimate.tracked else State.LOCALIZED
     text = f"{state} with {inliers} of {points} points"
-    return Told(state, text, values)
+    return frame.input_stamp_ns, Told(state, text, values)
 
 
 # Share of the last frames below which it is worth a warning that the IMU is not used.

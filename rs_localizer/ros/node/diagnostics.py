@@ -14,7 +14,7 @@ from rs_localizer.ros.node.conversion import steady_timer
 from rs_localizer.ros.node.statistics import WINDOW, Event, Summary
 
 SOME = 0.05
-"""Share of the messages that may be refused or replaced before it is worth a warning."""
+"""Share of the messages that may be refused, replaced or lost before it is worth a warning."""
 
 
 class State(StrEnum):
@@ -87,10 +87,16 @@ def one_line(oddities: Mapping[str, str]) -> str:
 
 def hindrance(summary: Summary, what: str) -> str:
     """Reason for which some of the last messages have no result; empty where nearly all have."""
-    lately, came = summary.lately, summary.lately.get(Event.RECEIVED, 0)
+    lately, lost = summary.lately, summary.recently_missing
+    came = lately.get(Event.RECEIVED, 0)
     for event, text in ((Event.REFUSED, "were refused"), (Event.REPLACED, "came too fast")):
         if (bad := lately.get(event, 0)) > SOME * came:
             return f"{bad} {what} {text} in the last {WINDOW:.0f} s"
+    if lost > SOME * came:
+        return (
+            f"messages are lost: by their stamps, {lost} of {came + lost} have not come in the "
+            f"last {WINDOW:.0f} s (is the publisher best effort, or the machine too slow?)"
+        )
     return ""
 
 
@@ -100,14 +106,17 @@ def counts(summary: Summary, what: str, done: str) -> dict[str, str]:
         f"{what} in (Hz)": f"{summary.rate_in:.1f}",
         f"{done} (Hz)": f"{summary.rate_out:.1f}",
     }
-    if summary.latency is not None:
-        values["Latency p50 (ms)"], values["Latency p95 (ms)"] = (
-            f"{1e3 * seconds:.2f}" for seconds in summary.latency
-        )
+    for name, value in (("Latency", summary.latency), ("Delay of the stamp", summary.delay)):
+        if value is not None:
+            values[f"{name} p50 (ms)"], values[f"{name} p95 (ms)"] = (
+                f"{1e3 * seconds:.2f}" for seconds in value
+            )
     for event in Event:
         count = summary.total.get(event, 0)
         if count or event is not Event.DROPPED:
             values[f"{what} {event}"] = str(count)
+    if summary.recently_missing:
+        values[f"{what} missing by their stamps, recently"] = str(summary.recently_missing)
     values |= {f"Refused: {reason}": str(n) for reason, n in sorted(summary.reasons.items())}
     return values | ({} if summary.last is None else summary.last.values)
 

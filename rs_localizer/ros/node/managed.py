@@ -65,7 +65,7 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
     Args:
         name: of the node.
         kind: class of its settings, which become its parameters.
-        tell: what the statistics keep of a result.
+        tell: stamp (ns) and what the statistics keep of a result.
         options: of rclpy's node.
 
     Raises:
@@ -80,7 +80,7 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
         self,
         name: str,
         kind: type[Config],
-        tell: Callable[[Result], Told],
+        tell: Callable[[Result], tuple[int, Told]],
         **options: Any,
     ) -> None:
         super().__init__(name, **options)
@@ -110,7 +110,9 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
         )
         self.autostart: bool = config.autostart
         self.refusals = Refusals(self.warn)
-        self.statistics: Statistics[Result] = Statistics(self.refusals, tell)
+        self.statistics: Statistics[Result] = Statistics(
+            self.refusals, tell, lambda: int(self.get_clock().now().nanoseconds)
+        )
         self._diagnostics = Diagnostics(
             self, self.examine, self.refusals.notice, self.task, self.lack
         )

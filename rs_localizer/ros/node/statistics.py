@@ -5,15 +5,46 @@
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from rs_localizer.io.messages import stamp_ns
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.node.refusals import Refusals
+
+_FEWEST = 8  # intervals of which something can be said
+# Intervals count as multiples of the shortest when they are off by less than this part of it.
+_LOOSE = 0.2
+_MOST_LOOSE = 0.1  # share of intervals that may be further off
+
+
+def missing(stamps_ns: Sequence[int]) -> int:
+    """Number of frames missing between these; 0 where the stamps are not of a steady rate.
+
+    Args:
+        stamps_ns: in the order of arrival.
+    """
+    intervals = np.diff(np.array(stamps_ns, np.int64)).astype(np.float64)
+    intervals = intervals[intervals > 0.0]  # a recording may start over
+    if len(intervals) < _FEWEST:
+        return 0
+    # A few may be shorter than the period: a late stamp, a frame that is sent twice.
+    period = float(np.percentile(intervals, 10, method="lower"))
+    total = multiples = 0.0
+    for interval in np.sort(intervals):  # the longer, the better the period has to be known
+        if interval > 0.5 * period:
+            total += interval
+            multiples += max(round(interval / period), 1)
+            period = total / multiples
+    counts = np.maximum(np.round(intervals / period), 1.0)
+    if np.mean(np.abs(intervals / period - counts) > _LOOSE) > _MOST_LOOSE:
+        return 0
+    return int(np.sum(counts - 1.0))
+
 
 Result = TypeVar("Result")
 
@@ -22,6 +53,8 @@ WINDOW = 5.0
 
 # Events that are remembered; a window of faster cameras is shorter.
 _MOST_EVENTS = 8192
+# A header's stamp that is older (s), or in the future, was made by another clock.
+_OLDEST_STAMP = 10.0
 
 Percentiles = tuple[float, float]  # s, the median and the 95th
 
@@ -55,9 +88,11 @@ class Summary:
     recent_reasons: Mapping[str, int]  # of frames
     rate_in: float  # Hz
     rate_out: float  # Hz
+    recently_missing: int  # sent and not received, by the gaps between the stamps
     refused_since_answer: int  # frames in a row
     busy: float | None  # s for which the worker has had the same frame
     latency: Percentiles | None  # from receiving to publishing
+    delay: Percentiles | None  # from the header's stamp to publishing, where that makes sense
     last: Told | None  # of the last frame that was answered; None: there was none
 
 
@@ -66,33 +101,36 @@ class Statistics(Generic[Result]):
 
     Args:
         refusals: logs and counts what is refused.
-        tell: what is told of a result.
+        tell: stamp of the frame (ns) and what is told of a result.
+        ros_time: now in ns, by the clock of the stamps.
         clock: s, monotonic.
     """
 
     def __init__(
         self,
         refusals: Refusals,
-        tell: Callable[[Result], Told],
+        tell: Callable[[Result], tuple[int, Told]],
+        ros_time: Callable[[], int] = time.time_ns,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._refusals, self._tell = refusals, tell
-        self._clock = clock
+        self._ros_time, self._clock = ros_time, clock
         self._lock = threading.Lock()
         self._total: Counter[Event] = Counter()
         self._in_a_row = 0
         self._last: Told | None = None
         self._started: float | None = None
-        # When what happened, with a reason, or the latency in s.
+        # When what happened, with a stamp (topic, ns), a reason, or latency and delay in s.
         self._events: deque[tuple[float, Event, Any]] = deque(maxlen=_MOST_EVENTS)
 
     def _add(self, event: Event, what: Any = None, count: int = 1) -> None:
         self._total[event] += count
         self._events.append((self._clock(), event, what))
 
-    def received(self) -> None:
+    def received(self, topic: str, message: Any) -> None:
+        """A frame has come: a message with a header."""
         with self._lock:
-            self._add(Event.RECEIVED)
+            self._add(Event.RECEIVED, (topic, stamp_ns(message)))
 
     def replaced(self) -> None:
         with self._lock:
@@ -117,9 +155,10 @@ class Statistics(Generic[Result]):
 
     def answered(self, result: Result, received: float) -> None:
         """A result was published of a frame that had been received at this time of the clock."""
-        kept = self._tell(result)
+        input_stamp_ns, kept = self._tell(result)
+        delay = (self._ros_time() - input_stamp_ns) * 1e-9
         with self._lock:
-            self._add(Event.ANSWERED, self._clock() - received)
+            self._add(Event.ANSWERED, (self._clock() - received, delay))
             self._in_a_row = 0
             self._last = kept
 
@@ -134,6 +173,7 @@ class Statistics(Generic[Result]):
             return [(when, what) for when, each, what in recent if each is event]
 
         came, out = of(Event.RECEIVED), of(Event.ANSWERED)
+        topics = {topic for _, (topic, _) in came}
         return Summary(
             total=total,
             lately=Counter(event for _, event, _ in recent),
@@ -141,9 +181,13 @@ class Statistics(Generic[Result]):
             recent_reasons=Counter(reason for _, reason in of(Event.REFUSED)),
             rate_in=_rate([when for when, _ in came]),
             rate_out=_rate([when for when, _ in out]),
+            recently_missing=sum(
+                missing([stamp for _, (topic, stamp) in came if topic == one]) for one in topics
+            ),
             refused_since_answer=in_a_row,
             busy=None if started is None else now - started,
-            latency=_percentiles([latency for _, latency in out]),
+            latency=_percentiles([latency for _, (latency, _) in out]),
+            delay=_percentiles([d for _, (_, d) in out if 0.0 <= d <= _OLDEST_STAMP]),
             last=last,
         )
 

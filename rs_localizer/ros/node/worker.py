@@ -120,7 +120,7 @@ class Worker(Generic[State, Result]):
 
         That takes its place. While a frame needs something it waits, and those behind it, too.
         """
-        self._statistics.received()
+        self._statistics.received(topic, message)
         with self._changed:
             replaced = topic in self._frames
             arrival = _Arrival(message, process, time.monotonic(), need, self._session)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rs_localizer.io.outputs import CameraShare
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.localizer.health import (
     Condition,
@@ -25,18 +26,21 @@ FRAMES = replace(COMES, topic="/correspondences")
 GOOD = Condition("active", False, (), {"camera_info": COMES, "correspondences": FRAMES})
 
 
-def frame() -> Any:
-    """Three inliers of four points, 3, 4 and 0 px off."""
+def frame(stamp: float = 0.0, tracked: bool = False, rig: bool = False) -> Any:
+    """Three inliers of four points, 3, 4 and 0 px off; of a rig, one is of another camera."""
     estimate = SimpleNamespace(
         inliers=np.array([True, True, False, True]),
         residuals=np.array([3.0, 4.0, 100.0, 0.0]),
         global_shutter_inliers=2,
         iterations=64,
         model_error=0.0,
-        tracked=False,
+        tracked=tracked,
         lens=None,
     )
-    return SimpleNamespace(estimate=estimate, cameras=())
+    cameras = (CameraShare("front", 3, 2, 3.5), CameraShare("rear", 1, 1, 0.0))
+    return SimpleNamespace(
+        input_stamp_ns=round(stamp * 1e9), estimate=estimate, cameras=cameras if rig else ()
+    )
 
 
 class World:
@@ -45,16 +49,21 @@ class World:
     def __init__(self) -> None:
         self.now = 1000.0
         self.refusals = Refusals(lambda text: None)
-        self.statistics = Statistics(self.refusals, tell, lambda: self.now)
+        self.statistics = Statistics(
+            self.refusals, tell, lambda: round(self.now * 1e9), lambda: self.now
+        )
 
     def receive(self) -> None:
-        self.statistics.received()
+        seconds, nanoseconds = divmod(round(self.now * 1e9), 1_000_000_000)
+        stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
+        message = SimpleNamespace(header=SimpleNamespace(stamp=stamp))
+        self.statistics.received("correspondences", message)
 
     def pass_frames(self, count: int, rate: float, latency: float = 0.0) -> None:
         for _ in range(count):
             self.receive()
             self.now += latency
-            self.statistics.answered(frame(), self.now - latency)
+            self.statistics.answered(frame(self.now - latency), self.now - latency)
             self.now += 1.0 / rate - latency
 
     def refuse(self, count: int, reason: str = "too_few_inliers") -> None:
@@ -83,6 +92,8 @@ def test_numbers_of_a_working_node(world):
         "Poses out (Hz)": "50.0",
         "Latency p50 (ms)": "4.00",
         "Latency p95 (ms)": "4.00",
+        "Delay of the stamp p50 (ms)": "4.00",
+        "Delay of the stamp p95 (ms)": "4.00",
         "Points": "4",
         "Inliers with rolling shutter": "3",
         "Inliers with global shutter": "2",

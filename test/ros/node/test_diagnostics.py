@@ -5,12 +5,14 @@
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 
 from rs_localizer.ros.node.diagnostics import Diagnostics, Health, Level, State
 from rs_localizer.ros.node.refusals import Refusals
+from rs_localizer.ros.node.statistics import missing
 
 
 class Bench:
@@ -73,6 +75,33 @@ def test_lines_of_a_lasting_state(bench, level, state, name):
             when.append(second)
     assert when == [5, 10, 20, 40, 80, 160, 320, 640, 1280, 1920]
     assert set(bench.lines) == {f"{name}: something is wrong"}
+
+
+RATES = (10.0, 30.0, 60.0)
+
+
+def stamps(rate: float, count: int, jitter: float, rng: np.random.Generator) -> np.ndarray:
+    """ns; jitter as a part of the period."""
+    period = 1e9 / rate
+    return (np.arange(count) * period + rng.normal(0.0, jitter * period, count)).astype(np.int64)
+
+
+@pytest.mark.parametrize(
+    ("rate", "share"), [(10.0, 0.6), (10.0, 0.9), (30.0, 0.3), (30.0, 0.9), (60.0, 0.2)]
+)
+def test_what_was_dropped_is_counted(rate, share):
+    rng = np.random.default_rng(0)
+    sent = stamps(rate, round(5 * rate), 0.02, rng)
+    keep = rng.random(len(sent)) < share
+    keep[[0, -1]] = True
+    assert missing(sent[keep]) == len(sent) - keep.sum()
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("jitter", [0.0, 0.02, 0.05])
+def test_a_steady_camera_misses_nothing(rate, jitter):
+    for seed in range(20):
+        assert missing(stamps(rate, 150, jitter, np.random.default_rng(seed))) == 0
 
 
 class Log:

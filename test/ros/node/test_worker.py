@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from sensor_msgs.msg import Image
 
 from rs_localizer.pipeline.refusal import Waiting
 from rs_localizer.ros.node.refusals import Refusals
@@ -18,7 +19,10 @@ PATIENCE = 10.0  # s, of a machine that is busy
 
 
 class Count(Statistics[str]):
-    """Frames are plain text here."""
+    """Frames are plain text here, without stamps."""
+
+    def received(self, topic: str, message: Any) -> None:
+        super().received(topic, Image())
 
     def answered(self, result: str, received: float) -> None:
         assert received <= time.monotonic()
@@ -38,7 +42,7 @@ class Fake:
         self.awaited: set[str] = set()
         self.patience = 10.0
         self.refusals = Refusals(lambda text: None)
-        self.statistics = Count(self.refusals, lambda text: text)
+        self.statistics = Count(self.refusals, lambda text: (0, text))
         self.worker: Worker[Fake, str] = Worker(self, self._publish, self.statistics, pytest.fail)
 
     def send(self, frame: str, topic: str = "frames", patience: float = PATIENCE) -> None:
