@@ -38,7 +38,6 @@ FREEDOMS = {
     "paper": Freedom(lens=True, landmarks=0.01, paper=True),
     "mounted": Freedom(lens=True, mounting=MOUNTED, fading=0.1),
     "bodies": Freedom(readout_time=False, mounting=MOUNTED),
-    "sizes": Freedom(sizes=0.1),
 }
 
 
@@ -60,7 +59,7 @@ def small(
         times=0.05 + 0.07 * frames, row_times=camera.row_time(pixels), pixels=pixels,
         landmarks=landmarks, points=rng.integers(0, 8, count), frames=frames,
         trusted=np.ones(count, bool),
-        bodies=np.repeat([-1, 0], 4) if of in ("bodies", "sizes") else None,
+        bodies=np.repeat([-1, 0], 4) if of == "bodies" else None,
     )  # fmt: skip
     state = start_state(camera, seen, spline, READOUT)
     extrinsics = MOUNTED.given if FREEDOMS[of].mounting else state.extrinsics
@@ -108,10 +107,10 @@ def test_a_gyroscope():
 
 
 @pytest.mark.parametrize(
-    ("of", "count"), [("board", 2), ("paper", 2), ("mounted", 2), ("bodies", 2), ("sizes", 1)]
+    ("of", "count"), [("board", 2), ("paper", 2), ("mounted", 2), ("bodies", 2)]
 )
 def test_what_is_known_beforehand(of, count):
-    """Of lens, mount, landmarks, sizes: the slope is half the derivative of the cost."""
+    """Of lens, mount, landmarks: the slope is half the derivative of the cost."""
     problem, state = small(of)
     step = 1e-4 * np.ones(problem.groups.kept)
     step[: problem.groups.motion] = 0.0

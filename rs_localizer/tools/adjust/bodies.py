@@ -9,10 +9,8 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 
-PLACE, BODY, SIZED = 3, 6, 7
-"""Numbers of a free point, and of a body: its place, then its turn in the map's axes; then the
-logarithm of its size, if that is free.
-"""
+PLACE, BODY = 3, 6
+"""Numbers of a free point, and of a body: its place, then its turn in the map's axes."""
 
 _FLAT = 1e-6  # thickness of a plane by its size: rounding of single precision
 # Standard deviations by half the size of a print. Paper curls by one part in a hundred (2 mm of an
@@ -59,12 +57,10 @@ class Pieces:
     Args:
         slots: (p,) number of the part that each landmark belongs to, from 0 on; -1: known.
         rigid: whether parts are bodies that turn, or single points.
-        sized: whether the bodies have a size that is not known.
     """
 
-    def __init__(self, slots: IntArray, rigid: bool, sized: bool = False) -> None:
-        self.slots, self.rigid, self.sized = slots, rigid, rigid and sized
-        self.width = PLACE if not rigid else SIZED if sized else BODY
+    def __init__(self, slots: IntArray, rigid: bool) -> None:
+        self.slots, self.rigid, self.width = slots, rigid, BODY if rigid else PLACE
         self.count = int(slots.max(initial=-1)) + 1
 
     @property
@@ -93,16 +89,6 @@ class Pieces:
         moved, own = landmarks.copy(), self.slots[free]
         moved[free] += step[own, :PLACE]
         if self.rigid:
-            turns, arms = so3.exp_many(step[:, PLACE:BODY]), self.arms(landmarks)[free]
-            grown = arms * np.exp(step[own, BODY:]) if self.sized else arms
-            moved[free] += np.einsum("nij,nj->ni", turns[own], grown) - arms
+            turns, arms = so3.exp_many(step[:, PLACE:]), self.arms(landmarks)[free]
+            moved[free] += np.einsum("nij,nj->ni", turns[own], arms) - arms
         return moved
-
-    def growth(self, landmarks: Array, given: Array) -> Array:
-        """Logarithms (c,) of the parts' sizes by those that landmarks (p,3) were given with."""
-        free = self.slots >= 0
-        sizes = [
-            np.bincount(self.slots[free], np.sum(self.arms(of)[free] ** 2, axis=1), self.count)
-            for of in (landmarks, given)
-        ]
-        return np.asarray(0.5 * np.log(sizes[0] / sizes[1]))

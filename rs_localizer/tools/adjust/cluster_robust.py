@@ -71,7 +71,7 @@ def _pull(problem: Problem, fitted: Fit) -> Pull:
     every = problem.keypoint_rows(fitted.state, fitted.deviation)
     for rows, view in zip(every, problem.views, strict=True):
         for first, end in _seconds(view.observations.times):
-            own = rows.times(slice(first, end), following)
+            own = rows.matrix(slice(first, end), len(following)) @ following
             total += float(np.sum((own.T @ rows.errors[first:end].ravel()) ** 2))
             share = own.T @ own if own.shape[0] > own.shape[1] else own @ own.T
             expected += float(np.trace(share) - np.sum(share**2))
@@ -96,7 +96,8 @@ def by_seconds(problem: Problem, fitted: Fit, number: int) -> tuple[Array, Array
     following = fitted.factored.kept(unit)
     following /= np.sqrt(following[at])
     every = problem.keypoint_rows(fitted.state, fitted.deviation)
-    own = np.concatenate([rows.times(slice(None), following).reshape(-1, 2) for rows in every])
+    parts = [rows.matrix(slice(None), len(following)) @ following for rows in every]
+    own = np.concatenate(parts).reshape(-1, 2)
     errors = np.concatenate([rows.errors for rows in every])
     times = np.concatenate([view.observations.times for view in problem.views])
     second = np.unique(np.floor(times / SECONDS), return_inverse=True)[1]

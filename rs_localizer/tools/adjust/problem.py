@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.tools.adjust.bodies import BODY, Pieces, paper_covariance
+from rs_localizer.tools.adjust.bodies import Pieces, paper_covariance
 from rs_localizer.tools.adjust.gyro import Gyroscope
 from rs_localizer.tools.adjust.intrinsics import lens_prior
 from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
@@ -186,10 +186,6 @@ class Problem:
             if pieces.rigid:  # a body none of whose landmarks fits stays where it is
                 information = np.full(pieces.columns, _LOOSE_BODY**-2)
                 offset = np.zeros(pieces.columns)
-                if pieces.sized:
-                    information[BODY :: pieces.width] = freedom.sizes**-2
-                    grown = pieces.growth(own.landmarks, view.observations.landmarks)
-                    offset[BODY :: pieces.width] = grown
             else:
                 free = pieces.slots >= 0
                 offset = (own.landmarks - view.observations.landmarks)[free].ravel()
@@ -308,7 +304,7 @@ def _pieces(view: CameraView, every: bool) -> Pieces:
     if every:
         return Pieces(np.arange(len(observations.landmarks)), rigid=False)
     if observations.bodies is not None:
-        return Pieces(observations.bodies, True, freedom.sizes > 0.0)
+        return Pieces(observations.bodies, rigid=True)
     slots = np.full(len(observations.landmarks), -1)
     if freedom.landmarks > 0.0:
         landmarks = np.unique(observations.points)

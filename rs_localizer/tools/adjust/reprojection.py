@@ -191,15 +191,13 @@ def _of_camera(
 def _of_landmark(
     sights: Projections, terms: Terms, n: int, column: int, by_landmark: Array, row: Array
 ) -> None:
-    """Fill the derivatives by the landmark's place, and by its body's turn and size."""
+    """Fill the derivatives by the landmark's place, and by its body's turn."""
     arm = sights.arms[n]
     for i in range(3 if terms.point_width > 0 else 0):
         a, b = (i + 1) % 3, (i + 2) % 3
         row[column + i] = by_landmark[i]
         if terms.point_width > 3:
             row[column + 3 + i] = arm[a] * by_landmark[b] - arm[b] * by_landmark[a]
-        if terms.point_width > 6:
-            row[column + 6] += arm[i] * by_landmark[i]
 
 
 @kernel

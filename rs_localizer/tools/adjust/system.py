@@ -57,12 +57,12 @@ class Rows(NamedTuple):
     errors: Array  # (n,r)
     cost: float  # sum of squares, or of what a robust loss makes of them
 
-    def times(self, part: slice, by: Array) -> Array:
-        """A part of the rows (m r,k) times what all unknowns are by others (N,k)."""
+    def matrix(self, part: slice, width: int) -> csr_array:
+        """A part of the derivatives (m r,width) by the first unknowns."""
         some = self._replace(
             values=self.values[part], first=self.first[part], others=self.others[part]
         )
-        return np.asarray(_sparse(some, len(by)) @ by)
+        return _sparse(some, width)
 
 
 class Quadratic(NamedTuple):

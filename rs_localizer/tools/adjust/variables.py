@@ -146,7 +146,6 @@ class Freedom:
     lens_deviations: tuple[float, float] | None = (0.02, 0.1)
     landmarks: float = 0.0  # m, standard deviation of their places; 0: they are known
     paper: bool = False  # they are those of one flat print, which may be bent as well
-    sizes: float = 0.0  # relative standard deviation of the sizes of bodies; 0: they are known
     stamps: float = 0.0  # s, standard deviation of each image's stamp; 0: they are right
     angular_acceleration: float = 100.0  # rad/s^2, zero-mean prior at each control
     linear_acceleration: float = 50.0  # m/s^2

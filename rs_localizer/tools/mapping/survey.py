@@ -24,13 +24,13 @@ from scipy.sparse.csgraph import connected_components
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
-from rs_localizer.tools.adjust.bodies import BODY, PLACE, SIZED
+from rs_localizer.tools.adjust.bodies import BODY, PLACE
 from rs_localizer.tools.adjust.cluster_robust import by_seconds, cluster_robust
 from rs_localizer.tools.adjust.fit import Fit, solve
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.adjust.spline import Spline
-from rs_localizer.tools.adjust.system import Factored, System, Undetermined
+from rs_localizer.tools.adjust.system import System, Undetermined
 from rs_localizer.tools.adjust.variables import (
     EXTRINSICS,
     CameraView,
@@ -94,7 +94,6 @@ class Adjustable:
         for one, seen in zip(self.filmed, self.seen, strict=True):
             own = replace(
                 freedom,
-                sizes=0.0 if markers_only else freedom.sizes,
                 readout_time=not markers_only
                 and (readout_times or not one.camera.readout_time > 0.0),
                 mounting=None if markers_only else one.mounting,
@@ -468,18 +467,26 @@ def _least_growth(given: Adjustable, fitted: Fit, grown: Array) -> Array:
     Args:
         grown: (m,) the same of the fit.
     """
-    noise = cluster_robust(given.problem(fitted.state, fitted.freedom, True), fitted).inflation
-    problem = given.problem(fitted.state, replace(fitted.freedom, sizes=_ANY_SIZE), True)
-    factored = Factored(problem.system(fitted.state, fitted.deviation))
-    columns = problem.place("points") + SIZED * np.arange(len(grown) - 1) + BODY
-    information = np.linalg.inv(factored.border_covariance()[np.ix_(columns, columns)])
-    # A larger origin is the same as all others smaller.
-    others = np.vstack([np.full(len(columns), -1.0), np.eye(len(columns))])
-    slope = -others @ information @ factored.step()[problem.groups.motion :][columns]
-    information = others @ information @ others.T
-    slope -= information @ grown
-    found, chosen, single = np.zeros(len(grown)), list[int](), np.diag(information)
-    while len(chosen) < len(grown) // 2:
+    problem = given.problem(fitted.state, fitted.freedom, True)
+    noise = cluster_robust(problem, fitted).inflation
+    corners, count = fitted.state.landmarks.reshape(-1, 4, 3), len(grown)
+    arms = (corners - corners.mean(axis=1, keepdims=True)).reshape(-1, 3)
+    kept, own = np.zeros((problem.groups.kept, count)), np.zeros((count, count))
+    slope = np.zeros(count)
+    every = problem.keypoint_rows(fitted.state, fitted.deviation)
+    for rows, seen in zip(every, given.seen, strict=True):
+        by_place = rows.values[:, :, -BODY : PLACE - BODY]
+        values = np.einsum("nri,ni->nr", by_place, arms[seen.points]).ravel()
+        columns, starts = np.repeat(seen.points // 4, 2), np.arange(len(values) + 1)
+        by_size = csr_array((values, columns, starts), shape=(len(values), count))
+        kept += (rows.matrix(slice(None), len(kept)).T @ by_size).toarray()
+        own += (by_size.T @ by_size).toarray()
+        slope += by_size.T @ rows.errors.ravel()
+    information = own - kept.T @ fitted.factored.kept(kept)
+    slope += kept.T @ fitted.factored.step() - information @ grown
+    found, chosen = np.zeros(count), list[int]()
+    single = np.maximum(np.diag(information), _ANY_SIZE**-2)
+    while len(chosen) < count // 2:
         off = -(slope + information @ found) / single
         gains = np.where(np.abs(off) > _SIZES_DIFFER, single * off**2, 0.0)
         gains[chosen] = 0.0
