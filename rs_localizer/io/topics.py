@@ -36,7 +36,6 @@ LIVE = {
     CAMERA_MARKER: "visualization_msgs/msg/MarkerArray",
 }
 DEBUG_IMAGE = "debug_image"
-COMPRESSED_DEBUG_IMAGE = "debug_image/compressed"
 # Of everybody.
 TF = "/tf"
 TF_STATIC = "/tf_static"

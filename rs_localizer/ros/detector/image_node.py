@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.lifecycle import LifecycleNode
@@ -210,11 +209,8 @@ def _image_topics(worker: Worker[Work, Result]) -> dict[str, Topic]:
     return {name: Topic(kind, images(name), single=True) for name, kind in _IMAGES.items()}
 
 
-_JPEG_QUALITY = 85
-
-
 class ImageOutputs(Generic[Result]):
-    """The clouds, ``~/debug_image`` and ``~/debug_image/compressed``.
+    """The clouds, and ``~/debug_image``.
 
     Nothing is built that nobody listens to. All methods may be called from any thread.
 
@@ -236,7 +232,6 @@ class ImageOutputs(Generic[Result]):
         self._make_cloud, self._draw = make_cloud, draw
         self._clouds = create_output(node, PointCloud2, topic)
         self._pictures = create_output(node, ImageMessage, f"~/{topics.DEBUG_IMAGE}")
-        self._jpegs = create_output(node, CompressedImage, f"~/{topics.COMPRESSED_DEBUG_IMAGE}")
         # Held while publishing: after close() nothing is published any more.
         self._lock = threading.Lock()
         self._closed = False
@@ -248,7 +243,7 @@ class ImageOutputs(Generic[Result]):
 
     @property
     def _publishers(self) -> tuple[Any, ...]:
-        return self._clouds, self._pictures, self._jpegs
+        return self._clouds, self._pictures
 
     @property
     def wanted(self) -> bool:
@@ -260,16 +255,13 @@ class ImageOutputs(Generic[Result]):
         with self._lock:
             if self._closed:
                 return
-            clouds, raw, compressed = (p.get_subscription_count() for p in self._publishers)
+            clouds, pictures = (p.get_subscription_count() for p in self._publishers)
             if clouds:
                 self._clouds.publish(self._make_cloud(result, make_message))
-            if raw or compressed:
+            if pictures:
                 image, picture = self._draw(result)
                 header = make_header(make_message, image.stamp_ns, image.frame)
-                if raw:
-                    self._pictures.publish(_raw(header, picture))
-                if compressed:
-                    self._jpegs.publish(_compressed(header, picture))
+                self._pictures.publish(_raw(header, picture))
 
     def close(self) -> None:
         with self._lock:
@@ -289,14 +281,4 @@ def _raw(header: Any, picture: Picture) -> Any:
         is_bigendian=0,
         step=3 * width,
         data=picture.ravel(),
-    )
-
-
-def _compressed(header: Any, picture: Picture) -> Any:
-    _, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    return make_message(
-        "sensor_msgs/msg/CompressedImage",
-        header=header,
-        format="bgr8; jpeg compressed bgr8",
-        data=jpeg.ravel(),
     )
