@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose and twist at one row time, with covariances: :mod:`rs_localizer.pipeline.pose_at_time`."""
+"""Covariances of pose and twist at one row time in REP-103's order: kernels of ``pose_at_time``."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Priors of the motion before the image: Gaussians and the direction of gravity.
+"""Priors of the motion before the image: Gaussians, a gyroscope's turn, gravity's direction.
 
 :class:`Prior` is what a user gives, :class:`PriorTerms` what kernels take, and :func:`add_prior`
 what it adds to the normal equations. :func:`assumptions` makes them of the configuration.

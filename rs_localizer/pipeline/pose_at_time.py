@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose and twist of the body at one moment of an estimated motion, with their covariances.
+"""Pose and twist of the body at one moment of a motion, with covariances in REP-103's order.
 
 The estimate is centred on the middle row and counts time in readouts; what is published holds at
 one moment, in SI units, and orders its covariance as REP-103 does. First-order propagation, with

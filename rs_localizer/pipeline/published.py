@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The way from an estimate to what is published: the moment, the velocities, and the body.
+"""Published frames: the moment, the velocities, and the way from the camera to ``base_frame``.
 
 With ``R = map_from_camera`` and ``p`` the camera's position, the camera's velocities ``v, w`` in
 its own axes, and the mounting ``camera_from_base`` with rotation ``C`` and translation ``r`` (where

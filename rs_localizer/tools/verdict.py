@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Verdicts on a calibration, in words."""
+"""Words on a calibration: what is believed (``readout_belief``), and what its lens is worth."""
 
 from __future__ import annotations
 
