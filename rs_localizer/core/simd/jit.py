@@ -29,6 +29,7 @@ from typing import Any, NamedTuple, Self, TypeVar, cast
 import llvmlite.binding
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.codegen import JITCodeLibrary
 
 from rs_localizer.core.simd import compiler
 from rs_localizer.core.simd.compiler import Request
@@ -97,6 +98,30 @@ def compile_here(kept: Callable[[], None]) -> None:
     ``kept`` is called whenever a kernel has come into the cache; it may end the process.
     """
     _thread.kept = kept
+    library: Any = JITCodeLibrary
+    finalize = library._finalize_final_module
+
+    def finalized(made: Any) -> None:
+        _keep_copies(made)
+        finalize(made)
+
+    library._finalize_final_module = finalized
+
+
+def _keep_copies(library: Any) -> None:
+    """Have a kernel call its own copies of those that it calls.
+
+    Numba leaves copies weak: the first that a process loads would serve all, and as each was
+    optimized where it is, last digits would depend on the order of loading.
+    """
+    linkages, module = llvmlite.binding.Linkage, library._final_module
+    library._shared_module = module.clone()  # for those that call this one, as Numba makes it
+    for function in library._shared_module.functions:
+        if not function.is_declaration and function.linkage == linkages.external:
+            function.linkage = linkages.linkonce_odr
+    for function in module.functions:
+        if not function.is_declaration and function.linkage == linkages.linkonce_odr:
+            function.linkage = linkages.internal
 
 
 def cache_directory() -> Path:

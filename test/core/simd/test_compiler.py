@@ -5,6 +5,7 @@
 import os
 import re
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -166,3 +167,34 @@ def test_who_must_not_wait_compiles_what_cannot_be_had_elsewhere(start, tmp_path
     (tmp_path / "cache").write_text("a file")
     process = start("import warnings\nwarnings.simplefilter('ignore')\n" + AT_ONCE)
     assert said(process) == ["True True"]
+
+
+def weak_functions(code: bytes) -> list[str]:
+    """Names of the weak functions of an ELF file of 64 bits."""
+    first, size, count = (
+        struct.unpack_from(kind, code, at)[0] for kind, at in (("<Q", 40), ("<H", 58), ("<H", 60))
+    )
+    headers = [struct.unpack_from("<IIQQQQIIQQ", code, first + size * k) for k in range(count)]
+    names = []
+    for header in headers:
+        if header[1] != 2:  # of symbols
+            continue
+        text = headers[header[6]][4]
+        for place in range(header[4], header[4] + header[5], 24):
+            name, info, _, section = struct.unpack_from("<IBBH", code, place)
+            if info >> 4 == 2 and info & 15 == 2 and section:
+                names.append(code[text + name : code.index(b"\0", text + name)].decode())
+    return names
+
+
+def test_kernels_call_copies_of_their_own(start, tmp_path):
+    """The first copy that a process loads would serve all, and digits depend on the order."""
+    said(start("import numpy as np; from rs_localizer.core import so3\n"
+               "so3.exp_many(np.zeros((1, 3)))"))  # fmt: skip
+    objects = [
+        content[content.index(b"\x7fELF") :]
+        for path in (tmp_path / "cache").rglob("*.nbc")
+        if b"\x7fELF" in (content := path.read_bytes())
+    ]
+    assert len(objects) > 1
+    assert [weak_functions(code) for code in objects] == [[]] * len(objects)
