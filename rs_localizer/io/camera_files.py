@@ -378,7 +378,7 @@ def lens_parameters(camera: Camera) -> dict[str, Any]:
         "distortion_model": str(camera.distortion_model),
         "camera_matrix": camera.K.ravel().tolist(),
         # Of an empty list ROS could not tell what it holds.
-        "distortion_coefficients": camera.D.tolist() or [0.0] * 5,
+        "distortion_coefficients": camera.D.tolist() or [0.0] * camera.law.counts[-1],
     }
 
 

@@ -6,7 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.io.camera_files import CalibrationError, read_calibration
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.camera_files import (
+    CalibrationError,
+    lens_camera,
+    lens_parameters,
+    read_calibration,
+)
 
 ROS = """
 image_width: 640
@@ -125,3 +131,11 @@ def test_faults_are_named(tmp_path, text, expected):
     (tmp_path / "camera.yaml").write_text(text)
     with pytest.raises(CalibrationError, match=expected):
         read_calibration(tmp_path / "camera.yaml")
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", "equidistant"])
+def test_a_lens_without_coefficients_is_read_as_it_was_written(model):
+    camera = Camera(640, 480, [[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]], distortion_model=model)
+    read = lens_camera(lens_parameters(camera))
+    assert read.distortion_model == model
+    np.testing.assert_array_equal(read.project(np.eye(3)[2:]), camera.project(np.eye(3)[2:]))
