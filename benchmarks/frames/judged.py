@@ -20,6 +20,7 @@ from benchmarks.frames.conditions import EXACT, Condition
 from benchmarks.frames.generated import Frame, Gyroscope, calibrated, generate
 from benchmarks.independent.rotations import Array, logarithm
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
+from rs_localizer.solvers.table import find_solver
 
 REGION = float(chi2.ppf(0.95, 6))
 # As unlikely as five standard deviations are of one variable (6 in 10 million).
@@ -131,8 +132,8 @@ def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, A
     config = configured(rsl.LocalizerConfig(), own, exact)
     variants = 1 if condition.calibration == EXACT else len(_DIRECTIONS)
     localizers = [rsl.Localizer(camera_of(condition, k), config) for k in range(variants)]
-    # P3P finds no velocities, and tracks nothing.
-    tracks = condition.sequence.length > 1 and config.solver != "p3p"
+    # A global shutter has no velocities, and is not tracked.
+    tracks = condition.sequence.length > 1 and find_solver(config.solver).rolling_shutter
     trackers = [rsl.Tracker(one) for one in localizers] if tracks else None
     figures: list[list[float]] = []
     reasons: list[str] = []
