@@ -58,8 +58,8 @@ setup(
         "mapping": ["pycolmap", "matplotlib"],
         "plots": ["matplotlib", "Pillow>=9.1"],
         "table": ["pyarrow"],
-        # Of telemetry-parser there is no wheel for 3.13, and a build needs Rust. PyAV reads the
-        # second stream of files of two lenses, which OpenCV does not.
+        # Of telemetry-parser there is no wheel for 3.13, and a build needs Rust. PyAV decodes
+        # what OpenCV may not (AV1), and says where a video stops.
         "video": ["av", "telemetry-parser; python_version < '3.13'"],
         "test": [
             "build",

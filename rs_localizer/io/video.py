@@ -36,8 +36,8 @@ class VideoImage(NamedTuple):
 class Video:
     """The images of a video, in the order of presentation; to be iterated over once.
 
-    They are read by PyAV, where it is installed, and compressed anew: it has one clock for all
-    streams of a file, decodes what OpenCV may have no decoder for (AV1), and says where it stops.
+    They are read by PyAV, where it is installed, and compressed anew: it decodes what OpenCV may
+    have no decoder for (AV1), and says where it stops.
     OpenCV counts from the first image on. A plain stream of JPEG images (``.mjpeg``) has no times.
 
     Args:
