@@ -78,7 +78,10 @@ class Points:
     tails: float = np.inf  # degrees of freedom of Student's t, of which ``noise`` is the scale
     shift: float = 0.0  # px, the same for all points of a recording
     alike: tuple[float, float] = (0.0, 0.0)  # share that is shifted alike, px
-    body: bool = False  # a third of the points is on another body that moves
+    near: tuple[float, float] = (0.0, 0.0)  # share that is wrong by up to so many px, each alone
+    # Share on one side of the image that is matched with points so many m on along a facade.
+    slip: tuple[float, float] = (0.0, 0.0)
+    body: float = 0.0  # share that is on another body that moves
     bent_map: float = 0.0  # m, rms of each coordinate, in long waves
     rough_map: float = 0.0  # m, each point alone
     gyroscope: bool = False  # says how the camera turned
@@ -281,7 +284,7 @@ def _body() -> Iterator[tuple[Any, ...]]:
     for (name, motion), noise, tracked in product(
         (("hand", HAND), ("rest", REST)), (0.3, 1.0), (False, True)
     ):
-        others = {"points": Points(body=True), "sequence": (SINGLE, TRACKED)[tracked]}
+        others = {"points": Points(body=1.0 / 3.0), "sequence": (SINGLE, TRACKED)[tracked]}
         yield f"{name}/{noise:g}px{'/tracked' * tracked}", motion, Rich(), noise, others
 
 

@@ -28,7 +28,7 @@ from benchmarks.independent.scenes import Scene, visible
 _MARGIN = 12.0  # px, of wrong points to the edge
 _SHIFTED = 0.6  # of the matches of a bad frame
 # Of the other body: a person or a vehicle that passes.
-_BODY_SHARE, _BODY_PLACE, _BODY_SPEED, _BODY_RATE = 1 / 3, 0.3, 0.5, math.radians(30.0)
+_BODY_PLACE, _BODY_SPEED, _BODY_RATE = 0.3, 0.5, math.radians(30.0)
 _BENT_METRES = (3.0, 8.0)  # lengths of the waves of a bent map
 # A gyroscope of a phone, whose bias and time offset are known by now.
 _GYRO_HERTZ, _GYRO_NOISE, _GYRO_BIAS = 400.0, math.radians(0.01), math.radians(0.05)
@@ -110,7 +110,7 @@ def _simulated(
     recordings: int,
     length: int,
     seed: int,
-    body: bool,
+    body: float,
 ) -> _Made:
     made: list[Moving] = []
 
@@ -120,20 +120,20 @@ def _simulated(
 
     key = zlib.crc32(repr((camera, motion, scene, length)).encode())
     number = int(np.random.SeedSequence([seed, key]).generate_state(1)[0])
-    other = _other_body(recordings, np.random.default_rng([seed, key])) if body else None
+    other = _other_body(recordings, np.random.default_rng([seed, key]), body) if body else None
     frames = simulate(camera, remembered, scene, recordings, length, number, other)
     times = first_row_times(camera, length)[frames.place] + 0.5 * camera.readout_time
     return _Made(frames, made[0], times)
 
 
-def _other_body(recordings: int, rng: np.random.Generator) -> Displaced:
-    """A third of the points turns about their middle, moves on, and was elsewhere in the map."""
+def _other_body(recordings: int, rng: np.random.Generator, share: float) -> Displaced:
+    """A share of the points turns about their middle, moves on, and was elsewhere in the map."""
     aside = _BODY_PLACE * directions(recordings, rng)
     velocity = _BODY_SPEED * directions(recordings, rng)
     rate = _BODY_RATE * directions(recordings, rng)
 
     def displaced(true: Array, time: Array, which: IntArray) -> Array:
-        count = round(_BODY_SHARE * true.shape[1])
+        count = round(share * true.shape[1])
         own, now = true[:, :count], time[:, :count, None]
         middle = own.mean(axis=1, keepdims=True)
         turned = exponential(now * rate[which][:, None]) @ (own - middle)[..., None]
@@ -173,6 +173,15 @@ class _Spoiler:
         if share:
             some = rng.permutation(len(pixels))[: round(share * len(pixels))]
             pixels[some] += shift * self._direction[recording]
+        share, shift = points.near
+        if share:
+            some = rng.permutation(len(pixels))[: round(share * len(pixels))]
+            angle = rng.uniform(0.0, 2.0 * np.pi, len(some))
+            far = shift * np.sqrt(rng.uniform(size=len(some)))  # anywhere in a circle
+            pixels[some] += far[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        share, cell = points.slip
+        if share:
+            mapped = _slipped(mapped, pixels, self._direction[recording], share, cell)
         count = round(points.wrong * len(pixels))
         if count:
             far = np.array([frames.camera.width, frames.camera.height]) - 1.0 - _MARGIN
@@ -184,6 +193,16 @@ class _Spoiler:
         rough = points.rough_map * self.rng.normal(size=places.shape)
         error: Array = rough + points.bent_map * self._map(places, recording)
         return error
+
+
+def _slipped(mapped: Array, pixels: Array, direction: Array, share: float, cell: float) -> Array:
+    """Points (n,3) with those farthest to one side of the image moved by a cell (m) along it."""
+    side = np.argsort(-(pixels @ direction))[: round(share * len(pixels))]
+    plane = np.linalg.lstsq(pixels - pixels.mean(axis=0), mapped - mapped.mean(axis=0))[0]
+    along = direction @ plane
+    moved = mapped.copy()
+    moved[side] += cell * along / np.linalg.norm(along)
+    return moved
 
 
 class _BentMap:
