@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The commands: ``python -m benchmarks.frames run``, ``compare``, ``times`` and ``gate``.
+"""The commands of ``python -m benchmarks.frames``: run, compare, paired, times and gate.
 
 Another version of the package is judged by the same benches from any other folder:
 
@@ -25,6 +25,7 @@ from typing import Any
 import yaml
 
 from benchmarks.experiments.results import Table
+from benchmarks.frames import paired
 from benchmarks.frames.compared import compare, read, totals, write
 from benchmarks.frames.conditions import BENCHES, Condition, conditions
 from benchmarks.frames.judged import Judged, judge
@@ -72,6 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     against.add_argument("after", type=Path, metavar="AFTER.csv")
     against.add_argument("--all", action="store_true", help="also conditions that hardly differ")
     against.set_defaults(command=compare)
+    paired.add_to(commands.add_parser("paired", help="some 1,500 frames, beside another version"))
     timed = commands.add_parser("times", help="CPU time beside PoseLib's")
     timed.add_argument("--frames", type=int, default=20, metavar="N", help="of a condition (20)")
     timed.add_argument("--rounds", type=int, default=7, metavar="N", help="of each frame (7)")
@@ -92,7 +94,7 @@ def _run(options: argparse.Namespace) -> int:
         sys.stderr.write(f"{error}\n")
         return 2
     each = [(one, options.frames, options.seed, settings) for one in wanted]
-    judged: list[Judged] = []
+    judged: dict[str, Judged] = {}
     width = max(len(one.name) for one in wanted)
     with options.out.open("w", newline="", encoding="utf-8") as file:
         table: Any = None
@@ -107,15 +109,15 @@ def _run(options: argparse.Namespace) -> int:
                 heads = " ".join(f"{name:>8}" for name in _SHOWN.values())
                 sys.stderr.write(f"{condition.bench:{width}} {heads}\n")
                 if judged:  # who stops the run keeps the benches that are done
-                    write(options.out, wanted, judged)
-            judged.append(one)
+                    write(options.out, judged)
+            judged[f"{condition.bench}/{condition.name}"] = one
             table.writerow(row)
             file.flush()
             cells = " ".join(f"{_short(row[name]):>8}" for name in _SHOWN)
             sys.stderr.write(f"{condition.name:{width}} {cells}  {row['reasons']}\n")
         if pool:
             pool.shutdown()
-    write(options.out, wanted, judged)
+    write(options.out, judged)
     rows = [
         (bench, *(f"{total[name]:.3g}" for name in _TOGETHER))
         for bench, total in totals(read(options.out)).items()

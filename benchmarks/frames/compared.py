@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import binomtest
 from scipy.stats import t as student
 
-from benchmarks.frames.conditions import Condition
 from benchmarks.frames.judged import FIGURES, REGION, Judged, far_off, quantile, sharpness
 from benchmarks.independent.rotations import Array
 
@@ -67,15 +66,15 @@ def compare(options: argparse.Namespace) -> int:
     return int(any(change.sign < 0 for each in changes.values() for change in each.values()))
 
 
-def write(table: Path, conditions: Sequence[Condition], judged: Sequence[Judged]) -> None:
-    """The frames of the first conditions, beside their table."""
-    np.savez_compressed(
-        table.with_suffix(".npz"),
-        names=[f"{one.bench}/{one.name}" for one in conditions[: len(judged)]],
-        counts=[len(one.reasons) for one in judged],
-        figures=np.concatenate([one.figures for one in judged]),
-        reasons=np.concatenate([one.reasons for one in judged]),
-    )
+def write(table: Path, judged: Mapping[str, Judged], **others: ArrayLike) -> None:
+    """The frames of conditions by ``bench/condition``, and other arrays, beside their table."""
+    kept: dict[str, ArrayLike] = {
+        "names": list(judged),
+        "counts": [len(one.reasons) for one in judged.values()],
+        "figures": np.concatenate([one.figures for one in judged.values()]),
+        "reasons": np.concatenate([one.reasons for one in judged.values()]),
+    }
+    np.savez_compressed(table.with_suffix(".npz"), **(kept | others))  # type: ignore[arg-type]
 
 
 def read(table: Path) -> dict[str, Judged]:

@@ -57,7 +57,7 @@ def judged(clip: Clip, lens: Camera, shutter: Shutter, config: NodeConfig) -> di
         reasons = [str(one.reason) for one in poses[name] if isinstance(one, Failure)]
         row |= {f"{name}_{reason}": count for reason, count in Counter(reasons).items()}
     for name in (*METHODS, *(peer for peer in PEERS if peer != PEER)):
-        of_name = _jitter(clip, poses[name], poses[PEER])
+        of_name = jitter(clip, poses[name], poses[PEER])
         row |= {f"{name}_{key}": x for key, x in of_name.items()}
     for name in METHODS[1:]:
         of_name = _twists(clip, poses[name], poses[PEER], shutter.readout_time)
@@ -93,7 +93,7 @@ def localized(
     return [localizer.localize(image.points, image.pixels) for image in images]
 
 
-def _jitter(clip: Clip, poses: Poses, others: Poses) -> dict[str, float]:
+def jitter(clip: Clip, poses: Poses, others: Poses) -> dict[str, float]:
     """Second differences of a method over those of another, on the images that both localize."""
     pairs = []
     stamps = np.array([image.stamp_ns for image in clip.images]) * 1e-9

@@ -1,0 +1,121 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of the estimator by name, each with what stands in its place while it is switched off.
+
+Only here, by changing attributes of its modules: the package has no such switches. Kernels are
+compiled with what they call, so that a switch is a Python function that a kernel is called from.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from rs_localizer.estimation.calibration import NO_EFFECT
+from rs_localizer.estimation.left_out import LeftOut
+
+_TINY = -20.0  # logarithm of a size, px
+
+
+class Switch(NamedTuple):
+    """An attribute ``module:name`` or ``module:class.name``, and what to put there for it."""
+
+    place: str
+    off: Callable[[Any], Any]
+
+
+def _always(value: Any) -> Callable[[Any], Any]:
+    """A function that returns this, whatever it is called with."""
+    return lambda old: lambda *_args, **_known: value
+
+
+def _with_posterior(**changed: Any) -> Callable[[Any], Any]:
+    """The refusal by a posterior with other values."""
+    return lambda old: (
+        lambda observations, posterior, *args, **known: old(
+            observations, posterior._replace(**changed), *args, **known
+        )
+    )
+
+
+_FRAME = "rs_localizer.estimation.frame_posterior"
+_REFUSAL = "rs_localizer.localizer:refusal"
+
+SWITCHES: dict[str, tuple[Switch, ...]] = {
+    # Blocks of the model.
+    "smooth-error": (
+        Switch(f"{_FRAME}:_size_of", _always((0.0, 0.0))),
+        Switch(f"{_FRAME}:fit_turn", lambda old: lambda *args: old(
+            *args[:9], _TINY, _TINY, *args[11:])),
+    ),
+    "in-frame-turn": (
+        Switch(f"{_FRAME}:_with_turn",
+               lambda old: lambda given, look, smooth, steady, evidence: steady),
+    ),
+    "calibration-effect": (
+        Switch("rs_localizer.localizer:calibration_effect", lambda old: lambda *args: old(
+            *args)._replace(covariance=NO_EFFECT.covariance, shifts=NO_EFFECT.shifts)),
+    ),
+    # Hypotheses.
+    "typical-speeds": (
+        Switch(f"{_FRAME}:_of_points", lambda old: lambda observations, start, terms, threshold,
+               assumed, one_lens: old(observations, start, terms, threshold,
+                                      replace(assumed, may_rest=False), one_lens)),
+    ),
+    "grid-over-leans": (
+        Switch(f"{_FRAME}:_steady", lambda old: lambda data, points, look, *args: old(
+            data, points, look._replace(planar=False), *args)),
+    ),
+    "mixture-of-steady-and-vibrating": (
+        Switch(f"{_FRAME}:_either", lambda old: lambda steady, evidence, other, shaken: (
+            steady if evidence > other else shaken)),
+    ),
+    # Refusals.
+    "too-few": (
+        Switch(_REFUSAL, lambda old: lambda *args, **known: old(
+            *args, **(known | {"min_inliers": 0}))),
+    ),
+    "undetermined": (Switch(_REFUSAL, _with_posterior(determined=True)),),
+    "uncertain": (Switch("rs_localizer.localizer:uncertain", _always(None)),),
+    "smooth-too-large": (Switch(_REFUSAL, _with_posterior(model_error=0.0)),),
+    "near-outliers": (Switch(_REFUSAL, _with_posterior(near_outliers=0)),),
+    "own-motion": (Switch("rs_localizer.estimation.left_out:_moved", _always(LeftOut())),),
+    "left-out": (Switch("rs_localizer.localizer:left_out", _always(LeftOut())),),
+    # Tracking.
+    "window": (Switch("rs_localizer.estimation.motion_window:LENGTH", lambda old: 2),),
+    "learnt-accelerations": (
+        Switch("rs_localizer.estimation.motion_window:MotionWindow._learnt",
+               lambda old: lambda self, deviations, scores: deviations),
+    ),
+}  # fmt: skip
+"""By the name that ``python -m benchmarks.frames paired without NAME`` takes."""
+
+
+def found(switch: Switch) -> tuple[Any, str, Any]:
+    """The object that has a switch's attribute, the attribute's name, and its value.
+
+    Raises:
+        AttributeError, ModuleNotFoundError: the package has no such part.
+    """
+    module, _, path = switch.place.partition(":")
+    holder: Any = importlib.import_module(module)
+    *outer, name = path.split(".")
+    for part in outer:
+        holder = getattr(holder, part)
+    return holder, name, getattr(holder, name)
+
+
+@contextmanager
+def switched_off(name: str) -> Iterator[None]:
+    """Within ``with``, the estimator lacks this part."""
+    before = [(found(switch), switch) for switch in SWITCHES[name]]
+    try:
+        for (holder, attribute, value), switch in before:
+            setattr(holder, attribute, switch.off(value))
+        yield
+    finally:
+        for (holder, attribute, value), _ in before:
+            setattr(holder, attribute, value)
