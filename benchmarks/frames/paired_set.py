@@ -61,7 +61,10 @@ _OF_BENCH = {
 # that goes astray is one event, however long it is.
 _FRAMES, _RECORDINGS, _COUNTED = 12, 3, 5
 _LONGEST = 40  # frames of a recording: longer ones cost as much as all others together
+_FLIGHTS = ((3.0, 0.03), (8.0, 0.02), (20.0, 0.01))  # m/s; s of a readout
 _REAL_IMAGES = 60
+OTHERS = "others"
+"""The bench of conditions that no bench has."""
 SPOILT = ("lens", "garbage", "bodies", "facades", "near")
 """Benches of frames whose errors are not compared: some of them should have no pose."""
 # The phone's, measured by its images and its gyroscope without this package.
@@ -90,7 +93,7 @@ def others() -> Iterator[Condition]:
     ) -> Condition:
         sequence = TRACKED if tracked else SINGLE
         name += "/tracked" * tracked
-        return Condition("others", name, motion, scene, 0.5, sequence=sequence, **others)
+        return Condition(OTHERS, name, motion, scene, 0.5, sequence=sequence, **others)
 
     shakes = {
         "slow": ((0.3, 8.0),), "fast": ((0.05, 120.0),), "two": ((0.1, 25.0), (0.03, 150.0)),
@@ -98,9 +101,9 @@ def others() -> Iterator[Condition]:
     for (name, shaking), tracked in product(shakes.items(), (False, True)):
         shaken = moving("shaken_hand", shaking=shaking)
         yield shown(f"shaken {name}", shaken, Rich(120), tracked=tracked)
-    for (speed, readout), tracked in product(((3.0, 0.03), (8.0, 0.02), (20.0, 0.01)), (0, 1)):
+    for (speed, readout), tracked in product(_FLIGHTS, (False, True)):
         flight, camera = moving("steady", rate=0.3, speed=speed), Camera(readout_time=readout)
-        yield shown(f"flight {speed:g}m/s", flight, Rich(120), tracked=bool(tracked), camera=camera)
+        yield shown(f"flight {speed:g}m/s", flight, Rich(120), tracked=tracked, camera=camera)
     for (scene, of), tracked in product(SEEN.items(), (False, True)):
         declared = {"points": Points(bent_map=0.005), "settings": (("map_deviation", 0.005),)}
         yield shown(f"waves/{scene}", HAND, of, tracked=tracked, **declared)

@@ -78,7 +78,7 @@ SWITCHES: dict[str, tuple[Switch, ...]] = {
         Switch(_REFUSAL, lambda old: lambda *args, **known: old(
             *args, **(known | {"min_inliers": 0}))),
     ),
-    "undetermined": (Switch(_REFUSAL, _with_posterior(determined=True)),),
+    "undetermined": (Switch(_REFUSAL, _with_posterior(smallest_eigenvalue=1.0)),),
     "uncertain": (Switch("rs_localizer.localizer:uncertain", _always(None)),),
     "smooth-too-large": (Switch(_REFUSAL, _with_posterior(model_error=0.0)),),
     "near-outliers": (Switch(_REFUSAL, _with_posterior(near_outliers=0)),),
@@ -109,9 +109,9 @@ def found(switch: Switch) -> tuple[Any, str, Any]:
 
 
 @contextmanager
-def switched_off(name: str) -> Iterator[None]:
-    """Within ``with``, the estimator lacks this part."""
-    before = [(found(switch), switch) for switch in SWITCHES[name]]
+def switched_off(*names: str) -> Iterator[None]:
+    """Within ``with``, the estimator lacks these parts."""
+    before = [(found(switch), switch) for name in names for switch in SWITCHES[name]]
     try:
         for (holder, attribute, value), switch in before:
             setattr(holder, attribute, switch.off(value))
