@@ -11,6 +11,7 @@ regions and 3 % of errors are noise. ``paired without NAME`` switches a part of 
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import sys
 import tempfile
@@ -156,11 +157,15 @@ def report(versions: Sequence[Result]) -> str:
     if spoilt:
         heads = (f"published, right to {_RIGHT} deg, beyond 5", "frames", *columns)
         parts.append(Table(heads, spoilt).text())
-    real = [
-        (name, *(f"{one.real.get(name, math.nan):.3f}" for one in versions)) for name in last.real
-    ]
-    if real:
-        parts.append(Table(("real", *columns), real).text())
+    real: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for method, names in itertools.groupby(last.real, lambda name: name.rpartition("/")[0]):
+        figures = [name.removeprefix(f"{method}/") for name in names]
+        cells = [
+            " -> ".join(f"{one.real.get(f'{method}/{name}', math.nan):.3g}" for one in versions)
+            for name in figures
+        ]
+        real.setdefault(tuple(figures), []).append((method, *cells))
+    parts += [Table(("", *figures), lines).text() for figures, lines in real.items()]
     return "\n\n".join(parts)
 
 
