@@ -62,11 +62,13 @@ _OF_BENCH = {
 _FRAMES, _RECORDINGS, _COUNTED = 12, 3, 5
 _LONGEST = 40  # frames of a recording: longer ones cost as much as all others together
 _FLIGHTS = ((3.0, 0.03), (8.0, 0.02), (20.0, 0.01))  # m/s; s of a readout
-_REAL_IMAGES = 60
+_REAL_IMAGES = 60  # of a board
+
 OTHERS = "others"
 """The bench of conditions that no bench has."""
 SPOILT = ("lens", "garbage", "bodies", "facades", "near")
 """Benches of frames whose errors are not compared: some of them should have no pose."""
+
 # The phone's, measured by its images and its gyroscope without this package.
 _PHONE = NodeConfig(readout_time=0.0318, stamp_offset=-0.0028)
 _WEBCAM_READOUT, _TAGS_READOUT = 0.011, 0.02  # s; a global shutter's is wrong, as users set it
@@ -123,9 +125,7 @@ def spoilt() -> Iterator[tuple[int, Condition]]:
     """Conditions of single frames of which some should have no pose, and how many frames."""
 
     def of(kind: str, name: str, motion: Motion, scene: Scene, points: Points) -> Condition:
-        # Nobody told the estimator: its gate is the default.
-        own = (("inlier_threshold", 2.0),)
-        return Condition(kind, name, motion, scene, 0.5, points=points, settings=own)
+        return Condition(kind, name, motion, scene, 0.5, points=points)
 
     yield 22, of("garbage", "all wrong", HAND, Rich(60), Points(wrong=1.0))
     yield 22, of("garbage", "90% wrong", HAND, Wall(60), Points(wrong=0.9))
