@@ -30,19 +30,12 @@ _MOST_TURN = 1.5
 # Errors as large as the gate lets them be are those of points strewn over it.
 # A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
 _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
-# Errors that neighbouring rows share although the motion follows vibration, in standard deviations:
-# chance exceeds this in one good frame of 100,000.
-_MOST_AGREEMENT = 4.2
-# Standard deviations of what map and calibration are known to be off that explain an error.
-_ALLOWED = 2.0
 # Smooth errors may be so many times what is declared: of printed boards, nine (benchmarks.real).
 _MOST_DECLARED = math.exp(3.5)
 # An orientation that is open because the camera may move is accepted up to so many times the limit:
 # hand-held boards of 12 to 20 cm come to 1.5 times (benchmarks.real), and beyond three a covariance
 # no longer says where a pose on an arc may be.
 _OPEN = 3.0
-# Less than this, in inlier thresholds, makes the covariance larger and refuses nothing.
-_LEAST_MODEL_ERROR = 0.05
 # Errors of map and lens (root mean square, inlier thresholds) beyond which no region is believed.
 _MOST_MODEL_ERROR = 1.5
 # A wrong lens before a wall is fitted by velocities that nobody expects, and leaves smooth errors:
@@ -106,16 +99,6 @@ def refusal(
             f"{found} inliers with errors of {posterior.noise:.2g} px (one sigma) around an "
             f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
             "too small for the noise",
-        )
-    shared = rolling and posterior.agreement > _MOST_AGREEMENT
-    if shared and posterior.noise > max(
-        _LEAST_MODEL_ERROR * threshold, _ALLOWED * posterior.declared
-    ):
-        return Failure(
-            Reason.MODEL_ERROR,
-            f"neighbouring rows share errors that no motion explains ({posterior.agreement:.1f} "
-            f"standard deviations, {posterior.noise:.2g} px): the camera vibrates faster than its "
-            "rows can resolve, or the scan direction is another one",
         )
     if posterior.near_outliers:
         return Failure(

@@ -16,7 +16,7 @@ from rs_localizer.estimation.mirror import leaning_less, plane_of
 from rs_localizer.estimation.observations import NEAREST, median_depth
 from rs_localizer.estimation.posterior import LEAST_EIGENVALUE, Best, best_motion
 from rs_localizer.estimation.prior import PriorTerms
-from rs_localizer.estimation.refine import LEAST_NOISE, inverted
+from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import Lines, linearized
 
 # Points just outside of the gate that are no chance: shaking may have moved them there. The corners
@@ -28,8 +28,6 @@ _NEAR_PART, _NEAR_GATE = 0.2, 8.0
 # Errors of points in neighbouring rows differ by less than those of any two, by so many standard
 # deviations, where it is the row that moves them.
 _WITH_ROWS = 3.0
-# Points nearer than this part of the image that the points fill are neighbours in it.
-_FAR_APART = 0.15
 # Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
 # which the prior knows less than this part: typical speeds are not weighed.
 _CLEARLY_MOVING, _LITTLE_OF_THE_PRIOR = 67.0, 0.05
@@ -44,7 +42,6 @@ class Look(NamedTuple):
     depth: float  # m
     near_outliers: int
     moving: bool  # neither rest nor another typical speed would change anything
-    agreement: float  # of neighbouring rows (see neighbours_agree)
 
 
 @kernel
@@ -56,7 +53,7 @@ def first_look(
     best = best_motion(data, len(points), start, terms, threshold)
     if not best.smallest_eigenvalue > LEAST_EIGENVALUE:
         lines = linearized(data, len(points), start, np.zeros((len(points), 6)))
-        return Look(best, lines, False, NEAREST, 0, False, 0.0)
+        return Look(best, lines, False, NEAREST, 0, False)
     is_mirrored, mirrored = leaning_less(points, best.inliers, best.state, 2.0)
     if is_mirrored:
         again = best_motion(data, len(points), mirrored, terms, threshold)
@@ -76,7 +73,6 @@ def first_look(
     return Look(
         best, lines, plane_of(points, best.inliers)[0], depth, near,
         _clearly_moving(best, terms, turn_known),
-        neighbours_agree(lines.errors, lines.tau, lines.image, best.inliers),
     )  # fmt: skip
 
 
@@ -133,39 +129,3 @@ def _clearly_moving(best: Best, terms: PriorTerms, turn_known: bool) -> bool:
         for j in range(len(spread)):
             squared += velocities[i] * information[i, j] * velocities[j]
     return part < _LITTLE_OF_THE_PRIOR and squared > _CLEARLY_MOVING
-
-
-@kernel
-def neighbours_agree(errors: Array, tau: Array, rays: Array, inliers: BoolArray) -> float:
-    """How much the errors of points in neighbouring rows agree: standard normal if they do not.
-
-    Neighbours in the image do not count: corners of one marker share errors whatever the camera
-    does.
-    """
-    order = np.argsort(tau)
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    squared, count = 0.0, 0
-    for i in order:
-        if inliers[i]:
-            squared += errors[i, 0] ** 2 + errors[i, 1] ** 2
-            count += 1
-            for k in range(2):
-                low[k], high[k] = min(low[k], rays[i, k]), max(high[k], rays[i, k])
-    if count < 2 or not squared > 0.0:
-        return 0.0
-    far = _FAR_APART * max(high[0] - low[0], high[1] - low[1])
-    agreement, pairs = 0.0, 0
-    previous = -1
-    for i in order:
-        if not inliers[i]:
-            continue
-        if previous >= 0:
-            x, y = rays[i, 0] - rays[previous, 0], rays[i, 1] - rays[previous, 1]
-            if x * x + y * y > far * far:
-                pairs += 1
-                agreement += errors[previous, 0] * errors[i, 0] + errors[previous, 1] * errors[i, 1]
-        previous = i
-    # Each of the two products of a pair has the square of the mean square as its variance.
-    variance = max(0.5 * squared / count, LEAST_NOISE * LEAST_NOISE)
-    normalized: float = agreement / (variance * np.sqrt(2.0 * max(pairs, 1)))
-    return normalized

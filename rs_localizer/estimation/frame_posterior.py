@@ -27,7 +27,7 @@ from rs_localizer.estimation.correlated import (
     nothing_shared,
     smooth_error,
 )
-from rs_localizer.estimation.first_look import Look, first_look, near_outliers, neighbours_agree
+from rs_localizer.estimation.first_look import Look, first_look, near_outliers
 from rs_localizer.estimation.mirror import farthest
 from rs_localizer.estimation.modes import (
     LEAST_LIKELY,
@@ -124,9 +124,7 @@ def _of_points(
     if not best.determined or np.count_nonzero(best.inliers) < _FEWEST:
         return best
     declared = assumed.map_deviation * assumed.focal_length / look.depth
-    best = best._replace(
-        agreement=look.agreement, near_outliers=look.near_outliers, declared=declared
-    )
+    best = best._replace(near_outliers=look.near_outliers, declared=declared)
     moving = look.moving and not declares and not look.planar
     slowest = 0 if assumed.may_rest and not moving else len(SPEEDS) - 1
     first = best.state
@@ -288,7 +286,6 @@ def _of_fit(
     return steady._replace(
         state=fit.state, covariance=fit.covariance, noise=fit.noise, freedom=fit.freedom,
         inliers=fit.inliers, squared_errors=fit.squared_errors, shake=fit.turns, arched=None,
-        agreement=neighbours_agree(lines.errors, lines.tau, lines.image, fit.inliers),
         near_outliers=near_outliers(lines, fit.squared_errors, fit.inliers, threshold),
         speeds=np.zeros(0), mirror=None, shared=size,
         scales=Scales(np.zeros(2), told, _NOTHING),

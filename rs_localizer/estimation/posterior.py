@@ -81,7 +81,6 @@ class Posterior(NamedTuple):
     shake: Array = np.zeros((0, 3))  # (k,3) rad, coefficients
     model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
     shared: float = 0.0  # px, likewise, of all modes together
-    agreement: float = 0.0  # of neighbouring rows, standard deviations
     declared: float = 0.0  # px, the part of it that the map is known to be off
     speeding: float = 0.0  # squared velocities, in deviations of what the configuration expects
     # Probabilities of the typical speeds; empty: the configured one

@@ -52,10 +52,6 @@ def mirrored(turn, covered):
         # Errors as large as the gate.
         ({"noise": 1.45}, None),
         ({"noise": 1.55}, Reason.RESIDUAL),
-        # Errors that neighbouring rows share: below a twentieth of the threshold no pose suffers.
-        ({"agreement": 4.1}, None),
-        ({"agreement": 4.3}, Reason.MODEL_ERROR),
-        ({"agreement": 4.3, "noise": 0.09}, None),
         ({"near_outliers": 5}, Reason.MODEL_ERROR),
         ({"model_error": 2.9}, None),
         ({"model_error": 3.1}, Reason.MODEL_ERROR),
