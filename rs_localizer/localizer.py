@@ -434,7 +434,6 @@ class Localizer:
             speeding=speeding(observed, posterior.state),
         )
         failure = refusal(
-            observed.observations,
             posterior,
             best.samples,
             min_inliers=self.config.min_inliers,

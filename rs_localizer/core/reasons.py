@@ -17,7 +17,6 @@ class Reason(StrEnum):
     BEHIND_CAMERA = "behind_camera"
     RESIDUAL = "residual"
     DEGENERATE = "degenerate"
-    IMPLAUSIBLE = "implausible"
     MIRRORED = "mirrored"
     MODEL_ERROR = "model_error"
     UNCERTAIN = "uncertain"

@@ -8,25 +8,13 @@ import math
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.blocks import median
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import (
-    LINEAR,
-    POSE,
-    POSE_SIZE,
-    STATE_ANGULAR,
-    STATE_LINEAR,
-    VELOCITIES,
-)
+from rs_localizer.core.state import LINEAR, POSE, POSE_SIZE, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.observations import Observations, Observed, median_depth
+from rs_localizer.estimation.observations import Observed
 from rs_localizer.estimation.posterior import Mirror, Posterior
-from rs_localizer.estimation.residuals import row_paces
 
-# Beyond this the camera turns by more than the motion model is meant for, rad per readout.
-_MOST_TURN = 1.5
 # Errors as large as the gate lets them be are those of points strewn over it.
 # A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
 _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
@@ -42,16 +30,12 @@ _MOST_MODEL_ERROR = 1.5
 # of this limit so many squared deviations of the velocities leave a part of 1 / e. Cameras that are
 # fast leave none (a phone at 3.4 deviations: 0.04 px).
 _SPEEDS_AND_ERRORS, _LEAST_OF_THE_LIMIT = 8.0, 0.25
-# An image that moves along with the rows is one moment of the scene, drawn out: any motion that
-# does so fits anything. See :func:`.row_paces`.
-_LEAST_PACE = 0.25
 # How far away (rad) a mirrored pose that fits as well may be: what the covariance speaks for may be
 # farther away than what it does not.
 _MOST_MIRRORED_TURN, _MOST_COVERED_TURN = 0.2, 0.35
 
 
 def refusal(
-    observations: Observations,
     posterior: Posterior,
     samples: int,
     *,
@@ -67,19 +51,18 @@ def refusal(
         min_inliers, threshold: of the configuration.
         rolling: whether velocities were estimated.
     """
-    state = posterior.state
+    state, count = posterior.state, len(posterior.inliers)
     found, needed = int(np.count_nonzero(posterior.inliers)), min_inliers
     if found < needed:
         behind = int(np.count_nonzero(np.isinf(posterior.squared_errors)))
-        if 2 * behind > observations.count:
+        if 2 * behind > count:
             return Failure(
                 Reason.BEHIND_CAMERA,
-                f"{behind} of {observations.count} points lie behind the camera",
+                f"{behind} of {count} points lie behind the camera",
             )
         return Failure(
             Reason.TOO_FEW_INLIERS,
-            f"{found} inliers of {observations.count} points after {samples} samples, "
-            f"{needed} are needed",
+            f"{found} inliers of {count} points after {samples} samples, {needed} are needed",
         )
     if not posterior.determined:
         return Failure(
@@ -115,25 +98,6 @@ def refusal(
             f"errors of {posterior.model_error:.2g} px are smooth over the image: the calibration "
             "or the map is too far off for any pose",
         )
-    pace, depth = _pace_and_depth(observations.packed, observations.count, state, posterior.inliers)
-    if pace < _LEAST_PACE:
-        return Failure(
-            Reason.IMPLAUSIBLE,
-            f"the image would move with the rows, at {1.0 - pace:.0%} of their speed",
-        )
-    turn = float(np.linalg.norm(state[STATE_ANGULAR]))
-    if turn > _MOST_TURN:
-        return Failure(
-            Reason.IMPLAUSIBLE,
-            f"the camera would rotate by {math.degrees(turn):.0f} deg per readout",
-        )
-    travel = float(np.linalg.norm(state[STATE_LINEAR]))
-    if travel > depth:
-        return Failure(
-            Reason.IMPLAUSIBLE,
-            f"the camera would move by {travel:.3g} m per readout in front of points "
-            f"{depth:.3g} m away",
-        )
     mirror = posterior.mirror
     if mirror is not None and mirror.turn > (
         _MOST_COVERED_TURN if mirror.covered else _MOST_MIRRORED_TURN
@@ -147,15 +111,6 @@ def speeding(observed: Observed, state: Array) -> float:
     part = VELOCITIES if observed.sighted.turn is None else LINEAR  # of the rest a gyroscope knows
     velocities = state[POSE_SIZE - POSE.stop :][part]
     return float(velocities @ observed.terms.informations[0][part, part] @ velocities)
-
-
-@kernel
-def _pace_and_depth(
-    data: Array, count: int, state: Array, chosen: BoolArray
-) -> tuple[float, float]:
-    """Medians of some points: their paces (:func:`.row_paces`) and depths."""
-    pace = median(row_paces(data, count, state)[chosen])
-    return pace, median_depth(data, state, chosen)
 
 
 def _not_ruled_out(other: Mirror, name: str) -> Failure:

@@ -138,9 +138,9 @@ class View:
             (rate[1] - v * rate[2]) * self.inverse_depth,
         ]
         image_rate = multiply(self._raw_by_ray, ray_rate)
-        self.pace = 1.0 - dot(self._gradient, image_rate)
-        seen = in_front & (self.pace > _LEAST_PACE)
-        divisor = select(self.pace > _LEAST_PACE, self.pace, _LEAST_PACE)
+        pace = 1.0 - dot(self._gradient, image_rate)
+        seen = in_front & (pace > _LEAST_PACE)
+        divisor = select(pace > _LEAST_PACE, pace, _LEAST_PACE)
         lead = [a / divisor for a in image_rate]
         correction = [[lead[i] * self._gradient[j] for j in range(2)] for i in range(2)]
         correction[0][0] = correction[0][0] + 1.0
@@ -291,10 +291,6 @@ def _squared_error(values: list[Lanes]) -> Vector:
     return [View(values, looks=2).squared]
 
 
-def _pace(values: list[Lanes]) -> Vector:
-    return [View(values, looks=2).pace]
-
-
 def _cost(values: list[Lanes]) -> Vector:
     return [View(values, looks=1).truncated]
 
@@ -326,7 +322,6 @@ def _last(values: list[Lanes]) -> Vector:
 
 
 _squared_error_lanes = traced(_squared_error, POINT_SIZE, UNIFORM_SIZE)
-_pace_lanes = traced(_pace, POINT_SIZE, UNIFORM_SIZE)
 _cost_lanes = traced(_cost, POINT_SIZE, UNIFORM_SIZE)
 _still_cost_lanes = traced(_still_cost, POINT_SIZE, UNIFORM_SIZE)
 _rows_lanes = traced(partial(_rows, 1), POINT_SIZE, UNIFORM_SIZE)
@@ -366,20 +361,6 @@ def squared_errors(data: Array, count: int, state: Array) -> Array:
         for lane in range(min(LANES, count - block * LANES)):
             errors[block * LANES + lane] = block_errors[lane]
     return errors
-
-
-@kernel
-def row_paces(data: Array, count: int, state: Array) -> Array:
-    """How much faster than the image points the rows move (count,): 1 at rest, 0 in step."""
-    uniform = np.empty(UNIFORM_SIZE * LANES)
-    spread_state(state, 1.0, 0.0, uniform)
-    block_paces = np.empty(LANES)
-    paces = np.empty(count)
-    for block in range(len(data)):
-        _pace_lanes(data[block], uniform, block_paces)
-        for lane in range(min(LANES, count - block * LANES)):
-            paces[block * LANES + lane] = block_paces[lane]
-    return paces
 
 
 @kernel

@@ -81,7 +81,6 @@ REASONS: dict[str, Meaning] = {
         "the points, such as a frontal plane, do not determine the motion",
         "look from an angle, show depth, keep tracking on",
     ),
-    Reason.IMPLAUSIBLE: Meaning("no camera moves like this", f"chance matches? check {SETTINGS}"),
     Reason.MIRRORED: Meaning(
         "planar ambiguity: two poses fit equally well",
         "come nearer, look from an angle",
