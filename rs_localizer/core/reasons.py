@@ -17,7 +17,6 @@ class Reason(StrEnum):
     BEHIND_CAMERA = "behind_camera"
     RESIDUAL = "residual"
     DEGENERATE = "degenerate"
-    MIRRORED = "mirrored"
     MODEL_ERROR = "model_error"
     UNCERTAIN = "uncertain"
     SCAN_AXIS = "scan_axis"

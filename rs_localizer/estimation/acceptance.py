@@ -13,7 +13,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.state import LINEAR, POSE, POSE_SIZE, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.observations import Observed
-from rs_localizer.estimation.posterior import Mirror, Posterior
+from rs_localizer.estimation.posterior import Posterior
 
 # Errors as large as the gate lets them be are those of points strewn over it.
 # A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
@@ -30,9 +30,6 @@ _MOST_MODEL_ERROR = 1.5
 # of this limit so many squared deviations of the velocities leave a part of 1 / e. Cameras that are
 # fast leave none (a phone at 3.4 deviations: 0.04 px).
 _SPEEDS_AND_ERRORS, _LEAST_OF_THE_LIMIT = 8.0, 0.25
-# How far away (rad) a mirrored pose that fits as well may be: what the covariance speaks for may be
-# farther away than what it does not.
-_MOST_MIRRORED_TURN, _MOST_COVERED_TURN = 0.2, 0.35
 
 
 def refusal(
@@ -98,11 +95,6 @@ def refusal(
             f"errors of {posterior.model_error:.2g} px are smooth over the image: the calibration "
             "or the map is too far off for any pose",
         )
-    mirror = posterior.mirror
-    if mirror is not None and mirror.turn > (
-        _MOST_COVERED_TURN if mirror.covered else _MOST_MIRRORED_TURN
-    ):
-        return _not_ruled_out(mirror, "the pose mirrored on it")
     return None
 
 
@@ -111,14 +103,6 @@ def speeding(observed: Observed, state: Array) -> float:
     part = VELOCITIES if observed.sighted.turn is None else LINEAR  # of the rest a gyroscope knows
     velocities = state[POSE_SIZE - POSE.stop :][part]
     return float(velocities @ observed.terms.informations[0][part, part] @ velocities)
-
-
-def _not_ruled_out(other: Mirror, name: str) -> Failure:
-    return Failure(
-        Reason.MIRRORED,
-        f"the points lie on a plane, and {name}, {math.degrees(other.turn):.0f} deg away, fits "
-        f"only {other.evidence:.1f} sigma^2 worse",
-    )
 
 
 def uncertain(estimate: Estimate, most: float) -> Failure | None:

@@ -105,7 +105,6 @@ class Sized(NamedTuple):
     step: Array  # (18,) from where the products are
     covariance: Array  # (18,18)
     evidence: float  # logarithm
-    cost: float  # noise variances, at the most probable size
     noise: float  # px
     size: float  # px, root mean square
     freedom: float
@@ -345,7 +344,7 @@ def over_sizes(
     equations, deviation = len(smooth.rows), max(noise.deviation, LEAST_NOISE)
     steps, evidences = np.zeros((grid, PARAMETERS)), np.full(grid, -np.inf)
     covariances = np.empty((grid, PARAMETERS, PARAMETERS))
-    sizes, noises, costs, left_over = np.zeros(grid), np.zeros(grid), np.zeros(grid), np.ones(grid)
+    sizes, noises, left_over = np.zeros(grid), np.zeros(grid), np.ones(grid)
     matrix, right = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
     best = -np.inf
     for g in range(grid):
@@ -373,17 +372,17 @@ def over_sizes(
         if not positive:
             break
         gained = -np.sum(right * steps[g])
-        costs[g] = left / variance + prior_cost - gained
+        cost = left / variance + prior_cost - gained
         spread = 0.0
         for k in range(len(taken)):
             spread -= math.log1p(-taken[k])
         density = equations * math.log(2.0 * math.pi * variance)
-        evidences[g] = volume - 0.5 * (costs[g] + density + spread + log_determinant + away * away)
+        evidences[g] = volume - 0.5 * (cost + density + spread + log_determinant + away * away)
         covariances[g] = squared(half, scale)
         best = max(best, evidences[g])
         if evidences[g] < best - _HOPELESS and away > 0.0:
             break
-    return _integrated(smooth, steps, covariances, evidences, sizes, noises, costs, left_over)
+    return _integrated(smooth, steps, covariances, evidences, sizes, noises, left_over)
 
 
 @kernel
@@ -407,13 +406,13 @@ def _solved(half: Array, scale: Array, right: Array) -> tuple[Array, float]:
 @kernel
 def _integrated(
     smooth: SmoothError, steps: Array, covariances: Array, evidences: Array, sizes: Array,
-    noises: Array, costs: Array, left_over: Array,
+    noises: Array, left_over: Array,
 ) -> Sized:  # fmt: skip
     best, grid = int(np.argmax(evidences)), len(sizes)
     if not evidences[best] > -np.inf:
         nothing = np.full(PARAMETERS, np.nan)
         return Sized(
-            nothing, np.full((PARAMETERS, PARAMETERS), np.nan), -np.inf, np.inf, noises[0], 0.0,
+            nothing, np.full((PARAMETERS, PARAMETERS), np.nan), -np.inf, noises[0], 0.0,
             1.0, smooth.log_size, 1.0 / smooth.precision,
         )  # fmt: skip
     weights = np.exp(evidences - evidences[best])
@@ -439,5 +438,5 @@ def _integrated(
                 covariance[i, j] += weights[g] * (own[i, j] + away[i] * away[j])
     return Sized(
         step, covariance, evidences[best] + math.log(total) - (_MASS if grid > 1 else 0.0),
-        costs[best], noise, math.sqrt(size), max(freedom, 6.0), log_size, spread,
+        noise, math.sqrt(size), max(freedom, 6.0), log_size, spread,
     )  # fmt: skip

@@ -28,7 +28,6 @@ from rs_localizer.estimation.correlated import (
     smooth_error,
 )
 from rs_localizer.estimation.first_look import Look, first_look, near_outliers
-from rs_localizer.estimation.mirror import farthest
 from rs_localizer.estimation.modes import (
     LEAST_LIKELY,
     REST_ODDS,
@@ -167,11 +166,6 @@ def _of_points(
         bend=bend,
         speeds=found.speeds,
         scales=best.scales._replace(size=of_size, speeds=found.log_likelihoods),
-        mirror=(
-            farthest(found.costs, found.evidences, found.steps, found.covariance)
-            if look.planar
-            else None
-        ),
     )
     if not assumed.rolling:
         return steady
@@ -287,7 +281,7 @@ def _of_fit(
         state=fit.state, covariance=fit.covariance, noise=fit.noise, freedom=fit.freedom,
         inliers=fit.inliers, squared_errors=fit.squared_errors, shake=fit.turns, arched=None,
         near_outliers=near_outliers(lines, fit.squared_errors, fit.inliers, threshold),
-        speeds=np.zeros(0), mirror=None, shared=size,
+        speeds=np.zeros(0), shared=size,
         scales=Scales(np.zeros(2), told, _NOTHING),
     )  # fmt: skip
 

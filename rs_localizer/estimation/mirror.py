@@ -16,16 +16,11 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.simd.jit import inlined, kernel
-from rs_localizer.estimation.posterior import Mirror
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.
 _PLANE = 0.1
 # What leans by less (rad) has no mirrored pose of its own.
 _LEAST_LEAN = 0.01
-# A pose that fits worse by this many noise variances is out of the question: odds of 100 to 1.
-CLEARLY_WORSE = 9.2
-# The covariance speaks for poses within so many standard deviations of the orientation.
-_COVERED = 4.0
 
 
 def is_plane(points: Array, inliers: BoolArray) -> bool:
@@ -100,21 +95,3 @@ def plane_of(points: Array, inliers: BoolArray) -> tuple[bool, Array, Array]:
 def longest_axis(covariance: Array) -> float:
     """Standard deviation (rad) of the turn about the axis that is known worst."""
     return math.sqrt(np.linalg.eigvalsh(covariance[:3, :3].copy())[-1])
-
-
-def farthest(costs: Array, evidence: Array, steps: Array, covariance: Array) -> Mirror | None:
-    """The farthest pose that is not out of the question: neither unlikely nor of a bad fit.
-
-    Args:
-        costs, evidence: (k,) of the modes, noise variances and logarithms.
-        steps: (k,18) to them from the estimate, whose covariance (18,18) speaks for what is near.
-    """
-    best = int(np.argmax(evidence))
-    worse = np.maximum(2.0 * (evidence[best] - evidence), costs - costs[best])
-    turns = np.where(worse < CLEARLY_WORSE, np.linalg.norm(steps[:, :3], axis=1), 0.0)
-    far = int(np.argmax(turns))
-    if turns[far] == 0.0:
-        return None
-    # Curved valleys leave the ellipsoid early; the longest axis tells how far they go.
-    deviation = longest_axis(covariance)
-    return Mirror(steps[far], float(worse[far]), bool(turns[far] < _COVERED * deviation))

@@ -147,17 +147,17 @@ def along_arcs(
 @kernel
 def averaged(
     states: Array, covariances: Array, best: int, counting: Array, possible: Array
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """Mean (24,) of Gaussians by the ones probabilities (k,), covariance (18,18) by the others.
 
     Both about the middle of the points, where arcs are straight (:func:`offset_between`). And the
-    offsets (k,18) from the best one to all, from the mean to all, and their covariances (k,18,18).
+    offsets (k,18) from the mean to all, and their covariances (k,18,18).
     """
     count, first = len(states), states[best]
-    steps, mean = np.empty((count, PARAMETERS)), np.zeros(PARAMETERS)
+    mean = np.zeros(PARAMETERS)
     for k in range(count):
-        steps[k], _ = offset_between(first, states[k], first[9:12])
-        mean += counting[k] * steps[k]
+        step, _ = offset_between(first, states[k], first[9:12])
+        mean += counting[k] * step
     # About the pivot, which the move of a step is not.
     state, middle = apply_step(first, mean), np.empty(3)
     for i in range(3):
@@ -174,7 +174,7 @@ def averaged(
             if possible[k] > _NO_PART:
                 abouts[k] = _about_pivot(covariances[k], by_turn)
                 covariance = covariance + possible[k] * abouts[k]
-    return state, covariance, steps, offsets, abouts
+    return state, covariance, offsets, abouts
 
 
 def mixed(
@@ -231,7 +231,6 @@ class Mode(NamedTuple):
     state: Array  # (24,)
     covariance: Array  # (18,18)
     evidence: float  # logarithm; minus infinity: nothing was found
-    cost: float  # noise variances
     noise: float  # px
     size: float  # px, of the smooth error
     freedom: float
@@ -243,7 +242,6 @@ class _Modes(NamedTuple):
     states: Array  # (k,24)
     covariances: Array  # (k,18,18)
     evidences: Array  # (k,)
-    costs: Array  # (k,)
     speeds: IntArray  # (k,) indices of SPEEDS
     errors: Array  # (k,5) noise, size, freedom, mean and variance of the size's logarithm
 
@@ -258,9 +256,6 @@ class Mixture(NamedTuple):
     speeds: Array  # (5,) weights of the typical speeds in the covariance
     log_likelihoods: Array  # (5,) of the typical speeds
     errors: Array  # (5,) of the most probable mode; the size is the root mean square of all
-    evidences: Array  # (k,) of the modes
-    costs: Array  # (k,) noise variances
-    steps: Array  # (k,18) to them from the most probable one
 
 
 @kernel
@@ -293,13 +288,13 @@ def mixture_of(
     if total == -np.inf:
         return Mixture(
             start, modes.covariances[0], modes.covariances[0], total, weights, weights,
-            modes.errors[0], evidences, modes.costs, np.zeros((count, PARAMETERS)),
+            modes.errors[0],
         )  # fmt: skip
     first = int(np.argmax(probable))
     probable = np.exp(probable - probable[first])
     possible = np.exp(TEMPER * (evidences - np.max(evidences)))
     probable, possible = probable / np.sum(probable), possible / np.sum(possible)
-    state, covariance, steps, offsets, abouts = averaged(
+    state, covariance, offsets, abouts = averaged(
         modes.states, modes.covariances, first, probable, possible
     )
     arched = along_arcs(covariance, state[9:12], possible, offsets, abouts)
@@ -310,10 +305,7 @@ def mixture_of(
         shared += possible[k] * modes.errors[k, 1] ** 2
     errors[1] = math.sqrt(shared)
     log_likelihoods = np.maximum(log_likelihoods - np.max(log_likelihoods), LEAST_LIKELY)
-    return Mixture(
-        state, covariance, arched, total, weights, log_likelihoods, errors, evidences,
-        modes.costs, steps,
-    )  # fmt: skip
+    return Mixture(state, covariance, arched, total, weights, log_likelihoods, errors)
 
 
 @inlined
@@ -337,7 +329,7 @@ def _modes(
     most = 2 * len(SPEEDS)
     modes = _Modes(
         np.empty((most, STATE_SIZE)), np.empty((most, PARAMETERS, PARAMETERS)), np.empty(most),
-        np.empty(most), np.empty(most, np.int64), np.empty((most, 5)),
+        np.empty(most, np.int64), np.empty((most, 5)),
     )  # fmt: skip
     near, count, best = start.copy(), 0, -np.inf
     if slowest == 0:
@@ -371,7 +363,7 @@ def _modes(
             break
     return _Modes(
         modes.states[:count], modes.covariances[:count], modes.evidences[:count],
-        modes.costs[:count], modes.speeds[:count], modes.errors[:count],
+        modes.speeds[:count], modes.errors[:count],
     )  # fmt: skip
 
 
@@ -380,8 +372,7 @@ def _keep(modes: _Modes, count: int, speed: int, mode: Mode) -> int:
     """Write a mode behind so many others; their new number."""
     write(modes.states[count], mode.state)
     modes.covariances[count] = mode.covariance
-    modes.evidences[count], modes.costs[count] = mode.evidence, mode.cost
-    modes.speeds[count] = speed
+    modes.evidences[count], modes.speeds[count] = mode.evidence, speed
     errors = modes.errors[count]
     errors[0], errors[1], errors[2] = mode.noise, mode.size, mode.freedom
     errors[3], errors[4] = mode.log_size, mode.spread
@@ -451,8 +442,8 @@ def _mode(
     state = apply_step(origin, found.step) if finite else origin
     return Mode(
         state, found.covariance if finite else np.zeros((PARAMETERS, PARAMETERS)),
-        found.evidence + odds if finite else -np.inf, found.cost, found.noise, found.size,
-        found.freedom, found.log_size, found.spread,
+        found.evidence + odds if finite else -np.inf, found.noise, found.size, found.freedom,
+        found.log_size, found.spread,
     ), origin, products  # fmt: skip
 
 
@@ -584,7 +575,7 @@ def _over_leans(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tup
         return mode, False
     probable = np.exp(evidences[:last] - best)
     total = np.sum(probable)
-    state, covariance, _, _, _ = averaged(
+    state, covariance, _, _ = averaged(
         states[:last], covariances[:last], int(np.argmax(probable)), probable / total,
         probable / total,
     )  # fmt: skip
@@ -594,7 +585,6 @@ def _over_leans(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tup
         state,
         covariance,
         evidence,
-        mode.cost,
         mode.noise,
         mode.size,
         mode.freedom,

@@ -53,19 +53,6 @@ class Best(NamedTuple):
     squared_errors: Array  # (n,) px^2
 
 
-class Mirror(NamedTuple):
-    """The mirrored pose before a plane, if it cannot be ruled out."""
-
-    step: Array  # (18,) from the estimate to it
-    evidence: float  # noise variances by which it fits worse
-    covered: bool  # the covariance speaks for it
-
-    @property
-    def turn(self) -> float:
-        """rad."""
-        return float(np.linalg.norm(self.step[:3]))
-
-
 class Posterior(NamedTuple):
     """The refined motion of one frame and what the points say of it."""
 
@@ -77,7 +64,6 @@ class Posterior(NamedTuple):
     smallest_eigenvalue: float  # of the information scaled to a unit diagonal, or less
     inliers: BoolArray  # (n,)
     squared_errors: Array  # (n,) px^2
-    mirror: Mirror | None = None
     shake: Array = np.zeros((0, 3))  # (k,3) rad, coefficients
     model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
     shared: float = 0.0  # px, likewise, of all modes together

@@ -81,10 +81,6 @@ REASONS: dict[str, Meaning] = {
         "the points, such as a frontal plane, do not determine the motion",
         "look from an angle, show depth, keep tracking on",
     ),
-    Reason.MIRRORED: Meaning(
-        "planar ambiguity: two poses fit equally well",
-        "come nearer, look from an angle",
-    ),
     Reason.MODEL_ERROR: Meaning(
         "residuals depend on row or place in the image",
         f"vibration (IMU)? check calibration, map, {SETTINGS}",

@@ -9,7 +9,7 @@ import pytest
 
 from rs_localizer.core.reasons import Reason
 from rs_localizer.estimation.acceptance import refusal, speeding
-from rs_localizer.estimation.posterior import Mirror, maximum_a_posteriori
+from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import motion_terms
 
 PRIOR = motion_terms((0.18, 0.09), (0.009, 0.0036))
@@ -29,12 +29,6 @@ def reason(posterior):
     return None if failure is None else failure.reason
 
 
-def mirrored(turn, covered):
-    step = np.zeros(18)
-    step[1] = turn
-    return {"mirror": Mirror(step, 1.0, covered)}
-
-
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
@@ -51,10 +45,6 @@ def mirrored(turn, covered):
         ({"near_outliers": 5}, Reason.MODEL_ERROR),
         ({"model_error": 2.9}, None),
         ({"model_error": 3.1}, Reason.MODEL_ERROR),
-        (mirrored(0.19, False), None),
-        (mirrored(0.21, False), Reason.MIRRORED),
-        (mirrored(0.34, True), None),
-        (mirrored(0.36, True), Reason.MIRRORED),
     ],
 )
 def test_what_is_wrong_with_a_posterior_is_its_reason(good, changes, expected):
