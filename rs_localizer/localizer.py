@@ -29,7 +29,6 @@ from rs_localizer.estimation.acceptance import refusal, speeding, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
 from rs_localizer.estimation.left_out import LeftOut, as_nearest, left_out
-from rs_localizer.estimation.mirror import is_plane
 from rs_localizer.estimation.observations import (
     NEAREST,
     Observed,
@@ -164,8 +163,7 @@ class Localizer:
         self.localize(points, pixels, np.arange(count, dtype=np.float64), prior=prior)
         self.localize(points, pixels)
         pivot_of(np.eye(18))  # by a tracker
-        is_plane(np.zeros((4, 3)), np.ones(4, np.bool_))  # where points are left out
-        as_nearest(np.zeros((2, 2)), np.zeros((2, 2)), 0.0)
+        as_nearest(np.zeros((2, 2)), np.zeros((2, 2)), 0.0)  # where points are left out
         so3.exp_many(np.zeros((1, 3)))  # of rows that shake
         likeness(np.zeros((2, 3)), np.zeros(2), 1)  # of inliers, for integrity
         # And with one that shakes, rows to and fro.

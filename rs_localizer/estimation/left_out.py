@@ -10,7 +10,6 @@ to, or it has a motion of its own.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +19,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import MOVE, TURN, step_between
 from rs_localizer.core.types import Failure
-from rs_localizer.estimation.mirror import is_plane
-from rs_localizer.estimation.observations import Observations, Observed
+from rs_localizer.estimation.observations import Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior
 from rs_localizer.estimation.residuals import linearized
 from rs_localizer.estimation.searching import GLOBAL_SHUTTER_SCALE, MotionSearch
@@ -47,12 +45,6 @@ _CIRCLE = 0.1
 # twice at most.
 _STRETCH = 0.5
 _MANY = 60
-# Focal lengths that are tried in place of K's: steps from half to twice, between which a motion
-# takes up what is left.
-_LENGTHS = [2.0 ** (step / 8.0) for step in range(-8, 9) if step]
-# More than this part of the points left out must fit with one of them: where K is off two thirds
-# and more do; of strewn, shifted or near matches of a right camera so many did in no 1,080 frames.
-_JOINED_SHARE = 0.5
 # A side of the image that has all but this part of a group.
 _ELSE = 0.1
 
@@ -86,15 +78,6 @@ def left_out(
         if found.failure is not None or known:  # what is matched near predictions is near them
             return found
         near = _not_strewn(observed, posterior)
-        if near == 0.0:
-            return found
-        joined, length = _with_another_length(search, observed, posterior, threshold)
-        if joined > max(_JOINED_SHARE * (count - inliers), _SAMPLE - 1):
-            return LeftOut(Failure(
-                Reason.MODEL_ERROR,
-                f"{inliers} points fit to {posterior.noise:.2g} px (one sigma), and {joined} more "
-                f"with a focal length of {length:.2g} times K's: is K of another image?",
-            ))  # fmt: skip
         if near < _SHARE * inliers:  # however fast: a few that lie near are seen from a car, too
             return found
     return LeftOut(Failure(
@@ -169,30 +152,6 @@ def _not_strewn(observed: Observed, posterior: Posterior) -> float:
     if beyond:
         surprise += beyond * math.log(beyond / ((1.0 - _CIRCLE) * count))
     return inside - beyond * _CIRCLE / (1.0 - _CIRCLE) if surprise > _LEAST_CHANCE else 0.0
-
-
-def _with_another_length(
-    search: MotionSearch, observed: Observed, posterior: Posterior, threshold: float
-) -> tuple[int, float]:
-    """How many more points fit as well with another focal length, and with which part of K's."""
-    observations, most = observed.observations, (0, 1.0)
-    if is_plane(observations.points, np.ones(observations.count, np.bool_)):
-        return most  # it fits any, by another distance
-    fitting, by_ray = posterior.squared_errors[posterior.inliers], observed.sighted.usable.by_ray
-    gate = max(math.sqrt(fitting.max(initial=0.0)), threshold)
-    rough = GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
-    for length in _LENGTHS:
-        rays, columns = observations.rays / length, by_ray * length
-        seen = Observations.of(
-            observations.points, rays, observations.tau, columns, observations.mounts,
-            observations.camera,
-        )  # fmt: skip
-        found = search.optimize(
-            replace(observed, observations=seen), posterior.state, 2.0 * rough, observed.terms
-        )
-        within = int(np.count_nonzero(seen.within(found.state, gate)))
-        most = max(most, (within - len(fitting), length))
-    return most
 
 
 def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> int:

@@ -23,11 +23,6 @@ _PLANE = 0.1
 _LEAST_LEAN = 0.01
 
 
-def is_plane(points: Array, inliers: BoolArray) -> bool:
-    """True if the points (n,3) that count lie on a plane."""
-    return bool(plane_of(points, inliers)[0])
-
-
 @kernel
 def leaning_less(
     points: Array, inliers: BoolArray, state: Array, leans: float
