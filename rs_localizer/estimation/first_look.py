@@ -12,7 +12,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import LINEAR, VELOCITIES
-from rs_localizer.estimation.mirror import leaning_less, plane_of
+from rs_localizer.estimation.mirror import plane_of
 from rs_localizer.estimation.observations import NEAREST, median_depth
 from rs_localizer.estimation.posterior import LEAST_EIGENVALUE, Best, best_motion
 from rs_localizer.estimation.prior import PriorTerms
@@ -54,15 +54,6 @@ def first_look(
     if not best.smallest_eigenvalue > LEAST_EIGENVALUE:
         lines = linearized(data, len(points), start, np.zeros((len(points), 6)))
         return Look(best, lines, False, NEAREST, 0, False)
-    is_mirrored, mirrored = leaning_less(points, best.inliers, best.state, 2.0)
-    if is_mirrored:
-        again = best_motion(data, len(points), mirrored, terms, threshold)
-        if (
-            again.smallest_eigenvalue > LEAST_EIGENVALUE
-            and again.cost < best.cost - best.noise**2
-            and np.count_nonzero(again.inliers) >= np.count_nonzero(best.inliers)
-        ):
-            best = again
     depth = median_depth(data, best.state, best.inliers)
     if not depth > NEAREST:  # NaN: there are no inliers
         depth = NEAREST

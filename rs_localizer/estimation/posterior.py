@@ -14,7 +14,7 @@ from rs_localizer.core.scales import Scales
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations, weighted
-from rs_localizer.estimation.prior import PriorTerms, add_prior
+from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.refine import (
     EXPECTED_NOISE,
     LEAST_NOISE,
@@ -44,7 +44,6 @@ class Best(NamedTuple):
     """The best motion of a frame, and what the points say of it."""
 
     state: Array  # (24,)
-    cost: float  # of the inliers, with the prior, px^2
     covariance: Array  # (18,18)
     noise: float  # px, measured standard deviation
     freedom: float  # of the errors
@@ -57,7 +56,6 @@ class Posterior(NamedTuple):
     """The refined motion of one frame and what the points say of it."""
 
     state: Array  # (24,)
-    cost: float  # of the inliers, with the prior, px^2
     covariance: Array  # (18,18), or more with the coefficients of the shaking
     noise: float  # px, measured standard deviation
     freedom: float  # of the errors
@@ -182,11 +180,8 @@ def best_motion(data: Array, count: int, start: Array, prior: PriorTerms, thresh
         noise = noise_deviation(errors, gate, freedom)
         gate = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
     inliers = errors < gate * gate
-    # Of all of these: a start that is far off may have been fitted to few of them.
-    cost = add_prior(prior, state, noise * noise, information.copy(), np.zeros(PARAMETERS))
-    cost += np.sum(errors[inliers])
     return Best(
-        state, cost, noise * noise * inverse, noise, 2.0 * np.sum(inliers) - freedom,
+        state, noise * noise * inverse, noise, 2.0 * np.sum(inliers) - freedom,
         _least_eigenvalue(information, inverse), inliers, errors,
     )  # fmt: skip
 
