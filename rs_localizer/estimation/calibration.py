@@ -27,8 +27,8 @@ from rs_localizer.core.shake import shake_at
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, rotation_of
 from rs_localizer.estimation.correlated import smooth_columns
-from rs_localizer.estimation.mirror import longest_axis
 from rs_localizer.estimation.observations import Observed, rays_of_lens
+from rs_localizer.estimation.plane import longest_axis
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import PriorTerms, add_prior, terms_at
 from rs_localizer.estimation.refine import inverted

@@ -12,8 +12,8 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import LINEAR, VELOCITIES
-from rs_localizer.estimation.mirror import plane_of
 from rs_localizer.estimation.observations import NEAREST, median_depth
+from rs_localizer.estimation.plane import plane_of
 from rs_localizer.estimation.posterior import LEAST_EIGENVALUE, Best, best_motion
 from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.refine import inverted

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The posterior of a frame: one model, its modes, and one Gaussian of them all.
 
-docs/estimator.md is the page. The discrete alternatives of a frame, {rest, typical speeds} x {this
-lean of a plane, the mirrored one} and {steady, vibrating}, become Gaussians with their evidence
-(:mod:`.modes`, :mod:`.turn`); the mixture's mean and covariance go out.
+docs/estimator.md is the page. The discrete alternatives of a frame, {rest, typical speeds} and
+{steady, vibrating}, become Gaussians with their evidence (:mod:`.modes`, :mod:`.turn`); the
+mixture's mean and covariance go out.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def _of_points(
     smooth = _smooth_of(look.lines, best.inliers, bend, *size)
     found = _steady(
         observations.packed, observations.points, look, best.inliers, smooth, first, terms, odds,
-        by_turn, slowest, turn_known, assumed.focal_length, declares,
+        by_turn, slowest, turn_known, assumed.focal_length,
     )  # fmt: skip
     if found.evidence == -math.inf:
         return best._replace(smallest_eigenvalue=0.0)
@@ -202,7 +202,7 @@ def _smooth_of(
 def _steady(
     data: Array, points: Array, look: Look, inliers: BoolArray, smooth: SmoothError, first: Array,
     terms: PriorTerms, odds: Array, by_turn: Array, slowest: int, turn_known: bool,
-    focal_length: float, declares: bool,
+    focal_length: float,
 ) -> Mixture:  # fmt: skip
     """The mixture of all modes of a camera that does not turn within its frame."""
     best = look.best
@@ -216,7 +216,7 @@ def _steady(
         best.noise, max(best.noise**2 / max(raw, LEAST_NOISE**2), 1.0),
         max(equations - best.freedom, 0.0),
     )  # fmt: skip
-    frame = Frame(data, points, inliers, smooth, noise, focal_length, look.depth, declares)
+    frame = Frame(data, points, inliers, smooth, noise, focal_length, look.depth)
     return mixture_of(frame, first, terms, odds, by_turn, slowest, turn_known, look.planar)
 
 

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Modes of a frame without an in-frame turn: Gaussians about its optima, and their mixture.
 
-Typical speeds and the two leans of a plane are starts of one fit (docs/estimator.md); each becomes
-a Gaussian with its evidence (Laplace's approximation), and the mixture one Gaussian.
+Each typical speed has a fit (docs/estimator.md), a Gaussian with its evidence (Laplace's
+approximation), before a plane over its leans; the mixture becomes one Gaussian.
 
 The points say precisely in which direction they are and roughly how far away. A camera whose
 orientation they hardly tell is somewhere on an arc about them, and arcs leave their tangents: by
@@ -42,11 +42,9 @@ from rs_localizer.estimation.correlated import (
     volume_of,
     weighed,
 )
-from rs_localizer.estimation.mirror import leaning_less, plane_of
-from rs_localizer.estimation.observations import weighted
-from rs_localizer.estimation.posterior import ITERATIONS, NO_SCALE
+from rs_localizer.estimation.plane import plane_of
 from rs_localizer.estimation.prior import PriorTerms, add_prior, offset_between, terms_at
-from rs_localizer.estimation.refine import TINY, apply_step, inverted, refine, solve_positive
+from rs_localizer.estimation.refine import TINY, apply_step, inverted, solve_positive
 
 # Logarithm of the odds of rest against each typical speed before any frame: errors of maps that no
 # polynomial of the image follows look like motion, and a hundred to one is what surveyed tags ask
@@ -59,10 +57,6 @@ FAR_LESS_PROBABLE = 9.0
 # probable (1 would hold on average over all cameras, and not for that one). The odds for rest and
 # those against an in-frame turn, which are choices, have no part in it.
 TEMPER = 0.25
-# A mirrored lean that fits worse by so many variances is none: odds of e^20.
-_WORSE, _FINE = 40.0, 1e-2
-# Optima nearer than this part of a deviation are one.
-_SAME = 1e-2
 # Part of the squared errors that is left at least: of a camera that shakes, noise is a tenth.
 _MOST_BETTER = 0.01
 # No frame says more than this against a typical speed.
@@ -213,7 +207,6 @@ class Frame(NamedTuple):
     noise: Noise
     focal_length: float  # px
     depth: float  # m
-    declares: bool  # the map is known to be off, by more than an ordinary one
 
 
 class _Held(NamedTuple):
@@ -242,7 +235,6 @@ class _Modes(NamedTuple):
     states: Array  # (k,24)
     covariances: Array  # (k,18,18)
     evidences: Array  # (k,)
-    speeds: IntArray  # (k,) indices of SPEEDS
     errors: Array  # (k,5) noise, size, freedom, mean and variance of the size's logarithm
 
 
@@ -272,27 +264,25 @@ def mixture_of(
         by_turn: (5,) log-likelihoods of them by what a gyroscope knows of this frame.
         slowest: index of the first typical speed; the others follow.
         turn_known: whether a gyroscope knows the turn.
-        planar: whether the mirrored lean is a start, too.
+        planar: whether leans that are hardly known are integrated.
     """
     modes = _modes(frame, start, terms, odds + by_turn, slowest, turn_known, planar)
-    count, evidences = len(modes.speeds), modes.evidences
+    count, evidences = len(modes.evidences), modes.evidences
     log_likelihoods, weights = np.full(len(SPEEDS), -np.inf), np.zeros(len(SPEEDS))
-    total, probable = -np.inf, evidences.copy()
-    for k in range(count):
-        speed = modes.speeds[k]
-        if SPEEDS[speed] == 0.0:
-            probable[k] += REST_ODDS
-        own = evidences[k] - odds[speed]
-        log_likelihoods[speed] = _log_sum(log_likelihoods[speed], own)
-        total = _log_sum(total, evidences[k])
-    if total == -np.inf:
+    top, probable = np.max(evidences), evidences.copy()
+    if top == -np.inf:
         return Mixture(
-            start, modes.covariances[0], modes.covariances[0], total, weights, weights,
+            start, modes.covariances[0], modes.covariances[0], top, weights, weights,
             modes.errors[0],
         )  # fmt: skip
+    for k in range(count):
+        if SPEEDS[slowest + k] == 0.0:
+            probable[k] += REST_ODDS
+        log_likelihoods[slowest + k] = evidences[k] - odds[slowest + k]
     first = int(np.argmax(probable))
     probable = np.exp(probable - probable[first])
-    possible = np.exp(TEMPER * (evidences - np.max(evidences)))
+    possible = np.exp(TEMPER * (evidences - top))
+    total = top + math.log(np.sum(np.exp(evidences - top)))
     probable, possible = probable / np.sum(probable), possible / np.sum(possible)
     state, covariance, offsets, abouts = averaged(
         modes.states, modes.covariances, first, probable, possible
@@ -300,7 +290,7 @@ def mixture_of(
     arched = along_arcs(covariance, state[9:12], possible, offsets, abouts)
     errors, shared = modes.errors[first].copy(), 0.0
     for k in range(count):
-        weights[modes.speeds[k]] += possible[k]
+        weights[slowest + k] = possible[k]
     for k in range(count):  # apart from the stores: see test_kernels_round_in_one_way
         shared += possible[k] * modes.errors[k, 1] ** 2
     errors[1] = math.sqrt(shared)
@@ -309,102 +299,37 @@ def mixture_of(
 
 
 @inlined
-def _log_sum(one: float, other: float) -> float:
-    """Logarithm of the sum of two numbers whose logarithms these are."""
-    most, least = max(one, other), min(one, other)
-    return most if least == -np.inf else most + math.log1p(math.exp(least - most))
-
-
-@inlined
 def _modes(
     frame: Frame, start: Array, terms: PriorTerms, odds: Array, slowest: int, turn_known: bool,
     planar: bool,
 ) -> _Modes:  # fmt: skip
-    """A Gaussian for each typical speed and each lean of a plane.
-
-    The valleys of the two leans join where the camera is free to move: a mirrored start that leads
-    back to the other lean would do so at every higher speed (so it did in 217 of 217 cases of
-    benchmarks.frames planes).
-    """
-    most = 2 * len(SPEEDS)
+    """A Gaussian for each typical speed, the slowest first."""
+    most = len(SPEEDS) - slowest
     modes = _Modes(
         np.empty((most, STATE_SIZE)), np.empty((most, PARAMETERS, PARAMETERS)), np.empty(most),
-        np.empty(most, np.int64), np.empty((most, 5)),
+        np.empty((most, 5)),
     )  # fmt: skip
     near, count, best = start.copy(), 0, -np.inf
     if slowest == 0:
         near[12:] = 0.0
-    points = len(frame.chosen)
-    products = products_at(frame.data, points, near, frame.chosen, frame.smooth.rows)
-    leans, twin, has_twin = planar, near, False
-    of_twin = products
+    products = products_at(frame.data, len(frame.chosen), near, frame.chosen, frame.smooth.rows)
     for speed in range(slowest, len(SPEEDS)):
         prior = terms_at(terms, SPEEDS[speed], turn_known)
         mode, near, products = _mode(frame, near, products, prior, odds[speed])
-        other = has_twin
-        if leans and not has_twin:
-            other, twin = leaning_less(frame.points, frame.chosen, mode.state, 2.0)
-            if other and frame.declares:
-                other, twin = _contends(frame, mode, twin, prior)
-            if other:
-                of_twin = products_at(frame.data, points, twin, frame.chosen, frame.smooth.rows)
-        whole, open_ = mode, False
         if planar:
-            whole, open_ = _over_leans(frame, mode, twin if other else mode.state, prior)
-        count, here = _keep(modes, count, speed, whole), whole.evidence
-        if other and not open_:
-            second, twin, of_twin = _mode(frame, twin, of_twin, prior, odds[speed])
-            leans = has_twin = _apart(mode, second)
-            if has_twin:
-                count = _keep(modes, count, speed, second)
-                here = max(here, second.evidence)
-        best = max(best, here)
-        if here < best - FAR_LESS_PROBABLE / TEMPER:
+            mode = _over_leans(frame, mode, prior)
+        write(modes.states[count], mode.state)
+        modes.covariances[count], modes.evidences[count] = mode.covariance, mode.evidence
+        errors = modes.errors[count]
+        errors[0], errors[1], errors[2] = mode.noise, mode.size, mode.freedom
+        errors[3], errors[4] = mode.log_size, mode.spread
+        count, best = count + 1, max(best, mode.evidence)
+        if mode.evidence < best - FAR_LESS_PROBABLE / TEMPER:
             break
     return _Modes(
         modes.states[:count], modes.covariances[:count], modes.evidences[:count],
-        modes.speeds[:count], modes.errors[:count],
+        modes.errors[:count],
     )  # fmt: skip
-
-
-@inlined
-def _keep(modes: _Modes, count: int, speed: int, mode: Mode) -> int:
-    """Write a mode behind so many others; their new number."""
-    write(modes.states[count], mode.state)
-    modes.covariances[count] = mode.covariance
-    modes.evidences[count], modes.speeds[count] = mode.evidence, speed
-    errors = modes.errors[count]
-    errors[0], errors[1], errors[2] = mode.noise, mode.size, mode.freedom
-    errors[3], errors[4] = mode.log_size, mode.spread
-    return count + 1
-
-
-@kernel
-def _contends(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tuple[bool, Array]:
-    """True if the optimum near a mirrored lean fits nearly as well beside noise alone, and its
-    state (24,).
-
-    Beside a smooth error a lean that is wrong looks like a board that is bent.
-    """
-    data = weighted(frame.data, frame.chosen)
-    variance = mode.noise * mode.noise + mode.size * mode.size
-    noise = math.sqrt(variance)
-    _, _, own, _ = refine(data, mode.state, NO_SCALE, 0.0, terms, noise, 2, ITERATIONS, _FINE)
-    state, _, cost, _ = refine(data, twin, NO_SCALE, 0.0, terms, noise, 2, ITERATIONS, _FINE)
-    return cost < own + _WORSE * variance, state
-
-
-@inlined
-def _apart(mode: Mode, other: Mode) -> bool:
-    """True if two modes are not the same optimum: by the squared angle between them, rad^2, for
-    small ones.
-    """
-    squared, spread = 0.0, 0.0
-    for i in range(9):
-        squared += 0.5 * (mode.state[i] - other.state[i]) ** 2
-    for i in range(3):
-        spread += mode.covariance[i, i]
-    return math.sqrt(squared) > _SAME * math.sqrt(max(spread, 0.0))
 
 
 @kernel
@@ -501,14 +426,11 @@ def _at_lean(
 
 
 @kernel
-def _over_leans(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tuple[Mode, bool]:
-    """The mode of a plane, integrated over its leans where they are hardly known; whether they are.
+def _over_leans(frame: Frame, mode: Mode, terms: PriorTerms) -> Mode:
+    """The mode of a plane, integrated over its leans where they are hardly known.
 
     Nested Laplace approximation: a Gaussian about the optimum beside each lean of a grid, along the
     one or two axes about which it is hardly known. Noise, inliers and scale are those of the mode.
-
-    Args:
-        twin: state (24,) of the mirrored lean, where the parts may be others; or that of the mode.
     """
     rotation, count = mode.state[:9].copy().reshape(3, 3), len(terms.informations)
     plane, centre, normal = plane_of(frame.points, frame.chosen)
@@ -516,10 +438,9 @@ def _over_leans(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tup
     flat = np.eye(3) - normal * normal.reshape(3, 1)
     sizes, axes = np.linalg.eigh(flat @ mode.covariance[TURN, TURN].copy() @ flat)
     if not (plane and sizes[2] > _KNOWN_LEAN**2):
-        return mode, False
-    away = axes.T @ step_between(mode.state, twin)[TURN]
-    used = 2 if max(sizes[1], away[1] ** 2) > _KNOWN_LEAN**2 else 1
-    axes, away = axes.T[::-1][:used].copy(), away[::-1][:used].copy()
+        return mode
+    used = 2 if sizes[1] > _KNOWN_LEAN**2 else 1
+    axes = axes.T[::-1][:used].copy()
     steps = _SPACING * np.sqrt(np.maximum(sizes[::-1][:used], TINY))
     taken = taken_by(frame.smooth.squares, mode.size, mode.noise)
     held = _Held(taken, mode.noise, 0.0, mode.freedom)
@@ -558,7 +479,6 @@ def _over_leans(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tup
             if shrunk:
                 first, last, best = 0, 1, -np.inf
                 continue
-            last = _queue(places, starts, last, np.rint(away / steps).astype(np.int64), twin)
         if not evidences[first - 1] > best - _LEAST_PART:
             continue
         near = states[first - 1]
@@ -572,7 +492,7 @@ def _over_leans(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tup
             begin[9:12] += old @ centre - new @ centre
             last = _queue(places, starts, last, place, begin)
     if not (best > -np.inf and np.isfinite(whole)):
-        return mode, False
+        return mode
     probable = np.exp(evidences[:last] - best)
     total = np.sum(probable)
     state, covariance, _, _ = averaged(
@@ -590,7 +510,7 @@ def _over_leans(frame: Frame, mode: Mode, twin: Array, terms: PriorTerms) -> tup
         mode.freedom,
         mode.log_size,
         mode.spread,
-    ), True
+    )
 
 
 @inlined

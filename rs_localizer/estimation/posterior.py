@@ -29,12 +29,12 @@ from rs_localizer.estimation.residuals import squared_errors
 GATE = 3.5
 WIDEST_GATE = 2.0
 _ROUNDS = 3
-ITERATIONS = 50
+_ITERATIONS = 50
 # Gain of a last step, noise variances: of the first round, whose inliers are not the last ones, and
 # of the others.
 _FIRST, _LATER = 1e-2, 1e-4
 # A truncation that truncates nothing, px.
-NO_SCALE = 1e6
+_NO_SCALE = 1e6
 # Of the information matrix scaled to a unit diagonal.
 LEAST_EIGENVALUE = 1e-11
 _NOISE_ROUNDS = 20
@@ -170,7 +170,7 @@ def best_motion(data: Array, count: int, start: Array, prior: PriorTerms, thresh
         for i in range(count):
             weights[i] = 1.0 if errors[i] < gate * gate else 0.0
         state, information, _, _ = refine(
-            weighted(data, weights), state, NO_SCALE, 0.0, prior, noise, 2, ITERATIONS,
+            weighted(data, weights), state, _NO_SCALE, 0.0, prior, noise, 2, _ITERATIONS,
             _FIRST if turn == 0 else _LATER,
         )  # fmt: skip
         errors = squared_errors(data, count, state)

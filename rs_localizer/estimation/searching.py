@@ -12,8 +12,8 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import POSE_SIZE, STATE_SIZE, rotation_of
-from rs_localizer.estimation.mirror import leaning_less
 from rs_localizer.estimation.observations import Observed
+from rs_localizer.estimation.plane import facing
 from rs_localizer.estimation.posterior import WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.ransac import (
@@ -193,7 +193,7 @@ class MotionSearch:
         points tell leaning from moving no better.
         """
         observations = observed.observations
-        leans, towards = leaning_less(observations.points, near, start.state, 1.0)
+        leans, towards = facing(observations.points, near, start.state)
         if not leans:
             return found
         state, cost = descend(

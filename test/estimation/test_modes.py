@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.estimation.correlated import Noise, nothing_shared, products_at
-from rs_localizer.estimation.mirror import leaning_less
 from rs_localizer.estimation.modes import (
     Frame,
     _mode,
@@ -68,12 +67,10 @@ def test_leans_are_integrated_as_on_a_fine_grid(tilt, noise):
     assert np.all(best.inliers)
     smooth = nothing_shared(COUNT)
     noise = Noise(best.noise, 1.0, 2.0 * COUNT - best.freedom)
-    seen = Frame(observations.packed, points, best.inliers, smooth, noise, 590.0, 1.6, False)
+    seen = Frame(observations.packed, points, best.inliers, smooth, noise, 590.0, 1.6)
     products = products_at(observations.packed, COUNT, best.state, best.inliers, smooth.rows)
     mode, _, _ = _mode(seen, best.state, products, terms, 0.0)
-    _, twin = leaning_less(points, best.inliers, mode.state, 2.0)
-    found, many = _over_leans(seen, mode, twin, terms)
-    assert many
+    found = _over_leans(seen, mode, terms)
     rotation, translation = mode.state[:9].reshape(3, 3), mode.state[9:12]
     normal = rotation[:, 2]
     across = np.linalg.svd(normal[None])[2][1:]

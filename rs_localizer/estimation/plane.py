@@ -1,11 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Planes show two poses: the one that is mirrored about the line of sight may fit as well.
-
-From far away, or on a small marker, a plane that leans to the left and one that leans to the right
-look alike but for perspective (Schweighofer, Pinz, "Robust pose estimation from a planar target",
-PAMI 2006). A minimum that was found says nothing of the other one, so it is looked for.
-"""
+"""Points on a plane: whether they are, its view that faces the camera, and its worst known turn."""
 
 from __future__ import annotations
 
@@ -19,18 +14,15 @@ from rs_localizer.core.simd.jit import inlined, kernel
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.
 _PLANE = 0.1
-# What leans by less (rad) has no mirrored pose of its own.
+# What leans by less (rad) faces the camera.
 _LEAST_LEAN = 0.01
 
 
 @kernel
-def leaning_less(
-    points: Array, inliers: BoolArray, state: Array, leans: float
-) -> tuple[bool, Array]:
-    """True and the state (24,) whose view of the plane leans by so many times its lean less.
+def facing(points: Array, inliers: BoolArray, state: Array) -> tuple[bool, Array]:
+    """True and the state (24,) whose view of the plane faces the camera.
 
-    Twice its lean less it is mirrored, once it faces the camera. False if the points (n,3) that
-    count are no plane, or face the camera.
+    False if the points (n,3) that count are no plane, or face the camera already.
     """
     plane, centre, axis_of_plane = plane_of(points, inliers)
     if not plane:
@@ -50,7 +42,7 @@ def leaning_less(
     lean = np.arcsin(min(length, 1.0))
     if lean < _LEAST_LEAN:
         return False, state
-    flip = so3.exp(-leans * lean / length * axis)
+    flip = so3.exp(-lean / length * axis)
     other = state.copy()
     for i in range(3):
         other[9 + i] = seen[i]
