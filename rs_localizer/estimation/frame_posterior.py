@@ -68,8 +68,6 @@ _ASKS = -0.5
 # Of a steady camera one of the seven sizes is ahead by so much (logarithm).
 _BY_CHANCE = math.log(len(FACTORS))
 _FEWEST = 6
-# A smooth error that is found so many times larger than it was known to be.
-_LARGER = 1.5
 
 
 class _Given(NamedTuple):
@@ -238,24 +236,13 @@ def _with_turn(
         if wide:
             gate = max(2.0 * WIDEST_GATE * threshold, _LARGEST_SHAKE * assumed.focal_length)
             noise = threshold
-        # What is smooth over the image may be what looks like vibration, or vibration what looked
-        # smooth.
-        log_sizes = [smooth.log_size]
-        if steady.shared > _LARGER * math.exp(smooth.log_size):
-            log_sizes.append(math.log(steady.shared))
-        fits = [
-            fit_turn(
-                observations.packed, observations.count, best.state, terms, threshold, gate, noise,
-                odds, steady.bend, log_size, smooth.log_size, smooth.precision,
-                assumed.focal_length,
-            )
-            for log_size in log_sizes
-        ]  # fmt: skip
-        evidences = [one.evidence if one.finite else -math.inf for one in fits]
-        fit = fits[(best_size := int(np.argmax(evidences)))]
+        fit = fit_turn(
+            observations.packed, observations.count, best.state, terms, threshold, gate, noise,
+            odds, steady.bend, smooth.log_size, smooth.precision, assumed.focal_length,
+        )  # fmt: skip
         kept, had = np.count_nonzero(fit.inliers), np.count_nonzero(best.inliers)
         if fit.finite and kept >= _KEPT * had and not (wide and fit.freedom < kept):
-            shaken = _of_fit(observations, steady, fit, threshold, math.exp(log_sizes[best_size]))
+            shaken = _of_fit(observations, steady, fit, threshold, math.exp(smooth.log_size))
             shaken, ratio = _at_any_speed(shaken, fit, terms, assumed, slowest)
             # As if any speed left it, where vibration hardly shows.
             return _either(steady, evidence, max(fit.evidence + ratio, evidence + gain), shaken)

@@ -445,7 +445,7 @@ def _row_times(data: Array, count: int) -> Array:
 @kernel
 def fit_turn(
     data: Array, count: int, start: Array, terms: PriorTerms, threshold: float, first_gate: float,
-    first_noise: float, odds: Array, bend: Array, log_size: float, mean: float, precision: float,
+    first_noise: float, odds: Array, bend: Array, log_size: float, precision: float,
     focal_length: float,
 ) -> TurnFit:  # fmt: skip
     """Fit motion and in-frame turn, the noise and the inliers.
@@ -457,7 +457,7 @@ def fit_turn(
         first_gate, first_noise: px; the gate closes from there to what the noise decides.
         odds: (v,) logarithms, of none and each vibration before the frame.
         bend: of the smooth error (:func:`.correlated.smooth_columns`).
-        log_size: of the smooth error (px), and what is known of that: ``mean``, ``precision``.
+        log_size, precision: of the smooth error (px).
     """
     state, turns, gate, noise = start.copy(), np.zeros(TURNS), first_gate, first_noise
     coefficients, size = np.zeros((FUNCTIONS, 3)), math.exp(log_size)
@@ -500,7 +500,6 @@ def fit_turn(
             base += math.log1p(size * size * smooth.squares[k] / (noise * noise))
         evidence = volume_of(terms) - 0.5 * base + gain
         evidence -= 2.0 * (count - kept) * math.log(focal_length)
-        evidence -= 0.5 * precision * (log_size - mean) ** 2
         state = apply_step(state, step + _middle(change, 1.0))
         turns = found.turns
         for k in range(FUNCTIONS):
