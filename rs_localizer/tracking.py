@@ -560,9 +560,8 @@ class Tracker:
         if result.turn is not None or not self._trusts_motion(context):
             return alone
         near = prior if result.tracked and not result.jumped else None
-        known = (self.localizer.known_of(before, result.span) for before in (near, None))
         try:
-            sample = sample_of(result, time_ns, *known)
+            sample = sample_of(result, time_ns, self.localizer.known_of(near, result.span))
             window = replace(window, readout_share=share).joined(sample)
         except np.linalg.LinAlgError:  # rounding errors are all that is left of a covariance
             return alone

@@ -55,8 +55,6 @@ class Estimate(Motion):
     undetected_covariance: Array = field(
         default_factory=np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)).copy
     )
-    # (18,m) by one deviation of each error of calibration and map, if no other frame told
-    calibration_shifts: Array = field(default_factory=np.zeros((PARAMETERS, 0)).copy)
     still_deviation: float = math.inf  # rad, orientation_deviation if the motion were known
     # (k,3) rad: what the camera turns beside the motion (rs_localizer.core.shake): vibration
     shake: Array = field(default_factory=np.zeros((0, 3)).copy)

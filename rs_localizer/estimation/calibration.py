@@ -70,15 +70,12 @@ class CalibrationEffect(NamedTuple):
     """Effect of the errors of calibration and map, one standard deviation of each, on a frame."""
 
     covariance: Array  # (12,12) of pose and velocities
-    shifts: Array  # (18,m) of the motion by each error, of whose motion no other frame tells
     residual: float  # px, root mean square of what no motion takes up; a smooth error may
     # rad, of the orientation about the axis known worst, if the camera's motion were known
     still_deviation: float
 
 
-NO_EFFECT = CalibrationEffect(
-    np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)), np.zeros((PARAMETERS, 0)), 0.0, np.inf
-)
+NO_EFFECT = CalibrationEffect(np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)), 0.0, np.inf)
 
 
 def calibration_effect(
@@ -123,7 +120,7 @@ def calibration_effect(
     parts = posterior.speeds if len(posterior.speeds) else _CONFIGURED
     effect: CalibrationEffect = _effect(
         by_motion, posterior.shared * smooth_columns(by_motion, image, bend), columns,
-        posterior.state, terms, observed.terms, parts, turn is not None, posterior.noise**2,
+        posterior.state, terms, parts, turn is not None, posterior.noise**2,
         posterior.inflation, tracked,
     )  # fmt: skip
     return effect
@@ -141,8 +138,7 @@ def _lines(
 @kernel
 def _effect(
     by_motion: Array, smooth: Array, columns: Array, state: Array, terms: PriorTerms,
-    configured: PriorTerms, parts: Array, turn_known: bool, variance: float, inflation: float,
-    tracked: bool,
+    parts: Array, turn_known: bool, variance: float, inflation: float, tracked: bool,
 ) -> CalibrationEffect:  # fmt: skip
     """How errors move motion and smooth error.
 
@@ -164,11 +160,9 @@ def _effect(
     products = every[:size, :size].copy()
     crossed = np.zeros((size, errors + q))
     crossed[:, :errors] = every[:size, size:]
-    for k in range(q):
-        crossed[PARAMETERS + k, errors + k] = variance
-    shifts = _shifts(products, crossed, state, configured, variance)
-    if not tracked:  # the covariance has what the smooth error does
-        crossed[:, errors:] = 0.0
+    if tracked:  # else the covariance has what the smooth error does
+        for k in range(q):
+            crossed[PARAMETERS + k, errors + k] = variance
     pull, taken = np.zeros((MOTION_PARAMETERS, errors + q)), np.zeros((PARAMETERS, errors))
     of_errors = crossed[:PARAMETERS, :errors].copy()
     for k in range(len(parts)):
@@ -185,7 +179,7 @@ def _effect(
         inverse = inverted(information)
         if not np.all(np.isfinite(inverse)):
             nothing = np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
-            return CalibrationEffect(nothing, np.zeros((PARAMETERS, 0)), 0.0, still)
+            return CalibrationEffect(nothing, 0.0, still)
         pull -= parts[k] * (inverse[:MOTION_PARAMETERS] @ crossed)
         taken += parts[k] * (inverted(of_motion) @ of_errors)
     # What no motion takes up.
@@ -193,21 +187,7 @@ def _effect(
     beside = products[:PARAMETERS, :PARAMETERS].copy() @ taken - 2.0 * of_errors
     left += np.sum(taken * beside)
     residual = np.sqrt(max(left, 0.0) / max(count, 1))
-    return CalibrationEffect(pull @ pull.T, shifts, residual, still)
-
-
-@kernel
-def _shifts(
-    products: Array, crossed: Array, state: Array, terms: PriorTerms, variance: float
-) -> Array:
-    """Shifts (18,m) of the motion by each error, the smooth error at its best beside it."""
-    information, slope = products[:PARAMETERS, :PARAMETERS].copy(), np.zeros(PARAMETERS)
-    add_prior(terms, state, variance, information, slope)
-    whole = products.copy()
-    whole[:PARAMETERS, :PARAMETERS] = information
-    for i in range(PARAMETERS, len(whole)):
-        whole[i, i] += variance
-    return -(inverted(whole) @ crossed)[:PARAMETERS].copy()
+    return CalibrationEffect(pull @ pull.T, residual, still)
 
 
 def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Array:

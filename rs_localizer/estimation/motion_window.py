@@ -14,10 +14,6 @@ which the transition adds ``Q`` to ``P``, is
 
 and a variance ``r`` times as large makes it ``(r - 1) tr(Q M Q M)`` in the mean: so the scales of
 a tripod, of a hand and of a car are found within a few frames, from below and from above.
-
-What errors of calibration and map move is the same in all frames: their effect on each frame's
-points runs through the same gains (Schmidt, "Application of state-space methods to navigation
-problems", 1966), so that it does not tell a motion from frame to frame.
 """
 
 from __future__ import annotations
@@ -34,7 +30,6 @@ from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import (
     ANGULAR,
     LINEAR,
-    MOTION_PARAMETERS,
     PARAMETERS,
     STATE_ANGULAR,
     STATE_ANGULAR_ACCELERATION,
@@ -76,7 +71,6 @@ class Gaussian(NamedTuple):
     time_ns: int
     state: Array  # (24,)
     covariance: Array  # (18,18) of a step
-    shifts: Array  # (18,m) by one deviation of each error of calibration and map
 
 
 class MotionSample(NamedTuple):
@@ -86,7 +80,6 @@ class MotionSample(NamedTuple):
     state: Array  # (24,) the frame's estimate
     information: Array  # (18,18)
     gradient: Array  # (18,)
-    pulls: Array  # (18,m) gradient by one deviation of each error of calibration and map
 
 
 class _Solved(NamedTuple):
@@ -95,10 +88,8 @@ class _Solved(NamedTuple):
     transports: Array  # (n,18,18) from the sample before
     filtered: Array  # (n,24)
     covariances: Array  # (n,18,18)
-    shifts: Array  # (n,18,m)
     smoothed: Array  # (n,24)
     smoothed_covariances: Array  # (n,18,18)
-    smoothed_shifts: Array  # (n,18,m)
     scores: Array  # (4,3) of the deviations: squared, expected, information
 
 
@@ -163,8 +154,7 @@ class MotionWindow:
             return self._smoothed_start()
         solved = self.solved
         return Gaussian(
-            self.samples[row].time_ns, solved.smoothed[row], solved.smoothed_covariances[row],
-            solved.smoothed_shifts[row],
+            self.samples[row].time_ns, solved.smoothed[row], solved.smoothed_covariances[row]
         )  # fmt: skip
 
     def after(self, time_ns: int) -> Gaussian:
@@ -183,8 +173,7 @@ class MotionWindow:
         row = int(np.searchsorted(times, time_ns)) - 1
         neighbour = self.samples[row]
         silent = MotionSample(
-            time_ns, neighbour.state, np.zeros((PARAMETERS,) * 2), np.zeros(PARAMETERS),
-            np.zeros_like(neighbour.pulls),
+            time_ns, neighbour.state, np.zeros((PARAMETERS,) * 2), np.zeros(PARAMETERS)
         )  # fmt: skip
         samples = (*self.samples[:row], silent, *self.samples[row:])
         solved = _solved(self.start, samples, self.deviations, self.readout_share)
@@ -196,9 +185,7 @@ class MotionWindow:
         if len(samples) >= LENGTH:
             assert self.solved is not None
             first, solved = samples[0], self.solved
-            start = Gaussian(
-                first.time_ns, solved.filtered[0], solved.covariances[0], solved.shifts[0]
-            )
+            start = Gaussian(first.time_ns, solved.filtered[0], solved.covariances[0])
             samples = samples[1:]
         deviations = self.deviations
         for _ in range(_ROUNDS):
@@ -223,10 +210,9 @@ class MotionWindow:
         return Gaussian(
             start.time_ns,
             *_back(
-                start.state, start.covariance, start.shifts, solved.predicted[0],
-                solved.predictions[0], inverted(solved.predictions[0]), solved.transports[0],
-                solved.smoothed[0],
-                solved.smoothed_covariances[0], solved.smoothed_shifts[0],
+                start.state, start.covariance, solved.predicted[0], solved.predictions[0],
+                inverted(solved.predictions[0]), solved.transports[0], solved.smoothed[0],
+                solved.smoothed_covariances[0],
             ),
         )  # fmt: skip
 
@@ -235,28 +221,22 @@ def _moved(motion: Gaussian, time_ns: int, deviations: Array, readout_share: flo
     seconds = 1e-9 * (time_ns - motion.time_ns)
     if seconds == 0.0:
         return motion
-    state, covariance, transport = _predicted(
+    state, covariance, _ = _predicted(
         motion.state, motion.covariance, seconds, deviations, readout_share
     )
-    return Gaussian(time_ns, state, covariance, transport @ motion.shifts)
+    return Gaussian(time_ns, state, covariance)
 
 
 def _solved(
     start: Gaussian, samples: tuple[MotionSample, ...], deviations: Array, readout_share: float
 ) -> _Solved:
     times = np.array([1e-9 * (sample.time_ns - start.time_ns) for sample in samples])
-    width = max(start.shifts.shape[1], *(sample.pulls.shape[1] for sample in samples))
-    pulls = np.zeros((len(samples), PARAMETERS, width))
-    for k, sample in enumerate(samples):
-        pulls[k, :, : sample.pulls.shape[1]] = sample.pulls
-    shifts = np.zeros((PARAMETERS, width))
-    shifts[:, : start.shifts.shape[1]] = start.shifts
     return _Solved(
         *_solve(
             times, np.array([sample.state for sample in samples]),
             np.array([sample.information for sample in samples]),
-            np.array([sample.gradient for sample in samples]), pulls,
-            start.state, start.covariance, shifts, deviations, readout_share,
+            np.array([sample.gradient for sample in samples]),
+            start.state, start.covariance, deviations, readout_share,
         )
     )  # fmt: skip
 
@@ -304,10 +284,9 @@ def _noise(seconds: float, deviations: Array) -> Array:
 
 @kernel
 def _back(
-    state: Array, covariance: Array, shifts: Array, predicted: Array, prediction: Array,
-    known: Array, transport: Array, smoothed: Array, smoothed_covariance: Array,
-    smoothed_shifts: Array,
-) -> tuple[Array, Array, Array]:  # fmt: skip
+    state: Array, covariance: Array, predicted: Array, prediction: Array, known: Array,
+    transport: Array, smoothed: Array, smoothed_covariance: Array,
+) -> tuple[Array, Array]:  # fmt: skip
     """A filtered motion with what the next sample's smoothed one tells of it.
 
     ``known``: (18,18) inverse of the prediction's covariance.
@@ -315,24 +294,21 @@ def _back(
     gain = covariance @ transport.T @ known
     back = apply_step(state, gain @ step_between(predicted, smoothed))
     spread = covariance + gain @ (smoothed_covariance - prediction) @ gain.T
-    moved = shifts + gain @ (smoothed_shifts - transport @ shifts)
-    return back, 0.5 * (spread + spread.T), moved
+    return back, 0.5 * (spread + spread.T)
 
 
 @kernel
 def _solve(
-    times: Array, states: Array, informations: Array, gradients: Array, pulls: Array,
-    start: Array, start_covariance: Array, start_shifts: Array, deviations: Array,
-    readout_share: float,
-) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:  # fmt: skip
+    times: Array, states: Array, informations: Array, gradients: Array, start: Array,
+    start_covariance: Array, deviations: Array, readout_share: float,
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array]:  # fmt: skip
     """Filter and smoother: the fields of :class:`_Solved`; times (n,) in s after the start."""
-    count, width = len(times), pulls.shape[2]
+    count = len(times)
     square = (count, PARAMETERS, PARAMETERS)
     predicted, filtered = np.empty((count, STATE_SIZE)), np.empty((count, STATE_SIZE))
     predictions, transports, covariances = np.empty(square), np.empty(square), np.empty(square)
     knowns = np.empty(square)  # inverses of the predictions
-    shifts = np.empty((count, PARAMETERS, width))
-    state, covariance, shift, time = start, start_covariance, start_shifts, 0.0
+    state, covariance, time = start, start_covariance, 0.0
     for k in range(count):
         predicted[k], predictions[k], transports[k] = _predicted(
             state, covariance, times[k] - time, deviations, readout_share
@@ -342,10 +318,9 @@ def _solve(
         covariances[k] = inverted(informations[k] + known)
         right = gradients[k] + known @ step_between(states[k], predicted[k])
         filtered[k] = apply_step(states[k], covariances[k] @ right)
-        shifts[k] = covariances[k] @ (pulls[k] + known @ (transports[k] @ shift))
-        state, covariance, shift, time = filtered[k], covariances[k], shifts[k], times[k]
+        state, covariance, time = filtered[k], covariances[k], times[k]
     smoothed, smoothed_covariances = filtered.copy(), covariances.copy()
-    smoothed_shifts, scores = shifts.copy(), np.zeros((4, 3))
+    scores = np.zeros((4, 3))
     weight, block, unit = 1.0, np.empty((3, 3)), np.empty((3, 3))
     for k in range(count - 1, -1, -1):
         known = knowns[k]
@@ -370,13 +345,13 @@ def _solve(
                     scores[place, 2] += weight * block[i, j] * block[j, i]
         weight *= _FORGETTING
         if k > 0:
-            smoothed[k - 1], smoothed_covariances[k - 1], smoothed_shifts[k - 1] = _back(
-                filtered[k - 1], covariances[k - 1], shifts[k - 1], predicted[k], predictions[k],
-                knowns[k], transports[k], smoothed[k], smoothed_covariances[k], smoothed_shifts[k],
+            smoothed[k - 1], smoothed_covariances[k - 1] = _back(
+                filtered[k - 1], covariances[k - 1], predicted[k], predictions[k], knowns[k],
+                transports[k], smoothed[k], smoothed_covariances[k],
             )  # fmt: skip
     return (
-        predicted, predictions, transports, filtered, covariances, shifts, smoothed,
-        smoothed_covariances, smoothed_shifts, scores,
+        predicted, predictions, transports, filtered, covariances, smoothed,
+        smoothed_covariances, scores,
     )  # fmt: skip
 
 
@@ -419,8 +394,7 @@ def gaussian_of(estimate: Estimate, time_ns: int) -> Gaussian:
     if estimate.turn is not None:
         motion, covariance = with_mean_turn(motion, covariance, estimate.turn)
     units = _per_second(estimate.span)
-    shifts = units[:, None] * estimate.calibration_shifts
-    return Gaussian(time_ns, _state(motion, units), covariance * np.outer(units, units), shifts)
+    return Gaussian(time_ns, _state(motion, units), covariance * np.outer(units, units))
 
 
 def within_readout(estimate: Estimate, deviations: Array) -> Estimate:
@@ -449,26 +423,19 @@ def motion_of(gaussian: Gaussian, span: float) -> tuple[Motion, Array]:
     return motion, gaussian.covariance * np.outer(units, units)
 
 
-def sample_of(
-    estimate: Estimate, time_ns: int, known: PriorTerms, configured: PriorTerms
-) -> MotionSample:
+def sample_of(estimate: Estimate, time_ns: int, known: PriorTerms) -> MotionSample:
     """Sample by the points of an estimate, beside what was known of its motion before.
 
-    Args:
-        known: that, in the map's frame.
-        configured: what the settings alone know of any frame.
+    ``known`` is that, in the map's frame.
     """
     motion, covariance, _, _ = unshaken(estimate)
     information, slope = np.zeros((PARAMETERS,) * 2), np.zeros(PARAMETERS)
     add_prior(known, state_in(motion, np.zeros(3)), 1.0, information, slope)
     units = _per_second(estimate.span)
     told: Array = _told_by_points(covariance, information)
-    # As far as the settings' prior lets errors move the motion, the points have pulled it.
-    pulls = (told + configured.informations[0]) @ estimate.calibration_shifts
     return MotionSample(
-        time_ns, _state(motion, units), told / np.outer(units, units), slope / units,
-        pulls / units[:, None],
-    )  # fmt: skip
+        time_ns, _state(motion, units), told / np.outer(units, units), slope / units
+    )
 
 
 def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
@@ -484,8 +451,6 @@ def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
     step = gain @ step_between(state_in(motion, origin), state_in(known, origin))
     state = apply_step(state_in(estimate, origin), step[:PARAMETERS])
     joint = joint + gain @ (spread - covariance) @ gain.T
-    units = 1.0 / _per_second(estimate.span)
-    shifts = gain[:MOTION_PARAMETERS] @ (units[:, None] * gaussian.shifts)
     return estimate.with_joint_covariance(
         0.5 * (joint + joint.T),
         rotation=rotation_of(state).copy(),
@@ -495,7 +460,6 @@ def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
         angular_acceleration=state[STATE_ANGULAR_ACCELERATION],
         linear_acceleration=state[STATE_LINEAR_ACCELERATION],
         shake=estimate.shake + step[PARAMETERS:].reshape(-1, 3),
-        calibration_covariance=shifts @ shifts.T,
     )
 
 
@@ -506,12 +470,9 @@ def predicted_estimate(nearest: Estimate, gaussian: Gaussian, swing: Array) -> E
         swing: (18,18) covariance of the shaking about that motion, per readout.
     """
     motion, covariance = motion_of(gaussian, nearest.span)
-    units = 1.0 / _per_second(nearest.span)
-    shifts = (units[:, None] * gaussian.shifts)[:MOTION_PARAMETERS]
     return nearest.with_joint_covariance(
         covariance + swing,
         **{each.name: getattr(motion, each.name) for each in fields(Motion)},
-        calibration_covariance=shifts @ shifts.T,
         shake=np.zeros((0, 3)),
         turn=None,
         time_ns=gaussian.time_ns,
@@ -566,8 +527,8 @@ def warm_up() -> None:
     """Compile the kernels, or load them from the cache."""
     still = np.concatenate([np.eye(3).ravel(), np.zeros(STATE_SIZE - 9)])
     unit = np.eye(PARAMETERS)
-    start = Gaussian(0, still, unit, np.zeros((PARAMETERS, 1)))
-    sample = MotionSample(10**7, still, unit, np.zeros(PARAMETERS), np.zeros((PARAMETERS, 1)))
+    start = Gaussian(0, still, unit)
+    sample = MotionSample(10**7, still, unit, np.zeros(PARAMETERS))
     window = MotionWindow.begin(start, Acceleration(1.0, 1.0)).joined(sample)
     window.before(1)
     later = window.after(2 * 10**7)

@@ -179,6 +179,5 @@ def estimate_of(
         delay=delay,
         span=observed.sighted.exposure.span,
         calibration_covariance=effect.covariance,
-        calibration_shifts=effect.shifts,
         still_deviation=effect.still_deviation,
     )

@@ -77,14 +77,12 @@ def samples_of(path, rng, first=0):
         seen = truth + np.concatenate([NOISE * rng.normal(size=12), np.zeros(6)])
         seen[12:] = 0.0
         time_ns = round(1e9 * PERIOD * (first + k + 1))
-        found.append(
-            MotionSample(time_ns, apply_step(STILL, seen), SEEN, np.zeros(18), np.zeros((18, 0)))
-        )
+        found.append(MotionSample(time_ns, apply_step(STILL, seen), SEEN, np.zeros(18)))
     return found
 
 
 def start():
-    return Gaussian(0, STILL, WIDE, np.zeros((18, 0)))
+    return Gaussian(0, STILL, WIDE)
 
 
 def through(samples, window=None):
@@ -192,24 +190,6 @@ def test_between_frames_it_passes_through_both_and_after_them_it_spreads():
     assert window.at(window.start.time_ns - 1) is None
 
 
-def test_what_all_frames_share_is_no_motion():
-    """An error that turns every frame alike moves the pose, and no velocity."""
-    shared = np.zeros((18, 1))
-    shared[:3, 0] = [1e-3, -2e-3, 5e-4]
-    pulls = SEEN @ shared
-    samples = [sample._replace(pulls=pulls)
-               for sample in samples_of(np.zeros((8, 18)), np.random.default_rng(5))]  # fmt: skip
-    window = MotionWindow.begin(
-        start()._replace(shifts=shared, covariance=np.linalg.inv(SEEN + np.linalg.inv(WIDE))),
-        Acceleration(HAND[0], HAND[3]),
-    )
-    window = through(samples, window)
-    for lag in (0, 1, 2):
-        shifts = window.before(lag).shifts
-        np.testing.assert_allclose(shifts[:3], shared[:3], rtol=1e-4)
-        np.testing.assert_allclose(shifts[6:9], 0.0, atol=1e-5)
-
-
 def estimate(step, joint, shake=None):
     state = apply_step(STILL, step)
     return Estimate(
@@ -237,7 +217,7 @@ def test_points_tell_what_the_posterior_knows_beside_its_prior():
     before = np.linalg.inv(spread)
     before[6:12, 6:12] += np.eye(6)  # the velocities of the settings
     posterior = np.linalg.inv(information + before)
-    sample = sample_of(estimate(posterior @ gradient, posterior), 7, known, known)
+    sample = sample_of(estimate(posterior @ gradient, posterior), 7, known)
     scale = np.sqrt(np.diag(information + before))
     np.testing.assert_allclose(
         sample.information / np.outer(UNITS * scale, UNITS * scale),
@@ -252,7 +232,7 @@ def test_points_tell_what_the_posterior_knows_beside_its_prior():
 
 def test_errors_ahead_are_squared_steps_over_what_was_claimed():
     random = np.random.default_rng(3)
-    start = Gaussian(0, apply_step(STILL, SMALL * random.normal(size=18)), WIDE, np.zeros((18, 1)))
+    start = Gaussian(0, apply_step(STILL, SMALL * random.normal(size=18)), WIDE)
     window = MotionWindow.begin(start, Acceleration(10.0, 4.0), readout_share=0.01)
     later = motion_of(window.after(40_000_000), SPAN)
     spread = random.normal(size=(18, 18)) * SMALL
