@@ -48,7 +48,6 @@ from rs_localizer.estimation.motion_window import (
     motion_of,
     predicted_estimate,
     sample_of,
-    within_readout,
 )
 from rs_localizer.estimation.prior import Prior, offset_between, pivot_of, state_in
 from rs_localizer.integrity import Integrity
@@ -421,9 +420,6 @@ class Tracker:
             result = self._judged(result, points, pixels, prior)
             if self._memory is Memory.MOTION:
                 result = replace(result, time_ns=time_ns)
-                window = None if self._track is None else self._track.window
-                if window is not None and result.turn is None:
-                    result = within_readout(result, window.deviations)
                 result = self._covering(result, context)
             self._remember(time_ns, prior, result, context)
             if self._aid is not None and imu is not None:

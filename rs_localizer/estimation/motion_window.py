@@ -28,8 +28,6 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.shutter import Motion, carried
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import (
-    ANGULAR,
-    LINEAR,
     PARAMETERS,
     STATE_ANGULAR,
     STATE_ANGULAR_ACCELERATION,
@@ -57,12 +55,6 @@ _LEAST_CHANGE, _MOST_CHANGE, _ROUNDS = 0.2, 25.0, 2
 _LEAST_SCALE, _MOST_SCALE = 0.03, 100.0
 # Who turns about one axis turns a little about the others: of the largest deviation.
 _LEAST_SHARE = 0.3
-
-
-# Variance of a slope by least squares over rows within h of the middle one, of a motion whose
-# acceleration is a random walk of density q: so many times q h^3, the integral of
-# 9/2 (v^3/6 - v^4/24)^2 over v from 0 to 1.
-_SLOPE_VARIANCE = 4.5 * (1.0 / 252.0 - 1.0 / 576.0 + 1.0 / 5184.0)
 
 
 class Gaussian(NamedTuple):
@@ -395,19 +387,6 @@ def gaussian_of(estimate: Estimate, time_ns: int) -> Gaussian:
         motion, covariance = with_mean_turn(motion, covariance, estimate.turn)
     units = _per_second(estimate.span)
     return Gaussian(time_ns, _state(motion, units), covariance * np.outer(units, units))
-
-
-def within_readout(estimate: Estimate, deviations: Array) -> Estimate:
-    """The same with what accelerations (4,), as of a window, change within the readout.
-
-    A frame's fit has one acceleration: how it changes bends what the rows say of the velocities.
-    """
-    densities = 2.0 / FADING * np.repeat(deviations, (1, 1, 1, 3)) ** 2
-    added = _SLOPE_VARIANCE * densities * (0.5 * estimate.span) ** 3 * estimate.span**2
-    joint = estimate.joint_covariance.copy()
-    velocities = np.arange(ANGULAR.start, LINEAR.stop)
-    joint[velocities, velocities] += added
-    return replace(estimate, joint_covariance=joint)
 
 
 def motion_of(gaussian: Gaussian, span: float) -> tuple[Motion, Array]:
