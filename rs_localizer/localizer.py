@@ -46,7 +46,6 @@ from rs_localizer.estimation.prior import (
     PriorTerms,
     assumptions,
     of_frame,
-    offset_between,
     pivot_of,
     state_in,
     with_motion,
@@ -59,9 +58,6 @@ from rs_localizer.solvers.table import find_solver, start_solver
 
 # A prediction may be off by this multiple of the inlier threshold.
 _PREDICTION_SCALE = 16.0
-# Squared Mahalanobis distance of a prediction; a chi-squared variable of 18 degrees of freedom
-# exceeds this once in a million.
-_MOST_INNOVATION = 62.0
 # Points whose places are off by a standard deviation in either direction lie within so many of them
 # (95 % of Rayleigh's distribution).
 _MAP_GATE = 2.45
@@ -327,11 +323,6 @@ class Localizer:
         best = self._search.optimize(observed, predicted, _PREDICTION_SCALE * threshold, terms)
         start = Candidate(predicted, best.cost)
         posterior = self._settle(observed, best, terms)
-        innovation, _ = offset_between(predicted, posterior.state, terms.pivots[-1])
-        known = len(terms.informations) > len(observed.terms.informations)
-        jumped = known and innovation @ terms.informations[-1] @ innovation > _MOST_INNOVATION
-        if jumped:  # the points know better
-            posterior = self._settle(observed, best, observed.terms)
         result = self._accept(observed, start, best, posterior, self._own_terms(observed, prior))
         if result and np.count_nonzero(result.inliers) < (
             _STILL_TRACKED * expected_share * observed.observations.count
@@ -341,7 +332,7 @@ class Localizer:
                 f"{np.count_nonzero(result.inliers)} inliers near the prior motion, "
                 f"{expected_share:.0%} of {observed.observations.count} were expected",
             )
-        return replace(result, jumped=bool(jumped)) if result else result
+        return result
 
     def reprojection_errors(
         self,

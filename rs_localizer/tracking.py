@@ -555,7 +555,7 @@ class Tracker:
         alone = replace(alone, deviations=window.deviations)
         if result.turn is not None or not self._trusts_motion(context):
             return alone
-        near = prior if result.tracked and not result.jumped else None
+        near = prior if result.tracked else None
         try:
             sample = sample_of(result, time_ns, self.localizer.known_of(near, result.span))
             window = replace(window, readout_share=share).joined(sample)

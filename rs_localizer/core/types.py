@@ -61,7 +61,6 @@ class Estimate(Motion):
     model_error: float = 0.0  # px, rms of what map, lens and motion leave beside the noise
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
     tracked: bool = False  # found near a prior motion, without a search
-    jumped: bool = False  # likewise, and the points denied that motion: they alone tell
     time_ns: int = 0  # of a tracker: when the middle row was exposed
     # How a gyroscope says that the camera turned; velocities and accelerations are those of both
     turn: GyroRotation | None = None
