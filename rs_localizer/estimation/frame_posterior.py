@@ -38,12 +38,7 @@ from rs_localizer.estimation.modes import (
     mixture_of,
 )
 from rs_localizer.estimation.observations import MOST_POINTS, NEAREST, Observations
-from rs_localizer.estimation.posterior import (
-    GATE,
-    WIDEST_GATE,
-    Posterior,
-    maximum_a_posteriori,
-)
+from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior
 from rs_localizer.estimation.prior import Assumed, PriorTerms, terms_at
 from rs_localizer.estimation.refine import LEAST_NOISE, apply_step
 from rs_localizer.estimation.residuals import Lines, linearized
@@ -51,8 +46,6 @@ from rs_localizer.estimation.turn import TurnFit, fit_turn, hidden_turn
 
 # Of the typical speeds.
 _RESTS, _NOTHING = np.array([speed == 0.0 for speed in SPEEDS], float), np.zeros(len(SPEEDS))
-# Gates have room for so many declared deviations of the map: a curled corner is no outlier.
-_ROOM = 3.0
 # Shaking of up to this (rad, 2 deg) moves points out of the gate of a motion without it.
 _LARGEST_SHAKE = 0.035
 # A fit that loses more inliers than this part leaves is another group of points.
@@ -113,10 +106,10 @@ def _of_points(
     one_lens: bool,
 ) -> Posterior:  # fmt: skip
     declares, turn_known = assumed.map_deviation > 0.0, assumed.turn is not None
-    wide = (_ROOM if declares and assumed.rolling else 1.0) * threshold
     look = first_look(
-        observations.packed, observations.points, start, terms, wide, assumed.rolling, turn_known
-    )
+        observations.packed, observations.points, start, terms, threshold, assumed.rolling,
+        turn_known,
+    )  # fmt: skip
     best = Posterior(*look.best)
     if not best.determined or np.count_nonzero(best.inliers) < _FEWEST:
         return best
@@ -124,14 +117,6 @@ def _of_points(
     best = best._replace(near_outliers=look.near_outliers, declared=declared)
     moving = look.moving and not declares and not look.planar
     slowest = 0 if assumed.may_rest and not moving else len(SPEEDS) - 1
-    first = best.state
-    if declares and slowest == 0:  # a bend is not taken for a motion from the start
-        still = start.copy()
-        still[12:] = 0.0
-        rest = maximum_a_posteriori(observations, still, terms_at(terms, 0.0, turn_known), wide)
-        if np.count_nonzero(rest.inliers) >= _FEWEST:
-            first = rest.state
-            best = best._replace(inliers=best.inliers | rest.inliers)
     bend = np.zeros((observations.count, 0))
     if declares and assumed.rolling:
         bend = bend_of(observations.points, best.inliers, look.depth / assumed.focal_length)
@@ -142,8 +127,8 @@ def _of_points(
         by_turn = np.array([assumed.turn.evidence(speed) for speed in SPEEDS])
     smooth = _smooth_of(look.lines, best.inliers, bend, *size)
     found = _steady(
-        observations.packed, observations.points, look, best.inliers, smooth, first, terms, odds,
-        by_turn, slowest, turn_known, assumed.focal_length,
+        observations.packed, observations.points, look, smooth, terms, odds, by_turn, slowest,
+        turn_known, assumed.focal_length,
     )  # fmt: skip
     if found.evidence == -math.inf:
         return best._replace(smallest_eigenvalue=0.0)
@@ -198,9 +183,8 @@ def _smooth_of(
 
 @kernel
 def _steady(
-    data: Array, points: Array, look: Look, inliers: BoolArray, smooth: SmoothError, first: Array,
-    terms: PriorTerms, odds: Array, by_turn: Array, slowest: int, turn_known: bool,
-    focal_length: float,
+    data: Array, points: Array, look: Look, smooth: SmoothError, terms: PriorTerms, odds: Array,
+    by_turn: Array, slowest: int, turn_known: bool, focal_length: float,
 ) -> Mixture:  # fmt: skip
     """The mixture of all modes of a camera that does not turn within its frame."""
     best = look.best
@@ -214,8 +198,8 @@ def _steady(
         best.noise, max(best.noise**2 / max(raw, LEAST_NOISE**2), 1.0),
         max(equations - best.freedom, 0.0),
     )  # fmt: skip
-    frame = Frame(data, points, inliers, smooth, noise, focal_length, look.depth)
-    return mixture_of(frame, first, terms, odds, by_turn, slowest, turn_known, look.planar)
+    frame = Frame(data, points, best.inliers, smooth, noise, focal_length, look.depth)
+    return mixture_of(frame, best.state, terms, odds, by_turn, slowest, turn_known, look.planar)
 
 
 def _with_turn(
