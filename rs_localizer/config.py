@@ -189,7 +189,7 @@ class LocalizerConfig:
     )
     max_iterations: int = setting(
         1000,
-        "Most minimal samples of a frame, for its global-shutter start and again for its motion",
+        "Most minimal samples of a frame's motion; its global-shutter start takes up to 384",
         (1, 1_000_000),
     )
     confidence: float = setting(

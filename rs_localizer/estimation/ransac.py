@@ -334,16 +334,15 @@ def search(
     when the chance that no sample so far held inliers alone, at the inlier ratios of the best
     *optimised* motion, is below ``1 - draws.confidence``: minimal models see too few of the inliers
     to count them (a six-point model sees a tenth). Only models that beat all minimal ones before
-    are optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). The samples of ``start`` count: a
-    search goes on from where another stopped.
+    are optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003).
     """
     solver, pools, mounts = hypotheses.solver, draws.pools, observations.mounts
     scales = hypotheses.score_scale, hypotheses.final_scale, hypotheses.noise
     state, cost, used = start.state, start.cost, len(pools.ends)
-    drawn, shares = np.full(used, start.samples // max(used, 1)), np.full(used, np.nan)
+    drawn, shares = np.zeros(used, np.int64), np.full(used, np.nan)
     rotations = mounts.axes @ draws.rotation
     no_fit, best_gain = observations.count * hypotheses.score_scale**2, 0.0
-    left = draws.most - int(drawn.sum()) if used else 0
+    left = draws.most if used else 0
     while left > 0:
         samples = np.empty((min(hypotheses.block, left), solver.sample_size), np.int64)
         _draw_block(pools, drawn, observations.tau, draws.random, samples)

@@ -40,11 +40,11 @@ _POOL_SCALE = 0.12
 _SCORE_SCALE = 2.0
 _GLOBAL_SHUTTER_BLOCK = 48
 _BLOCK = 64
-# Either search first draws at most so many: they do for all but the hardest frames, and what they
-# find tells whether more are worth it.
-_FIRST_SAMPLES = 384
-# A global-shutter start near more than this part of a motion's inliers would lead to it again.
-_SAME_GROUP = 0.5
+# A start, or a motion of left-out points, draws at most so many: of a fast camera one pose explains
+# so few points that the search would not end, and 70 to 80 % of outliers need no more (239 frames).
+_FEW_SAMPLES = 384
+# A start leads nowhere if its own motion fits less than this part of the points near it.
+_AGREEING = 0.5
 # Enough to find three inliers among points of which two fifths are.
 _SECOND_LOOK_SAMPLES = 96
 
@@ -75,37 +75,9 @@ class MotionSearch:
         if not self._solver.rolling_shutter:
             start = self._global_shutter(observed, everything, most)
             return start, start
-        first = min(_FIRST_SAMPLES, most)
-        start = self._global_shutter(observed, everything, first)
-        best = self._motion(observed, start, first)
-        if first < most and max(start.samples, best.samples) >= _FIRST_SAMPLES:
-            start, best = self._go_on(observed, start, best)
+        start = self._global_shutter(observed, everything, min(_FEW_SAMPLES, most))
+        best = self._motion(observed, start, most)
         return self._largest_group(observed, start, best) if best.found else (start, best)
-
-    def _go_on(
-        self, observed: Observed, start: Candidate, best: Candidate
-    ) -> tuple[Candidate, Candidate]:
-        """The start and the motion after more samples, where the first ones may not be enough."""
-        most, observations = self._config.max_iterations, observed.observations
-        if start.samples >= _FIRST_SAMPLES:
-            inliers = observations.within(best.state, self._config.inlier_threshold) & best.found
-            # The motion tells, not the start: where the camera is fast, that explains but a part
-            # of the inliers.
-            share = float(np.mean(inliers))
-            chance = (1.0 - share**self._start.sample_size) ** start.samples
-            if chance > 1.0 - self._config.confidence:
-                everything = np.ones(len(inliers), np.bool_)
-                later = self._global_shutter(observed, everything, most, start)
-                near = observations.within(later.state, self._near)[inliers]
-                if not len(near) or np.mean(near) < _SAME_GROUP:
-                    rival = self._motion(observed, later, most)
-                    if rival.cost < best.cost:
-                        return later, rival
-                elif later.cost < start.cost:
-                    start = later
-        if best.samples >= _FIRST_SAMPLES:
-            best = self._motion(observed, start, most, best)
-        return start, best
 
     def _largest_group(
         self, observed: Observed, start: Candidate, best: Candidate
@@ -144,11 +116,9 @@ class MotionSearch:
             or np.count_nonzero(part.observations.within(start.state, self._rough)) <= least
         ):
             return NOTHING
-        return self._motion(part, start, _FIRST_SAMPLES)
+        return self._motion(part, start, _FEW_SAMPLES)
 
-    def _global_shutter(
-        self, observed: Observed, among: BoolArray, most: int, before: Candidate = NOTHING
-    ) -> Candidate:
+    def _global_shutter(self, observed: Observed, among: BoolArray, most: int) -> Candidate:
         """A pose that fits all rows roughly, from some points and with a wide threshold."""
         observations = observed.observations
         pools = pools_of(
@@ -156,24 +126,21 @@ class MotionSearch:
             self._start.sample_size, among, observed.ranking, False,
         )  # fmt: skip
         draws = Draws(np.eye(3), pools, self._config.confidence, most, observed.random)
-        return search(observations, self._starts, held_terms(), draws, before)
+        return search(observations, self._starts, held_terms(), draws, NOTHING)
 
-    def _motion(
-        self, observed: Observed, start: Candidate, most: int, before: Candidate | None = None
-    ) -> Candidate:
+    def _motion(self, observed: Observed, start: Candidate, most: int) -> Candidate:
         """The motion that most points agree on, from the solver's hypotheses."""
         if not start.found:
             return start
         observations, threshold = observed.observations, self._config.inlier_threshold
         near, state, cost, agreeing = _from_start(
             observations.packed, observations.count, start.state, self._near, threshold,
-            observed.terms, self._noise, before is None,
+            observed.terms, self._noise,
         )  # fmt: skip
         # The global-shutter pose is a hypothesis, too: at rest it is the best one.
-        if before is None:
-            before = Candidate(state, cost)
-            if agreeing < _SAME_GROUP * np.count_nonzero(near):
-                before = self._facing(observed, start, near, before)
+        first = Candidate(state, cost)
+        if agreeing < _AGREEING * np.count_nonzero(near):
+            first = self._facing(observed, start, near, first)
         pools = pools_of(
             observations.camera, observations.tau, len(observations.mounts.axes),
             self._solver.sample_size, near, observed.ranking, True,
@@ -181,7 +148,7 @@ class MotionSearch:
         draws = Draws(
             rotation_of(start.state), pools, self._config.confidence, most, observed.random
         )
-        return search(observations, self._motions, observed.terms, draws, before)
+        return search(observations, self._motions, observed.terms, draws, first)
 
     def _facing(
         self, observed: Observed, start: Candidate, near: BoolArray, found: Candidate
@@ -235,18 +202,17 @@ def _others(
 @kernel
 def _from_start(
     data: Array, count: int, start: Array, wide: float, threshold: float, prior: PriorTerms,
-    noise: float, optimizes: bool,
+    noise: float,
 ) -> tuple[BoolArray, Array, float, int]:  # fmt: skip
     """Which points may belong to a motion whose global-shutter pose this is; that motion and its
-    cost, by local optimisation if it is asked for; how many of the points agree with it.
+    cost, by local optimisation; how many of the points agree with it.
     """
-    near, state, cost, agreeing = squared_errors(data, count, start) < wide * wide, start, np.inf, 0
-    if optimizes:
-        states = start.copy().reshape(1, STATE_SIZE)
-        state, cost = optimize(states, np.zeros(1), data, wide, threshold, prior, noise)
-        if cost < np.inf:
-            errors = squared_errors(data, count, state)
-            agreeing = int(np.count_nonzero(near & (errors < threshold * threshold)))
+    near, agreeing = squared_errors(data, count, start) < wide * wide, 0
+    states = start.copy().reshape(1, STATE_SIZE)
+    state, cost = optimize(states, np.zeros(1), data, wide, threshold, prior, noise)
+    if cost < np.inf:
+        errors = squared_errors(data, count, state)
+        agreeing = int(np.count_nonzero(near & (errors < threshold * threshold)))
     return near, state, cost, agreeing
 
 
