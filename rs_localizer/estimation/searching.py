@@ -14,7 +14,6 @@ from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import POSE_SIZE, STATE_SIZE, rotation_of
 from rs_localizer.estimation.observations import Observed
 from rs_localizer.estimation.plane import facing
-from rs_localizer.estimation.posterior import WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.ransac import (
     NOTHING,
@@ -45,8 +44,8 @@ _BLOCK = 64
 _FEW_SAMPLES = 384
 # A start leads nowhere if its own motion fits less than this part of the points near it.
 _AGREEING = 0.5
-# Enough to find three inliers among points of which two fifths are.
-_SECOND_LOOK_SAMPLES = 96
+# Of points that are left out: enough to find three inliers among those of which two fifths are.
+_START_SAMPLES = 96
 
 
 class MotionSearch:
@@ -70,38 +69,12 @@ class MotionSearch:
 
     def find(self, observed: Observed) -> tuple[Candidate, Candidate]:
         """The global-shutter start and the motion found from it; the start may not be found."""
-        everything = np.ones(observed.observations.count, np.bool_)
         most = self._config.max_iterations
         if not self._solver.rolling_shutter:
-            start = self._global_shutter(observed, everything, most)
+            start = self._global_shutter(observed, most)
             return start, start
-        start = self._global_shutter(observed, everything, min(_FEW_SAMPLES, most))
-        best = self._motion(observed, start, most)
-        return self._largest_group(observed, start, best) if best.found else (start, best)
-
-    def _largest_group(
-        self, observed: Observed, start: Candidate, best: Candidate
-    ) -> tuple[Candidate, Candidate]:
-        """The start and the motion of another group of points, if it is the larger one.
-
-        The search stays near its global-shutter start. Where that lies on a second moving object,
-        the points that it leaves out may hold more inliers than it found.
-        """
-        observations = observed.observations
-        # At the widest gate of the final estimate, so that noise hides none of them.
-        gate = WIDEST_GATE * self._config.inlier_threshold
-        others, inliers = _others(
-            observations.packed, observations.count, start.state, self._near, best.state, gate
-        )
-        if np.count_nonzero(others) <= inliers:
-            return start, best
-        second = self._global_shutter(observed, others, _SECOND_LOOK_SAMPLES)
-        if not second.found or (
-            np.count_nonzero(observations.within(second.state, self._near) & others) <= inliers
-        ):
-            return start, best
-        rival = self._motion(observed, second, self._config.max_iterations)
-        return (second, rival) if rival.cost < best.cost else (start, best)
+        start = self._global_shutter(observed, min(_FEW_SAMPLES, most))
+        return start, self._motion(observed, start, most)
 
     def among(self, observed: Observed, chosen: BoolArray, least: int) -> Candidate:
         """The motion of these points alone, if more than so many agree roughly on a pose."""
@@ -109,8 +82,7 @@ class MotionSearch:
             observed, observations=observed.observations.only(np.flatnonzero(chosen)),
             ranking=observed.ranking[:0],
         )  # fmt: skip
-        everything = np.ones(part.observations.count, np.bool_)
-        start = self._global_shutter(part, everything, _SECOND_LOOK_SAMPLES)
+        start = self._global_shutter(part, _START_SAMPLES)
         if (
             not start.found
             or np.count_nonzero(part.observations.within(start.state, self._rough)) <= least
@@ -118,12 +90,12 @@ class MotionSearch:
             return NOTHING
         return self._motion(part, start, _FEW_SAMPLES)
 
-    def _global_shutter(self, observed: Observed, among: BoolArray, most: int) -> Candidate:
-        """A pose that fits all rows roughly, from some points and with a wide threshold."""
+    def _global_shutter(self, observed: Observed, most: int) -> Candidate:
+        """A pose that fits all rows roughly, with a wide threshold."""
         observations = observed.observations
         pools = pools_of(
             observations.camera, observations.tau, len(observations.mounts.axes),
-            self._start.sample_size, among, observed.ranking, False,
+            self._start.sample_size, np.ones(observations.count, np.bool_), observed.ranking, False,
         )  # fmt: skip
         draws = Draws(np.eye(3), pools, self._config.confidence, most, observed.random)
         return search(observations, self._starts, held_terms(), draws, NOTHING)
@@ -187,16 +159,6 @@ class MotionSearch:
             threshold, held_terms(), self._noise,
         )  # fmt: skip
         return explained
-
-
-@kernel
-def _others(
-    data: Array, count: int, start: Array, near: float, best: Array, gate: float
-) -> tuple[BoolArray, int]:
-    """Which points are not near a start (px), and how many inliers the best motion has."""
-    inliers = squared_errors(data, count, best) < gate * gate
-    others = ~(squared_errors(data, count, start) < near * near)
-    return others, int(np.count_nonzero(inliers))
 
 
 @kernel
