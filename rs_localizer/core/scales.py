@@ -11,7 +11,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.shake import CYCLES, TYPICAL_SIZES
 
-SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
+SPEEDS = (0.0, 0.1, 1.0)
 """Typical speeds, as parts of the configured one; 0 is a camera at rest."""
 _CENTRES, _WIDTH, _FLOOR = (0.75, 1.5, 3.0, 5.0), 0.4, 0.03
 _BANDS = np.exp(-0.5 * (np.log(CYCLES[None] / np.array(_CENTRES)[:, None]) / _WIDTH) ** 2) + _FLOOR
@@ -32,7 +32,7 @@ class Scales(NamedTuple):
 
     size: Array  # (2,) of the logarithm of the smooth error (px): mean, and precision; 0: unknown
     vibrations: Array  # (v,) logarithms of the odds of none and of each vibration
-    speeds: Array  # (5,) logarithms of the odds of the typical speeds
+    speeds: Array  # (s,) logarithms of the odds of the typical speeds
 
     @classmethod
     def nothing(cls) -> Scales:

@@ -145,7 +145,7 @@ def _effect(
     Args:
         by_motion, smooth, columns: derivatives (n,2,18), (n,2,q) by the motion and the smooth
             error, and by how much the errors move the points (n,2,k).
-        parts: (5,) of the typical speeds.
+        parts: (s,) of the typical speeds.
         variance, inflation: of the noise, px^2, and because it is an estimate.
     """
     count, q, errors = 2 * len(by_motion), smooth.shape[2], columns.shape[2]

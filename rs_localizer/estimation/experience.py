@@ -17,7 +17,6 @@ from rs_localizer.core.scales import INDEPENDENT, SPEED_MEMORY, SPEEDS, Scales, 
 from rs_localizer.core.state import POSE, VELOCITIES
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.modes import FAR_LESS_PROBABLE
-from rs_localizer.estimation.prior import WALKING
 
 # Smooth errors (px, root mean square) that nobody has who calibrated well: surveyed tags before a
 # calibrated lens have 0.2; and the deviations of the logarithm that make it sure.
@@ -61,7 +60,7 @@ class Experience:
         spread = before.joint_covariance[POSE, POSE] + after.joint_covariance[POSE, POSE]
         likelihoods = []
         for part in SPEEDS[1:]:
-            fast = np.repeat([part * typical.angular, max(part, WALKING) * typical.linear], 3)
+            fast = np.repeat([part * typical.angular, part * typical.linear], 3)
             covariance = spread + np.diag((seconds * fast) ** 2)
             squared = step @ np.linalg.solve(covariance, step)
             likelihoods.append(-0.5 * (squared + np.linalg.slogdet(covariance)[1]))

@@ -245,8 +245,8 @@ class Mixture(NamedTuple):
     covariance: Array  # (18,18)
     arched: Array  # (18,18) of steps, see along_arcs
     evidence: float  # logarithm of the sum
-    speeds: Array  # (5,) weights of the typical speeds in the covariance
-    log_likelihoods: Array  # (5,) of the typical speeds
+    speeds: Array  # (s,) weights of the typical speeds in the covariance
+    log_likelihoods: Array  # (s,) of the typical speeds
     errors: Array  # (5,) of the most probable mode; the size is the root mean square of all
 
 
@@ -260,8 +260,8 @@ def mixture_of(
     Args:
         start: state (24,).
         terms: of the configured speed.
-        odds: (5,) logarithms, of the typical speeds before this frame.
-        by_turn: (5,) log-likelihoods of them by what a gyroscope knows of this frame.
+        odds: (s,) logarithms, of the typical speeds before this frame.
+        by_turn: (s,) log-likelihoods of them by what a gyroscope knows of this frame.
         slowest: index of the first typical speed; the others follow.
         turn_known: whether a gyroscope knows the turn.
         planar: whether leans that are hardly known are integrated.

@@ -23,7 +23,7 @@ from .frames import PRIOR, frame
 
 NOISE = 0.4
 SIZES = np.linspace(-2.5, 5.5, 11)  # as the module has them
-TERMS = terms_at(PRIOR, SPEEDS[3], False)
+TERMS = terms_at(PRIOR, SPEEDS[1], False)
 
 
 def everything(bent):

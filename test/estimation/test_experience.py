@@ -39,8 +39,8 @@ def test_images_tell_how_fast_cameras_move_within_them():
     calm, drone = speeds_after(0.003, 0.005), speeds_after(0.1, 0.2)  # 0.15 and 6 rad/s
     assert calm.scales.speeds.max() == 0.0
     assert np.argmax(calm.scales.speeds[1:]) == 0
-    assert calm.scales.speeds[4] == -9.0  # not less: a camera may start to move
-    assert np.argmax(drone.scales.speeds) == 4
+    assert calm.scales.speeds[-1] == -9.0  # not less: a camera may start to move
+    assert np.argmax(drone.scales.speeds) == 2
     assert drone.scales.speeds[0] == drone.scales.speeds[1] < -3.0
     # A shutter may be a global one, and poses that are hardly known tell nothing.
     assert calm.scales.speeds[0] == calm.scales.speeds[1]
