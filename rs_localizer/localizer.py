@@ -304,13 +304,13 @@ class Localizer:
             if tracked:
                 return replace(tracked, tracked=True)
         # 3. A global-shutter start, then hypotheses of the solver (LO-RANSAC).
-        start, best = self._search.find(observed)
-        if not start.found:
+        best = self._search.find(observed)
+        if not best.found:
             return Failure(Reason.NO_HYPOTHESIS, "no three points gave a pose")
-        # 4. Maximum a posteriori on the inliers; rest or motion; the mirrored pose of a plane.
+        # 4. Maximum a posteriori on the inliers; rest or motion; the leans of a plane.
         posterior = self._settle(observed, best, observed.terms)
         # 5. Nothing rather than a wrong pose.
-        return self._accept(observed, start, best, posterior, observed.terms)
+        return self._accept(observed, best, posterior, observed.terms)
 
     def _track(self, observed: Observed, prior: Prior, expected_share: float) -> Estimate | Failure:
         """The motion nearest to the prior one, if the points agree with it."""
@@ -321,9 +321,8 @@ class Localizer:
             observed.terms, prior, observed.centre, observed.sighted.turn is not None
         )
         best = self._search.optimize(observed, predicted, _PREDICTION_SCALE * threshold, terms)
-        start = Candidate(predicted, best.cost)
         posterior = self._settle(observed, best, terms)
-        result = self._accept(observed, start, best, posterior, self._own_terms(observed, prior))
+        result = self._accept(observed, best, posterior, self._own_terms(observed, prior))
         if result and np.count_nonzero(result.inliers) < (
             _STILL_TRACKED * expected_share * observed.observations.count
         ):
@@ -407,9 +406,8 @@ class Localizer:
         return with_motion(observed.terms, of_velocities, observed.centre, turned)
 
     def _accept(
-        self, observed: Observed, start: Candidate, best: Candidate, posterior: Posterior,
-        own_terms: PriorTerms,
-    ) -> Estimate | Failure:  # fmt: skip
+        self, observed: Observed, best: Candidate, posterior: Posterior, own_terms: PriorTerms
+    ) -> Estimate | Failure:
         """Accept the motion or say what is wrong with it."""
         effect = NO_EFFECT
         enough = np.count_nonzero(posterior.inliers) >= self.config.min_inliers
@@ -438,6 +436,5 @@ class Localizer:
             odd = left_out(self._search, observed, posterior, gate, known=known)
         if odd.failure is not None:
             return odd.failure
-        still = self._search.global_shutter_inliers(observed, start)
-        estimate = estimate_of(observed, posterior, still, best.samples, effect)
+        estimate = estimate_of(observed, posterior, best.samples, effect)
         return replace(estimate, left_out=odd.notice) if odd.notice else estimate

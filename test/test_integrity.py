@@ -20,7 +20,7 @@ def estimate(kept: Any, tracked: bool = True) -> Estimate:
     return Estimate(
         rotation=np.eye(3), translation=np.zeros(3), angular_velocity=np.zeros(3),
         linear_velocity=np.zeros(3), inliers=np.asarray(kept), residuals=residuals,
-        joint_covariance=1e-4 * np.eye(18), global_shutter_inliers=0, iterations=0, tracked=tracked,
+        joint_covariance=1e-4 * np.eye(18), iterations=0, tracked=tracked,
     )  # fmt: skip
 
 

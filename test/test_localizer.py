@@ -115,7 +115,6 @@ def test_every_rolling_shutter_solver_finds_inliers_and_pose(solver):
         assert np.linalg.norm(result.position - position) < 0.03
         assert np.degrees(np.linalg.norm(result.angular_velocity - READOUT * path.rate)) < 0.8
         assert 0.3 < result.residual_rms / np.sqrt(2) < 0.7
-        assert result.global_shutter_inliers < 0.8 * inliers.sum()
 
 
 def test_p3p_is_a_global_shutter_and_knows_no_motion():

@@ -43,7 +43,6 @@ LOCALIZED = Estimate(
     inliers=np.ones(8, dtype=bool),
     residuals=np.ones(8),
     joint_covariance=1e-4 * np.eye(18),
-    global_shutter_inliers=8,
     iterations=10,
     scales=SAID,
 )

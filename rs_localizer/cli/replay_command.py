@@ -366,15 +366,13 @@ def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:
         rows += [(name, count)] if count else []
     if tally.localized:
         rolling = find_solver(config.solver).rolling_shutter
-        still = [("  inliers with a global shutter", "global_shutter_inliers", ".0f")]
         rows += [
             (name, f"{np.median(tally.column(column)):{form}}")
             for name, column, form in (
                 ("residual of the inliers (px rms, median)", "residual", ".3f"),
                 ("error of map and lens (px rms, median)", "model_error", ".3f"),
                 ("points of a frame (median)", "points", ".0f"),
-                (f"  inliers{' with a rolling shutter' * rolling}", "inliers", ".0f"),
-                *still * rolling,
+                ("  inliers", "inliers", ".0f"),
             )
         ]
         if rolling:

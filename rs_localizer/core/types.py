@@ -44,7 +44,6 @@ class Estimate(Motion):
     inliers: BoolArray  # (n,)
     residuals: Array  # (n,) reprojection error in raw pixels, NaN where a point was unusable
     joint_covariance: Array  # (18 + 3 k, 18 + 3 k)
-    global_shutter_inliers: int  # of the best global-shutter pose, at the same threshold
     iterations: int  # minimal samples drawn
     # (12,12) of what calibration and declared map may be off, a part of ``covariance``
     calibration_covariance: Array = field(

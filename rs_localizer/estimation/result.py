@@ -131,12 +131,11 @@ def _turned(errors: Array, by_turn: Array, shown: Array, rotations: Array, middl
 
 
 def estimate_of(
-    observed: Observed, posterior: Posterior, still: int, samples: int, effect: CalibrationEffect
+    observed: Observed, posterior: Posterior, samples: int, effect: CalibrationEffect
 ) -> Estimate:
     """The estimate of an accepted posterior, in the map frame and for all given points.
 
     Args:
-        still: how many points a global shutter would explain.
         samples: minimal samples drawn.
         effect: of what map and calibration are off.
     """
@@ -173,7 +172,6 @@ def estimate_of(
         model_error=posterior.model_error,
         # Posteriors share the default of what they leave open.
         scales=Scales(*map(np.copy, posterior.scales)),
-        global_shutter_inliers=still,
         iterations=samples,
         turn=turn,
         delay=delay,

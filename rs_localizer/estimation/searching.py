@@ -11,7 +11,7 @@ import numpy as np
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import POSE_SIZE, STATE_SIZE, rotation_of
+from rs_localizer.core.state import STATE_SIZE, rotation_of
 from rs_localizer.estimation.observations import Observed
 from rs_localizer.estimation.plane import facing
 from rs_localizer.estimation.prior import PriorTerms, held_terms
@@ -67,14 +67,13 @@ class MotionSearch:
         self._starts = Hypotheses(start, _GLOBAL_SHUTTER_BLOCK, *scales, *expected)
         self._motions = Hypotheses(solver, _BLOCK, _SCORE_SCALE * threshold, threshold, *expected)
 
-    def find(self, observed: Observed) -> tuple[Candidate, Candidate]:
-        """The global-shutter start and the motion found from it; the start may not be found."""
+    def find(self, observed: Observed) -> Candidate:
+        """The motion found from a global-shutter start, or nothing."""
         most = self._config.max_iterations
         if not self._solver.rolling_shutter:
-            start = self._global_shutter(observed, most)
-            return start, start
+            return self._global_shutter(observed, most)
         start = self._global_shutter(observed, min(_FEW_SAMPLES, most))
-        return start, self._motion(observed, start, most)
+        return self._motion(observed, start, most)
 
     def among(self, observed: Observed, chosen: BoolArray, least: int) -> Candidate:
         """The motion of these points alone, if more than so many agree roughly on a pose."""
@@ -151,15 +150,6 @@ class MotionSearch:
         )  # fmt: skip
         return Candidate(optimized, cost)
 
-    def global_shutter_inliers(self, observed: Observed, start: Candidate) -> int:
-        """Number of points that a global-shutter pose explains at the inlier threshold."""
-        threshold, observations = self._config.inlier_threshold, observed.observations
-        explained: int = _at_rest(
-            observations.packed, observations.count, start.state, 2.0 * _SCORE_SCALE * threshold,
-            threshold, held_terms(), self._noise,
-        )  # fmt: skip
-        return explained
-
 
 @kernel
 def _from_start(
@@ -176,16 +166,3 @@ def _from_start(
         errors = squared_errors(data, count, state)
         agreeing = int(np.count_nonzero(near & (errors < threshold * threshold)))
     return near, state, cost, agreeing
-
-
-@kernel
-def _at_rest(
-    data: Array, count: int, start: Array, wide: float, threshold: float, held: PriorTerms,
-    noise: float,
-) -> int:  # fmt: skip
-    """Number of points that a pose near this one explains, of a camera that does not move."""
-    states = np.zeros((1, STATE_SIZE))
-    states[0, :POSE_SIZE] = start[:POSE_SIZE]
-    state, _ = optimize(states, np.zeros(1), data, wide, threshold, held, noise)
-    inliers = squared_errors(data, count, state) < threshold * threshold
-    return int(np.count_nonzero(inliers))

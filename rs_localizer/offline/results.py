@@ -117,10 +117,7 @@ def write_frame(
 
 
 # Of each frame with a pose.
-_COLUMNS = (
-    *("residual", "model_error", "inliers", "global_shutter_inliers", "points", "tracked"),
-    *("dropped", "twist"),
-)
+_COLUMNS = (*("residual", "model_error", "inliers", "points", "tracked", "dropped", "twist"),)
 
 
 @dataclass(slots=True)
@@ -150,8 +147,7 @@ class Tally:
         self._stamps_ns.append(frame.input_stamp_ns)
         self._numbers.extend((
             estimate.residual_rms, estimate.model_error, int(np.count_nonzero(estimate.inliers)),
-            estimate.global_shutter_inliers, len(estimate.inliers), estimate.tracked,
-            frame.dropped, frame.twist is not None,
+            len(estimate.inliers), estimate.tracked, frame.dropped, frame.twist is not None,
         ))  # fmt: skip
 
     def smooth(self, part: Any) -> list[Localized]:

@@ -160,7 +160,6 @@ class Smoothed:
                 inliers=empty.astype(np.bool_),
                 residuals=empty,
                 joint_covariance=covariance,
-                global_shutter_inliers=0,
                 iterations=0,
                 span=self.readout_time,
             )

@@ -37,7 +37,7 @@ def some_estimate(shaken=0, gyroscope=False, speed=0.2, acceleration=0.3):
         angular_acceleration=acceleration * rng.normal(size=3),
         linear_acceleration=acceleration * rng.normal(size=3),
         inliers=np.array([True, False, True]), residuals=np.array([3.0, np.nan, 4.0]),
-        joint_covariance=half @ half.T, global_shutter_inliers=0, iterations=0,
+        joint_covariance=half @ half.T, iterations=0,
         shake=shake[:shaken], span=SPAN, time_ns=10**12,
     )  # fmt: skip
     turn = GyroRotation.of(TAU, RATES, rate_noise=0.01)

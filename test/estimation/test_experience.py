@@ -18,7 +18,7 @@ def estimate_at(position, deviation=1e-3, turn=0.0):
     return Estimate(
         rotation, -rotation @ position, nothing, nothing, inliers=np.ones(12, dtype=bool),
         residuals=np.zeros(12), joint_covariance=deviation**2 * np.eye(18),
-        global_shutter_inliers=12, iterations=0,
+        iterations=0,
     )  # fmt: skip
 
 

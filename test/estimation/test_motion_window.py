@@ -196,7 +196,7 @@ def estimate(step, joint, shake=None):
         state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18],
         angular_acceleration=state[18:21], linear_acceleration=state[21:],
         inliers=np.ones(5, bool), residuals=np.zeros(5), joint_covariance=joint,
-        global_shutter_inliers=0, iterations=0, span=SPAN,
+        iterations=0, span=SPAN,
         shake=np.zeros((0, 3)) if shake is None else shake,
     )  # fmt: skip
 
@@ -240,7 +240,7 @@ def test_errors_ahead_are_squared_steps_over_what_was_claimed():
     state = apply_step(state_in(later[0], np.zeros(3)), SMALL * random.normal(size=18))
     found = Estimate(
         state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18], np.ones(0, bool),
-        np.zeros(0), joint, 0, 0, time_ns=40_000_000, span=SPAN,
+        np.zeros(0), joint, 0, time_ns=40_000_000, span=SPAN,
     )  # fmt: skip
     step, claimed = step_between(state_in(later[0], np.zeros(3)), state), later[1] + swing
     expected = []

@@ -95,7 +95,6 @@ def estimate() -> Estimate:
         inliers=np.ones(8, dtype=bool),
         residuals=np.ones(8),
         joint_covariance=root @ root.T,
-        global_shutter_inliers=4,
         iterations=10,
         span=READOUT_TIME,
     )

@@ -46,7 +46,6 @@ def estimate(rate: float, seed: int = 0, acceleration: float = 0.0, shake: float
         inliers=np.ones(20, dtype=bool),
         residuals=np.ones(20),
         joint_covariance=root @ root.T,
-        global_shutter_inliers=10,
         iterations=100,
     )
 

@@ -35,8 +35,7 @@ def tell(frame: Localized) -> tuple[int, Told]:
     residual = float(np.sqrt(residuals @ residuals / max(inliers, 1)))
     values = {
         "Points": str(points),
-        "Inliers with rolling shutter": str(inliers),
-        "Inliers with global shutter": str(estimate.global_shutter_inliers),
+        "Inliers": str(inliers),
         "Residual RMS (px)": f"{residual:.3f}",
         "Model error (px)": f"{estimate.model_error:.3f}",
         "Iterations": str(estimate.iterations),

@@ -31,7 +31,6 @@ def frame(stamp: float = 0.0, tracked: bool = False, rig: bool = False) -> Any:
     estimate = SimpleNamespace(
         inliers=np.array([True, True, False, True]),
         residuals=np.array([3.0, 4.0, 100.0, 0.0]),
-        global_shutter_inliers=2,
         iterations=64,
         model_error=0.0,
         tracked=tracked,
@@ -95,8 +94,7 @@ def test_numbers_of_a_working_node(world):
         "Delay of the stamp p50 (ms)": "4.00",
         "Delay of the stamp p95 (ms)": "4.00",
         "Points": "4",
-        "Inliers with rolling shutter": "3",
-        "Inliers with global shutter": "2",
+        "Inliers": "3",
         "Residual RMS (px)": f"{np.sqrt(25.0 / 3.0):.3f}",
         "Model error (px)": "0.000",
         "Iterations": "64",
