@@ -283,7 +283,7 @@ class Localizer:
         exposure, counts, points, pixels, scores, prior, expected_share, turn, modes = given
         terms, assumed = self._assume(exposure.span)
         if prior is not None or turn is not None:
-            terms, assumed, prior = of_frame(terms, assumed, prior, turn)
+            terms, assumed = of_frame(terms, assumed, prior, turn)
         # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
         usable = find_usable(exposure, points, pixels, counts, turn)
         failure = unfit(exposure, pixels, usable, self.config.min_inliers)

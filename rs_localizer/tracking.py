@@ -18,21 +18,20 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum, auto
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
-from rs_localizer.core.state import ANGULAR, PARAMETERS, TURN
+from rs_localizer.core.state import ANGULAR, PARAMETERS, TURN, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
-from rs_localizer.estimation.experience import Experience, covering
 from rs_localizer.estimation.motion_model import (
     FADING,
     acceleration_covariance,
@@ -60,16 +59,6 @@ if TYPE_CHECKING:  # without a gyroscope nobody needs them
     from rs_localizer.inertial.gyroscope_noise import InertialSettings
     from rs_localizer.inertial.samples import ImuSamples
     from rs_localizer.inertial.status import InertialStatus
-
-
-class Memory(Enum):
-    """What frames tell the next ones."""
-
-    NOTHING = auto()
-    # A slightly wrong map looks like motion within a frame, now and then like much; many frames
-    # tell which it is.
-    MAP_AND_LENS = auto()
-    MOTION = auto()  # with it, map and lens
 
 
 # A prediction over a longer gap (s) says less than a fresh search costs.
@@ -120,8 +109,7 @@ class _Track:
     estimate: Estimate
     time_ns: int
     share: float  # of inliers among the points
-    experience: Experience  # with shaking, map and lens
-    window: MotionWindow | None = None  # of the motion; None: it is not remembered
+    window: MotionWindow
     # Beside a gyroscope: how many times the configured linear accelerations, squared
     linear_scale: float = 1.0
 
@@ -147,7 +135,7 @@ class Tracker:
         inertial: of the gyroscope whose samples come with the frames of a camera alone, which needs
             a readout time; None: there is none. Unless the motion is remembered, its bias is any
             that a gyroscope may have, and the offset of its stamps the given one.
-        memory: what frames pass on to the next ones.
+        remembers_motion: whether frames tell the next ones how the camera moves.
         output_lag: frames that :meth:`localize` waits for: its results are those of the frame so
             many before, as the later ones tell, too; those without a gyroscope, of a camera alone.
         max_prediction: s after the last frame until which :meth:`at` predicts.
@@ -161,12 +149,12 @@ class Tracker:
         self,
         localizer: Localizer,
         inertial: InertialSettings | None = None,
-        memory: Memory = Memory.MOTION,
+        remembers_motion: bool = True,
         output_lag: int = 0,
         max_prediction: float = 0.1,
     ) -> None:
         instance("localizer", localizer, Localizer)
-        if memory is Memory.MOTION:
+        if remembers_motion:
             _check_motion(localizer)
         elif inertial is not None:
             inertial = replace(inertial, estimate_time_offset=False)
@@ -174,7 +162,7 @@ class Tracker:
             raise ValueError(f"output_lag must be 0 to {LENGTH - 1} frames, got {output_lag!r}")
         if not 0.0 <= max_prediction < math.inf:
             raise ValueError(f"max_prediction must be 0 s or more, got {max_prediction!r}")
-        self.localizer, self._memory = localizer, memory
+        self.localizer, self.remembers_motion = localizer, remembers_motion
         self.output_lag, self.max_prediction = int(output_lag), max_prediction
         self._seen: deque[_Seen] = deque(maxlen=LENGTH)  # the newest last
         self._track: _Track | None = None
@@ -208,27 +196,15 @@ class Tracker:
         """Localize with the same cameras where they are now; the rig's axes stay the same."""
         self.localizer = Localizer(rig, self.localizer.config)
 
-    @property
-    def remembers_motion(self) -> bool:
-        """Whether frames tell the next ones how the camera moves."""
-        return self._memory is Memory.MOTION
-
-    @property
-    def smooth_error(self) -> float:
-        """Size (px) of the errors of map or lens on which frames agree so far; else 0."""
-        return 0.0 if self._track is None else self._track.experience.smooth_error
-
     def _trusts_motion(self, context: FrameContext) -> bool:
         """Whether how far the camera goes from frame to frame tells how it moves within one."""
         least = min(camera.readout_time for camera in self.localizer.rig.cameras.values())
         known = context.readout_time_deviation < FAR_OFF * least
-        return self._memory is Memory.MOTION and context.trusts_readout_time and known
+        return self.remembers_motion and context.trusts_readout_time and known
 
     def _follows(self, time_ns: int) -> bool:
         """Whether the motion of the last frame with a pose predicts that at a time."""
         track = self._track
-        if self._memory is not Memory.MOTION:
-            return False
         return track is not None and 0.0 < (time_ns - track.time_ns) * 1e-9 <= _LONGEST_GAP
 
     def _check_time(self, time_ns: int) -> None:
@@ -264,18 +240,14 @@ class Tracker:
         ``span``: s, of the row times of the frame; None: as of the last one.
         """
         track = self._track
-        if track is None or track.window is None or not self._follows(time_ns):
+        if track is None or not self._follows(time_ns):
             given = self._given
             return given[1] if given is not None and given[0] == time_ns else None
         own = track.estimate.span
         window = replace(track.window, readout_share=context.readout_time_deviation / own)
         motion, covariance = motion_of(window.after(time_ns), own if span is None else span)
         try:
-            return Prior(
-                motion=motion,
-                covariance=covariance + unshaken(track.estimate)[2],
-                scales=track.experience.scales,
-            )
+            return Prior(motion=motion, covariance=covariance + unshaken(track.estimate)[2])
         except ValueError:  # rounding errors are all that is left of the covariance
             return None
 
@@ -293,7 +265,7 @@ class Tracker:
                 turns as they say.
         """
         track = self._track
-        if track is None or track.window is None:
+        if track is None:
             return None
         window, swing = track.window, unshaken(track.estimate)[2]
         if (time_ns - track.time_ns) * 1e-9 > self.max_prediction:
@@ -384,7 +356,7 @@ class Tracker:
         if isinstance(points, Mapping) and points:
             exposure = self.localizer.rig.exposure(tuple(points), stamps)
             later, span = round(1e9 * exposure.time), exposure.span
-        if self._memory is Memory.MOTION:
+        if self.remembers_motion:
             self._check_time(time_ns)
             time_ns += later
             if not self._follows(time_ns):
@@ -405,23 +377,15 @@ class Tracker:
 
         if self._aid is None:
             result, prior = localized(None)
-            if not result and self._track is not None and not self._trusts_motion(context):
-                # What other frames said may no longer hold: a hand bent the board, and let it go.
-                alone = self.localizer.find(
-                    points, pixels, scores, stamps=stamps, error_modes=context.error_modes
-                )
-                if alone:
-                    result, prior, self._track = alone, None, None
         else:
             result, prior = self._aid.localize(
                 imu, time_ns, lambda: self._before(time_ns), localized
             )
         if result:
             result = self._judged(result, points, pixels, prior)
-            if self._memory is Memory.MOTION:
-                result = replace(result, time_ns=time_ns)
-                result = self._covering(result, context)
-            self._remember(time_ns, prior, result, context)
+            if self.remembers_motion:
+                result = self._covering(replace(result, time_ns=time_ns), context)
+                self._remember(time_ns, prior, result, context)
             if self._aid is not None and imu is not None:
                 camera = self.localizer.camera
                 assert pixels is not None and not isinstance(points, Mapping)  # noqa: PT018
@@ -454,8 +418,7 @@ class Tracker:
 
     def _publish(self) -> None:
         """Give the last frames the motion that the window knows of them."""
-        window = None if self._track is None else self._track.window
-        if window is None or len(window) < 2:
+        if self._track is None or len(window := self._track.window) < 2:
             return
         known = {time_ns: k for k, time_ns in enumerate(reversed(window.times))}
         for seen in list(self._seen)[-1 - self.output_lag :]:
@@ -463,12 +426,25 @@ class Tracker:
                 seen.found = self._published(seen, window.before(known[seen.time_ns]))
 
     def _covering(self, result: Estimate, context: FrameContext) -> Estimate:
-        """The same; where rows may not tell it, velocities as uncertain as frames show them."""
+        """Return the estimate with velocities as uncertain as frames show them, if rows may not.
+
+        Rows of a readout time that nobody knows may all have been exposed at once: then they show
+        no motion, however fast the camera is.
+        """
         track = self._track
         if track is None or self._trusts_motion(context):
             return result
         seconds = 1e-9 * (result.time_ns - track.time_ns)
-        return covering(track.estimate, result, seconds) if seconds > 0.0 else result
+        if not seconds > 0.0:
+            return result
+        before = track.estimate
+        turn = so3.log(np.ascontiguousarray(before.rotation @ result.rotation.T))
+        moved = result.rotation @ (result.position - before.position)
+        off = np.concatenate([turn, moved]) * result.span / seconds
+        off -= np.concatenate([result.angular_velocity, result.linear_velocity])
+        joint = result.joint_covariance.copy()
+        joint[VELOCITIES, VELOCITIES] += np.outer(off, off)
+        return replace(result, joint_covariance=joint)
 
     def _judged(
         self,
@@ -487,10 +463,8 @@ class Tracker:
         self, time_ns: int, turn: GyroRotation | None, span: float | None, context: FrameContext
     ) -> Prior | None:
         """What is known of a frame of whose motion a gyroscope predicts no more than the turn."""
-        if self._memory is Memory.NOTHING:
+        if not self.remembers_motion:
             return Prior(of_rest=context.of_rest) if turn is None else None
-        if self._memory is Memory.MAP_AND_LENS:
-            return None if self._track is None else Prior(scales=self._track.experience.scales)
         prior = self.prediction(time_ns, span, context)
         if prior is not None and not self._trusts_motion(context):
             rest = context.of_rest if turn is None else 0.0
@@ -517,28 +491,14 @@ class Tracker:
         self, time_ns: int, prior: Prior | None, result: Estimate, context: FrameContext
     ) -> None:
         """Keep what the next frames are to know of this one."""
-        track = self._track
-        if self._memory is Memory.NOTHING:
-            return
-        experience = Experience.of(result) if track is None else track.experience.and_of(result)
-        self._track = _Track(result, time_ns, 0.0, experience)
-        if self._memory is Memory.MOTION:
-            self._track.share = share = float(np.mean(result.inliers))
-            if track is not None:
-                if result.tracked:
-                    self._track.share = (1.0 - _NEWEST) * track.share + _NEWEST * share
-                if result.turn is not None:
-                    self._track.linear_scale = _learnt(track.linear_scale, prior, result)
-            self._track.window = self._window(time_ns, prior, result, track, context)
-            self._errors.add(result, self._track.window, unshaken(result)[2])
-        if track is None or self._track is None or self._trusts_motion(context):
-            return
-        seconds = 1e-9 * (time_ns - track.time_ns)
-        if 0.0 < seconds < _LONGEST_GAP:
-            self._track.experience = self._track.experience.moving(
-                track.experience.scales.speeds, track.estimate, result, seconds,
-                self.localizer.config.velocity_prior,
-            )  # fmt: skip
+        track, share, linear_scale = self._track, float(np.mean(result.inliers)), 1.0
+        if track is not None and result.tracked:
+            share = (1.0 - _NEWEST) * track.share + _NEWEST * share
+        if track is not None and result.turn is not None:
+            linear_scale = _learnt(track.linear_scale, prior, result)
+        window = self._window(time_ns, prior, result, track, context)
+        self._track = _Track(result, time_ns, share, window, linear_scale)
+        self._errors.add(result, window, unshaken(result)[2])
 
     def _window(
         self, time_ns: int, prior: Prior | None, result: Estimate, track: _Track | None,
@@ -549,9 +509,9 @@ class Tracker:
         alone = MotionWindow.begin(
             gaussian_of(result, time_ns), self.localizer.config.acceleration, share
         )
-        window = None if track is None else track.window
-        if window is None:
+        if track is None:
             return alone
+        window = track.window
         alone = replace(alone, deviations=window.deviations)
         if result.turn is not None or not self._trusts_motion(context):
             return alone
@@ -579,14 +539,7 @@ class Tracker:
         motion, covariance, added, _ = unshaken(track.estimate)
         dt = 1e-9 * (time_ns - track.time_ns)
         added += acceleration_covariance(self._beside_gyro(track), dt, readout_time)
-        return Before(
-            track.time_ns,
-            motion,
-            covariance,
-            added,
-            FADING / readout_time,
-            track.experience.scales,
-        )
+        return Before(track.time_ns, motion, covariance, added, FADING / readout_time)
 
 
 def _check_motion(localizer: Localizer) -> None:

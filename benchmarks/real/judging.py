@@ -24,7 +24,7 @@ from rs_localizer.core.state import ANGULAR, POSE, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
 from rs_localizer.tools.adjust.observe import ImagePoints
-from rs_localizer.tracking import FrameContext, Memory, Tracker
+from rs_localizer.tracking import FrameContext, Tracker
 
 Pose = Estimate | GlobalPose
 Poses = Sequence[Pose | Failure | None]
@@ -75,11 +75,7 @@ def localized(
     tracked: with it, one after the other. Or by one of the peers.
     """
     if name == "default":
-        localizer = Localizer(replace(camera, readout_time=0.0), config)
-        remembering = Tracker(localizer, memory=Memory.MAP_AND_LENS)
-        return [
-            remembering.localize(image.stamp_ns, image.points, image.pixels) for image in images
-        ]
+        camera, name = replace(camera, readout_time=0.0), "single"
     if name == "tracked":
         tracker = Tracker(Localizer(camera, config))
         known = FrameContext(readout_time_deviation=config.readout_time_deviation)

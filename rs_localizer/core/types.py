@@ -14,7 +14,6 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.gyro_rotation import GyroRotation, late_at
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.scales import Scales
 from rs_localizer.core.shake import FUNCTIONS, shake_at, shake_basis, within_rows
 from rs_localizer.core.shutter import Motion, carried, numbers_of
 from rs_localizer.core.simd.jit import kernel
@@ -58,7 +57,6 @@ class Estimate(Motion):
     # (k,3) rad: what the camera turns beside the motion (rs_localizer.core.shake): vibration
     shake: Array = field(default_factory=np.zeros((0, 3)).copy)
     model_error: float = 0.0  # px, rms of what map, lens and motion leave beside the noise
-    scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
     tracked: bool = False  # found near a prior motion, without a search
     time_ns: int = 0  # of a tracker: when the middle row was exposed
     # How a gyroscope says that the camera turned; velocities and accelerations are those of both

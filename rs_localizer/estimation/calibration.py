@@ -22,7 +22,6 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.bearings import pinhole, radial_slopes
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
-from rs_localizer.core.scales import SPEEDS
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, rotation_of
@@ -30,7 +29,7 @@ from rs_localizer.estimation.correlated import smooth_columns
 from rs_localizer.estimation.observations import Observed, rays_of_lens
 from rs_localizer.estimation.plane import longest_axis
 from rs_localizer.estimation.posterior import Posterior
-from rs_localizer.estimation.prior import PriorTerms, add_prior, terms_at
+from rs_localizer.estimation.prior import SPEEDS, PriorTerms, add_prior, terms_at
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import linearized
 

@@ -77,8 +77,7 @@ class SmoothError(NamedTuple):
 
     rows: Array  # (2m,q) orthonormal combinations of the columns
     squares: Array  # (q,) of the columns' lengths, for a size of 1 px
-    log_size: float
-    precision: float  # of the logarithm
+    log_size: float  # px, mean of the logarithm, whose deviation is 1
 
 
 class Noise(NamedTuple):
@@ -108,8 +107,6 @@ class Sized(NamedTuple):
     noise: float  # px
     size: float  # px, root mean square
     freedom: float
-    log_size: float  # mean
-    spread: float  # variance of the logarithm of the size
 
 
 @kernel
@@ -198,14 +195,12 @@ def bend_of(points: Array, inliers: BoolArray, size: float) -> Array:
 
 
 @kernel
-def smooth_error(
-    lines: Lines, chosen: BoolArray, bend: Array, log_size: float, precision: float
-) -> SmoothError:
+def smooth_error(lines: Lines, chosen: BoolArray, bend: Array, log_size: float) -> SmoothError:
     """The smooth error at the chosen ones of points (n,), orthogonal columns.
 
     Args:
         bend: (n,b), or (n,0): see :func:`smooth_columns`.
-        log_size, precision: what is known of the size (px).
+        log_size: what is known of the size (px).
     """
     columns = smooth_columns(lines.by_motion[chosen], lines.image[chosen], bend[chosen])
     count, q = len(columns), columns.shape[2]
@@ -220,7 +215,7 @@ def smooth_error(
             length = math.sqrt(values[kept[k]])
             for i in range(count):
                 rows[2 * i, k] = rows[2 * i + 1, few + k] = each[i, k] / length
-        return SmoothError(rows, squares, log_size, precision)
+        return SmoothError(rows, squares, log_size)
     flat = columns.reshape(2 * count, q)
     values, axes = np.linalg.eigh(flat.T @ flat)
     kept = np.flatnonzero(values > _LEAST_SQUARE * max(values[-1], 1e-300))
@@ -228,13 +223,13 @@ def smooth_error(
     rows = flat @ np.ascontiguousarray(axes[:, kept])
     for k in range(len(kept)):
         rows[:, k] /= math.sqrt(squares[k])
-    return SmoothError(rows, squares, log_size, precision)
+    return SmoothError(rows, squares, log_size)
 
 
 @kernel
 def nothing_shared(count: int) -> SmoothError:
     """The smooth error of so many inliers where there is none."""
-    return SmoothError(np.zeros((2 * count, 1)), np.zeros(1), 0.0, 1.0)
+    return SmoothError(np.zeros((2 * count, 1)), np.zeros(1), 0.0)
 
 
 @kernel
@@ -349,9 +344,7 @@ def over_sizes(
     best = -np.inf
     for g in range(grid):
         away = _SIZES[g] if grid > 1 else 0.0
-        sizes[g] = math.exp(smooth.log_size + away / math.sqrt(smooth.precision))
-        if grid == 1:
-            sizes[g] = 0.0
+        sizes[g] = math.exp(smooth.log_size + away) if grid > 1 else 0.0
         for _ in range(2 if g == 0 and grid > 1 else 1):
             variance = deviation * deviation
             taken = taken_by(smooth.squares, sizes[g], deviation)
@@ -382,7 +375,7 @@ def over_sizes(
         best = max(best, evidences[g])
         if evidences[g] < best - _HOPELESS and away > 0.0:
             break
-    return _integrated(smooth, steps, covariances, evidences, sizes, noises, left_over)
+    return _integrated(steps, covariances, evidences, sizes, noises, left_over)
 
 
 @kernel
@@ -405,38 +398,34 @@ def _solved(half: Array, scale: Array, right: Array) -> tuple[Array, float]:
 
 @kernel
 def _integrated(
-    smooth: SmoothError, steps: Array, covariances: Array, evidences: Array, sizes: Array,
-    noises: Array, left_over: Array,
+    steps: Array, covariances: Array, evidences: Array, sizes: Array, noises: Array,
+    left_over: Array,
 ) -> Sized:  # fmt: skip
     best, grid = int(np.argmax(evidences)), len(sizes)
     if not evidences[best] > -np.inf:
         nothing = np.full(PARAMETERS, np.nan)
         return Sized(
             nothing, np.full((PARAMETERS, PARAMETERS), np.nan), -np.inf, noises[0], 0.0,
-            1.0, smooth.log_size, 1.0 / smooth.precision,
+            1.0,
         )  # fmt: skip
     weights = np.exp(evidences - evidences[best])
     total = np.sum(weights)
     weights /= total
-    step, noise, size, freedom, log_size = np.zeros(PARAMETERS), 0.0, 0.0, 0.0, 0.0
+    step, noise, size, freedom = np.zeros(PARAMETERS), 0.0, 0.0, 0.0
     for g in range(grid):
         step += weights[g] * steps[g]
         noise += weights[g] * noises[g]
         size += weights[g] * sizes[g] ** 2
         freedom += weights[g] * left_over[g]
-        if sizes[g] > 0.0:
-            log_size += weights[g] * math.log(sizes[g])
-    covariance, spread = np.zeros((PARAMETERS, PARAMETERS)), 0.0
+    covariance = np.zeros((PARAMETERS, PARAMETERS))
     for g in range(grid):
         if weights[g] < _NO_PART:
             continue
         own, away = covariances[g], steps[g] - step
-        if sizes[g] > 0.0:
-            spread += weights[g] * (math.log(sizes[g]) - log_size) ** 2
         for i in range(PARAMETERS):
             for j in range(PARAMETERS):
                 covariance[i, j] += weights[g] * (own[i, j] + away[i] * away[j])
     return Sized(
         step, covariance, evidences[best] + math.log(total) - (_MASS if grid > 1 else 0.0),
-        noise, math.sqrt(size), max(freedom, 6.0), log_size, spread,
+        noise, math.sqrt(size), max(freedom, 6.0),
     )  # fmt: skip

@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.scales import FACTORS, SPEEDS, Scales
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.shake import MIDDLE_RATES, shake_at
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, POSE, POSE_SIZE
@@ -29,7 +28,6 @@ from rs_localizer.estimation.correlated import (
 )
 from rs_localizer.estimation.first_look import Look, first_look, near_outliers
 from rs_localizer.estimation.modes import (
-    LEAST_LIKELY,
     REST_ODDS,
     TEMPER,
     Frame,
@@ -39,13 +37,13 @@ from rs_localizer.estimation.modes import (
 )
 from rs_localizer.estimation.observations import MOST_POINTS, NEAREST, Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior
-from rs_localizer.estimation.prior import Assumed, PriorTerms, terms_at
+from rs_localizer.estimation.prior import SPEEDS, Assumed, PriorTerms, terms_at
 from rs_localizer.estimation.refine import LEAST_NOISE, apply_step
-from rs_localizer.estimation.residuals import Lines, linearized
+from rs_localizer.estimation.residuals import linearized
 from rs_localizer.estimation.turn import TurnFit, fit_turn, hidden_turn
 
 # Of the typical speeds.
-_RESTS, _NOTHING = np.array([speed == 0.0 for speed in SPEEDS], float), np.zeros(len(SPEEDS))
+_RESTS = np.array([speed == 0.0 for speed in SPEEDS], float)
 # Shaking of up to this (rad, 2 deg) moves points out of the gate of a motion without it.
 _LARGEST_SHAKE = 0.035
 # A fit that loses more inliers than this part leaves is another group of points.
@@ -58,8 +56,6 @@ _STEADY_ODDS = REST_ODDS
 _HIDDEN_ODDS = math.log(10.0)
 # Logarithm of the evidence of an ordinary vibration against none from which it is fitted.
 _ASKS = -0.5
-# Of a steady camera one of the seven sizes is ahead by so much (logarithm).
-_BY_CHANCE = math.log(len(FACTORS))
 _FEWEST = 6
 
 
@@ -120,23 +116,21 @@ def _of_points(
     bend = np.zeros((observations.count, 0))
     if declares and assumed.rolling:
         bend = bend_of(observations.points, best.inliers, look.depth / assumed.focal_length)
-    size = _size_of(declared, assumed) if assumed.rolling and one_lens else (0.0, 0.0)
-    odds = assumed.scales.speeds + assumed.of_rest * _RESTS
-    by_turn = _NOTHING
+    odds = assumed.of_rest * _RESTS
     if assumed.turn is not None:
-        by_turn = np.array([assumed.turn.evidence(speed) for speed in SPEEDS])
-    smooth = _smooth_of(look.lines, best.inliers, bend, *size)
+        odds = odds + [assumed.turn.evidence(speed) for speed in SPEEDS]
+    if assumed.rolling and one_lens:
+        log_size = math.log(declared if declared > 0.0 else ORDINARY)
+        smooth = smooth_error(look.lines, best.inliers, bend, log_size)
+    else:
+        smooth = nothing_shared(int(np.count_nonzero(best.inliers)))
     found = _steady(
-        observations.packed, observations.points, look, smooth, terms, odds, by_turn, slowest,
-        turn_known, assumed.focal_length,
+        observations.packed, observations.points, look, smooth, terms, odds, slowest, turn_known,
+        assumed.focal_length,
     )  # fmt: skip
     if found.evidence == -math.inf:
         return best._replace(smallest_eigenvalue=0.0)
-    noise, shared, freedom, log_size, spread = found.errors.tolist()
-    told = max(1.0 / max(spread, 1e-3) - size[1], 0.0) if size[1] > 0.0 else 0.0
-    of_size = np.zeros(2)
-    if told > 0.0:
-        of_size[:] = (log_size * (told + size[1]) - size[0] * size[1]) / told, told
+    noise, shared, freedom = found.errors.tolist()
     steady = best._replace(
         state=found.state,
         covariance=found.covariance,
@@ -148,7 +142,6 @@ def _of_points(
         shared=shared,
         bend=bend,
         speeds=found.speeds,
-        scales=best.scales._replace(size=of_size, speeds=found.log_likelihoods),
     )
     if not assumed.rolling:
         return steady
@@ -164,27 +157,10 @@ def _of_points(
     )
 
 
-def _size_of(declared: float, assumed: Assumed) -> tuple[float, float]:
-    """Mean and precision of the logarithm of the size of the smooth error."""
-    mean, precision = assumed.scales.size.tolist()
-    own = math.log(declared if declared > 0.0 else ORDINARY)
-    return (own + precision * mean) / (1.0 + precision), 1.0 + precision
-
-
-@kernel
-def _smooth_of(
-    lines: Lines, inliers: BoolArray, bend: Array, log_size: float, precision: float
-) -> SmoothError:
-    """The smooth error of the inliers; ``precision`` 0: there is none."""
-    if precision > 0.0:
-        return smooth_error(lines, inliers, bend, log_size, precision)
-    return nothing_shared(int(np.count_nonzero(inliers)))
-
-
 @kernel
 def _steady(
     data: Array, points: Array, look: Look, smooth: SmoothError, terms: PriorTerms, odds: Array,
-    by_turn: Array, slowest: int, turn_known: bool, focal_length: float,
+    slowest: int, turn_known: bool, focal_length: float,
 ) -> Mixture:  # fmt: skip
     """The mixture of all modes of a camera that does not turn within its frame."""
     best = look.best
@@ -199,7 +175,7 @@ def _steady(
         max(equations - best.freedom, 0.0),
     )  # fmt: skip
     frame = Frame(data, points, best.inliers, smooth, noise, focal_length, look.depth)
-    return mixture_of(frame, best.state, terms, odds, by_turn, slowest, turn_known, look.planar)
+    return mixture_of(frame, best.state, terms, odds, slowest, turn_known, look.planar)
 
 
 def _with_turn(
@@ -207,22 +183,21 @@ def _with_turn(
 ) -> Posterior:
     """The posterior of a camera that may turn within the frame."""
     observations, terms, threshold, assumed, slowest = given
-    best, odds = look.best, assumed.scales.vibrations
-    wide = look.near_outliers > 0
+    best, wide = look.best, look.near_outliers > 0
     if assumed.turn is not None and not wide:  # what a gyroscope leaves tells its offset
         return steady
-    gain, likelihoods, moments = hidden_turn(
+    gain, moments = hidden_turn(
         look.lines, best.state, steady.inliers, smooth, steady.shared, terms, steady.noise,
-        steady.freedom, odds,
+        steady.freedom,
     )  # fmt: skip
-    if wide or gain > _ASKS or odds[1:].max() - odds[0] > _BY_CHANCE:
+    if wide or gain > _ASKS:
         gate, noise = min(max(threshold, GATE * best.noise), WIDEST_GATE * threshold), best.noise
         if wide:
             gate = max(2.0 * WIDEST_GATE * threshold, _LARGEST_SHAKE * assumed.focal_length)
             noise = threshold
         fit = fit_turn(
             observations.packed, observations.count, best.state, terms, threshold, gate, noise,
-            odds, steady.bend, smooth.log_size, smooth.precision, assumed.focal_length,
+            steady.bend, smooth.log_size, assumed.focal_length,
         )  # fmt: skip
         kept, had = np.count_nonzero(fit.inliers), np.count_nonzero(best.inliers)
         if fit.finite and kept >= _KEPT * had and not (wide and fit.freedom < kept):
@@ -232,28 +207,22 @@ def _with_turn(
             return _either(steady, evidence, max(fit.evidence + ratio, evidence + gain), shaken)
     weight = 1.0 / (1.0 + math.exp(min(_HIDDEN_ODDS - TEMPER * gain, 700.0)))
     undetected = weight * moments[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
-    told = np.maximum(likelihoods - likelihoods.max(), LEAST_LIKELY)
-    return steady._replace(undetected=undetected, scales=steady.scales._replace(vibrations=told))
+    return steady._replace(undetected=undetected)
 
 
 def _of_fit(
     observations: Observations, steady: Posterior, fit: TurnFit, threshold: float, size: float
 ) -> Posterior:
-    """The posterior of a camera that turns within the frame, beside a smooth error of a size (px).
-
-    What a steady camera would need of that tells the next frames nothing.
-    """
+    """The posterior of a camera that turns within the frame; ``size``: px, of the smooth error."""
     lines = linearized(
         observations.packed, observations.count, fit.state,
         shake_at(observations.tau, fit.turns),
     )  # fmt: skip
-    told = np.maximum(fit.vibrations - fit.vibrations.max(), LEAST_LIKELY)
     return steady._replace(
         state=fit.state, covariance=fit.covariance, noise=fit.noise, freedom=fit.freedom,
         inliers=fit.inliers, squared_errors=fit.squared_errors, shake=fit.turns, arched=None,
         near_outliers=near_outliers(lines, fit.squared_errors, fit.inliers, threshold),
         speeds=np.zeros(0), shared=size,
-        scales=Scales(np.zeros(2), told, _NOTHING),
     )  # fmt: skip
 
 
@@ -266,7 +235,7 @@ def _at_any_speed(
     accelerations are known better to be zero (Kalman 1960), at unknown noise (Student's form).
     """
     last, turn_known = len(SPEEDS) - 1, assumed.turn is not None
-    odds = assumed.scales.speeds + assumed.of_rest * _RESTS
+    odds = assumed.of_rest * _RESTS
     rates = np.zeros((PARAMETERS, len(fit.covariance)))
     rates[:, :PARAMETERS] = np.eye(PARAMETERS)
     for axis in range(3):
@@ -298,13 +267,7 @@ def _at_any_speed(
     probable = np.exp(evidences + REST_ODDS * rests - (evidences + REST_ODDS * rests).max())
     possible = np.exp(TEMPER * (evidences - evidences.max()))
     state, turns, covariance = mixed(parts, probable / probable.sum(), possible / possible.sum())
-    likelihoods = np.full(len(SPEEDS), LEAST_LIKELY)
-    likelihoods[::-1][: len(own)] = evidences - odds[::-1][: len(own)]
-    likelihoods = np.maximum(likelihoods - likelihoods.max(), LEAST_LIKELY)
-    return shaken._replace(
-        state=state, shake=turns, covariance=covariance,
-        scales=shaken.scales._replace(speeds=likelihoods),
-    ), total  # fmt: skip
+    return shaken._replace(state=state, shake=turns, covariance=covariance), total
 
 
 def _either(
@@ -316,9 +279,8 @@ def _either(
     weight = 1.0 / (1.0 + math.exp(min(-TEMPER * better, 700.0)))
     if weight < _NO_PART:
         return shaken
-    vibrations = shaken.scales.vibrations
     if weight > 1.0 - _NO_PART:
-        return steady._replace(scales=steady.scales._replace(vibrations=vibrations))
+        return steady
     whole = np.zeros_like(shaken.covariance)
     whole[:PARAMETERS, :PARAMETERS] = steady.covariance
     state, turns, covariance = mixed(
@@ -330,12 +292,4 @@ def _either(
         np.array([weight, 1.0 - weight]),
     )
     likely = steady if probable > 0.5 else shaken
-    return likely._replace(
-        state=state,
-        covariance=covariance,
-        arched=None,
-        shake=turns,
-        scales=Scales(
-            steady.scales.size * [1.0, weight], vibrations, weight * steady.scales.speeds
-        ),
-    )
+    return likely._replace(state=state, covariance=covariance, arched=None, shake=turns)

@@ -28,7 +28,6 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.blocks import write
-from rs_localizer.core.scales import SPEEDS
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import PARAMETERS, STATE_SIZE, TURN, step_between
@@ -43,7 +42,7 @@ from rs_localizer.estimation.correlated import (
     weighed,
 )
 from rs_localizer.estimation.plane import plane_of
-from rs_localizer.estimation.prior import PriorTerms, add_prior, offset_between, terms_at
+from rs_localizer.estimation.prior import SPEEDS, PriorTerms, add_prior, offset_between, terms_at
 from rs_localizer.estimation.refine import TINY, apply_step, inverted, solve_positive
 
 # Logarithm of the odds of rest against each typical speed before any frame: errors of maps that no
@@ -51,7 +50,7 @@ from rs_localizer.estimation.refine import TINY, apply_step, inverted, solve_pos
 # for.
 REST_ODDS = math.log(100.0)
 # Logarithm of the odds of a typical speed beside a better one, beyond which no faster one is tried.
-FAR_LESS_PROBABLE = 9.0
+_FAR_LESS_PROBABLE = 9.0
 # The pose is the mean of the posterior. Its region is that of the posterior with probabilities to
 # this power, about the same mean: it holds for a camera that moves so little that rest is more
 # probable (1 would hold on average over all cameras, and not for that one). The odds for rest and
@@ -59,8 +58,6 @@ FAR_LESS_PROBABLE = 9.0
 TEMPER = 0.25
 # Part of the squared errors that is left at least: of a camera that shakes, noise is a tenth.
 _MOST_BETTER = 0.01
-# No frame says more than this against a typical speed.
-LEAST_LIKELY = -10.0
 # Linearizations of a mode, at most; and the last one is where the step to the optimum leaves its
 # tangent by less than this part of the noise.
 _LOOKS, _STRAIGHT = 8, 0.1
@@ -227,15 +224,13 @@ class Mode(NamedTuple):
     noise: float  # px
     size: float  # px, of the smooth error
     freedom: float
-    log_size: float  # mean
-    spread: float  # variance of the logarithm of the size
 
 
 class _Modes(NamedTuple):
     states: Array  # (k,24)
     covariances: Array  # (k,18,18)
     evidences: Array  # (k,)
-    errors: Array  # (k,5) noise, size, freedom, mean and variance of the size's logarithm
+    errors: Array  # (k,3) noise, size, freedom
 
 
 class Mixture(NamedTuple):
@@ -246,39 +241,34 @@ class Mixture(NamedTuple):
     arched: Array  # (18,18) of steps, see along_arcs
     evidence: float  # logarithm of the sum
     speeds: Array  # (s,) weights of the typical speeds in the covariance
-    log_likelihoods: Array  # (s,) of the typical speeds
-    errors: Array  # (5,) of the most probable mode; the size is the root mean square of all
+    errors: Array  # (3,) of the most probable mode; the size is the root mean square of all
 
 
 @kernel
 def mixture_of(
-    frame: Frame, start: Array, terms: PriorTerms, odds: Array, by_turn: Array, slowest: int,
-    turn_known: bool, planar: bool,
+    frame: Frame, start: Array, terms: PriorTerms, odds: Array, slowest: int, turn_known: bool,
+    planar: bool,
 ) -> Mixture:  # fmt: skip
     """The modes of typical speeds and leans near a motion, and their mixture.
 
     Args:
         start: state (24,).
         terms: of the configured speed.
-        odds: (s,) logarithms, of the typical speeds before this frame.
-        by_turn: (s,) log-likelihoods of them by what a gyroscope knows of this frame.
+        odds: (s,) logarithms, of the typical speeds by all but the points.
         slowest: index of the first typical speed; the others follow.
         turn_known: whether a gyroscope knows the turn.
         planar: whether leans that are hardly known are integrated.
     """
-    modes = _modes(frame, start, terms, odds + by_turn, slowest, turn_known, planar)
+    modes = _modes(frame, start, terms, odds, slowest, turn_known, planar)
     count, evidences = len(modes.evidences), modes.evidences
-    log_likelihoods, weights = np.full(len(SPEEDS), -np.inf), np.zeros(len(SPEEDS))
-    top, probable = np.max(evidences), evidences.copy()
+    weights, top, probable = np.zeros(len(SPEEDS)), np.max(evidences), evidences.copy()
     if top == -np.inf:
         return Mixture(
-            start, modes.covariances[0], modes.covariances[0], top, weights, weights,
-            modes.errors[0],
+            start, modes.covariances[0], modes.covariances[0], top, weights, modes.errors[0]
         )  # fmt: skip
     for k in range(count):
         if SPEEDS[slowest + k] == 0.0:
             probable[k] += REST_ODDS
-        log_likelihoods[slowest + k] = evidences[k] - odds[slowest + k]
     first = int(np.argmax(probable))
     probable = np.exp(probable - probable[first])
     possible = np.exp(TEMPER * (evidences - top))
@@ -294,8 +284,7 @@ def mixture_of(
     for k in range(count):  # apart from the stores: see test_kernels_round_in_one_way
         shared += possible[k] * modes.errors[k, 1] ** 2
     errors[1] = math.sqrt(shared)
-    log_likelihoods = np.maximum(log_likelihoods - np.max(log_likelihoods), LEAST_LIKELY)
-    return Mixture(state, covariance, arched, total, weights, log_likelihoods, errors)
+    return Mixture(state, covariance, arched, total, weights, errors)
 
 
 @inlined
@@ -307,7 +296,7 @@ def _modes(
     most = len(SPEEDS) - slowest
     modes = _Modes(
         np.empty((most, STATE_SIZE)), np.empty((most, PARAMETERS, PARAMETERS)), np.empty(most),
-        np.empty((most, 5)),
+        np.empty((most, 3)),
     )  # fmt: skip
     near, count, best = start.copy(), 0, -np.inf
     if slowest == 0:
@@ -322,9 +311,8 @@ def _modes(
         modes.covariances[count], modes.evidences[count] = mode.covariance, mode.evidence
         errors = modes.errors[count]
         errors[0], errors[1], errors[2] = mode.noise, mode.size, mode.freedom
-        errors[3], errors[4] = mode.log_size, mode.spread
         count, best = count + 1, max(best, mode.evidence)
-        if mode.evidence < best - FAR_LESS_PROBABLE / TEMPER:
+        if mode.evidence < best - _FAR_LESS_PROBABLE / TEMPER:
             break
     return _Modes(
         modes.states[:count], modes.covariances[:count], modes.evidences[:count],
@@ -368,7 +356,6 @@ def _mode(
     return Mode(
         state, found.covariance if finite else np.zeros((PARAMETERS, PARAMETERS)),
         found.evidence + odds if finite else -np.inf, found.noise, found.size, found.freedom,
-        found.log_size, found.spread,
     ), origin, products  # fmt: skip
 
 
@@ -508,8 +495,6 @@ def _over_leans(frame: Frame, mode: Mode, terms: PriorTerms) -> Mode:
         mode.noise,
         mode.size,
         mode.freedom,
-        mode.log_size,
-        mode.spread,
     )
 
 

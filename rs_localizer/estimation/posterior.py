@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.scales import Scales
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations, weighted
@@ -70,7 +69,6 @@ class Posterior(NamedTuple):
     # Probabilities of the typical speeds; empty: the configured one
     speeds: Array = np.zeros(0)
     near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance
-    scales: Scales = Scales.nothing()  # what the frame says of them
     # (18,18) with the second order of arcs, of a mixture; None: of the covariance as a Gaussian's
     arched: Array | None = None
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise

@@ -21,7 +21,6 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rig import Rig
-from rs_localizer.core.scales import SPEEDS, Scales
 from rs_localizer.core.shutter import Motion, numbers_of
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import log
@@ -145,7 +144,6 @@ class Prior:
             ``Estimate.joint_covariance``; infinite variances leave a parameter free.
         angular_velocity, angular_velocity_deviation: a gyroscope's body rate (3,) in camera axes
             times the readout time (rad per readout), and its standard deviation.
-        scales: what the frames before say of shaking, smooth errors and speed.
         of_rest: logarithm of the odds that the camera does not move within the image, beside
             those of any camera.
         gravity, gravity_deviation: a vector (3,) in camera axes at the middle row that points
@@ -163,7 +161,6 @@ class Prior:
     gravity: ArrayLike | None = None
     gravity_deviation: float = math.nan
     gravity_in_map: ArrayLike = (0.0, 0.0, -1.0)
-    scales: Scales | None = None
     of_rest: float = 0.0
 
     def __post_init__(self) -> None:
@@ -203,6 +200,10 @@ def state_in(motion: Motion, centre: Array) -> Array:
 
 # Of the turn's variance, for the axis about which it may not turn.
 _RIDGE = 1e-9
+
+
+SPEEDS = (0.0, 0.1, 1.0)
+"""Typical speeds, as parts of the configured one; 0 is a camera at rest."""
 
 
 class PriorTerms(NamedTuple):
@@ -561,7 +562,6 @@ class Assumed:
     focal_length: float  # px
     may_rest: bool  # nothing speaks for a motion but the points
     rolling: bool  # velocities are estimated
-    scales: Scales  # of shaking, smooth errors and speed, as the frames before tell
     of_rest: float = 0.0  # logarithm of the odds for rest, beside those of any camera
     turn: TurnSeen | None = None  # by a gyroscope
 
@@ -589,49 +589,22 @@ def assumptions(
         focal_length=rig.focal_length,
         may_rest=solver.rolling_shutter and min(velocity.angular, velocity.linear) > 0.0,
         rolling=solver.rolling_shutter,
-        scales=Scales.nothing(),
     )
-
-
-# Logarithm of the odds at which frames deny a typical speed.
-_DENIED = -4.0
-# What is denied never leaves less than this part of the configured speed: cameras start to move.
-_SLOWEST = 0.1
-
-
-def told_speed(terms: PriorTerms, prior: Prior | None) -> tuple[PriorTerms, Prior | None]:
-    """The prior of the fastest motion that frames before leave possible, and what else they say."""
-    if prior is None or knows_motion(prior) or prior.scales is None:
-        return terms, prior
-    possible = [
-        part for part, odds in zip(SPEEDS, prior.scales.speeds, strict=True) if odds > _DENIED
-    ]
-    part = max(possible, default=1.0)
-    if part == 1.0:
-        return terms, prior
-    part = max(part, _SLOWEST)
-    odds = np.interp(part * np.array(SPEEDS), SPEEDS, prior.scales.speeds)
-    scales = prior.scales._replace(speeds=odds)
-    return terms_at(terms, part, False), replace(prior, scales=scales)
 
 
 def of_frame(
     terms: PriorTerms, assumed: Assumed, prior: Prior | None, turn: GyroRotation | None
-) -> tuple[PriorTerms, Assumed, Prior | None]:
-    """The terms of the configuration, the assumptions and the prior with what is known of this
-    frame, but for its motion: by a gyroscope, of the speed, and of what frames share.
+) -> tuple[PriorTerms, Assumed]:
+    """The terms of the configuration and the assumptions with what is known of this frame, but for
+    its motion: by a gyroscope, and of rest.
     """
     if turn is not None:
         assumed = replace(assumed, turn=turn_seen(terms, turn))
-    if assumed.may_rest:
-        terms, prior = told_speed(terms, prior)
-    if turn is not None:
         terms = terms._replace(informations=_with_turn(terms.informations, turn.error))
     if prior is not None:
-        scales = assumed.scales if prior.scales is None else prior.scales
-        assumed = replace(assumed, of_rest=prior.of_rest, scales=scales)
+        assumed = replace(assumed, of_rest=prior.of_rest)
         terms = with_measurements(terms, prior)
-    return terms, assumed, prior
+    return terms, assumed
 
 
 def turn_seen(terms: PriorTerms, turn: GyroRotation) -> TurnSeen:

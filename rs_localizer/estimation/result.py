@@ -23,7 +23,6 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rate_spline import multiplied
-from rs_localizer.core.scales import Scales
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
@@ -170,8 +169,6 @@ def estimate_of(
         undetected_covariance=posterior.undetected + beside[:MOTION_PARAMETERS, :MOTION_PARAMETERS],
         shake=posterior.shake,
         model_error=posterior.model_error,
-        # Posteriors share the default of what they leave open.
-        scales=Scales(*map(np.copy, posterior.scales)),
         iterations=samples,
         turn=turn,
         delay=delay,

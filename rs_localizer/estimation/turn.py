@@ -24,14 +24,15 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.scales import FACTORS, SPECTRA, VIBRATIONS
 from rs_localizer.core.shake import (
     COMBINATIONS,
+    CYCLES,
     FUNCTIONS,
     IN_COMBINATIONS,
     MIDDLE_RATES,
     MIDDLE_VALUES,
     RESOLVED,
+    TYPICAL_SIZES,
     shake_at,
     shake_basis,
 )
@@ -50,6 +51,16 @@ from rs_localizer.estimation.residuals import POINT_SIZE, Lines, linearized, squ
 
 TURNS = 3 * RESOLVED
 """Columns of the in-frame turn."""
+_CENTRES, _WIDTH, _FLOOR = (0.75, 1.5, 3.0, 5.0), 0.4, 0.03
+_BANDS = np.exp(-0.5 * (np.log(CYCLES[None] / np.array(_CENTRES)[:, None]) / _WIDTH) ** 2) + _FLOOR
+SPECTRA = np.concatenate([
+    TYPICAL_SIZES[None],
+    _BANDS * np.sqrt((TYPICAL_SIZES**2).sum() / (_BANDS**2).sum(axis=1))[:, None],
+])  # fmt: skip
+"""(s,14) rad, deviations of the frequencies of the in-frame turn: of an ordinary vibration, and of
+bands about some cycles per readout, all of the same mean square."""
+FACTORS = np.exp(1.15 * np.arange(-2.0, 5.0))
+"""Vibration is so many times the ordinary one: three in a decade, up to a degree."""
 
 
 def _halves() -> Array:
@@ -96,7 +107,6 @@ class TurnFit(NamedTuple):
     freedom: float
     inliers: BoolArray  # (n,)
     squared_errors: Array  # (n,) px^2, beside the in-frame turn
-    vibrations: Array  # (v,) log-likelihoods of none and each vibration, the largest 0
     evidence: float  # logarithm, of all vibrations but none
     gain: float  # logarithm of the evidence over that of none at the same motion
     finite: bool
@@ -196,7 +206,6 @@ def _beside_motion(
 
 
 class _Vibrating(NamedTuple):
-    log_likelihoods: Array  # (v,) of none and each vibration, none is 0
     turns: Array  # (54,) mean
     covariance: Array  # (54,54)
     variance: float  # px^2, of the noise
@@ -322,23 +331,18 @@ def _add_inverse(diagonal: Array, off: Array, part: float, weight: float, total:
 
 
 @kernel
-def _integrate(
-    turned: _Turned, noise: float, freedom: float, odds: Array, first: int
-) -> _Vibrating:
+def _integrate(turned: _Turned, noise: float, freedom: float, first: int) -> _Vibrating:
     """Integrate over spectra and sizes.
 
     Each spectrum is brought to tridiagonal form once, which costs as much as two or three of the
     Cholesky factors that each size would need.
 
     Args:
-        odds: (v,) logarithms, of none and each vibration before the frame.
         first: how many spectra are looked at.
     """
-    likelihoods, factors = np.full(VIBRATIONS, -np.inf), len(FACTORS)
-    likelihoods[0] = 0.0
-    rest, variance = max(turned.rest, TINY), noise * noise
-    variances, means = np.empty(VIBRATIONS), np.empty((VIBRATIONS, TURNS))
-    weights = np.full(VIBRATIONS, -np.inf)
+    factors, rest, variance = len(FACTORS), max(turned.rest, TINY), noise * noise
+    variances, means = np.empty(first * factors), np.empty((first * factors, TURNS))
+    weights = np.empty(first * factors)
     form = _Tridiagonal(
         np.empty((first, TURNS)), np.empty((first, TURNS)), np.empty((first, TURNS, TURNS)),
         np.empty((first, TURNS)),
@@ -348,16 +352,14 @@ def _integrate(
         form.along[s] = half.T @ turned.along
         _reduce(half.T @ turned.own @ half, s, form)
         for f in range(factors):
-            place, part = 1 + s * factors + f, FACTORS[f] ** 2 / variance
+            place, part = s * factors + f, FACTORS[f] ** 2 / variance
             explained, determinant = _solved(
                 form.diagonal[s], form.off[s], form.along[s], part, means[place]
             )
             left = max(1.0 - part * explained / rest, _LEAST_LEFT)
             variances[place] = rest * left / freedom
-            likelihoods[place] = -determinant - 0.5 * freedom * math.log(left)
-            weights[place] = likelihoods[place] + odds[place] + _OF_FACTORS[f]
-    best = int(np.argmax(weights))
-    top = weights[best]
+            weights[place] = _OF_FACTORS[f] - determinant - 0.5 * freedom * math.log(left)
+    top = np.max(weights)
     weights = np.exp(weights - top)
     total = np.sum(weights)
     turns, covariance = np.zeros(TURNS), np.zeros((TURNS, TURNS))
@@ -365,7 +367,7 @@ def _integrate(
     for s in range(first):
         mean, spread, counts = np.zeros(TURNS), np.zeros((TURNS, TURNS)), False
         for f in range(factors):
-            place, part = 1 + s * factors + f, FACTORS[f] ** 2 / variance
+            place, part = s * factors + f, FACTORS[f] ** 2 / variance
             weight = weights[place] / total
             if weight < _NO_PART:
                 continue
@@ -382,7 +384,7 @@ def _integrate(
             turns += mean @ back
             covariance += back.T @ spread @ back
     covariance -= turns.reshape(TURNS, 1) * turns.reshape(1, TURNS)
-    return _Vibrating(likelihoods, turns, covariance, mean_variance, top + math.log(total))
+    return _Vibrating(turns, covariance, mean_variance, top + math.log(total))
 
 
 @kernel
@@ -402,26 +404,21 @@ def _joint(turned: _Turned, covariance: Array, variance: float) -> Array:
 @kernel
 def hidden_turn(
     lines: Lines, state: Array, inliers: BoolArray, smooth: SmoothError, size: float,
-    terms: PriorTerms, noise: float, freedom: float, odds: Array,
-) -> tuple[float, Array, Array]:  # fmt: skip
+    terms: PriorTerms, noise: float, freedom: float,
+) -> tuple[float, Array]:  # fmt: skip
     """Effect and evidence of vibration at the best motion without it.
 
     Returns:
-        logarithm of its evidence, against none, with the odds of before; (v,) logarithms of how
-        probable the frame is by each, without them; (18,18) second moments of the motion by it.
+        logarithm of its evidence, against none; (18,18) second moments of the motion by it.
     """
     rows = _columns(lines, inliers, int(np.count_nonzero(inliers)))
     turned = _beside_motion(rows, smooth, size, noise, np.zeros(TURNS), terms, state)
     moments = np.zeros((PARAMETERS, PARAMETERS))
     if not np.all(np.isfinite(turned.own)):
-        return -np.inf, np.zeros(VIBRATIONS), moments
-    found = _integrate(turned, noise, max(freedom, 1.0), odds, 1)
-    if found.gain <= _MAY_SHAKE:  # of the same size the others say as much
-        sizes = len(FACTORS)
-        for place in range(1 + sizes, VIBRATIONS):
-            found.log_likelihoods[place] = found.log_likelihoods[1 + (place - 1) % sizes]
-    else:
-        found = _integrate(turned, noise, max(freedom, 1.0), odds, len(SPECTRA))
+        return -np.inf, moments
+    found = _integrate(turned, noise, max(freedom, 1.0), 1)
+    if found.gain > _MAY_SHAKE:
+        found = _integrate(turned, noise, max(freedom, 1.0), len(SPECTRA))
     pulled = np.zeros((PARAMETERS, TURNS))
     pulled[:] = -turned.inverse @ turned.crossed
     for j in range(RESOLVED):
@@ -429,7 +426,7 @@ def hidden_turn(
             pulled[axis, 3 * j + axis] += _VALUES[j]
             pulled[6 + axis, 3 * j + axis] += _RATES[j]
     second = found.covariance + found.turns.reshape(TURNS, 1) * found.turns.reshape(1, TURNS)
-    return found.gain, found.log_likelihoods, pulled @ second @ pulled.T
+    return found.gain, pulled @ second @ pulled.T
 
 
 @inlined
@@ -445,8 +442,7 @@ def _row_times(data: Array, count: int) -> Array:
 @kernel
 def fit_turn(
     data: Array, count: int, start: Array, terms: PriorTerms, threshold: float, first_gate: float,
-    first_noise: float, odds: Array, bend: Array, log_size: float, precision: float,
-    focal_length: float,
+    first_noise: float, bend: Array, log_size: float, focal_length: float,
 ) -> TurnFit:  # fmt: skip
     """Fit motion and in-frame turn, the noise and the inliers.
 
@@ -455,9 +451,8 @@ def fit_turn(
         terms: of the motion without its in-frame turn.
         threshold: px, of inliers.
         first_gate, first_noise: px; the gate closes from there to what the noise decides.
-        odds: (v,) logarithms, of none and each vibration before the frame.
         bend: of the smooth error (:func:`.correlated.smooth_columns`).
-        log_size, precision: of the smooth error (px).
+        log_size: of the smooth error (px).
     """
     state, turns, gate, noise = start.copy(), np.zeros(TURNS), first_gate, first_noise
     coefficients, size = np.zeros((FUNCTIONS, 3)), math.exp(log_size)
@@ -467,14 +462,14 @@ def fit_turn(
     squares = front.copy()
     inliers, done, finite = squares < gate * gate, False, True
     nothing = np.zeros((PARAMETERS + TURNS, PARAMETERS + TURNS))
-    joint, log_likelihoods, evidence, gain = nothing, np.zeros(VIBRATIONS), -np.inf, -np.inf
+    joint, evidence, gain = nothing, -np.inf, -np.inf
     freedom, moved, used = 1.0, np.inf, 0.0
     for _ in range(_STEPS):
         kept = int(np.count_nonzero(inliers))
         if kept < _FEWEST:
             finite = False
             break
-        smooth = smooth_error(lines, inliers, bend, log_size, precision)
+        smooth = smooth_error(lines, inliers, bend, log_size)
         still = apply_step(state, _middle(turns, -1.0))
         rows = _columns(lines, inliers, kept)
         turned = _beside_motion(rows, smooth, size, noise, turns, terms, still)
@@ -482,9 +477,8 @@ def fit_turn(
         if not (np.all(np.isfinite(turned.own)) and np.all(np.isfinite(turned.along))):
             finite = False
             break
-        found = _integrate(turned, noise, freedom, odds, len(SPECTRA))
-        log_likelihoods, gain = found.log_likelihoods, found.gain
-        change = found.turns - turns
+        found = _integrate(turned, noise, freedom, len(SPECTRA))
+        gain, change = found.gain, found.turns - turns
         step = -turned.inverse @ (turned.slope + turned.crossed @ found.turns)
         joint = _joint(turned, found.covariance, found.variance)
         used = np.sum(turned.own * found.covariance) / found.variance
@@ -527,8 +521,8 @@ def fit_turn(
     finite = finite and bool(np.all(np.isfinite(joint))) and moved < 1.0
     whole = _in_functions(joint)
     return TurnFit(
-        state, coefficients, whole, noise, max(freedom - used, 1.0), inliers, squares,
-        log_likelihoods, evidence, gain, finite,
+        state, coefficients, whole, noise, max(freedom - used, 1.0), inliers, squares, evidence,
+        gain, finite,
     )  # fmt: skip
 
 

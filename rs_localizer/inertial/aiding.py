@@ -15,7 +15,6 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import ImuReason
-from rs_localizer.core.scales import Scales
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN, step_between
 from rs_localizer.core.types import Estimate, Failure
@@ -60,7 +59,6 @@ class Before:
     covariance: Array  # (18,18)
     added: Array  # (18,18) that the prediction gets, but for the rotation
     fading: float  # of accelerations, in readouts
-    scales: Scales  # as of a :class:`Prior`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,11 +258,7 @@ class GyroscopeAid:
             last.motion, last.covariance, between, within, readouts, last.fading
         )
         predicted = predicted.spread(last.added)
-        prior = Prior(
-            motion=predicted.motion,
-            covariance=predicted.covariance,
-            scales=last.scales,
-        )
+        prior = Prior(motion=predicted.motion, covariance=predicted.covariance)
         return GyroPrediction(middle_ns, within, prior, predicted)
 
     def _learn(self, foreseen: GyroPrediction, found: Estimate | Failure, step: Array) -> bool:

@@ -10,6 +10,7 @@ where the others are, TF says, at the time of the frame. Poses are those of ``ba
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
@@ -59,7 +60,7 @@ from rs_localizer.pipeline.rig_frames import (
 from rs_localizer.pipeline.rig_watch import RigWatch
 from rs_localizer.pipeline.stream import Stream
 from rs_localizer.solvers.table import find_solver
-from rs_localizer.tracking import FrameContext, Memory, Tracker
+from rs_localizer.tracking import FrameContext, Tracker
 
 if TYPE_CHECKING:
     from rs_localizer.inertial.samples import ImuSamples
@@ -67,6 +68,9 @@ if TYPE_CHECKING:
 
 # From this chance on of a wrong pose or map, it is more probable than not.
 _DOUBTFUL = 0.5
+# Smooth errors (px, root mean square; median of so many frames) that nobody has who calibrated
+# well: surveyed tags before a calibrated lens have 0.2.
+_MUCH, _FRAMES = 0.3, 30
 
 ANY_CALIBRATION = Calibration(
     "camera", 640, 480, (500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0), (), "plumb_bob",
@@ -135,6 +139,7 @@ class FrameLocalizer:
         self._waiting: dict[int, tuple[Correspondences, float]] = {}
         # The newest of them that has a pose, without its rows.
         self._newest: tuple[Correspondences, float] | None = None
+        self._smooth_errors: deque[float] = deque(maxlen=_FRAMES)
         self._too_many = False  # whether clouds above max_points have been noticed
         self._settings = self._config = config  # an estimated readout time takes the place of one
         self._use(config)
@@ -182,17 +187,15 @@ class FrameLocalizer:
         device = next(iter(seen.values())) if alone else self._rig(seen)
         rolling = find_solver(config.solver).rolling_shutter
         timed = rolling and all(camera.readout_time > 0.0 for camera in seen.values())
-        memory = Memory.NOTHING
-        if config.tracking and rolling:
-            # Without a readout time frames cannot predict each other; map and lens stay the same.
-            memory = Memory.MOTION if timed else Memory.MAP_AND_LENS
+        tracks = config.tracking and timed  # without a readout time frames predict nothing
         inertial = inertial_settings(config) if timed and alone else None
-        lag = config.output_lag if memory is Memory.MOTION and alone else 0
+        lag = config.output_lag if tracks and alone else 0
         self._tracker = Tracker(
-            Localizer(device, config), inertial, memory, lag, config.max_prediction
+            Localizer(device, config), inertial, tracks, lag, config.max_prediction
         )
         self._newest = None
         self._waiting.clear()
+        self._smooth_errors.clear()
         if config.rig != self._config.rig:
             self._assembler = FrameAssembler(config.cameras, config.rig.window, self._notice)
         self._cameras, self._config = seen, config
@@ -271,6 +274,7 @@ class FrameLocalizer:
     def _forget_motion(self) -> None:
         self._newest = None
         self._waiting.clear()
+        self._smooth_errors.clear()
         self.readout_watch.reset()
         self._tracker.reset()
 
@@ -577,7 +581,11 @@ class FrameLocalizer:
             self._notice(Notice.DOUBTFUL, text)
         if result.left_out:
             self._notice(Notice.DOUBTFUL, result.left_out)
-        if (off := self._tracker.smooth_error) > 0.0 and not watch.axis.doubtful:
+        if not len(result.shake):  # vibration moves points smoothly, too
+            self._smooth_errors.append(result.model_error)
+        off = float(np.median(self._smooth_errors)) if self._smooth_errors else 0.0
+        known = len(self._smooth_errors) == _FRAMES
+        if known and off > _MUCH and not watch.axis.doubtful:
             self._notice(
                 Notice.LENS,
                 f"residuals vary smoothly over the image ({off:.1f} px rms): recalibrate the lens, "

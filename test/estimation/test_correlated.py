@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from rs_localizer.core.scales import SPEEDS
 from rs_localizer.estimation.correlated import (
     Noise,
     bend_of,
@@ -23,7 +22,7 @@ from .frames import PRIOR, frame
 
 NOISE = 0.4
 SIZES = np.linspace(-2.5, 5.5, 11)  # as the module has them
-TERMS = terms_at(PRIOR, SPEEDS[1], False)
+TERMS = terms_at(PRIOR, 0.1, False)
 
 
 def everything(bent):
@@ -34,7 +33,7 @@ def everything(bent):
     bend = np.zeros((30, 0))
     if bent:
         bend = bend_of(observations.points, chosen, 4.0 / 590.0)
-    smooth = smooth_error(lines, chosen, bend, np.log(0.2), 1.0)
+    smooth = smooth_error(lines, chosen, bend, np.log(0.2))
     columns = smooth_columns(lines.by_motion[chosen], lines.image[chosen], bend[chosen])
     return observations, truth, chosen, lines, smooth, columns.reshape(56, -1)
 

@@ -2,14 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """All that the points leave possible: rest and motion, in-frame turns, and wrong maps."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from rs_localizer.core.scales import SPEEDS, VIBRATIONS, Scales
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.frame_posterior import frame_posterior
 from rs_localizer.estimation.posterior import maximum_a_posteriori
@@ -156,16 +153,3 @@ def test_few_points_of_a_vibrating_camera_are_refused_or_covered(count, wrong, p
     beyond = np.array(squared) > chi2.ppf(0.95, 12)
     assert beyond.sum() <= max(1, 0.2 * len(squared))
     assert max(squared, default=0.0) < chi2.isf(5.7e-7, 12)  # five sigma
-
-
-@pytest.mark.parametrize("sure", [-10.0, 10.0])
-def test_however_sure_frames_are_what_is_clear_is_seen(sure):
-    """Frames before that were all at rest, or all fast; calm, or shaken."""
-    speeds = sure * np.arange(len(SPEEDS)) / len(SPEEDS)
-    size = np.array([-7.0 if sure < 0.0 else 1.0, 100.0])
-    scales = Scales(size, sure * (np.arange(VIBRATIONS) > 0.0), speeds)
-    knows = replace(ASSUMED, scales=scales)
-    observations, truth = frame(3, 0.1, 0.5)
-    found = frame_posterior(observations, truth, PRIOR, 2.0, knows)
-    assert distance(found, truth, slice(0, 6)) < chi2.ppf(0.999, 6)
-    assert distance(found, truth, slice(6, 12)) < chi2.ppf(0.999, 6)
