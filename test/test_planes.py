@@ -14,7 +14,7 @@ from benchmarks.frames.judged import far_off, judge
 from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.posterior import maximum_a_posteriori
+from rs_localizer.estimation.posterior import Posterior, best_motion
 from rs_localizer.estimation.prior import assumptions, state_in
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.solvers.table import find_solver
@@ -90,7 +90,8 @@ def test_the_best_motion_is_the_minimum_of_the_exact_problem(tilt, turn, travel)
             points - centre, rays, CAMERA.row_time(pixels), CAMERA.pixel_jacobian(rays),
             Mounts.one(CAMERA.row_time_gradient),
         )  # fmt: skip
-        best = maximum_a_posteriori(observations, state_in(estimate, centre), terms, 4.0)
+        start = state_in(estimate, centre)
+        best = Posterior(*best_motion(observations.packed, len(points), start, terms, 4.0))
         if best.inliers.all():
             found, lowest = exact_minimum(points - centre, pixels, best, terms)
             assert found - lowest < 0.5, seed

@@ -143,15 +143,13 @@ def _of_points(
         bend=bend,
         speeds=found.speeds,
     )
-    if not assumed.rolling:
+    if not assumed.rolling or (declares and look.planar):
+        # What looks like vibration before a board that is bent is more of its bend.
         return steady
     evidence = found.evidence - math.log(len(SPEEDS) - slowest)
     # Points that are no inliers are anywhere in an image of a focal length squared.
     outside = observations.count - np.count_nonzero(best.inliers)
     evidence -= 2.0 * outside * math.log(assumed.focal_length)
-    if not assumed.rolling or (declares and look.planar):
-        # What looks like vibration before a board that is bent is more of its bend.
-        return steady
     return _with_turn(
         _Given(observations, terms, threshold, assumed, slowest), look, smooth, steady, evidence
     )

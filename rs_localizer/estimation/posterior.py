@@ -12,7 +12,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
-from rs_localizer.estimation.observations import Observations, weighted
+from rs_localizer.estimation.observations import weighted
 from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.refine import (
     EXPECTED_NOISE,
@@ -182,10 +182,3 @@ def best_motion(data: Array, count: int, start: Array, prior: PriorTerms, thresh
         state, noise * noise * inverse, noise, 2.0 * np.sum(inliers) - freedom,
         _least_eigenvalue(information, inverse), inliers, errors,
     )  # fmt: skip
-
-
-def maximum_a_posteriori(
-    observations: Observations, start: Array, prior: PriorTerms, threshold: float
-) -> Posterior:
-    """Best motion as of :func:`best_motion`, near a state (24,)."""
-    return Posterior(*best_motion(observations.packed, observations.count, start, prior, threshold))

@@ -10,6 +10,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.posterior import Posterior, best_motion
 from rs_localizer.estimation.prior import assumptions
 from rs_localizer.solvers.table import find_solver
 
@@ -48,6 +49,11 @@ def frame(seed, speed, noise, count=60, acceleration=0.0, **more):
     )  # fmt: skip
     points = rng.uniform([-1.5, -1.2, -1.0], [1.5, 1.2, 1.0], (count, 3)) @ rotation
     return observe(state, points, noise, rng, **more), state
+
+
+def fitted(observations, start, prior, threshold):
+    """The best motion near a state (24,)."""
+    return Posterior(*best_motion(observations.packed, observations.count, start, prior, threshold))
 
 
 def distance(posterior, truth, parts):

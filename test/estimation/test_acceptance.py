@@ -9,8 +9,9 @@ import pytest
 
 from rs_localizer.core.reasons import Reason
 from rs_localizer.estimation.acceptance import refusal, speeding
-from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import motion_terms
+
+from .frames import fitted
 
 PRIOR = motion_terms((0.18, 0.09), (0.009, 0.0036))
 THRESHOLD = 2.0
@@ -21,7 +22,7 @@ ELEVEN = np.arange(40) < 11
 def good(scene):
     camera, motion, points, _, measured = scene.frame(noise=0.3, count=40)
     observations = scene.observe(camera, points, measured)
-    return maximum_a_posteriori(observations, scene.state_of(motion), PRIOR, THRESHOLD)
+    return fitted(observations, scene.state_of(motion), PRIOR, THRESHOLD)
 
 
 def reason(posterior):

@@ -9,10 +9,9 @@ from scipy.stats import chi2
 
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.frame_posterior import frame_posterior
-from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import held_terms
 
-from .frames import ASSUMED, PRIOR, distance, frame, observe
+from .frames import ASSUMED, PRIOR, distance, fitted, frame, observe
 from .projection import disturbed, jacobian_of
 
 
@@ -27,9 +26,7 @@ def resting(request):
     found = []
     for seed in range(request.param):
         observations, truth = frame(seed, 0.0, 0.5)
-        moving, still = (
-            maximum_a_posteriori(observations, truth, terms, 2.0) for terms in (PRIOR, held_terms())
-        )
+        moving, still = (fitted(observations, truth, terms, 2.0) for terms in (PRIOR, held_terms()))
         found.append(
             (frame_posterior(observations, truth, PRIOR, 2.0, ASSUMED), moving, still, truth)
         )
@@ -67,7 +64,7 @@ def test_a_bent_board_at_rest_does_not_turn(frames):
         rotation = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)).as_matrix()
         state = np.concatenate([rotation.ravel(), [0.0, 0.0, 1.0], np.zeros(12)])
         observations = observe(state, bent, 0.1, rng, seen_as=flat)
-        fooled += turns(maximum_a_posteriori(observations, state, PRIOR, 2.0))
+        fooled += turns(fitted(observations, state, PRIOR, 2.0))
         turning += turns(frame_posterior(observations, state, PRIOR, 2.0, ASSUMED))
     assert fooled > frames / 2  # the best motion alone
     assert turning <= frames / 10
@@ -144,7 +141,7 @@ def test_few_points_of_a_vibrating_camera_are_refused_or_covered(count, wrong, p
     squared = []
     for seed in range(10):
         observations, state = shaken(seed, 3.0, 2.0 * SWING, 0.5, wrong, count)
-        start = maximum_a_posteriori(observations, state, PRIOR, 8.0)
+        start = fitted(observations, state, PRIOR, 8.0)
         found = frame_posterior(observations, start.state, PRIOR, 2.0, ASSUMED)
         if refused_of(observations, found):
             continue

@@ -13,10 +13,9 @@ from rs_localizer.estimation.modes import (
     _over_leans,
     along_arcs,
 )
-from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import held_terms
 
-from .frames import observe
+from .frames import fitted, observe
 from .projection import in_camera, pixels_of
 
 COUNT = 40
@@ -63,7 +62,7 @@ def beside(points, pixels, rotation, translation, axes):
 def test_leans_are_integrated_as_on_a_fine_grid(tilt, noise):
     observations, points, pixels, truth = plane_frame(3, tilt, noise)
     terms = held_terms()
-    best = maximum_a_posteriori(observations, truth, terms, 4.0)
+    best = fitted(observations, truth, terms, 4.0)
     assert np.all(best.inliers)
     smooth = nothing_shared(COUNT)
     noise = Noise(best.noise, 1.0, 2.0 * COUNT - best.freedom)

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from rs_localizer.estimation.posterior import decided, maximum_a_posteriori, noise_deviation
+from rs_localizer.estimation.posterior import decided, noise_deviation
 from rs_localizer.estimation.prior import held_terms, motion_terms
 from rs_localizer.estimation.refine import inverted
+
+from .frames import fitted
 
 # Per readout of 0.03 s: the defaults.
 PRIOR = motion_terms((0.18, 0.09), (0.009, 0.0036))
@@ -61,7 +63,7 @@ def test_the_noise_of_few_points_is_not_lowered_by_what_they_fit(scene):
     squared, freedom = 0.0, 0.0
     for seed in range(60):
         observations, truth = observe(scene, 0.05, 0.5, 20, seed)
-        posterior = maximum_a_posteriori(observations, truth, PRIOR, 5.0)
+        posterior = fitted(observations, truth, PRIOR, 5.0)
         squared += posterior.squared_errors.sum()
         freedom += posterior.freedom
     assert squared / freedom == pytest.approx(0.25, rel=0.1)  # 2.6 % is one standard deviation
