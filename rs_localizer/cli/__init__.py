@@ -5,11 +5,10 @@
 from __future__ import annotations
 
 import importlib
-import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,13 @@ from typing import Any
 from tqdm import tqdm
 
 from rs_localizer.cli.options import UsageError
-from rs_localizer.io.atomic_files import atomic_files, check_writable
+from rs_localizer.io.atomic_files import (
+    atomic_files,
+    check_writable,
+    content,
+    resume,
+    resume_results,
+)
 
 # Bars are shown by one process. tqdm's own lock for several is a semaphore, of which Python 3.14
 # says that it leaked when a signal ends the command.
@@ -27,39 +32,31 @@ WORKING = True
 """True where commands work: one that only shows its arguments imports no more than these need."""
 
 
-def _clear(directory: Path) -> None:
-    for path in directory.iterdir():
-        if path.is_dir() and not path.is_symlink():
-            if not path.name.startswith(".unfinished-"):
-                shutil.rmtree(path)
-        else:
-            path.unlink()
-
-
-def replaced(
-    args: Any,
-    mark: str,
-    place: Path | None = None,
-    clear: Callable[[Path], None] = _clear,
-) -> Callable[[Path], None] | None:
-    """Function that removes an earlier result from a directory; None: nothing is there.
+def earlier_result(
+    args: Any, mark: str, place: Path | None = None, names: Sequence[str] | None = None
+) -> Sequence[str]:
+    """Names of an earlier result in a directory, which a new one is to replace.
 
     Args:
         mark: a file that each result has.
         place: of the result; None: ``--out``.
-        clear: the function; without it, all that is there goes.
+        names: of what a result has; None: all that is there.
 
     Raises:
         ValueError: when what is there is not to be replaced, or is something else.
     """
     out: Path = place or args.out
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return None
+    resume_results([out])
+    if resume(out):
+        raise ValueError(f"another command is writing into {out}; wait for its end")
+    there = content(out)
+    if not out.exists() or (out.is_dir() and not there):
+        return ()
     if not args.overwrite:
         raise ValueError(f"{out} exists; choose another OUT, or --overwrite")
     if not (out / mark).is_file():
         raise ValueError(f"{out} has no {mark}: it is no earlier result, and stays as it is")
-    return clear
+    return there if names is None else names
 
 
 def refuse_existing(args: Any, *files: Path) -> None:

@@ -28,6 +28,7 @@ if WORKING:
     from rs_localizer.core.shutter import Motion
     from rs_localizer.core.simd import compiler
     from rs_localizer.core.simd.jit import cache_directory
+    from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import open_bag
     from rs_localizer.io.camera_info import read_camera_info
     from rs_localizer.io.messages import stamp_ns
@@ -100,7 +101,9 @@ def run(options: Options) -> None:
         true = _true(camera, motion, flight)
         answers = _localized("Simulated flight", flight, camera.readout_time, true)
         picture = options.out / "flight_errors.png"
-        errors.draw({name: _errors(found, true) for name, found in answers.items()}, picture)
+        found_errors = {name: _errors(found, true) for name, found in answers.items()}
+        with atomic_files(picture) as (part,):
+            errors.draw(found_errors, part)
         print(picture, flush=True)
         webcam = read_frames(data.path(data.WEBCAM), most)
         settings = build(load_params_file(data.path(data.WEBCAM) / "parameters.yaml"))
@@ -216,7 +219,8 @@ def _cube(walls: cube_clip.Walls, most: int | None, out: Path) -> None:
         "ours: a pose for every row": [frame and frame.estimate for frame in ours],
     }
     animation, off = cube_clip.clip(walls, images[shown], stamps[shown], motions)
-    out.write_bytes(animation)
+    with atomic_files(out) as (part,):
+        part.write_bytes(animation)
     theirs, own = (np.median(each) for each in off.values())
     print(
         f"The cube's farthest corner is off by {own:.2f} px in the median, by {theirs:.1f} px with "

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, replaced
+from rs_localizer.cli import WORKING, earlier_result
 from rs_localizer.cli.image_input import (
     ImageOptions,
     opened,
@@ -84,7 +84,7 @@ def detect(args: Options) -> Figures:
     """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
     of_map, look = _of_markers(args) if args.features is None else _of_features(args)
     settings, every, warnings = build(shutter_values(args)), list[Figures](), list[str]()
-    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as out:
+    with atomic_directory(args.out, earlier_result(args, "metadata.yaml")) as out:
         with BagWriter(out) as bag:
             cameras = {"": args}
             if settings.of_cameras:

@@ -8,7 +8,6 @@ import functools
 import importlib.util
 import math
 import shlex
-import shutil
 import textwrap
 import time
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NoReturn
 
-from rs_localizer.cli import WORKING, replaced
+from rs_localizer.cli import WORKING, earlier_result
 from rs_localizer.cli.image_input import ImageOptions
 from rs_localizer.cli.options import FleetOptions, UsageError, argument, option
 from rs_localizer.cli.settings_args import given_topics, given_values
@@ -236,7 +235,9 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
         tally = Tally(bag.count([topics.frames]), notices)
         if options.parquet is not None:
             tally.table = frame_table.FrameTable(recording, localizer, options.smooth)
-        earlier = replaced(options, f"{RESULT}/metadata.yaml", out, _remove_results)
+        # What a user has beside these stays.
+        names = POSES, TWISTS, BRIDGED, RESULT, fleet.MARKER, fleet.LOG
+        earlier = earlier_result(options, f"{RESULT}/metadata.yaml", out, names)
         with atomic_directory(out, earlier) as built:
             built.mkdir()
             _hint(path, options.params)
@@ -341,12 +342,6 @@ def _replay(
 # Notices of a frame that could not follow the one before.
 _RESTARTS = ("time_went_back", "map_changed")
 _WIDTH = 96  # columns of a terminal that is not narrow
-
-
-def _remove_results(out: Path) -> None:
-    for name in (POSES, TWISTS, BRIDGED, fleet.MARKER, fleet.LOG):
-        (out / name).unlink(missing_ok=True)
-    shutil.rmtree(out / RESULT, ignore_errors=True)
 
 
 def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:

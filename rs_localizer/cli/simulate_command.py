@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, replaced
+from rs_localizer.cli import WORKING, earlier_result
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
@@ -196,7 +196,7 @@ def run(args: Options) -> dict[str, object]:
     camera, motion = camera_of(args), motion_of(args)
     stamps = stamps_of(args, camera, motion)
     world, counts = world_of(args, motion, np.random.default_rng(args.seed)), list[int]()
-    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
+    with atomic_directory(args.out, earlier_result(args, "metadata.yaml")) as built:
         with BagWriter(built) as bag:
             frames = see(args, world, camera, motion, stamps)
             for frame in tqdm(frames, "simulate", len(stamps), unit="frame", disable=None):

@@ -14,11 +14,9 @@ import json
 import logging
 import multiprocessing
 import os
-import shutil
 import signal
 import socket
 import threading
-import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +25,14 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, cast
 
-from rs_localizer.io.atomic_files import atomic_files, write_errors
+from rs_localizer.io.atomic_files import (
+    atomic_directory,
+    atomic_files,
+    content,
+    resume,
+    resume_results,
+    write_errors,
+)
 
 Figures = dict[str, float | int | str]
 """Figures of a recording, by identifiers with their units."""
@@ -148,36 +153,36 @@ def perform(task: Task) -> Outcome:
         return Outcome(None, f"the worker on {here} does not see {task.folder.parent}")
     if (figures := finished(task)) is not None:
         return Outcome(figures)
-    # A folder of its own: a worker that is taken for lost may still be at it.
-    partial = task.folder.with_name(f"{_unfinished(task)}{uuid.uuid4().hex}")
-    inner = partial / task.folder.name  # under its final name, which some files repeat
-    said = io.StringIO()
+    said, inner = io.StringIO(), task.folder
     try:
-        with write_errors(partial):
-            partial.mkdir()
-        with _PRINTING, contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            figures = task.work(task.recording, inner)
-        about = {"recording": str(task.recording), "identity": task.identity, "figures": figures}
-        with write_errors(inner):
+        # What is there is of other settings.
+        with atomic_directory(task.folder, content(task.folder)) as inner:
+            with _PRINTING, contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+                figures = _worked(task, inner)
+            about = {
+                "recording": str(task.recording), "identity": task.identity, "figures": figures
+            }  # fmt: skip
             text = said.getvalue().replace(str(inner), task.folder.name)
             (inner / LOG).write_text(text, encoding="utf-8")
             (inner / MARKER).write_text(json.dumps(about, indent=1, default=str), encoding="utf-8")
-            if task.folder.exists() and finished(task) is None:  # of other settings
-                task.folder.rename(partial / "replaced")
-            if finished(task) is None:  # else another worker, taken for lost, has done it
-                inner.rename(task.folder)
+            if finished(task) is not None:
+                raise ValueError(f"{task.folder} is there now")
     except Exception as error:
+        # Another worker, taken for lost, may have been at it, too.
+        if (known := finished(task)) is not None:
+            return Outcome(known)
         text = " ".join(str(error).split()) or type(error).__name__
         kind = "" if isinstance(error, (ValueError, OSError)) else f"{type(error).__name__}: "
         return Outcome(None, (kind + text).replace(str(inner), str(task.folder)))
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return Outcome(figures)
 
 
-def _unfinished(task: Task) -> str:
-    """Beginning of the names of folders in which this task is worked on."""
-    return f".unfinished-{task.identity[:16]}-"
+def _worked(task: Task, folder: Path) -> Figures:
+    """Do the work of a task; what cannot be read is not said to be what cannot be written."""
+    try:
+        return task.work(task.recording, folder)
+    except OSError as error:
+        raise ValueError(str(error)) from error
 
 
 def perform_all(tasks: Sequence[Task], scheduler: str | None, workers: int | None) -> Performed:
@@ -286,8 +291,9 @@ def _lost(error: Exception) -> Outcome:
 
 def refuse_others(tasks: Sequence[Task]) -> None:
     """Raise ``ValueError`` for a folder that is there, and no result of its task."""
+    resume_results(task.folder for task in tasks)
     for task in tasks:
-        if task.folder.exists() and finished(task) is None:
+        if content(task.folder) and finished(task) is None:
             raise ValueError(
                 f"{task.folder} exists and is no result of this recording, settings and version; "
                 "choose another --out, or --overwrite"
@@ -347,7 +353,7 @@ def _summarize(tasks: Sequence[Task], outcomes: Mapping[Path, Outcome], file: Pa
 
 
 def _clear(tasks: Sequence[Task]) -> None:
-    """Remove what workers that were killed have left of these tasks."""
+    """Finish or remove what workers that were killed have left of these tasks."""
     for task in tasks:
-        for rest in task.folder.parent.glob(f"{_unfinished(task)}*"):
-            shutil.rmtree(rest, ignore_errors=True)
+        for folder in (task.folder.parent, task.folder):
+            resume(folder)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from rs_localizer.cli import WORKING, replaced, stage
+from rs_localizer.cli import WORKING, earlier_result, stage
 from rs_localizer.cli.image_input import (
     ImageOptions,
     opened,
@@ -103,7 +103,7 @@ def run(args: Options) -> None:
     markers = None if args.markers is None else read_checked_map(args.markers)
     tell_telemetry(args)
     shutter, frame = shutter_of(args), MAP_FRAME if markers is None else markers.map_frame
-    with atomic_directory(args.out, replaced(args, MAP)) as out:
+    with atomic_directory(args.out, earlier_result(args, MAP)) as out:
         out.mkdir()
         with TemporaryDirectory(dir=out) as images:
             looker = Looker(FeatureConfig().max_keypoints, Path(images), markers)

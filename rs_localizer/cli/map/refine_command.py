@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, refuse_existing, replaced, write_all
+from rs_localizer.cli import WORKING, earlier_result, refuse_existing, write_all
 from rs_localizer.cli.image_input import LensOptions
 from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import UsageError, argument, option
@@ -194,7 +194,7 @@ def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
     readout = build(values).readout_time or None
     direction = str(build(values).scan_direction)
     known = direction if readout or "scan_direction" in values else None
-    earlier = replaced(replace(args, out=out), "images.txt")
+    earlier = earlier_result(replace(args, out=out), "images.txt")
     with atomic_directory(out, earlier) as built:
         result = undo_shutter(camera, model, stamps, (readout, known), args.intrinsics, _step)
         check_readout(result.readout_check)
