@@ -38,6 +38,9 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # One stamp per interpreter, so that another PYTHON makes a new environment.
 ready := $(VENV)/.ready-$(subst /,_,$(PYTHON))
 python := $(VENV)/bin/python
+# What takes long says what it does, a line at least every 20 s.
+progress := $(PYTHON) .ci/progress.py
+pip := $(python) -m pip install --disable-pip-version-check --no-input --progress-bar off
 
 .PHONY: demo test bench ros coverage docs collect warm lint clean
 .DELETE_ON_ERROR:
@@ -52,12 +55,12 @@ test: $(ready)
 	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 4 --dist loadfile
 
 bench: $(ready) warm
-	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 2 --dist loadfile -m bench --timeout 1800
+	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 2 --dist loadfile -m bench
 
 coverage: $(ready) warm
-	@$(python) -m pip install -qq --disable-pip-version-check --no-input --upgrade --no-deps --target $(VENV)/coverage coverage pytest-cov
+	@$(progress) --quiet coverage $(pip) --upgrade --no-deps --target $(VENV)/coverage coverage pytest-cov
 	@PYTHONPATH="$$(cd $(VENV) && pwd)/coverage" OPENBLAS_NUM_THREADS=1 \
-	    $(python) -m pytest -q -n 2 --dist loadfile --timeout 900 --cov-report term:skip-covered $(COVERAGE)
+	    $(python) -m pytest -q -n 2 --dist loadfile --cov-report term:skip-covered $(COVERAGE)
 
 # In the environment of ROS, which the line above has taken away.
 ros:
@@ -67,23 +70,23 @@ ros:
 	. $(OUT)/ros/install/setup.sh && ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST python3 -m pytest -q -rs test/real_ros
 
 docs: $(ready)
-	@$(python) -m pip install -qq --disable-pip-version-check --no-input --editable '.[docs]'
-	@$(python) -m sphinx -q -W --keep-going -c docs . $(OUT)/docs
+	@$(progress) --quiet docs $(pip) --editable '.[docs]'
+	@$(progress) docs $(python) -m sphinx -q -W --keep-going -c docs . $(OUT)/docs
 	@echo $(OUT)/docs/README.html
 
 # Leaves the tests with their assertions rewritten, which each of the processes would do.
 collect: $(ready)
-	@$(python) -m pytest -q --collect-only >/dev/null
+	@$(progress) --quiet "collecting tests" $(python) -m pytest -q --collect-only
 
 warm: $(ready)
-	@$(python) -m rs_localizer warm >/dev/null
+	@$(progress) --quiet "compiling kernels" $(python) -m rs_localizer warm
 
 lint: $(ready)
-	@$(python) -m ruff check --quiet --output-format concise .
-	@$(python) -m ruff format --quiet --check .
-	@$(python) -m codespell_lib
-	@$(python) .ci/notices.py
-	@$(python) -m mypy --no-error-summary
+	@$(progress) "linting" $(python) -m ruff check --quiet --output-format concise .
+	@$(progress) "checking the format" $(python) -m ruff format --quiet --check .
+	@$(progress) "checking the spelling" $(python) -m codespell_lib
+	@$(progress) "checking notices" $(python) .ci/notices.py
+	@$(progress) "checking types" $(python) -m mypy --no-error-summary
 
 $(ready): setup.py pyproject.toml Makefile
 	@$(PYTHON) -c '$(supported)' 2>/dev/null || { \
@@ -94,10 +97,10 @@ $(ready): setup.py pyproject.toml Makefile
 	    echo "$(PYTHON) cannot make virtual environments." \
 	        "On Debian and Ubuntu: sudo apt install python3-venv" >&2; exit 1; }
 	@echo "Preparing $(VENV) (once, takes a few minutes)"
-	@[ -e $@ ] || $(PYTHON) -m venv --clear $(VENV)
-	@$(python) -m pip install -qq --disable-pip-version-check --no-input --no-compile --editable '.[ros,evo,fleet,examples,mapping,plots,table,video,test]'
+	@[ -e $@ ] || $(progress) "making the environment" $(PYTHON) -m venv --clear $(VENV)
+	@$(progress) --quiet "installing packages" $(pip) --no-compile --editable '.[ros,evo,fleet,examples,mapping,plots,table,video,test]'
 	@# Which pip does one file after the other, and the tests of other packages with them.
-	@$(python) -m compileall -qq -j 0 -x '/(tests|pip)/' $(VENV)/lib || true
+	@$(progress) --quiet "compiling packages" $(python) -m compileall -j 0 -x '/(tests|pip)/' $(VENV)/lib 2>/dev/null || true
 	@touch $@
 
 clean:
