@@ -45,7 +45,5 @@ def test_programs_start_with_light_imports(module):
         "heavy = ('numpy', 'numba', 'cv2', 'rclpy', 'rosbags', 'scipy', 'matplotlib')\n"
         "sys.exit([name for name in sys.modules if name.startswith(heavy)])"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr.strip() == "[]"

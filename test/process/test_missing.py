@@ -33,9 +33,7 @@ def without(tmp_path: Path, *names: str) -> dict[str, str]:
 
 def run(code: str, environment: dict[str, str], *words: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", code, *words]
-    return subprocess.run(
-        command, env=environment, text=True, capture_output=True, timeout=120, check=False
-    )
+    return subprocess.run(command, env=environment, text=True, capture_output=True, check=False)
 
 
 @pytest.mark.parametrize(

@@ -16,14 +16,12 @@ def said(command: list[str], text: str, log: Path) -> None:
     with log.open("w") as file:
         process = subprocess.Popen(command, stdout=file, stderr=file)
         try:
-            deadline = time.monotonic() + 60.0
             while text not in log.read_text():
                 assert process.poll() is None, log.read_text()
-                assert time.monotonic() < deadline, log.read_text()
                 time.sleep(0.1)
         finally:
             process.terminate()
-            process.wait(30)
+            process.wait()
 
 
 def test_both_are_answered_by_the_node(start_node, tmp_path):

@@ -95,6 +95,10 @@ def serialized(messages: list[Any], kind: str) -> dict[int, bytes]:
     return {stamp_ns(m): bytes(typestore().serialize_cdr(m, kind)) for m in messages}
 
 
+# Diagnostics, once a second, after which a frame that they do not count was lost.
+_SILENT = 3
+
+
 class Robot:
     """Sends what the node needs, and keeps what it answers and says of itself."""
 
@@ -102,6 +106,7 @@ class Robot:
         self.peer = peer
         self._node = f"{namespace}/rs_localizer"
         self.answers: dict[str, list[bytes]] = {name: [] for name in TYPES}
+        self.frames_sent = 0  # frames, without those that were lost
         self.values: dict[str, str] = {}  # of the diagnostics
         self.states: list[str] = []  # by them: level and message
         self.odd: set[str] = set()  # what has ever been odd by them
@@ -133,19 +138,39 @@ class Robot:
         assert self.peer.spin_until(connected), "the node was not found"
         self.peer.spin_until(lambda: False, 0.3)  # the other side has to find us, too
 
-    def send(self, info: Any, cloud: Any, timeout: float = 1.0) -> bool:
-        """Send a frame; whether the node has answered."""
-        before = len(self.answers["inliers"])
+    def send(self, info: Any, cloud: Any) -> None:
+        """Send a frame."""
+        self.frames_sent += 1
         if info is not None:
             self.publishers["/camera_info"].publish(info)
             self.peer.spin_until(lambda: False, 0.02)
         self.publishers["/correspondences"].publish(cloud)
-        return bool(self.peer.spin_until(lambda: len(self.answers["inliers"]) > before, timeout))
 
     def localize(self, info: Any, cloud: Any) -> None:
-        """Send a frame until the node has answered."""
-        # Again only once it must be lost: the answer to a second copy would be heard as the next.
-        assert any(self.send(info, cloud, timeout=20.0) for _ in range(3)), "no answer"
+        """Send a frame until the node has answered.
+
+        Again only when it has been lost, as the node's diagnostics say: the answer to a second copy
+        would be heard as the next.
+        """
+        before = len(self.answers["inliers"])
+
+        def answered() -> bool:
+            return len(self.answers["inliers"]) > before
+
+        while not answered():
+            said = len(self.states)
+            self.send(info, cloud)
+
+            def lost() -> bool:
+                return len(self.states) > said + _SILENT and self.received < self.frames_sent  # noqa: B023
+
+            assert self.peer.spin_until(lambda: answered() or lost()), "no answer"
+            self.frames_sent = self.frames_sent if answered() else self.received
+
+    @property
+    def received(self) -> int:
+        """Frames that have come to the node, by its diagnostics."""
+        return int(self.values.get("Frames received", 0))
 
     def answered(self, name: str) -> dict[int, bytes]:
         """What the node said on a topic, by stamp."""

@@ -121,7 +121,7 @@ class Robot(around.Robot):
                 # The first correction is sent for the frame's own time, too.
                 for heard, count in ((answers, sent), (self.sent, sent and sent + 1)):
                     assert self.peer.spin_until(
-                        lambda heard=heard, count=count: len(heard) >= count, 20.0
+                        lambda heard=heard, count=count: len(heard) >= count
                     ), self.values
                 sent += 1
             if message is None:

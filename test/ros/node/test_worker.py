@@ -15,7 +15,7 @@ from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
 from rs_localizer.ros.node.worker import Need, Worker, wait_for_workers
 
-PATIENCE = 10.0  # s, of a machine that is busy
+PATIENCE = 3500.0  # s: what has not come by then hangs
 
 
 class Count(Statistics[str]):
@@ -40,7 +40,7 @@ class Fake:
         self.done = threading.Semaphore(0)
         self.mounted: set[str] = set()
         self.awaited: set[str] = set()
-        self.patience = 10.0
+        self.patience = PATIENCE
         self.refusals = Refusals(lambda text: None)
         self.statistics = Count(self.refusals, lambda text: (0, text))
         self.worker: Worker[Fake, str] = Worker(self, self._publish, self.statistics, pytest.fail)
