@@ -248,6 +248,27 @@ def test_results_of_a_frame_later_know_their_velocities_better():
     assert errors[2] < 1.1 * errors[1]
 
 
+@pytest.mark.parametrize("lag", [0, 2])
+def test_the_inliers_of_a_track_are_those_of_the_gate_of_their_frame(lag):
+    """Which its noise has widened; the residuals are those of the motion that is published."""
+    hand, tracker, noise = Hand(), Tracker(rsl.Localizer(CAMERA), output_lag=lag), 1.1
+    results = []
+    for t in times(12):
+        points, pixels = hand.frame(t, 300, noise=noise)
+        pixels[:5, 0] += 7.0  # matched wrongly, beyond the gate by as much again
+        results.append(tracker.localize(ns(t), points, pixels))
+    results = [*results[lag:], *tracker.flush()]
+    threshold, beyond = tracker.localizer.config.inlier_threshold, 0
+    for result in results:
+        inliers, residuals = result.inliers, result.residuals
+        assert np.all(inliers[residuals <= threshold])
+        assert residuals[inliers].max() < residuals[~inliers].min()
+        assert residuals[inliers].max() < 1.2 * 3.5 * noise
+        assert not np.any(inliers[:5] & (residuals[:5] > 5.0))
+        beyond += np.count_nonzero(residuals[inliers] > threshold)
+    assert beyond > 10  # a gate of the threshold alone would leave these out
+
+
 @pytest.mark.parametrize("kind", ["gyroscope", "gravity"])
 def test_a_measured_rate_or_direction_helps_on_a_wall(kind):
     hand, localizer = Hand(), rsl.Localizer(CAMERA)

@@ -5,6 +5,7 @@
 import dataclasses
 import re
 import weakref
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,10 @@ from rs_localizer.cli import replay_command
 from rs_localizer.cli.commands import main
 from rs_localizer.cli.replay_command import print_summary
 from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
+from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized
 from rs_localizer.io.trajectories import read_motions, read_tum, read_twists
+from rs_localizer.offline import frame_table
 from rs_localizer.offline.results import Tally, figures
 from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.tools.simulation.scene import room
@@ -45,6 +48,32 @@ def recording(tmp_path_factory) -> Path:
 def messages(path: Path) -> list[tuple[str, int, Any]]:
     with open_bag(path) as bag:
         return list(bag.messages(tuple(bag.topics)))
+
+
+@pytest.mark.parametrize("lag", [1, 3, 5])
+def test_results_that_wait_for_frames_come_at_the_end(recording, tmp_path, lag):
+    """As many as without, of the same frames in the same order, each once."""
+    words = ["replay", str(recording), *SHUTTER, "--parquet"]
+    for k in (0, lag):
+        out, table = tmp_path / f"out{k}", tmp_path / f"{k}.parquet"
+        given = [str(table), "--out", str(out), "-p", f"output_lag:={k}"]
+        assert main([*words, *given]) == 0
+    at_once, later = (read_tum(tmp_path / f"out{k}" / "poses.txt") for k in (0, lag))
+    np.testing.assert_array_equal(later.stamps_ns, at_once.stamps_ns)
+    assert len(later.stamps_ns) == FRAMES
+    of = [
+        Counter((name, stamp_ns(message)) for name, _, message in messages(out / "result"))
+        for out in (tmp_path / "out0", tmp_path / f"out{lag}")
+    ]
+    assert of[0] == of[1]
+    rows = [
+        frame_table.read_parquet(tmp_path / f"{k}.parquet")["stamp_ns"].to_pylist()
+        for k in (0, lag)
+    ]
+    assert rows[0] == rows[1]
+    assert len(rows[0]) == FRAMES
+    # The later a result, the better it is known: it is another one.
+    assert not np.array_equal(later.positions, at_once.positions)
 
 
 def test_what_comes_out(recording, tmp_path, capsys):

@@ -17,6 +17,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import BodyPose, Localized
 from rs_localizer.ros.localizer.tf import Broadcaster, check
 
+from ..node.test_worker import waits  # noqa: TID252 - Python has a package "test"
 from .robot import tf2_ros
 
 Notes = list[tuple[str, str]]
@@ -147,3 +148,21 @@ def test_without_tf2_ros_only_what_needs_it_is_refused(monkeypatch):
         check(NodeConfig(base_frame="base_link"))
     with pytest.raises(ValueError, match=f"^publish_tf map_to_odom needs {package}$"):
         check(NodeConfig(publish_tf="map_to_odom"))
+
+
+def test_who_forgets_waits_until_what_is_being_sent_is_out(made, peer, robot, monkeypatch):
+    """Afterwards nothing of the frames so far is sent: the node may be cleaned up."""
+    node = made(publish_tf="map_to_odom", transform_tolerance=0.2)
+    for tenth in range(50, 61):
+        robot.send("odom", "base_link", 0.1 * tenth, tenth * 10**8, NO_TURN)
+    known(node, peer, "odom", "base_link", 6 * 10**9)
+    broadcaster, waited = node.broadcaster._broadcaster, []
+    send = broadcaster.sendTransform
+
+    def sending(item: Any) -> None:
+        waited.append(waits(node.broadcaster.forget))
+        send(item)
+
+    monkeypatch.setattr(broadcaster, "sendTransform", sending)
+    node.publish(frame(5_500_000_000, x=5.5), node.config)
+    assert waited[:1] == [True]

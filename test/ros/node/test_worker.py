@@ -4,7 +4,7 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -29,6 +29,14 @@ class Count(Statistics[str]):
         super().answered(result, received)
 
 
+def waits(function: Callable[[], Any]) -> bool:
+    """Whether another thread that calls it has to wait for this one."""
+    thread = threading.Thread(target=function, daemon=True)
+    thread.start()
+    thread.join(0.2)
+    return thread.is_alive()
+
+
 class Fake:
     """Stands in for the localizer of the frames."""
 
@@ -41,6 +49,7 @@ class Fake:
         self.mounted: set[str] = set()
         self.awaited: set[str] = set()
         self.patience = PATIENCE
+        self.while_publishing: Callable[[], Any] = lambda: None
         self.refusals = Refusals(lambda text: None)
         self.statistics = Count(self.refusals, lambda text: (0, text))
         self.worker: Worker[Fake, str] = Worker(self, self._publish, self.statistics, pytest.fail)
@@ -68,6 +77,7 @@ class Fake:
         return Waiting("no_transform", "not yet", again, self.patience)
 
     def _publish(self, frame: Any) -> None:
+        self.while_publishing()
         self.published.append(frame)
         self.done.release()
 
@@ -127,6 +137,89 @@ def test_nothing_is_published_after_a_pause(fake):
     fake.wait(fake.done)
     assert fake.published == ["three old"]
     assert fake.statistics.summary().total["dropped"] == 2  # none is lost unseen
+
+
+@pytest.mark.parametrize("end", ["pause", "close"])
+def test_who_pauses_or_closes_waits_until_what_is_being_published_is_out(fake, end):
+    """Afterwards publishers are destroyed."""
+    waited: list[bool] = []
+    fake.while_publishing = lambda: waited.append(waits(getattr(fake.worker, end)))
+    fake.go_on.release()
+    fake.send("one")
+    fake.wait(fake.done)
+    assert waited == [True]
+
+
+class Entered:
+    """A lock before which something happens, as when another thread comes first."""
+
+    def __init__(self, lock: Any, before: Callable[[], Any]) -> None:
+        self._lock, self._before = lock, before
+
+    def __enter__(self) -> None:
+        self._before()
+        self._lock.__enter__()
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.__exit__(*error)
+
+
+def test_a_pause_just_before_something_is_published_still_counts(fake):
+    lock = fake.worker._publishing
+    paused = threading.Semaphore(0)
+
+    def pause() -> None:
+        fake.worker._publishing = lock
+        fake.worker.pause()
+        paused.release()
+
+    fake.worker._publishing = Entered(lock, pause)
+    fake.go_on.release(2)
+    fake.send("one")
+    fake.wait(paused)
+    fake.send("two")
+    fake.wait(fake.done)
+    assert fake.published == ["two old"]
+    total = fake.statistics.summary().total
+    assert (total["received"], total["dropped"]) == (2, 1)
+
+
+def test_a_worker_that_is_closed_takes_nothing_more(fake):
+    fake.go_on.release(10)
+    fake.send("one")
+    fake.wait(fake.done)
+    fake.worker.close()
+    assert wait_for_workers(PATIENCE)
+    fake.send("two")
+    assert fake.published == ["one old"]
+
+
+def test_all_that_wakes_the_worker_does_so_at_once(fake):
+    """An update without a frame, and a frame without an update."""
+    changed = threading.Semaphore(0)
+    for _ in range(3):
+        fake.worker.update("settings", lambda frames: changed.release())
+        fake.wait(changed)
+    fake.go_on.release()
+    fake.send("one")
+    fake.wait(fake.done)
+
+
+def test_what_an_update_of_nobody_foresaw_is_told_and_the_next_is_done():
+    told: list[str] = []
+    done = threading.Semaphore(0)
+    worker: Worker[None, str] = Worker(None, print, Count(Refusals(print), print), told.append)
+
+    def fail(state: None) -> None:
+        raise TypeError("a bug")
+
+    worker.update("one", fail)
+    worker.update("other", lambda state: done.release())
+    assert done.acquire(timeout=PATIENCE)
+    worker.close()
+    assert wait_for_workers(PATIENCE)
+    assert len(told) == 1
+    assert "a bug" in told[0]
 
 
 def test_a_late_mounting_keeps_no_other_frame_waiting(fake):
