@@ -15,11 +15,15 @@ result = rsl.Localizer(camera).localize(points, pixels)
 
 if result:  # a Failure is false, and str() of it says why
     state = rsl.camera_state(result, camera)  # at the middle row, in the map, SI units
+    # Of orientation and position, then of both velocities per readout, in the camera's axes.
     deviations = np.sqrt(np.diag(result.covariance))
+    turning, moving_by = deviations[6:9] / READOUT, deviations[9:] / READOUT
     print("inliers", result.inliers.sum(), "of", len(points))
     print("position (m)", state.position.round(4), "+-", deviations[3:6].round(4))
-    print("angular velocity (rad/s)", state.angular_velocity.round(3), "true", moving.turn)
-    print("velocity (m/s)", state.linear_velocity_in_map.round(3), "true", moving.velocity)
+    print("angular velocity (rad/s)", state.angular_velocity.round(3), "+-", turning.round(3))
+    print("    true", moving.turn)
+    print("velocity (m/s)", state.linear_velocity.round(3), "+-", moving_by.round(3))
+    print("    true", moving.velocity)
     print("pose at the first row", *result.at(-0.5))
 else:
     print("no pose:", result)

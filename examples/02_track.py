@@ -18,6 +18,6 @@ for k in range(30):
         print(k, "no pose:", result)  # tracking continues where it can
         continue
     state = rsl.camera_state(result, camera)
-    errors.append(np.linalg.norm(state.position - seconds * np.array(moving.velocity)))
+    errors.append(np.linalg.norm(state.position - moving.position(seconds)))
     print(f"{k:2} {'tracked' if result.tracked else 'searched'} {state.position.round(3)}")
 print(f"{len(errors)} of 30 frames, {1e3 * np.median(errors):.1f} mm off in the median")

@@ -9,14 +9,19 @@ Other formats: ``to_gsplat.py`` and its neighbours, from ``rs_localizer replay -
 """
 
 import json
-import sys
+
+from script import run
 
 import rs_localizer as rsl
 from rs_localizer import data
 
+ROWS = ("first_row", "middle_row", "last_row")
+
 
 def main(recording: str, row: str, out: str, *settings: str) -> None:
     """Localize each image and write its pose, map_from_camera, when a row was exposed."""
+    if row not in ROWS:
+        raise ValueError(f"the row must be one of {', '.join(ROWS)}, found {row}")
     pairs = (text.split(":=") for text in settings)
     values = {name: json.loads(value) for name, value in pairs}
     table = rsl.localize_recording(recording, settings=values)
@@ -35,4 +40,4 @@ def main(recording: str, row: str, out: str, *settings: str) -> None:
 
 if __name__ == "__main__":
     bundled = [str(data.path(data.WEBCAM)), "first_row", "webcam.txt", "readout_time:=0.011"]
-    main(*(sys.argv[1:] or bundled))
+    run(main, "RECORDING ROW OUT.txt [NAME:=VALUE ...]    (a setting each)", *bundled)

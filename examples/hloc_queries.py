@@ -6,21 +6,22 @@
 
 Takes a sparse model of COLMAP in metres, hloc's list of queries with intrinsics, its pairs,
 features and matches, and the readout time in s. Writes hloc's own result file,
-``NAME QW QX QY QZ TX TY TZ`` (camera_from_map at the middle row), and ``poses_motion.json`` beside
-it. Needs pycolmap and h5py.
+``NAME QW QX QY QZ TX TY TZ`` (camera_from_map at the middle row), and ``poses_motion.json``.
 """
 
 import json
-import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
-import pycolmap
+from script import one_line, run
 
 import rs_localizer as rsl
+
+with one_line():
+    import h5py
+    import pycolmap
 
 # COLMAP's models: names of their coefficients here.
 LENSES = {
@@ -116,4 +117,4 @@ def main(sfm: str, queries: str, retrieval: str, features: str, matches: str, re
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main, "SFM QUERIES PAIRS FEATURES.h5 MATCHES.h5 POSES READOUT_TIME    (files of hloc; s)")

@@ -12,11 +12,11 @@ heading; ``ned``: its x is east and its y north. Of covariances PX4 takes varian
 along the axes of its world, of orientations and velocities along those of the body.
 """
 
-import sys
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from script import run
 
 FLIP = np.diag([1.0, -1.0, -1.0])  # FLU and FRD, either way
 # PX4's world from the map: its axes, and the message's number for them.
@@ -93,8 +93,11 @@ def main(world: str = "frd") -> None:
     import rclpy
     from nav_msgs.msg import Odometry
     from px4_msgs.msg import VehicleOdometry
+    from rclpy.signals import SignalHandlerOptions
 
-    rclpy.init()
+    if world not in WORLDS:
+        raise ValueError(f"the world must be one of {', '.join(WORLDS)}, found {world}")
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # whose end cuts callbacks off
     node = rclpy.create_node("px4_odometry")
     out = node.create_publisher(VehicleOdometry, "/fmu/in/vehicle_visual_odometry", 10)
     state: dict[str, Any] = {"last": None, "resets": 0}
@@ -106,8 +109,9 @@ def main(world: str = "frd") -> None:
         out.publish(VehicleOdometry(**vehicle_odometry(message, world, state["resets"], now_ns)))
 
     node.create_subscription(Odometry, "/rs_localizer/odometry", convert, 10)
-    rclpy.spin(node)
+    while True:
+        rclpy.spin_once(node, timeout_sec=0.2)  # in between, Ctrl-C is heard
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main, "[frd | ned]    (until Ctrl-C)")

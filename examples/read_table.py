@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
@@ -35,6 +34,8 @@ def read_table(file: str) -> tuple[dict[str, Any], list[Shot]]:
     Raises:
         ValueError: when there is none, or they are of several cameras.
     """
+    import pyarrow.parquet as pq  # late, so that main() says what is missing
+
     rows = pq.read_table(file, filters=[("state", "=", "localized")]).to_pylist()
     cameras = {row["camera"] for row in rows}
     if len(cameras) != 1:

@@ -10,7 +10,6 @@ show; without it everything is far away, and only the turn of the camera is undo
 between the first and the last row is taken for one at constant velocities.
 """
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import cv2
 import numpy as np
 from read_table import Shot, intrinsics, read_table, write_images
 from scipy.spatial.transform import Rotation, Slerp
+from script import run
 
 import rs_localizer as rsl
 
@@ -65,14 +65,17 @@ def rectified(camera: rsl.Camera, image: np.ndarray, shot: Shot, depth: float) -
 def main(table: str, out: str, depth: str = "inf") -> None:
     """Write the images."""
     told, shots = read_table(table)
-    folder, camera = Path(out), camera_of(told)
+    folder, camera, count = Path(out), camera_of(told), 0
     for shot, name in zip(shots, write_images(shots, folder), strict=True):
         image = cv2.imread(str(folder / name))
         if image is not None:
             made = rectified(camera, image, shot, float(depth))
             cv2.imwrite(str(folder / name), made)
-    print(f"{out}: {len(shots)} images")
+            count += 1
+    if not count:
+        raise ValueError(f"the recording of {table} has no images: detect --images keeps them")
+    print(f"{out}: {count} images")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main, "TABLE.parquet OUT [METRES]    (the table: rs_localizer replay --parquet)")

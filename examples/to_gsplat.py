@@ -11,11 +11,11 @@ the name of ``rolling_shutter``. ``radial_coeffs.npy`` and so on of a lens with 
 ``names.txt``, ``images/``: in the same order.
 """
 
-import sys
 from pathlib import Path
 
 import numpy as np
 from read_table import coefficients, intrinsics, read_table, shutter, write_images
+from script import run
 
 
 def main(table: str, out: str) -> None:
@@ -34,4 +34,4 @@ def main(table: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main, "TABLE.parquet OUT    (the table: rs_localizer replay --parquet)")

@@ -12,12 +12,12 @@ Where the package nvidia-ncore is installed (run with 19.8.3), ``sequence`` is w
 
 import importlib.util
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from read_table import Shot, coefficients, intrinsics, read_table, shutter, write_images
+from script import run
 
 import rs_localizer as rsl
 
@@ -93,4 +93,4 @@ def main(table: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main, "TABLE.parquet OUT    (the table: rs_localizer replay --parquet)")

@@ -11,13 +11,13 @@ of ``transform_matrix``; velocities are m/s and rad/s in the camera axes of Open
 """
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from read_table import Shot, intrinsics, read_table, shutter, write_images
 from scipy.spatial.transform import Rotation
+from script import run
 
 # OpenGL's camera looks along -z with y up.
 OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -74,4 +74,4 @@ def main(table: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main, "TABLE.parquet OUT    (the table: rs_localizer replay --parquet)")

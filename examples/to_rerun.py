@@ -9,15 +9,17 @@ Images are shown where the recording has them (``detect --images``). The ellipso
 position with 95 %; the orange line is the way of the camera's centre during the readout.
 """
 
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rerun as rr
 from read_table import Shot, intrinsics, read_table, write_images
 from scipy.spatial.transform import Rotation
+from script import one_line, run
+
+with one_line():
+    import rerun as rr
 
 # 95 % of the chi-square distribution with three degrees of freedom.
 WITHIN = np.sqrt(7.8147)
@@ -90,4 +92,4 @@ def main(table: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main, "TABLE.parquet OUT.rrd    (the table: rs_localizer replay --parquet)")

@@ -15,14 +15,17 @@ from typing import Any
 import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, TwistStamped
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
 
 from rs_localizer import data
 from rs_localizer.io import topics
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
+from rs_localizer.process.stopping import StopRequest
 from rs_localizer.ros.node.conversion import copy_message, message_class
 from rs_localizer.settings import NODE_NAME
 
@@ -91,14 +94,14 @@ def _text(*numbers: float) -> str:
     return " ".join(f"{number:+.3f}" for number in numbers)
 
 
-def run(args: list[str] | None = None) -> None:
-    """Publish until Ctrl-C or SIGTERM."""
-    rclpy.init(args=args)
+def run(stop: StopRequest, args: list[str] | None = None) -> None:
+    """Publish until ``stop`` is requested."""
+    # rclpy's own handlers end the context from a thread while the node still publishes.
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node = ExampleMatcher()
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
-        pass
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while not stop.requested:
+        executor.spin_once()  # returns after each of the timer's calls
+    node.destroy_node()
+    rclpy.try_shutdown()

@@ -90,7 +90,7 @@ def example_matcher(args: list[str] | None = None) -> int:
         except ImportError as error:
             sys.stderr.write(f"example_matcher: {explain(error)}\n")
             return 1
-    node.run(args)
+        node.run(stop, args)
     return 0
 
 

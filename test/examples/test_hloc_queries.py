@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What hloc has matched becomes poses; its files are made here."""
 
-import importlib
 import json
 from pathlib import Path
 from typing import Any
@@ -10,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typed_commands import EXAMPLES, commands, started
 
 import rs_localizer as rsl
 from rs_localizer.core.shutter import project_rolling
 
 h5py = pytest.importorskip("h5py")
 pytest.importorskip("pycolmap")
-hloc_queries = importlib.import_module("hloc_queries")
 
 READOUT = 0.03
 CAMERA = rsl.Camera(640, 480, [[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], readout_time=READOUT)
@@ -39,8 +38,8 @@ def seen(motion: rsl.Motion) -> tuple[Any, Any]:
     return shown, pixels[shown]
 
 
-def write(folder: Path, queries: dict[str, rsl.Motion]) -> list[str]:
-    """A model of two images, and queries matched with them; the example's files."""
+def write(folder: Path, queries: dict[str, rsl.Motion]) -> None:
+    """A model of two images, and queries matched with them: the example's files."""
     model, tracks, shows = folder / "sfm", {}, []
     model.mkdir()
     lines = []
@@ -75,7 +74,6 @@ def write(folder: Path, queries: dict[str, rsl.Motion]) -> list[str]:
             # hloc looks for a pair in both orders, and wrote another separator.
             matched.create_group(f"{flat}/1.j").create_dataset("matches0", data=there[0])
             matched.create_group(f"2.j_{flat}").create_dataset("matches0", data=back)
-    return [str(model), *map(str, names)]
 
 
 def test_moving_queries_have_their_poses_and_velocities(tmp_path):
@@ -87,8 +85,11 @@ def test_moving_queries_have_their_poses_and_velocities(tmp_path):
         )
         for k in range(4)
     }  # fmt: skip
-    files = write(tmp_path, truth)
-    hloc_queries.main(*files, str(tmp_path / "poses.txt"), str(READOUT))
+    write(tmp_path, truth)
+    (tmp_path / "examples").symlink_to(EXAMPLES)
+    (line,) = commands("hloc_queries.py")
+    done = started(line, tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
     lines = [line.split() for line in (tmp_path / "poses.txt").read_text().splitlines()]
     told = json.loads((tmp_path / "poses_motion.json").read_text())["queries"]
     assert [name for name, *_ in lines] == [Path(name).name for name in truth]
