@@ -40,6 +40,13 @@ def test_commands_are_found():
     assert len(_LAUNCHES) > 4
 
 
+@pytest.mark.parametrize("target", ["demo", "test"])
+def test_the_readme_has_both_commands_of_make_and_what_they_take(target):
+    (told,) = re.findall(rf"^ {{4}}make {target} +# (.+)$", pages.text("README.md"), re.MULTILINE)
+    assert re.search(r"minutes|hour", told)
+    assert re.search(rf"^{target}: ", pages.text("Makefile"), re.MULTILINE)
+
+
 @pytest.mark.parametrize(("page", "words"), _OURS)
 def test_commands_and_options_exist(page, words):
     if words.startswith("COMMAND"):
