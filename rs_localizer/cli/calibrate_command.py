@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from rs_localizer.cli.marker_map import TargetOptions, find_map
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.cli.rig_input import cameras_of, mounting_lines
 from rs_localizer.cli.settings_args import given_settings, given_topics, remapped
+from rs_localizer.cli.typed import typed
 from rs_localizer.io.image_clock import DEFAULT_START_NS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
 
@@ -353,7 +355,7 @@ def _next(args: Options, lens: bool, shape: Path | None) -> str:
     if shape is not None:
         words += ["--map", str(shape), *(["--rate", str(args.rate)] if args.rate else [])]
         words += [word for text in args.remaps for word in ("-r", text)]
-    return shlex.join(["rs_localizer", *words, "--out", f"{out.with_suffix('')}_poses"])
+    return typed("rs_localizer", *words, "--out", f"{out.with_suffix('')}_poses")
 
 
 def _calibrate_rig(args: Options) -> dict[str, Figures]:
@@ -403,7 +405,8 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
         transforms = partial(rigs.write_static_transforms, parts=parts, frames=frames)
         writers = Writers({_beside(args, _TRANSFORMS): transforms})
         _write_files(args, values, rigs.mounted_lenses(parts), parts.cameras, writers, comments)
-        print(f"next: {shlex.join(['ros2', 'launch', str(_beside(args, _TRANSFORMS))])}")
+        when = "next" if shutil.which("ros2") else "next, in a ROS 2 workspace"
+        print(f"{when}: {shlex.join(['ros2', 'launch', str(_beside(args, _TRANSFORMS))])}")
     if refusals:
         raise ValueError(
             "not observable: " + "; ".join(f"{name}: {text}" for name, text in refusals.items())

@@ -17,6 +17,7 @@ import numpy as np
 
 from rs_localizer.cli import WORKING, Compiling, import_ros, stage
 from rs_localizer.cli.options import option
+from rs_localizer.cli.typed import typed
 from rs_localizer.config import NodeConfig
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 
@@ -60,9 +61,9 @@ _METHODS = (NodeConfig().solver, "p3p")
 
 _AFTERWARDS = """
 Your own camera, next:
-  rs_localizer markers make board --help            print a board
-  rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --out shutter.yaml
-  localizer --ros-args --params-file shutter.yaml   the node (docs/node.md)
+  {rs_localizer} markers make board --help            print a board
+  {rs_localizer} calibrate video.mp4 --board 9x6 --square 0.025 --out shutter.yaml
+  {localizer} --ros-args --params-file shutter.yaml   the node (docs/node.md)
 """
 
 
@@ -110,7 +111,8 @@ def run(options: Options) -> None:
         _localized("Webcam over a board", webcam, settings.readout_time, None)
         _cube(cube_clip.Walls(hand), most, options.out / "cube.gif")
         _live(flight, answers[_METHODS[0]], camera.readout_time, Path(directory) / "node.log")
-    print(f"done in {time.monotonic() - started:.0f} s\n{_AFTERWARDS}", end="")
+    afterwards = _AFTERWARDS.format_map({it: typed(it) for it in ("rs_localizer", "localizer")})
+    print(f"done in {time.monotonic() - started:.0f} s\n{afterwards}", end="")
 
 
 def read_frames(path: Path, most: int | None = None) -> list[FrameMessages]:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -25,6 +24,7 @@ from rs_localizer.cli.image_input import (
 from rs_localizer.cli.marker_map import TargetOptions, find_map
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.cli.rig_input import cameras_of
+from rs_localizer.cli.typed import typed
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.recording import PARAMETERS
@@ -75,8 +75,8 @@ def run(args: Options) -> Figures:
         )
     parameters = args.out / PARAMETERS
     params = ["--params", str(parameters)] if parameters.exists() else []
-    words = ["rs_localizer", "replay", str(args.out), *params, "--out", f"{args.out}_poses"]
-    print(f"next: {shlex.join(words)}{' --map MAP' if args.features else ''}")
+    words = ["replay", str(args.out), *params, "--out", f"{args.out}_poses"]
+    print(f"next: {typed('rs_localizer', *words)}{' --map MAP' if args.features else ''}")
     return figures
 
 

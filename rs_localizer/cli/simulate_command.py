@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 from rs_localizer.cli import WORKING, earlier_result
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
+from rs_localizer.cli.typed import typed
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.camera_files import pinhole_matrix, read_calibration
@@ -220,24 +220,22 @@ def _tell(
     args: Options, world: Scene | Array, stamps: list[int], counts: list[int]
 ) -> dict[str, object]:
     """Say what was written, and what comes next."""
-    out, lasted = shlex.quote(str(args.out)), (stamps[-1] - stamps[0]) * 1e-9
+    out, lasted = str(args.out), (stamps[-1] - stamps[0]) * 1e-9
     figures: dict[str, object] = {"recording": str(args.out), "images": len(stamps)}
     said = f"{args.out}: {len(stamps)} {'images' if args.images else 'frames'} in {lasted:.1f} s"
-    following = ""
+    following = list[str]()
     if counts:
         figures["points_per_image"] = mean = float(np.mean(counts))
         said += f", {mean:.0f} points each"
         if few := sum(count < args.points for count in counts):
             said += f" (of {args.points} asked for; {few} frames see fewer, "
             said += f"{counts.count(0)} of them none)"
-        poses = shlex.quote(f"{args.out}_poses")
-        following = f"replay {out} --params {out}/{PARAMETERS} --out {poses}"
+        following = ["replay", out, "--params", f"{out}/{PARAMETERS}", "--out", f"{out}_poses"]
     elif isinstance(world, Scene) and world.marker_map is not None:
         figures["markers"] = count = len(world.marker_map.markers)
         said += f", {count} markers on the walls"
-        markers = shlex.quote(f"{args.out}_markers")
-        following = f"detect {out} --map {out}/{MARKER_MAP} --out {markers}"
+        following = ["detect", out, "--map", f"{out}/{MARKER_MAP}", "--out", f"{out}_markers"]
     print(said)
     if following:
-        print(f"next: rs_localizer {following}")
+        print(f"next: {typed('rs_localizer', *following)}")
     return figures

@@ -267,3 +267,35 @@ def test_kernels_that_cannot_be_kept_are_a_failure(tmp_path):
     assert done.stderr.startswith(f"rs_localizer warm: cache of kernels in {tmp_path}/cache/")
     assert done.stderr.endswith(("Not a directory\n", "File exists\n"))
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("how", ["in PATH", "by its place", "as a module"])
+def test_what_comes_next_can_be_pasted(how, tmp_path):
+    """After ``make`` nothing is in PATH; what is printed runs from where it was printed."""
+    place = tmp_path / "clone of mine" / ".venv" / "bin"
+    place.mkdir(parents=True)
+    (place / "python").symlink_to(sys.executable)
+    program = place / "rs_localizer"
+    program.write_text(
+        f"#!{sys.executable}\nimport sys\nfrom rs_localizer.__main__ import run\nsys.exit(run())\n"
+    )
+    program.chmod(0o755)
+    begin, path = [str(program)], "/usr/bin:/bin"
+    if how == "in PATH":
+        begin, path = ["rs_localizer"], f"{place}:{path}"
+    elif how == "as a module":
+        begin = [sys.executable, "-m", "rs_localizer"]
+    work = tmp_path / "clone of mine"
+    paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    more = {"cwd": work, "env": {**os.environ, "PATH": path, "PYTHONPATH": ":".join(paths)}}
+    words = ["simulate", "my flight", "--duration", "0.2", "--json"]
+    done = subprocess.run([*begin, *words], capture_output=True, text=True, check=True, **more)
+    command = json.loads(done.stdout)["next"]
+    assert (command.split()[0] == "rs_localizer") == (how == "in PATH")
+    if how == "by its place":
+        assert command.startswith(".venv/bin/rs_localizer ")
+    pasted = subprocess.run(
+        ["bash", "-c", f"{command} --help"], capture_output=True, text=True, check=False, **more
+    )
+    assert pasted.returncode == 0, pasted.stderr
+    assert "usage: rs_localizer replay" in pasted.stdout

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from rs_localizer.cli.image_input import (
     tell_times,
 )
 from rs_localizer.cli.options import UsageError, argument, number, option
+from rs_localizer.cli.typed import typed
 from rs_localizer.config import FeatureConfig
 
 if WORKING:
@@ -185,5 +185,5 @@ def _tell(args: Options, built: Built, looked: Looked) -> None:
         print(f"warning: {built.placement.doubt}")
     for text in advice(built, looked.views):
         print(f"to film otherwise: {text}")
-    out = shlex.quote(str(args.out))
-    print(f"next, for images of another walk: rs_localizer replay IMAGES --map {out} --out poses")
+    following = typed("rs_localizer", "replay", "IMAGES", "--map", str(args.out), "--out", "poses")
+    print(f"next, for images of another walk: {following}")
