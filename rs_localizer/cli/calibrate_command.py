@@ -247,7 +247,8 @@ def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
     images: list[ImagePoints] = []
     camera: Camera | None = None
     size = (0, 0)
-    seen = seen_by(shots, NodeConfig().scan_direction)
+    refused = dict[str, str]()
+    seen = seen_by(shots, NodeConfig().scan_direction, refused)
     for image, own in tqdm(seen, unit="image", desc="detect", disable=None):
         camera, size = camera or own, image.pixels.shape[::-1]
         found = detector.detect(image).detections
@@ -255,6 +256,7 @@ def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
         images.append(ImagePoints(image.stamp_ns, found.points, found.pixels))
     shown = sum(len(image.points) > 0 for image in images)
     print(f"{shown} of {len(images)} images show the map")
+    image_input.tell_left_out(refused, {})
     if fault := sizes.fault():
         print(f"warning: {fault}", file=sys.stderr)
     new_lens = camera is None

@@ -138,9 +138,9 @@ def tell_telemetry(args: ImageOptions, used: float | None = None) -> None:
 
 
 def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> None:
-    """Images that could not be read, and other messages that are kept."""
+    """Images that could not be used, and other messages that are kept."""
     for detail in refused.values():
-        print(f"images that cannot be read are left out, the first one because {detail}")
+        print(f"images that cannot be used are left out, the first one because {detail}")
     if carried:
         kept = ", ".join(f"{topic} ({count})" for topic, count in carried.items())
         print(f"kept for replay: {kept}")

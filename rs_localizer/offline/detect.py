@@ -13,6 +13,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.io.bags import BagWriter, make_message
@@ -45,6 +46,8 @@ _LEAST_INLIERS = 8
 # A global-shutter pose leaves at most so much (px rms) in the stillest images, in percent of all,
 # unless calibration or map are wrong: a good one leaves 0.1 to 0.5.
 _MOST_STILL, _STILL_PERCENT = 1.5, 10.0
+# So many images of another size than the calibration's are no stray ones, if none fits it.
+_MISFITS = 3
 
 
 class DetectError(ValueError):
@@ -101,10 +104,9 @@ def record(
     """
     found = Extraction()
     tally = _MarkerTally(detector.map, found)
-    cameras = Cameras(options.scan_direction)
-    for shot, image in _readable(shots, bag, found, done):
+    for shot, image, camera in _readable(shots, bag, found, options, done):
         detected = detector.detect(image)
-        tally.add(cameras.of(shot, image), detected)
+        tally.add(camera, detected)
         if len(detected.detections.ids):
             corners = correspondences(detected, make_message)
             _write(bag, shot, CORRESPONDENCES_TOPIC, corners, options)
@@ -118,9 +120,15 @@ def record(
 
 
 def _readable(
-    shots: Iterable[Shot | Carried], bag: BagWriter, found: Extraction, done: Callable[[], object]
-) -> Iterator[tuple[Shot, Image]]:
-    """The images that can be read, counted; what else is to be kept is written."""
+    shots: Iterable[Shot | Carried], bag: BagWriter, found: Extraction, options: DetectionOptions,
+    done: Callable[[], object],
+) -> Iterator[tuple[Shot, Image, Camera]]:  # fmt: skip
+    """The images that can be used, with their cameras, counted; what else is to be kept is written.
+
+    Raises:
+        DetectError: when they and their calibration differ in size.
+    """
+    cameras = Cameras(options.scan_direction)
     for shot in shots:
         if isinstance(shot, Carried):
             found.carried[shot.topic] += 1
@@ -131,8 +139,13 @@ def _readable(
             found.refused.setdefault(shot.image.reason, shot.image.detail)
         else:
             found.stamps_ns.append(shot.image.stamp_ns)
-            yield shot, shot.image
+            camera = cameras.of(shot, shot.image)
+            if isinstance(camera, Refusal):
+                found.refused.setdefault(camera.reason, camera.detail)
+            else:
+                yield shot, shot.image, camera
         done()
+    cameras.check()
 
 
 class _MarkerTally:
@@ -213,12 +226,15 @@ class Cameras:
     def __init__(self, scan_direction: str) -> None:
         self._scan_direction = scan_direction
         self._last: tuple[Calibration, Camera] | None = None
+        self._fit = 0  # images of the size of their calibration
+        self._misfit, self._fault = 0, ""  # images of another one, and what the first of them is
 
-    def of(self, shot: Shot, image: Image) -> Camera:
-        """Camera of one image.
+    def of(self, shot: Shot, image: Image) -> Camera | Refusal:
+        """Camera of one image; refused where it is of another size than those that fit.
 
         Raises:
-            DetectError: when its camera_info cannot be used, or is of another size.
+            DetectError: when its camera_info cannot be used, or the first images are all of
+                another size.
         """
         try:
             calibration = read_camera_info(shot.camera_info)
@@ -229,21 +245,60 @@ class Cameras:
         camera = self._last[1]
         height, width = image.pixels.shape
         if (width, height) != camera.size:
-            raise DetectError(
+            self._misfit += 1
+            self._fault = self._fault or (
                 f"the images are of {width}x{height}, the calibration is for "
                 f"{camera.size[0]}x{camera.size[1]}{_why((width, height), camera.size)}"
             )
+            if self._misfit >= _MISFITS:
+                self.check()
+            return Refusal(
+                Reason.BAD_IMAGE,
+                f"the image at {1e-9 * image.stamp_ns:.3f} s is of {width}x{height}, the "
+                f"calibration is for {camera.size[0]}x{camera.size[1]}",
+            )
+        self._fit += 1
         return camera
+
+    def check(self) -> None:
+        """Raise DetectError if no image so far was of the size of its calibration."""
+        if self._misfit and not self._fit:
+            raise DetectError(self._fault)
 
 
 def seen_by(
-    shots: Iterable[Shot | Carried], scan_direction: str
+    shots: Iterable[Shot | Carried], scan_direction: str, refused: dict[str, str]
 ) -> Iterator[tuple[Image, Camera | None]]:
-    """The images that can be read, each with its camera, without a readout time, if it is known."""
-    cameras = Cameras(scan_direction)
+    """The images that can be used, each with its camera, without a readout time, if it is known.
+
+    Args:
+        refused: receives the first detail of each reason of those that cannot be used.
+
+    Raises:
+        DetectError: when they and their calibration differ in size, or, without one, they are of
+            several sizes.
+    """
+    cameras, size = Cameras(scan_direction), None
     for shot in shots:
-        if not isinstance(shot, Carried) and isinstance(shot.image, Image):
-            yield shot.image, None if shot.camera_info is None else cameras.of(shot, shot.image)
+        if isinstance(shot, Carried):
+            continue
+        image = shot.image
+        if isinstance(image, Refusal):
+            refused.setdefault(image.reason, image.detail)
+            continue
+        camera = None if shot.camera_info is None else cameras.of(shot, image)
+        if isinstance(camera, Refusal):
+            refused.setdefault(camera.reason, camera.detail)
+            continue
+        size = size or image.pixels.shape
+        if camera is None and image.pixels.shape != size:
+            (height, width), (other, across) = size, image.pixels.shape
+            raise DetectError(
+                f"the image at {1e-9 * image.stamp_ns:.3f} s is of {across}x{other}, those before "
+                f"it are of {width}x{height}: a lens is calibrated with images of one size"
+            )
+        yield image, camera
+    cameras.check()
 
 
 def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
@@ -288,9 +343,7 @@ def record_features(
         DetectError: when no image has keypoints, or images and calibration differ in size.
     """
     extraction = Extraction()
-    cameras = Cameras(options.scan_direction)
-    for shot, image in _readable(shots, bag, extraction, done):
-        cameras.of(shot, image)
+    for shot, image, _ in _readable(shots, bag, extraction, options, done):
         extracted = extractor.extract(image)
         if len(extracted.features):
             extraction.counts.append(len(extracted.features))

@@ -234,6 +234,25 @@ def test_a_wrong_calibration_is_named(here, capsys):
     assert re.search(r"warning: even the stillest images leave \d+\.\d px rms: the calib", said)
 
 
+@pytest.mark.parametrize("odd", [0, 5])
+def test_a_single_image_of_another_size_is_left_out(here, odd, capsys):
+    boards = [board(x=0.001 * k) for k in range(12)]
+    boards[odd] = cv2.resize(boards[odd], (160, 120))
+    images = folder(here.path / "images", boards)
+    assert detect(here, images, *here.calibration, *here.board, "--rate", "10") == 0
+    said = capsys.readouterr().out
+    assert "11 of 12 images" in said
+    assert re.search(r"left out, .* because the image at [\d.]+ s is of 160x120, the calib", said)
+
+
+@pytest.mark.parametrize("count", [1, 12])
+def test_images_that_are_all_of_another_size_are_named(here, count, capsys):
+    images = folder(here.path / "images", [cv2.resize(board(), (160, 120))] * count)
+    assert detect(here, images, *here.calibration, *here.board, "--rate", "10") == 1
+    said = capsys.readouterr().err
+    assert "the images are of 160x120, the calibration is for 320x240: another resolution" in said
+
+
 @pytest.mark.parametrize("own_calibration", [True, False])
 def test_transforms_and_imu_of_a_bag_are_kept(here, own_calibration, capsys):
     start, still = 100 * 10**9, Rotation.identity()  # the recorder's clock is another one

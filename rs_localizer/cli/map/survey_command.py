@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, refuse_existing, write_all
-from rs_localizer.cli.image_input import ImageOptions, opened, tell_times
+from rs_localizer.cli.image_input import ImageOptions, opened, tell_left_out, tell_times
 from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
@@ -112,12 +112,14 @@ def _filmed(given: MapCamera[Options], spotter: Spotter) -> Filmed:
     args, config, spotted = given.args, given.config, dict[int, Spotted]()
     camera: Camera | None = None
     with opened(args) as source:
-        seen = seen_by(source.shots, config.scan_direction)
+        refused = dict[str, str]()
+        seen = seen_by(source.shots, config.scan_direction, refused)
         for image, own in tqdm(seen, unit="image", desc="detect", disable=None):
             if camera is not None and own is not camera:
                 raise ValueError("camera_info changes within the recording; cut it there")
             camera, stamp = own, image.stamp_ns
             spotted[stamp] = spotter.spot(image.pixels, stamp)
+    tell_left_out(refused, {})
     tell_times(source.clock)
     if camera is None:
         raise ValueError(f"{args.recording} has no image that can be read")

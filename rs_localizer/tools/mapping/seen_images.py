@@ -139,6 +139,9 @@ def look(
             found.refused.setdefault(image.reason, image.detail)
             continue
         camera = None if shot.camera_info is None else cameras.of(shot, image)
+        if isinstance(camera, Refusal):
+            found.refused.setdefault(camera.reason, camera.detail)
+            continue
         if size not in (None, image.pixels.shape) or (found.views and camera is not found.camera):
             raise ValueError("the camera changes within the recording; cut it there")
         found.camera, size = camera, image.pixels.shape
@@ -151,6 +154,7 @@ def look(
             found.views.append(looker.look(image))
             if len(found.views) == _EARLY_VIEWS:
                 check_features(found.views)
+    cameras.check()
     return found
 
 
