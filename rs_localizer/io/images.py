@@ -184,11 +184,7 @@ def decode(packed: bytes, format_: str) -> Gray:
         raise MessageError(
             f"the {name} image of {len(data)} bytes cannot be decoded: no header has its size"
         )
-    if math.prod(size) > min(_DENSEST * len(data), _MOST_PIXELS):
-        raise MessageError(
-            f"the {name} image says that it is {size[0]} x {size[1]}, too much for {len(data)} "
-            f"bytes, or more than {_MOST_PIXELS // 1_000_000} megapixels"
-        )
+    check_size(size, len(data), f"the {name} image")
     if name == "PNG":
         data = np.frombuffer(_still_png(packed), np.uint8)
     try:
@@ -198,6 +194,15 @@ def decode(packed: bytes, format_: str) -> Gray:
     if decoded is None:
         raise MessageError(f"the {name} image of {len(data)} bytes cannot be decoded")
     return _eight_bits(np.asarray(decoded))
+
+
+def check_size(size: tuple[int, int], count: int, what: str) -> None:
+    """Refuse an image (``what``) of more pixels than so many bytes can hold, or any camera has."""
+    if math.prod(size) > min(_DENSEST * count, _MOST_PIXELS):
+        raise MessageError(
+            f"{what} says that it is {size[0]} x {size[1]}, too much for {count} bytes, or more "
+            f"than {_MOST_PIXELS // 1_000_000} megapixels"
+        )
 
 
 def _claimed_size(data: bytes, name: str) -> tuple[int, int] | None:

@@ -3,6 +3,7 @@
 """Sources of images, offline: a video, a folder of files, a bag."""
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagReader, make_message
 from rs_localizer.io.image_clock import ImageClock
+from rs_localizer.io.image_files import FOREIGN, SUFFIXES, packed_image
 from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.imu import make_reading
 from rs_localizer.io.messages import make_header, stamp_ns
@@ -26,7 +28,6 @@ from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-SUFFIXES = (".jpg", ".jpeg", ".png")
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".mjpeg", ".mjpg", ".m4v", ".h264", ".ts",
            ".insv")  # fmt: skip
 
@@ -101,29 +102,44 @@ def with_telemetry(
 
 
 def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> Iterator[Shot]:
-    """JPEG and PNG files; their names are times in ns, or they follow each other at a rate."""
+    """Images of files; their names are times in ns, or they follow each other at a rate."""
     times = name_times(files)
     for file in files:
         own = None if times is None else times[file]
         now = clock.relative(None) if own is None else clock.absolute(own)
         assert now is not None  # a clock without a rate has refused
-        name = "png" if file.suffix.lower() == ".png" else "jpeg"
-        compressed = _compressed(now, CAMERA_FRAME, file.read_bytes(), name)
-        image = read_or_refuse(read_any_image, compressed, Reason.BAD_IMAGE)
+        image, compressed = _read_file(file, now)
         if isinstance(image, Refusal):
             image = Refusal(image.reason, f"{file.name}: {image.detail}")
         yield Shot(image, _info(camera, now, CAMERA_FRAME), compressed, now)
 
 
+def _read_file(file: Path, stamp: int) -> tuple[Image | Refusal, Any]:
+    """The image of a file, and the same as sensor_msgs/CompressedImage; None: there is none."""
+    packed = read_or_refuse(packed_image, file, Reason.BAD_IMAGE)
+    if isinstance(packed, Refusal):
+        return packed, None
+    compressed = _compressed(stamp, CAMERA_FRAME, *packed)
+    return read_or_refuse(read_any_image, compressed, Reason.BAD_IMAGE), compressed
+
+
 def image_files(folder: Path) -> list[Path]:
-    """The JPEG and PNG files of a folder by name, or by number if the names are numbers.
+    """The image files of a folder by name, or by number if the names are numbers.
 
     Raises:
         SourceError: when there is none.
     """
-    files = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
+    every = list(folder.iterdir())
+    files = [file for file in every if file.suffix.lower() in SUFFIXES]
     if not files:
-        raise SourceError(f"{folder} has no images: no file ends in {', '.join(SUFFIXES)}")
+        foreign = Counter(file.suffix.lower() for file in every if file.suffix.lower() in FOREIGN)
+        if not foreign:
+            raise SourceError(f"{folder} has no images: no file ends in {', '.join(SUFFIXES)}")
+        (suffix, count), *_ = foreign.most_common(1)
+        raise SourceError(
+            f"{folder} has {count} images that cannot be read ({suffix}): convert them to PNG or "
+            f"JPEG, without turning or scaling them, by {FOREIGN[suffix]} for example"
+        )
     if (times := name_times(files)) is not None:
         return sorted(files, key=times.__getitem__)
     if all(file.stem.isdecimal() for file in files):
@@ -134,7 +150,7 @@ def image_files(folder: Path) -> list[Path]:
 def holds_images(path: Path) -> str:
     """Images of a path that is no recording, as ``is a video``; empty: none."""
     if path.is_dir():
-        count = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
+        count = sum(file.suffix.lower() in (*SUFFIXES, *FOREIGN) for file in path.iterdir())
         return f"is a folder of {count} images" if count else ""
     if path.suffix.lower() in SUFFIXES:
         return "is an image"
