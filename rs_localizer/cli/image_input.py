@@ -27,10 +27,10 @@ if WORKING:
     from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_telemetry
     from rs_localizer.io.video import has_times
     from rs_localizer.offline.image_sources import (
-        IMAGE_TYPES,
         INFO_TYPE,
         Carried,
         Shot,
+        find_images,
         find_topic,
         from_bag,
         from_files,
@@ -204,7 +204,7 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
 def _of_bag(
     bag: BagReader, camera: Camera | None, topics: Mapping[str, str], calibrated: bool
 ) -> Source:
-    topic = find_topic(bag, IMAGE_TYPES, topics.get(IMAGE), "-r image:=")
+    topic = find_images(bag, topics.get(IMAGE))
     info = None
     if camera is None and (calibrated or INFO_TYPE in bag.topics.values()):
         info = find_topic(bag, (INFO_TYPE,), topics.get(CAMERA_INFO), "-r camera_info:=")

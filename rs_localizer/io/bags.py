@@ -30,8 +30,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
+from rs_localizer.io import detections, video_packets
 from rs_localizer.io.containers import METADATA, ZSTD, data_files, magic, storage
-from rs_localizer.io.detections import DEFINITIONS
 from rs_localizer.io.topics import TF_STATIC
 from rs_localizer.io.yaml_text import load_yaml
 
@@ -43,6 +43,10 @@ _LATCHED = Qos(
     QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
     _NO_LIMIT, _NO_LIMIT, QosLiveliness.AUTOMATIC, _NO_LIMIT, False,
 )  # fmt: skip
+
+
+# Types that ROS itself does not have.
+_DEFINITIONS = detections.DEFINITIONS | video_packets.DEFINITIONS
 
 
 class BagError(ValueError):
@@ -62,9 +66,9 @@ def _unpack_file(packed: Path, out: Path) -> None:
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """The message types of ROS 2 Jazzy, and of detections."""
+    """The message types of ROS 2 Jazzy, of detections and of videos in packets."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in DEFINITIONS.items():
+    for name, text in _DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
     return store
 
@@ -125,7 +129,7 @@ class BagReader:
     def _check_types(self, names: Collection[str]) -> None:
         """Refuse types that a recording describes otherwise than ROS: fields would be missed."""
         own, standard = self._reader.typestore.fielddefs, typestore().fielddefs
-        for name in (set(names) & set(standard)) - set(DEFINITIONS):
+        for name in (set(names) & set(standard)) - set(_DEFINITIONS):
             if _fields_of(name, own) != _fields_of(name, standard):
                 raise BagError(f"{self.path} describes {name} otherwise than ROS 2 Jazzy does")
 

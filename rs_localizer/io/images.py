@@ -65,8 +65,8 @@ _ENCODINGS = _encodings()
 _FORMATS = (("JPEG", b"\xff\xd8", b"\xff\xd9"), ("PNG", b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"))
 # Pixels per byte that nothing can be packed better than: a PNG of one bit per pixel, all alike.
 _DENSEST = 8 * 1032
-# No camera has more; decoded they take 8 bytes each at most.
-_MOST_PIXELS = 150_000_000
+MOST_PIXELS = 150_000_000
+"""Of an image: no camera has more; decoded they take 8 bytes each at most."""
 # What a gray image depends on; PNG (third edition), section 5.6.
 _STILL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 # JPEG's markers of frames, by which the size is given.
@@ -198,10 +198,10 @@ def decode(packed: bytes, format_: str) -> Gray:
 
 def check_size(size: tuple[int, int], count: int, what: str) -> None:
     """Refuse an image (``what``) of more pixels than so many bytes can hold, or any camera has."""
-    if math.prod(size) > min(_DENSEST * count, _MOST_PIXELS):
+    if math.prod(size) > min(_DENSEST * count, MOST_PIXELS):
         raise MessageError(
             f"{what} says that it is {size[0]} x {size[1]}, too much for {count} bytes, or more "
-            f"than {_MOST_PIXELS // 1_000_000} megapixels"
+            f"than {MOST_PIXELS // 1_000_000} megapixels"
         )
 
 

@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.io.images import MOST_PIXELS
+
 Image = NDArray[np.uint8]
 
 _JPEG_START = b"\xff\xd8"
@@ -99,7 +101,7 @@ class Video:
                 for frame in self._decoded(packet):
                     seconds = float(frame.time) if timed and frame.time is not None else last
                     is_new, last = seconds > last, max(last, seconds)
-                    yield _compressed(frame.to_ndarray(format="bgr24"), seconds if is_new else None)
+                    yield compress(frame.to_ndarray(format="bgr24"), seconds if is_new else None)
 
     def _decoded(self, packet: Any) -> list[Any]:
         """The images of a packet; of a damaged one none, as OpenCV has it."""
@@ -132,12 +134,11 @@ class Video:
                 seconds = 1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC))
                 is_new = seconds > last
                 last = max(last, seconds)
-                yield _compressed(color, seconds if is_new else None)
+                yield compress(color, seconds if is_new else None)
         finally:
             video.release()
 
 
-_MOST_PIXELS = 150_000_000  # of an image: no camera has more
 # FFmpeg's AVFMT_NOTIMESTAMPS, of raw streams.
 _NO_TIMES = 0x0080
 # Images that may be missing, images from the last one to the end, and s that another stream may
@@ -161,7 +162,7 @@ def _container(path: Path) -> Iterator[Any]:
 def _stream(container: Any) -> Any:
     """The first stream of images that has a decoder."""
     for stream in container.streams.video:
-        if stream.codec_context is not None and 0 < stream.width * stream.height <= _MOST_PIXELS:
+        if stream.codec_context is not None and 0 < stream.width * stream.height <= MOST_PIXELS:
             return stream
     raise VideoError(f"{container.name} has no stream of images that can be decoded")
 
@@ -176,7 +177,8 @@ def has_times(path: Path | str) -> bool:
     return first[-1].seconds is not None
 
 
-def _compressed(color: Any, seconds: float | None) -> VideoImage:
+def compress(color: Any, seconds: float | None) -> VideoImage:
+    """An image (h,w,3) or (h,w) of a video as it is kept: JPEG and grey."""
     _, jpeg = cv2.imencode(".jpg", color, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     grey = color if color.ndim == 2 else cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)
     return VideoImage(jpeg.tobytes(), np.asarray(grey, np.uint8), seconds)

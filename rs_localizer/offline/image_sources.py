@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from rs_localizer.io.messages import make_header, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
 from rs_localizer.io.telemetry import Telemetry
 from rs_localizer.io.topics import IMU
-from rs_localizer.io.video import Video
+from rs_localizer.io.video import Video, VideoImage
+from rs_localizer.io.video_packets import PACKET_TYPES, Packet, PacketDecoder
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 
@@ -158,8 +160,28 @@ def holds_images(path: Path) -> str:
 
 
 def image_topics(bag: BagReader) -> list[str]:
-    """Topics of a bag with images."""
-    return sorted(topic for topic, kind in bag.topics.items() if kind in IMAGE_TYPES)
+    """Topics of a bag with images, or with packets of a video."""
+    kinds = (*IMAGE_TYPES, *PACKET_TYPES)
+    return sorted(topic for topic, kind in bag.topics.items() if kind in kinds)
+
+
+def find_images(bag: BagReader, given: str | None) -> str:
+    """The topic of images, given or the only one; that of a video in packets if there is no other.
+
+    Raises:
+        SourceError: when it is not there, several could be meant, or PyAV is missing.
+    """
+    kinds = set(bag.topics.values())
+    packed = bag.topics.get(given) in PACKET_TYPES if given else not kinds & set(IMAGE_TYPES)
+    if not packed or not kinds & set(PACKET_TYPES):
+        return find_topic(bag, IMAGE_TYPES, given, "-r image:=")
+    topic = find_topic(bag, PACKET_TYPES, given, "-r image:=")
+    if find_spec("av") is None:
+        raise SourceError(
+            f"the images of {topic} are packets of a video ({bag.topics[topic]}), which PyAV "
+            "decodes: pip install av (the extra video of rs_localizer)"
+        )
+    return topic
 
 
 def _since_1970(file: Path) -> int | None:
@@ -203,6 +225,8 @@ def find_topic(bag: BagReader, types: tuple[str, ...], given: str | None, option
         choose = f"; choose one with {option}" if of_type else ""
         if types == (INFO_TYPE,) and not of_type:  # as a part of a split recording has it
             choose = "; give --calibration FILE"
+        if types == IMAGE_TYPES and not of_type:
+            known = f"it has {', '.join(f'{name} ({kind})' for name, kind in bag.topics.items())}"
         raise SourceError(f"{bag.path} has {what} of type {' or '.join(types)}: {known}{choose}")
     return of_type[0]
 
@@ -215,6 +239,7 @@ def from_bag(
     Between them comes what replay needs besides: transforms and inertial measurements.
     """
     carried = [topic for topic, kind in bag.topics.items() if kind in CARRIED_TYPES]
+    decoder = PacketDecoder() if bag.topics[image_topic] in PACKET_TYPES else None
     topics = [image_topic, *carried]
     latest: Any = None
     if info_topic is not None:
@@ -227,6 +252,9 @@ def from_bag(
             latest = message
         elif topic in carried:
             yield Carried(topic, recorded_ns, as_tf2(message))
+        elif decoder is not None:
+            for decoded in decoder.decode(message, (latest, recorded_ns)):
+                yield _of_packet(*decoded, camera)
         else:
             image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
             compressed = message if hasattr(message, "format") else None
@@ -235,6 +263,20 @@ def from_bag(
                 frame = str(message.header.frame_id) or CAMERA_FRAME
                 info = make_camera_info(camera, stamp_ns(message), frame)
             yield Shot(image, info, compressed, recorded_ns)
+    if decoder is not None:
+        for decoded in decoder.rest():
+            yield _of_packet(*decoded, camera)
+
+
+def _of_packet(packet: Packet, found: VideoImage | str, camera: Camera | None) -> Shot:
+    """The image of a packet, which came beside camera_info and time of recording, or its loss."""
+    info, recorded_ns = packet.beside
+    if camera is not None:
+        info = make_camera_info(camera, packet.stamp_ns, packet.frame or CAMERA_FRAME)
+    if isinstance(found, str):
+        return Shot(Refusal(Reason.BAD_IMAGE, found), info, None, recorded_ns)
+    compressed = _compressed(packet.stamp_ns, packet.frame, found.jpeg, "jpeg")
+    return Shot(Image(packet.stamp_ns, packet.frame, found.image), info, compressed, recorded_ns)
 
 
 def _compressed(stamp: int, frame: str, data: bytes, format_: str) -> Any:
