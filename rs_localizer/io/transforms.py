@@ -118,6 +118,34 @@ def make_transform(
     )
 
 
+class UnusableTransforms:
+    """Transforms that have come and are none, which tf2 leaves out as if they had not come."""
+
+    def __init__(self) -> None:
+        self._faults: dict[tuple[str, str], str] = {}  # by parent and child, the last one
+
+    def read(self, stamped: Any) -> Transform | None:
+        """The transform of a geometry_msgs/TransformStamped; None: it is none, which is kept."""
+        names = _name(stamped.header.frame_id), _name(stamped.child_frame_id)
+        try:
+            link = read_transform(stamped.transform)
+        except TransformError as error:
+            self._faults[names] = f"of {names[1]!r} in {names[0]!r} on TF {error}"
+            return None
+        self._faults.pop(names, None)
+        return link
+
+    def of(self, frame: str) -> str:
+        """What is wrong with a transform of this frame; empty: nothing has come that is."""
+        faults = (fault for names, fault in list(self._faults.items()) if frame in names)
+        return next(faults, "")
+
+    def explain(self, text: str) -> str:
+        """A sentence on frames without a transform, with the last of the faults."""
+        faults = [fault for fault in list(self._faults.values()) if fault not in text]
+        return f"{text}; {faults[-1]}" if faults else text
+
+
 @dataclass(slots=True)
 class _Links:
     """A frame in its parent over time: for ever, or samples in the order of time."""
@@ -164,17 +192,14 @@ class TransformTree:
     def __init__(self) -> None:
         self._tracks: dict[str, _Links] = {}  # by child
         self._parents: set[str] = set()
+        self._unusable = UnusableTransforms()
 
     def add(self, message: Any, *, static: bool) -> None:
         """Take the transforms of a tf2_msgs/TFMessage; like tf2, leave out those that are none."""
         for stamped in message.transforms:
-            parent = stamped.header.frame_id.removeprefix("/")
-            child = stamped.child_frame_id.removeprefix("/")
-            try:
-                link = read_transform(stamped.transform)
-            except TransformError:
-                continue
-            if not parent or not child or parent == child:
+            parent, child = _name(stamped.header.frame_id), _name(stamped.child_frame_id)
+            link = self._unusable.read(stamped)
+            if link is None or not parent or not child or parent == child:
                 continue
             self._parents.add(parent)
             if static:
@@ -187,7 +212,7 @@ class TransformTree:
 
     def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
         """``target_from_source`` at a time; None: the latest that all its links have."""
-        target, source = target.removeprefix("/"), source.removeprefix("/")
+        target, source = _name(target), _name(source)
         if target == source:
             return Transform(np.eye(3), np.zeros(3))
         if stamp_ns is None:
@@ -197,12 +222,12 @@ class TransformTree:
         of_target, other_gap = self._above(target, stamp_ns)
         meeting = next((name for name in of_source if name in of_target), None)
         if meeting is None:
-            raise other_gap or gap or _unconnected(target, source)
+            raise other_gap or gap or self._unconnected(target, source)
         return of_target[meeting].inverse() @ of_source[meeting]
 
     def moves(self, target: str, source: str) -> bool:
         """True if a link between the two frames comes with a time."""
-        target, source = target.removeprefix("/"), source.removeprefix("/")
+        target, source = _name(target), _name(source)
         return target != source and self._latest(target, source) is not None
 
     def _latest(self, target: str, source: str) -> int | None:
@@ -211,7 +236,7 @@ class TransformTree:
         ways = [list(self._above(name, None)[0]) for name in (target, source)]
         meeting = next((name for name in ways[0] if name in ways[1]), None)
         if meeting is None:
-            raise _unconnected(target, source)
+            raise self._unconnected(target, source)
         tracks = [self._tracks[name] for way in ways for name in way[: way.index(meeting)]]
         return min((track.stamps[-1] for track in tracks if track.stamps), default=None)
 
@@ -219,6 +244,8 @@ class TransformTree:
         for name in names:
             if name not in self._tracks and name not in self._parents:
                 frames = ", ".join(sorted(self._parents | set(self._tracks))) or "none"
+                if fault := self._unusable.of(name):
+                    raise TransformError(f"frame {name!r} has no usable transform: {fault}")
                 raise TransformError(f"frame {name!r} does not exist; there are {frames}")
 
     def _above(
@@ -238,6 +265,10 @@ class TransformTree:
             found[name] = here
         return found, None
 
+    def _unconnected(self, target: str, source: str) -> TransformError:
+        text = f"frames {target!r} and {source!r} are not connected"
+        return TransformError(self._unusable.explain(text))
 
-def _unconnected(target: str, source: str) -> TransformError:
-    return TransformError(f"frames {target!r} and {source!r} are not connected")
+
+def _name(frame: str) -> str:
+    return str(frame).removeprefix("/")

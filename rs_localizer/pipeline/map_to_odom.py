@@ -54,12 +54,13 @@ class Holding:
     seconds: float  # since the frame that it is of
     position: float  # m, standard deviation of the body's place in the map
     angle: float  # rad, of its orientation
+    ended: bool = False  # it is older than ``hold`` and no longer sent
 
     def __str__(self) -> str:
-        return (
-            f"holding for {self.seconds:.1f} s, {100.0 * self.position:.2g} cm, "
-            f"{math.degrees(self.angle):.2g} deg"
-        )
+        off = f"{100.0 * self.position:.2g} cm, {math.degrees(self.angle):.2g} deg"
+        if self.ended:
+            return f"not sent since hold ended, {self.seconds:.1f} s after the last frame, {off}"
+        return f"holding for {self.seconds:.1f} s, {off}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,20 +124,25 @@ class MapToOdom:
             hold: s for which it is; 0: for ever.
         """
         last = self._last
-        if last is None or 0.0 < hold < 1e-9 * (time_ns - last.stamp_ns):
-            return None
-        return last.map_from_odom
+        return None if last is None or self._ended(time_ns, hold) else last.map_from_odom
 
-    def holding(self, time_ns: int, odom_from_body: Transform) -> Holding | None:
-        """Age and deviations at a time when odometry has the body there; None: nothing is held.
+    def _ended(self, time_ns: int, hold: float) -> bool:
+        return self._last is not None and 0.0 < hold < 1e-9 * (time_ns - self._last.stamp_ns)
+
+    def holding(self, time_ns: int, odom_from_body: Transform, hold: float) -> Holding | None:
+        """Age and deviations at a time when odometry has the body there; None: there was no frame.
 
         To be asked often: the way since the last frame counts, not the distance.
+
+        Args:
+            hold: as of :meth:`held`.
         """
         if self._last is None:
             return None
         seconds = max(1e-9 * (time_ns - self._last.stamp_ns), 0.0)
         position, angle = self._grown(self._last, seconds, odom_from_body)
-        return Holding(seconds, math.sqrt(position), math.sqrt(angle))
+        ended = self._ended(time_ns, hold)
+        return Holding(seconds, math.sqrt(position), math.sqrt(angle), ended)
 
     def _grown(
         self, since: _Correction, seconds: float, odom_from_body: Transform

@@ -48,7 +48,7 @@ def test_in_the_plane_it_is_as_sure_as_of_x_and_y_and_heading():
     for two_d, expected in ((True, [3.0, 6.0]), (False, [6.0, 15.0])):
         correction = MapToOdom()
         correction.take(frame, place(0, 0, 0), two_d=two_d)
-        holding = correction.holding(SECOND, place(0, 0, 0))
+        holding = correction.holding(SECOND, place(0, 0, 0), 0.0)
         assert [holding.position**2, holding.angle**2] == pytest.approx(expected)
 
 
@@ -80,7 +80,7 @@ def test_the_error_stays_within_what_is_claimed(scale, turn, gap):
                 assert correction.take(found(stamp, body @ off), odom, two_d=False) == ""
             elif i < 600 + gap:
                 error = correction.held(stamp, 0.0) @ odom
-                claimed = correction.holding(stamp, odom)
+                claimed = correction.holding(stamp, odom, 0.0)
                 off = np.linalg.norm(error.translation - body.translation)
                 inside += off < 2.0 * claimed.position
                 total += 1
@@ -103,10 +103,14 @@ def test_a_jump_that_nothing_explains_is_told():
 def test_it_is_held_for_ever_or_as_long_as_is_wanted():
     correction = MapToOdom()
     assert correction.held(SECOND, 0.0) is None
-    assert correction.holding(SECOND, place(0, 0, 0)) is None
+    assert correction.holding(SECOND, place(0, 0, 0), 0.0) is None
     assert correction.take(found(SECOND, place(1, 0, 0)), place(0, 0, 0), two_d=False) == ""
     for hold, seconds, there in ((0.0, 1e4, True), (2.0, 1.9, True), (2.0, 2.1, False)):
-        held = correction.held(SECOND + round(seconds * SECOND), hold)
+        now = SECOND + round(seconds * SECOND)
+        held = correction.held(now, hold)
         assert (held is not None) == there
+        # What is said of it is what is sent of it.
+        said = str(correction.holding(now, place(0, 0, 0), hold))
+        assert said.startswith(f"holding for {seconds:.1f} s, " if there else "not sent since hold")
     correction.forget()
     assert correction.held(SECOND, 0.0) is None

@@ -122,7 +122,7 @@ class Condition:
     missing: Sequence[str]  # inputs without which no frame can be localized
     silence: Mapping[str, Silence]  # by input topic
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
-    holding: Holding | None = None  # the correction of odometry; None: none is sent
+    holding: Holding | None = None  # the correction of odometry; None: there has been none
     values: Mapping[str, str] = field(default_factory=dict)  # others, by readable names
 
 

@@ -31,6 +31,7 @@ from rs_localizer.io.transforms import (
     NotYetError,
     Transform,
     TransformError,
+    UnusableTransforms,
     make_transform,
     read_transform,
 )
@@ -93,6 +94,7 @@ class Tf:
         self._buffer: Any = None
         self._errors: Any = None  # tf2_ros
         self._deaf = "TF is not listened to"  # why it is not
+        self._unusable = UnusableTransforms()
         self._undo = contextlib.ExitStack()
 
     def configure(self, config: NodeConfig) -> None:
@@ -124,10 +126,15 @@ class Tf:
         )
         self._errors, self._buffer = tf2_ros, buffer
         node = _WithoutExecutor(self._node)
-        listener = _listen(tf2_ros.TransformListener, buffer, node, self._heard)
+        listener = _listen(tf2_ros.TransformListener, buffer, node, self._hear)
         intake = Intake(self._node.context, node.subscriptions, self._failed)
         for undo in (jumps.unregister, listener.unregister, intake.close):
             self._undo.callback(undo)
+
+    def _hear(self, transforms: list[Any]) -> None:
+        for item in transforms:
+            self._unusable.read(item)
+        self._heard(transforms)
 
     def close(self) -> None:
         """Stop listening; whoever asks for a transform gets none."""
@@ -172,7 +179,7 @@ class Tf:
         except self._errors.ExtrapolationException as error:
             text = _text(error)
         except self._errors.TransformException as error:
-            raise TransformError(_text(error)) from error
+            raise TransformError(self._unusable.explain(_text(error))) from error
         latest_ns = None
         with contextlib.suppress(self._errors.TransformException):
             latest_ns = stamp_of(buffer.lookup_transform(target, source, Time()))
@@ -300,7 +307,7 @@ class Broadcaster:
 
     @property
     def holding(self) -> Holding | None:
-        """Age and deviations of the correction of odometry; None: none is sent."""
+        """Age and deviations of the correction of odometry; None: there has been none."""
         return self._holding
 
     def close(self) -> None:
@@ -380,7 +387,7 @@ class Broadcaster:
             return
         newest_ns, body_in_odom = self.tf.latest(config.odom_frame, body_frame)
         newest_ns = newest_ns or self._node.get_clock().now().nanoseconds
-        self._holding = self._correction.holding(newest_ns, body_in_odom)
+        self._holding = self._correction.holding(newest_ns, body_in_odom, config.hold)
         ahead_ns = newest_ns + round(config.transform_tolerance * 1e9)
         if ahead_ns < self._sent_ns - _RESTART:
             self._sent_ns = 0

@@ -10,6 +10,7 @@ import pytest
 from rs_localizer.io.transforms import TransformError, TransformTree, from_numbers
 
 Numbers = tuple[float, ...]
+NAN = float("nan")
 HALF_TURN = (0.0, 0.0, 1.0, 0.0)
 NO_TURN = (0.0, 0.0, 0.0, 1.0)
 
@@ -132,20 +133,34 @@ def test_loops_end():
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "text"),
     [
-        tf("a", "b", (float("nan"), 0.0, 0.0), NO_TURN),
-        tf("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)),
-        tf("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.1, 1.1)),
-        tf("", "b", (0.0, 0.0, 0.0), NO_TURN),
-        tf("b", "/b", (0.0, 0.0, 0.0), NO_TURN),
+        (tf("a", "b", (NAN, 0.0, 0.0), NO_TURN), r"usable .*'b' in 'a' on TF the tr.*not finite"),
+        (tf("a", "/b", (0.0, 0.0, 0.0), (0.0,) * 4), r"usable .* the quat.* is not a rotation"),
+        (tf("a", "b", (0.0, 0.0, 0.0), (NAN,) * 4), r"usable .* \(nan, nan, .* is not a rotation"),
+        (tf("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.1, 1.1)), "usable .* is not a rotation"),
+        (tf("", "b", (0.0, 0.0, 0.0), NO_TURN), "does not exist; there are none"),
+        (tf("b", "/b", (0.0, 0.0, 0.0), NO_TURN), "does not exist; there are none"),
     ],
 )
-def test_garbage_is_left_out(wrong):
+def test_garbage_is_left_out(wrong, text):
     tree = TransformTree()
     tree.add(wrong, static=True)
-    with pytest.raises(TransformError, match="there are none"):
+    with pytest.raises(TransformError, match=text):
         tree.lookup("a", "b", None)
     tree.add(tf("a", "b", (0.0, 0.0, 1.0), HALF_TURN), static=True)
     tree.add(wrong, static=True)
     assert tree.lookup("a", "b", None).translation.tolist() == [0.0, 0.0, 1.0]
+
+
+def test_a_gap_of_garbage_between_frames_is_named():
+    tree = TransformTree()
+    tree.add(tf("map", "odom", (0.0, 0.0, 0.0), NO_TURN), static=True)
+    tree.add(tf("odom", "base", (0.0, 0.0, 0.0), (0.0,) * 4, 10**9), static=False)
+    tree.add(tf("base", "camera", (0.0, 0.0, 0.0), NO_TURN), static=True)
+    with pytest.raises(TransformError, match="not connected; of 'base' in 'odom' on TF the quat"):
+        tree.lookup("map", "camera", None)
+    tree.add(tf("odom", "base", (0.0, 0.0, 0.0), NO_TURN, 2 * 10**9), static=False)
+    assert tree.lookup("map", "camera", None).translation.tolist() == [0.0, 0.0, 0.0]
+    with pytest.raises(TransformError, match="'no' does not exist; there are base, camera, map, o"):
+        tree.lookup("map", "no", None)

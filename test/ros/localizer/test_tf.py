@@ -15,6 +15,7 @@ from rclpy.time import Time
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import BodyPose, Localized
+from rs_localizer.io.transforms import TransformError
 from rs_localizer.ros.localizer.tf import Broadcaster, check
 
 from ..node.test_worker import waits  # noqa: TID252 - Python has a package "test"
@@ -108,6 +109,22 @@ def heard(robot: Any, peer: Any, parent: str, child: str, stamp_ns: int = 0) -> 
     return awaited(peer, lambda: robot.buffer.lookup_transform(parent, child, at))
 
 
+@pytest.mark.parametrize("turn", [(0.0,) * 4, (float("nan"),) * 4])
+def test_a_transform_without_a_rotation_is_named(made, robot, peer, turn):
+    node = made(publish_tf="map_to_odom")
+    robot.send("odom", "base_link", 0.0, turn=turn)
+
+    def said() -> str:
+        try:
+            node.tf.lookup("odom", "base_link", None)
+        except TransformError as error:
+            return str(error)
+        return ""
+
+    assert peer.spin_until(lambda: "'base_link' in 'odom' on TF the quaternion" in said())
+    assert "is not a rotation" in said()
+
+
 def test_the_correction_never_stops(made, robot, peer):
     node = made(publish_tf="map_to_odom", transform_tolerance=0.2, hold=3.0)
     assert not node.notes
@@ -137,6 +154,7 @@ def test_the_correction_never_stops(made, robot, peer):
     peer.spin_until(lambda: False, 0.3)
     with pytest.raises(Exception, match="future"):
         robot.buffer.lookup_transform("map", "base_link", Time(nanoseconds=11_300_000_000))
+    assert str(node.broadcaster.holding).startswith("not sent since hold ended, 3.6 s after the ")
 
 
 def test_without_tf2_ros_only_what_needs_it_is_refused(monkeypatch):
