@@ -21,7 +21,7 @@ from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_
 from rs_localizer.io.transforms import Transform, TransformError, TransformTree
 from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.offline.image_sources import IMAGE_TYPES, INFO_TYPE, SourceError, find_topic
-from rs_localizer.offline.replay import TF_TYPE, Topics, as_tf2, tf_topics
+from rs_localizer.offline.replay import TF_TYPE, Topics, as_tf2, imu_topics, tf_topics
 from rs_localizer.pipeline.inputs import IMU_TYPE
 
 
@@ -96,6 +96,8 @@ def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> 
         SourceError: when the topic is not there, or several could be meant.
         RecordingError: when none of its messages can be used, with the reason.
     """
+    if topic is None and len(found := imu_topics(bag)) == 1:
+        topic = found[0]
     topic = find_topic(bag, (IMU_TYPE,), topic, "--imu")
     stamps, rates, frame, fault = [], [], "", ""
     for _, _, message in bag.messages([topic]):

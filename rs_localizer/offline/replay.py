@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +17,8 @@ from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagError, BagReader, make_message
-from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.imu import read_imu
+from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import (
     CAMERA_INFO,
@@ -135,7 +138,10 @@ def find_topics(bag: BagReader, given: Mapping[str, str | None] | None = None) -
         if item.role == Role.FRAMES:
             needed = item is frames
         elif item.role == Role.SAMPLES:
-            needed = name in wanted or len(_named(bag, item) or imu_topics(bag)) == 1
+            found = _named(bag, item) or imu_topics(bag)
+            if len(found) == 1:
+                wanted.setdefault(name, found[0])
+            needed = name in wanted
         else:
             # A map is of no use for frames that bring their own points.
             used = name == frames.needs or all(name != other.needs for other in INPUTS.values())
@@ -206,9 +212,27 @@ def _choose_frames(bag: BagReader, wanted: Mapping[str, str]) -> Input:
     return candidates[0] if candidates else kinds[0]
 
 
+# Messages by which a gyroscope is told from an accelerometer: half a second at 200 Hz.
+_LOOKED_AT = 100
+
+
 def imu_topics(bag: BagReader) -> list[str]:
-    """All topics of inertial measurements."""
-    return sorted(topic for topic, kind in bag.topics.items() if kind == IMU_TYPE)
+    """All topics of inertial measurements; of several those with angular velocities, if any has.
+
+    RealSense's driver publishes its accelerometer beside its gyroscope, in the same type.
+    """
+    topics = sorted(topic for topic, kind in bag.topics.items() if kind == IMU_TYPE)
+    if len(topics) < 2:
+        return topics
+    return [topic for topic in topics if _has_rates(bag, topic)] or topics
+
+
+def _has_rates(bag: BagReader, topic: str) -> bool:
+    for _, _, message in islice(bag.messages([topic]), _LOOKED_AT):
+        with contextlib.suppress(MessageError):
+            if any(read_imu(message).angular_velocity):
+                return True
+    return False
 
 
 def has_frames(bag: BagReader) -> bool:
