@@ -111,6 +111,21 @@ def _check_exchanged(K: Array, width: int, height: int) -> None:
         )
 
 
+# A focal length of so many widths sees 6 degrees; in pixels nothing is as short.
+_LONGEST_IN_WIDTHS = 10.0
+
+
+def _check_unit(K: Array, width: int, height: int) -> None:
+    """Refuse a camera matrix in widths and heights of the image, as of normalized calibrations."""
+    is_middle = np.all(np.abs(K[:2, 2] - 0.5) < _BESIDE)
+    if is_middle and min(width, height) > 2 and max(K[0, 0], K[1, 1]) < _LONGEST_IN_WIDTHS:
+        raise ValueError(
+            f"K is in widths and heights of the image, not in pixels: focal lengths "
+            f"{K[0, 0]:g}, {K[1, 1]:g}, principal point ({K[0, 2]:g}, {K[1, 2]:g}); multiply its "
+            f"first row by {width} and its second by {height}"
+        )
+
+
 def _matrix(K: Any) -> Array:
     """A camera matrix (3,3), or its nine numbers as CameraInfo has them."""
     matrix = numbers("K", K)
@@ -217,6 +232,7 @@ class Camera:
             raise ValueError(f"{roi} does not lie on a sensor of {self.width}x{self.height}")
         if roi is None:
             _check_exchanged(K, self.width, self.height)
+        _check_unit(K, self.width, self.height)
         for array in (K, D):
             array.flags.writeable = False
         set_field(self, "K", K)

@@ -40,6 +40,15 @@ def test_width_and_height_that_are_exchanged():
     Camera(480, 640, [[500.0, 0, 319.5], [0, 510, 300.0], [0, 0, 1]])
 
 
+def test_a_matrix_in_widths_of_the_image_is_named():
+    with pytest.raises(ValueError, match=r"not in pixels: focal lengths 0\.78, 1\.04, .* by 640"):
+        Camera(640, 480, [[0.78, 0, 0.5], [0, 1.04, 0.5], [0, 0, 1]])
+    Camera(640, 480, [[0.78 * 640, 0, 0.5 * 640], [0, 1.04 * 480, 0.5 * 480], [0, 0, 1]])
+    # A wide lens on a small image, and one whose corner is in the middle of its view.
+    Camera(16, 16, [[5.0, 0, 7.5], [0, 5, 7.5], [0, 0, 1]])
+    Camera(640, 480, [[500.0, 0, 0.5], [0, 500, 0.5], [0, 0, 1]])
+
+
 @pytest.mark.parametrize(("model", "D"), LENSES)
 def test_rays_lead_back_to_their_pixels_by_opencv(model, D):
     raw = pixels()
