@@ -3,6 +3,9 @@
 #
 # make demo   the whole thing on the bundled recording: a table on the screen, pictures in out/
 # make test   lint, types and tests
+# make kernels  compiles what has been edited of the kernels; the others do that first
+# make wheel  wheels for other machines, in dist/
+# make jit    the kernels' own tests under Numba, and the native module against what they gave
 # make bench  the statistical tests, which take longer: coverage of regions, verdicts of experiments
 # make coverage  the tests once more, and which lines they run: without what Numba compiles, and
 #                without what runs in processes of its own (nodes, some commands); COVERAGE is
@@ -16,6 +19,8 @@
 
 VENV ?= .venv
 OUT ?= out
+# What `make jit` runs: tests that call kernels.
+JIT ?= test/core test/solvers test/estimation test/inertial test/matching test/markers test/native
 COVERAGE ?= --cov
 
 # The first interpreter that will do; without any, python3 is refused below with the reason.
@@ -40,24 +45,27 @@ ready := $(VENV)/.ready-$(subst /,_,$(PYTHON))
 python := $(VENV)/bin/python
 # What takes long says what it does, a line at least every 20 s.
 progress := $(PYTHON) .ci/progress.py
+# The processor that Numba compiles for, as the native module was: see rs_localizer/native/build.py.
+native = $$($(python) -m rs_localizer.native.build --environment)
 pip := $(python) -m pip install --disable-pip-version-check --no-input --progress-bar off
 
-.PHONY: demo test bench ros coverage docs collect warm lint clean
+.PHONY: demo test bench ros coverage docs collect kernels wheel jit lint clean
 .DELETE_ON_ERROR:
 
-demo: $(ready)
+demo: kernels
 	@$(python) -m rs_localizer demo --out $(OUT)
 
 # Of four processes one or two often wait, for nodes that have to hear of each other. Threads of BLAS
 # would wait for each other, too, and spin: 119 s of the processor instead of 26 in one file.
 test: $(ready)
-	@$(MAKE) --no-print-directory --jobs 2 lint warm collect
+	@$(MAKE) --no-print-directory kernels
+	@$(MAKE) --no-print-directory --jobs 2 lint collect
 	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 4 --dist loadfile
 
-bench: $(ready) warm
+bench: kernels
 	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 2 --dist loadfile -m bench
 
-coverage: $(ready) warm
+coverage: kernels
 	@$(progress) --quiet coverage $(pip) --upgrade --no-deps --target $(VENV)/coverage coverage pytest-cov
 	@PYTHONPATH="$$(cd $(VENV) && pwd)/coverage" OPENBLAS_NUM_THREADS=1 \
 	    $(python) -m pytest -q -n 2 --dist loadfile --cov-report term:skip-covered $(COVERAGE)
@@ -78,8 +86,21 @@ docs: $(ready)
 collect: $(ready)
 	@$(progress) --quiet "collecting tests" $(python) -m pytest -q --collect-only
 
-warm: $(ready)
-	@$(progress) --quiet "compiling kernels" $(python) -m rs_localizer warm
+# Compiles what has been edited since: nothing, mostly. Objects are kept in .kernels.
+kernels: $(ready)
+	@$(progress) "compiling kernels" $(python) -m rs_localizer.native.build
+
+# Wheels for all levels of x86-64 and for aarch64, on Linux since glibc 2.28, in dist/.
+wheel: $(ready)
+	@$(progress) --quiet "installing packages" $(pip) build ziglang auditwheel
+	@bash .ci/portable_wheels dist
+
+# The kernels under Numba: their own tests, and whether the native module answers as they do.
+jit: kernels
+	@RS_LOCALIZER_KERNELS=numba RS_LOCALIZER_CALLS=$(VENV)/calls.pkl PYTHONPATH=test/native \
+	    $(native) OPENBLAS_NUM_THREADS=1 $(progress) "running kernels by Numba" \
+	    $(python) -m pytest -q -p recorder $(JIT)
+	@$(python) test/native/compare.py $(VENV)/calls.pkl
 
 lint: $(ready)
 	@$(progress) "linting" $(python) -m ruff check --quiet --output-format concise .
@@ -98,11 +119,15 @@ $(ready): setup.py pyproject.toml Makefile
 	        "On Debian and Ubuntu: sudo apt install python3-venv" >&2; exit 1; }
 	@echo "Preparing $(VENV) (once, takes a few minutes)"
 	@[ -e $@ ] || $(progress) "making the environment" $(PYTHON) -m venv --clear $(VENV)
-	@$(progress) --quiet "installing packages" $(pip) --no-compile --editable '.[ros,evo,fleet,examples,mapping,plots,table,video,test]'
+	@$(progress) --quiet "installing build tools" $(pip) $$($(python) .ci/build_requires.py)
+	@$(progress) "compiling kernels" $(python) -m rs_localizer.native.build
+	@$(progress) --quiet "installing packages" $(pip) --no-compile --no-build-isolation \
+	    --editable '.[ros,tools,evaluate,fleet,examples,mapping,table,video,test]'
 	@# Which pip does one file after the other, and the tests of other packages with them.
 	@$(progress) --quiet "compiling packages" $(python) -m compileall -j 0 -x '/(tests|pip)/' $(VENV)/lib 2>/dev/null || true
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(OUT) build install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .coverage
+	rm -rf $(VENV) $(OUT) .kernels build install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .coverage
+	rm -f rs_localizer/native/*.so rs_localizer/native/_kernels_*.json
 	find rs_localizer benchmarks test -name __pycache__ -type d -prune -exec rm -rf {} +

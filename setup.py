@@ -3,19 +3,61 @@
 """The package for colcon (ament_python) and for pip."""
 
 import os
+import sys
 from glob import glob
+from pathlib import Path
 
-from setuptools import find_packages, setup
+from setuptools import Extension, find_packages, setup
+from setuptools.command.build_ext import build_ext
+from setuptools.command.build_py import build_py
 
 package_name = "rs_localizer"
+# Of rs_localizer/native: what only the build needs.
+build_tools = ("bitcode", "build", "jit", "sources")
+
+
+class BuildKernels(build_ext):
+    """Compiles the kernels; see rs_localizer/native/build.py.
+
+    ``RS_LOCALIZER_LEVELS``, as "v2 v3 v4", makes portable modules of these levels (`make wheel`);
+    without it, one for this machine.
+    """
+
+    def run(self):
+        folder = Path(__file__).resolve().parent
+        sys.path.insert(0, str(folder))
+        from rs_localizer.native import build
+
+        in_place = bool(self.inplace or getattr(self, "editable_mode", False))
+        to = folder if in_place else Path(self.build_lib)
+        levels = os.environ.get("RS_LOCALIZER_LEVELS", "").split()
+        try:
+            build.build(to / package_name / "native", levels, bool(levels), is_checkout=in_place)
+        except build.CannotBuild as fault:
+            sys.exit(f"rs_localizer: {fault}")
+
+    def get_outputs(self):
+        return sorted(map(str, Path(self.build_lib, package_name, "native").glob("*.so")))
+
+    def get_source_files(self):
+        return []
+
+
+class BuildPython(build_py):
+    """Leaves out of wheels what only the build needs."""
+
+    def find_package_modules(self, package, package_dir):
+        modules = super().find_package_modules(package, package_dir)
+        if package != f"{package_name}.native":
+            return modules
+        return [module for module in modules if module[1] not in build_tools]
+
 
 requirements = [
-    "numba",
     "numpy>=1.26",
     "opencv-python-headless>=4.6",
     "PyYAML",
     "rosbags",
-    "scipy",
     "tqdm",
 ]
 if os.environ.get("AMENT_PREFIX_PATH"):
@@ -33,6 +75,10 @@ setup(
     license="Apache-2.0",
     packages=find_packages(include=[package_name, f"{package_name}.*"]),
     package_data={package_name: ["py.typed", "data/**/*"]},
+    cmdclass={"build_ext": BuildKernels, "build_py": BuildPython},
+    # One module serves Python 3.11 and all that follow.
+    ext_modules=[Extension(f"{package_name}.native._kernels", [], py_limited_api=True)],
+    options={"bdist_wheel": {"py_limited_api": "cp311"}},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
@@ -51,18 +97,23 @@ setup(
         ],
         "colcon": ["colcon-common-extensions", "ros-jazzy-ament-package"],
         "docs": ["sphinx", "myst-parser", "sphinxcontrib-mermaid"],
-        "evo": ["evo"],
         "examples": ["h5py", "pyarrow", "pycolmap", "rerun-sdk"],
+        # calibrate, map survey, --smooth; pictures.
+        "tools": ["scipy", "matplotlib", "Pillow>=9.1"],
+        "evaluate": ["evo", "scipy", "matplotlib", "Pillow>=9.1"],
         "fleet": ["dask", "distributed"],
         "peers": ["poselib"],  # of the benchmarks
-        "mapping": ["pycolmap", "matplotlib"],
-        "plots": ["matplotlib", "Pillow>=9.1"],
+        "mapping": ["pycolmap", "scipy", "matplotlib"],
         "table": ["pyarrow"],
         # Of telemetry-parser there is no wheel for 3.13, and a build needs Rust. PyAV decodes
         # what OpenCV may not (AV1), and says where a video stops.
         "video": ["av", "telemetry-parser; python_version < '3.13'"],
         "test": [
             "build",
+            # Kernels that are edited are run by Numba; numbers as in pyproject.toml.
+            "numba>=0.61,<0.69",
+            "scipy",
+            "cmeel-eigen>=3.4,<4",
             "catkin_pkg",
             "codespell==2.4.*",
             # Against whose bundle adjustment the own one is tested.

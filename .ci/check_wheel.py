@@ -14,6 +14,8 @@ import zipfile
 # Patterns of which each has to match a file.
 WANTED = (
     r"rs_localizer/py\.typed",
+    r"rs_localizer/native/_cpu\.abi3\.so",
+    r"rs_localizer/native/_kernels_(v2|v3|v4|generic)\.abi3\.so",
     r"rs_localizer/data/webcam_chessboard/recording/rec\.mcap",
     r"rs_localizer/data/webcam_chessboard/ATTRIBUTION\.md",
     r".*\.dist-info/(licenses/)?LICENSE",
@@ -24,15 +26,23 @@ WANTED = (
 )
 # Where all files are.
 PLACES = r"(rs_localizer/|rs_localizer-[^/]+\.(dist-info|data/data/share)/).*"
-# Beside the recording that the demo plays, in bytes of the wheel.
-MOST_BYTES = 3_000_000
-UNWANTED = r".*(__pycache__|\.pyc$|(^|/)tests?/|\.so$|\.orig$|~$)"
+# Beside the recording that the demo plays, in bytes of the wheel; and of each level's kernels.
+MOST_BYTES, MOST_OF_KERNELS = 3_000_000, 1_200_000
+KERNELS = r"rs_localizer/native/_(cpu|kernels_\w+)\.abi3\.so"
+# What only the build needs stays in the sdist.
+TOOLS = (
+    r"rs_localizer/native/(bitcode|build|jit|sources)\.py|rs_localizer/native/.*\.(c|cpp|h|json)"
+)
+UNWANTED = rf"(?!{KERNELS}).*(__pycache__|\.pyc$|(^|/)tests?/|\.so$|\.orig$|~$)|{TOOLS}"
 
 
 def main() -> None:
     entries = zipfile.ZipFile(sys.argv[1]).infolist()
     names = [entry.filename for entry in entries]
-    size = sum(e.compress_size for e in entries if "/webcam_chessboard/" not in e.filename)
+    sizes = {entry.filename: entry.compress_size for entry in entries}
+    kernels = {name: sizes.pop(name) for name in names if re.fullmatch(KERNELS, name)}
+    assert max(kernels.values()) <= MOST_OF_KERNELS, kernels
+    size = sum(size for name, size in sizes.items() if "/webcam_chessboard/" not in name)
     assert size <= MOST_BYTES, f"{size} bytes beside the demo's recording"
     for pattern in WANTED:
         assert any(re.fullmatch(pattern, name) for name in names), f"nothing like {pattern}"
@@ -46,7 +56,7 @@ def main() -> None:
         if parts[:2] == ["rs_localizer", "data"] and len(parts) > 3
     }
     assert data == attributed, f"data without its authors: {data - attributed}"
-    print(f"  {len(names)} files, {size} bytes beside the demo's recording")
+    print(f"  {len(names)} files, {size} bytes beside the demo's recording and {kernels}")
 
 
 if __name__ == "__main__":

@@ -13,10 +13,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
+from rs_localizer.native import entry
 
 # k1 k2 p1 p2 k3, k4 k5 k6, s1 s2 s3 s4; those behind them tilt the sensor.
 _COEFFICIENTS = 12
@@ -101,9 +101,9 @@ def _step(values: list[Lanes]) -> Vector:
 _step_lanes = traced(_step, _PLACE, _COEFFICIENTS)
 
 
-@kernel
+@entry
 def _bearings(
-    pixels: Array, focal: Array, centre: Array, lens: Array
+    pixels: Array2, focal: Array1, centre: Array1, lens: Array1
 ) -> tuple[Array, Array, BoolArray]:
     """Bearings (n,2), derivatives (n,2,2) of the pixels by them, and which (n,) are none.
 
@@ -148,8 +148,8 @@ def _bearings(
     return rays, by_ray, lost
 
 
-@kernel
-def _projected(rays: Array, focal: Array, centre: Array, lens: Array) -> tuple[Array, Array]:
+@entry
+def _projected(rays: Array2, focal: Array1, centre: Array1, lens: Array1) -> tuple[Array, Array]:
     """Pixels (n,2), and their derivatives (n,2,2) by the rays."""
     k1, k2, p1, p2, k3, k4 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
     k5, k6, s1, s2, s3, s4 = lens[6], lens[7], lens[8], lens[9], lens[10], lens[11]
@@ -178,8 +178,8 @@ def _projected(rays: Array, focal: Array, centre: Array, lens: Array) -> tuple[A
     return pixels, by_ray
 
 
-@kernel
-def radial_slopes(rays: Array, focal: Array, lens: Array) -> tuple[Array, Array]:
+@entry
+def radial_slopes(rays: Array2, focal: Array1, lens: Array1) -> tuple[Array, Array]:
     """Pixels (n,2) of rays (n,2) from the image's centre, and derivatives (n,2) by k1.
 
     Through a lens of :func:`pinhole`.

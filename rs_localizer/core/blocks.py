@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.simd.jit import kernel
+from rs_localizer.native import kernel
 
 
 @kernel

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3
 from rs_localizer.core.rate_spline import (
     change_at,
     place_of,
@@ -24,7 +24,7 @@ from rs_localizer.core.rate_spline import (
     turn_in,
     turn_on,
 )
-from rs_localizer.core.simd.jit import kernel
+from rs_localizer.native import entry, kernel
 
 # Gauss' rule on the readout; the sum of the weights is its length.
 _NODES, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(5))
@@ -105,15 +105,15 @@ class GyroRotation:
 class Turning(NamedTuple):
     """Fields of a :class:`GyroRotation` that kernels need."""
 
-    tau: Array
-    rates: Array
-    rotations: Array
-    parabola: Array
-    rate: Array
-    change: Array
+    tau: Array1
+    rates: Array3
+    rotations: Array3
+    parabola: Array2
+    rate: Array1
+    change: Array1
     delay: float
     rate_noise: float
-    rate_error: Array  # infinite where it is not known
+    rate_error: Array2  # infinite where it is not known
 
 
 NO_TURN = Turning(
@@ -142,9 +142,9 @@ def find_turn(
     turn_on((on * rate[0], on * rate[1], on * rate[2]), rotation.copy(), rotation)
 
 
-@kernel
+@entry
 def _turn_at_rows(
-    wanted: Array, times: Array, cubics: Array, rotations: Array, parabola: Array
+    wanted: Array1, times: Array1, cubics: Array3, rotations: Array3, parabola: Array2
 ) -> tuple[Array, Array]:
     turns, rates = np.empty((len(wanted), 3, 3)), np.empty((len(wanted), 3))
     for i in range(len(wanted)):
@@ -152,8 +152,8 @@ def _turn_at_rows(
     return turns, rates
 
 
-@kernel
-def late_at(tau: float, times: Array, cubics: Array, parabola: Array) -> tuple[Array, Array]:
+@entry
+def late_at(tau: float, times: Array1, cubics: Array3, parabola: Array2) -> tuple[Array, Array]:
     """Turn (3,) and rate (3,) at a row time that a delay of one readout would leave.
 
     What a motion under constant acceleration follows is told by the points and left out.
@@ -167,8 +167,8 @@ def late_at(tau: float, times: Array, cubics: Array, parabola: Array) -> tuple[A
     return rate, change
 
 
-@kernel
-def turn_of(tau: Array, rates: Array) -> tuple[Array, Array, Array, Array, Array, float]:
+@entry
+def turn_of(tau: Array1, rates: Array2) -> tuple[Array, Array, Array, Array, Array, float]:
     """Fields of a :class:`GyroRotation` of rates (k,3) at row times (k,)."""
     cubics = spline(tau, rates)
     rotations = rotations_at_knots(tau, cubics)
@@ -230,10 +230,10 @@ def gyro_compensated(
     return compensated
 
 
-@kernel
+@entry
 def _gyro_compensated(
-    rays: Array, tau: Array, by_ray: Array, gradient: Array,
-    times: Array, cubics: Array, rotations: Array, parabola: Array,
+    rays: Array2, tau: Array1, by_ray: Array3, gradient: Array1,
+    times: Array1, cubics: Array3, rotations: Array3, parabola: Array2,
 ) -> tuple[Array, Array]:  # fmt: skip
     count = len(rays)
     turned, by_turned = np.empty((count, 2)), np.empty((count, 2, 2))

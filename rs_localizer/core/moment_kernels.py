@@ -7,19 +7,19 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array2
 from rs_localizer.core.blocks import add_block
 from rs_localizer.core.gyro_rotation import Turning, find_turn, late_at
 from rs_localizer.core.rate_spline import change_at
 from rs_localizer.core.shake import FUNCTIONS, shake_basis
 from rs_localizer.core.shutter import Numbers
-from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
+from rs_localizer.native import entry, inlined, kernel
 
 
-@kernel
+@entry
 def pose_of(
-    motion: Numbers, shake: Array, joint: Array, turn: Turning, tau: float, beyond: float
+    motion: Numbers, shake: Array2, joint: Array2, turn: Turning, tau: float, beyond: float
 ) -> tuple[Array, Array, Array]:
     """Position (3,), rotation (3,3) map_from_camera and covariance (6,6): place, then turn.
 
@@ -60,9 +60,9 @@ def pose_of(
     return map_from_middle @ (displacement - translation), map_from_then, covariance
 
 
-@kernel
+@entry
 def twist_of(
-    motion: Numbers, shake: Array, joint: Array, turn: Turning, tau: float,
+    motion: Numbers, shake: Array2, joint: Array2, turn: Turning, tau: float,
     beyond: tuple[float, float],
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Linear and angular velocity (3,) in camera axes, and their covariance (6,6); per readout.

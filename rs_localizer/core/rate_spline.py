@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3
 from rs_localizer.core.blocks import write
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import coefficients
+from rs_localizer.native import entry, kernel
 
 
 @kernel
@@ -49,8 +49,8 @@ def change_at(time: float, times: Array, cubics: Array) -> Array:
     return change
 
 
-@kernel
-def spline(times: Array, values: Array) -> Array:
+@entry
+def spline(times: Array1, values: Array2) -> Array:
     """Natural cubic spline (k-1,4,3) through values (k,3) at times (k,): powers from each start."""
     count = len(times)
     # Second derivatives by Thomas' algorithm; zero at both ends.
@@ -128,8 +128,8 @@ def place_of(time: float, times: Array) -> int:
     return place
 
 
-@kernel
-def rotations_at_knots(times: Array, cubics: Array) -> Array:
+@entry
+def rotations_at_knots(times: Array1, cubics: Array3) -> Array:
     """Rotations (k,3,3), camera_then_from_camera_at_time_0, at the knots of a spline of rates."""
     count = len(times)
     rotations = np.empty((count, 3, 3))
@@ -144,8 +144,10 @@ def rotations_at_knots(times: Array, cubics: Array) -> Array:
     return rotations
 
 
-@kernel
-def turns_at(wanted: Array, times: Array, cubics: Array, rotations: Array) -> tuple[Array, Array]:
+@entry
+def turns_at(
+    wanted: Array1, times: Array1, cubics: Array3, rotations: Array3
+) -> tuple[Array, Array]:
     """Rotations (n,3,3) and rates (n,3) at times (n,) of a spline of rates; see `GyroRotation`."""
     turns, rates = np.empty((len(wanted), 3, 3)), np.empty((len(wanted), 3))
     for i in range(len(wanted)):

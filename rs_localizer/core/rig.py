@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray, instance
+from rs_localizer.core.arrays import Array, Array2, Array3, IntArray, instance
 from rs_localizer.core.bearings import bearings, projected
 from rs_localizer.core.camera import Camera, numbers
 from rs_localizer.core.types import Estimate
@@ -246,9 +246,9 @@ class Side(NamedTuple):
 class Mounts(NamedTuple):
     """Mounting of the k sides of a frame's cameras to the rig, and the way their shutters run."""
 
-    axes: Array  # (k,3,3) side_from_rig
-    centres: Array  # (k,3) m, of the cameras in the rig
-    gradients: Array  # (k,2) of the row time by the pixel
+    axes: Array3  # (k,3,3) side_from_rig
+    centres: Array2  # (k,3) m, of the cameras in the rig
+    gradients: Array2  # (k,2) of the row time by the pixel
 
     @classmethod
     def one(cls, gradient: Array) -> Mounts:

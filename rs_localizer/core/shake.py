@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.arrays import Array, Array1, Array2, Out
+from rs_localizer.native import entry
 
 CYCLES = 0.5 * np.arange(1.0, 15.0)
 """Cycles per readout. With a readout of 30 ms up to 233 Hz; half a cycle apart is what a window of
@@ -46,8 +46,8 @@ def _resolved() -> tuple[Array, Array]:
 COMBINATIONS, IN_COMBINATIONS = _resolved()
 
 
-@kernel
-def shake_basis(tau: float, values: Array, rates: Array) -> None:
+@entry
+def shake_basis(tau: float, values: Out[Array1], rates: Out[Array1]) -> None:
     """Fill in ``cos(w tau) - 1`` and ``sin(w tau) - w tau`` of each frequency, and their rates.
 
     By the recurrence of the half-cycle: frequencies are its multiples.
@@ -61,8 +61,8 @@ def shake_basis(tau: float, values: Array, rates: Array) -> None:
         rates[2 * k], rates[2 * k + 1] = -RATES[k] * s, RATES[k] * (c - 1.0)
 
 
-@kernel
-def shake_at(tau: Array, coefficients: Array) -> Array:
+@entry
+def shake_at(tau: Array1, coefficients: Array2) -> Array:
     """Turn of the camera beside its motion, and its rate, (n,6) at row times (n,).
 
     ``coefficients`` (k,3) rad, of :func:`shake_basis`; none: the camera does not shake.

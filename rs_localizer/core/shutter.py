@@ -25,15 +25,15 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2
 from rs_localizer.core.blocks import add_block
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import (
     PARAMETERS,
 )
+from rs_localizer.native import entry
 
-Numbers = tuple[Array, Array, Array, Array, Array, Array]
+Numbers = tuple[Array2, Array1, Array1, Array1, Array1, Array1]
 """The fields of a :class:`Motion`, in their order, as kernels take them."""
 
 
@@ -100,8 +100,8 @@ def motion_of(numbers: Numbers) -> Motion:
     return Motion(*velocities, angular_acceleration=change, linear_acceleration=acceleration)
 
 
-@kernel
-def _at_rows(motion: Numbers, tau: Array) -> tuple[Array, Array]:
+@entry
+def _at_rows(motion: Numbers, tau: Array1) -> tuple[Array, Array]:
     """Rotations (n,3,3) and translations (n,3) at row times (n,)."""
     rotation, translation, angular, linear, change, acceleration = motion
     rotations, translations = np.empty((len(tau), 3, 3)), np.empty((len(tau), 3))
@@ -125,7 +125,7 @@ def _at_rows(motion: Numbers, tau: Array) -> tuple[Array, Array]:
     return rotations, translations
 
 
-@kernel
+@entry
 def carried(motion: Numbers, readouts: float, fading: float) -> tuple[Numbers, Array]:
     """The motion some readout times later, or before, and its derivative (18,18)."""
     rotation, translation, angular, linear, change, acceleration = motion

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.arrays import Array, Array1, Array2
+from rs_localizer.native import entry, kernel
 
 # Below this angle the series of the coefficients are exact to double precision.
 _SMALL_ANGLE = 1e-3
@@ -35,8 +35,8 @@ def coefficients(angle_squared: float) -> tuple[float, float, float]:
     )
 
 
-@kernel
-def exp(vector: Array) -> Array:
+@entry
+def exp(vector: Array1) -> Array:
     """Rotation matrix (3,3) of a rotation vector (3,) (Rodrigues' formula)."""
     x, y, z = vector[0], vector[1], vector[2]
     s, c, _ = coefficients(x * x + y * y + z * z)
@@ -53,8 +53,8 @@ def exp(vector: Array) -> Array:
     return matrix
 
 
-@kernel
-def quaternion(matrix: Array) -> Array:
+@entry
+def quaternion(matrix: Array2) -> Array:
     """Unit quaternion (4,) ``x y z w`` with ``w >= 0`` of a rotation matrix (3,3)."""
     # Shepperd's choice of the largest component keeps the division well conditioned.
     q = np.empty(4)
@@ -85,8 +85,8 @@ def quaternion(matrix: Array) -> Array:
     return q
 
 
-@kernel
-def log(matrix: Array) -> Array:
+@entry
+def log(matrix: Array2) -> Array:
     """Rotation vector (3,), of angle 0 to pi, of a rotation matrix (3,3)."""
     q = quaternion(matrix)
     sine_squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
@@ -119,8 +119,8 @@ def right_jacobian(vector: Array) -> Array:
     return right_jacobian_of(np.asarray(vector, float))
 
 
-@kernel
-def hat_of(vector: Array) -> Array:
+@entry
+def hat_of(vector: Array1) -> Array:
     """One of :func:`hat`, for kernels."""
     matrix = np.zeros((3, 3))
     matrix[0, 1], matrix[0, 2] = -vector[2], vector[1]
@@ -129,8 +129,8 @@ def hat_of(vector: Array) -> Array:
     return matrix
 
 
-@kernel
-def right_jacobian_of(vector: Array) -> Array:
+@entry
+def right_jacobian_of(vector: Array1) -> Array:
     """:func:`right_jacobian`, for kernels."""
     x, y, z = vector[0], vector[1], vector[2]
     _, second, third = coefficients(x * x + y * y + z * z)
@@ -150,8 +150,8 @@ def exp_many(vectors: Array) -> Array:
     return _exp_many(vectors)
 
 
-@kernel
-def _exp_many(vectors: Array) -> Array:
+@entry
+def _exp_many(vectors: Array2) -> Array:
     matrices = np.empty((len(vectors), 3, 3))
     for i in range(len(vectors)):
         matrices[i] = exp(vectors[i])

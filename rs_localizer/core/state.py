@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.arrays import Array, Array1, Out
+from rs_localizer.native import entry
 
 STATE_SIZE = 24
 PARAMETERS = 18
@@ -43,8 +43,8 @@ def rotation_of(state: Array) -> Array:
     return state[:9].reshape(3, 3)
 
 
-@kernel
-def step_between(state: Array, other: Array) -> Array:
+@entry
+def step_between(state: Out[Array1], other: Array1) -> Array:
     """The step (18,) that leads from one state to another."""
     turn, step = np.empty((3, 3)), np.empty(PARAMETERS)
     for i in range(3):

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.gyro_rotation import GyroRotation, late_at
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shake import FUNCTIONS, shake_at, shake_basis, within_rows
 from rs_localizer.core.shutter import Motion, carried, numbers_of
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, TURN
+from rs_localizer.native import entry
 
 # Readouts within which accelerations fade by exp(-1): they stay what they are.
 _NO_FADING = 1e9
@@ -253,8 +253,8 @@ class Estimate(Motion):
         )
 
 
-@kernel
-def _widening(added: Array, scale: Array) -> Array:
+@entry
+def _widening(added: Array2, scale: Array1) -> Array:
     """The positive semidefinite part of a symmetric matrix (n,n); ``scale``: (n,) its units."""
     units = np.outer(scale, scale)
     values, vectors = np.linalg.eigh(added / units)

@@ -18,12 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.config import CalibrationErrors
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, BoolArray1
 from rs_localizer.core.bearings import pinhole, radial_slopes
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.shake import shake_at
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, rotation_of
 from rs_localizer.estimation.correlated import smooth_columns
 from rs_localizer.estimation.observations import Observed, rays_of_lens
@@ -32,6 +31,7 @@ from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import SPEEDS, PriorTerms, add_prior, terms_at
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import linearized
+from rs_localizer.native import entry
 
 # Of each camera: centre (2), focal length, distortion.
 _ERRORS = 4
@@ -125,19 +125,19 @@ def calibration_effect(
     return effect
 
 
-@kernel
+@entry
 def _lines(
-    data: Array, tau: Array, state: Array, shake: Array, chosen: BoolArray
+    data: Array2, tau: Array1, state: Array1, shake: Array2, chosen: BoolArray1
 ) -> tuple[Array, Array, Array]:
     """Derivatives (m,2,18) of the chosen points by the motion, rays (m,2), and row times (m,)."""
     lines = linearized(data, len(tau), state, shake_at(tau, shake))
     return lines.by_motion[chosen], lines.image[chosen], tau[chosen]
 
 
-@kernel
+@entry
 def _effect(
-    by_motion: Array, smooth: Array, columns: Array, state: Array, terms: PriorTerms,
-    parts: Array, turn_known: bool, variance: float, inflation: float, tracked: bool,
+    by_motion: Array3, smooth: Array3, columns: Array3, state: Array1, terms: PriorTerms,
+    parts: Array1, turn_known: bool, variance: float, inflation: float, tracked: bool,
 ) -> CalibrationEffect:  # fmt: skip
     """How errors move motion and smooth error.
 

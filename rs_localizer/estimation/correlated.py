@@ -25,12 +25,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
-from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, BoolArray, BoolArray1
 from rs_localizer.core.state import MOVE, PARAMETERS, TURN
 from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.refine import LEAST_NOISE, half_inverse, squared
 from rs_localizer.estimation.residuals import Lines, linearized
+from rs_localizer.native import entry, kernel
 
 DEGREE = 3
 # Expected size of each degree: printers stretch paper, lenses bend at the rim; the mean square
@@ -75,8 +75,8 @@ _HOPELESS, _NO_PART = 12.0, 1e-3
 class SmoothError(NamedTuple):
     """The columns of smooth errors at the inliers, and what is known of their size."""
 
-    rows: Array  # (2m,q) orthonormal combinations of the columns
-    squares: Array  # (q,) of the columns' lengths, for a size of 1 px
+    rows: Array2  # (2m,q) orthonormal combinations of the columns
+    squares: Array1  # (q,) of the columns' lengths, for a size of 1 px
     log_size: float  # px, mean of the logarithm, whose deviation is 1
 
 
@@ -109,8 +109,8 @@ class Sized(NamedTuple):
     freedom: float
 
 
-@kernel
-def smooth_columns(by_motion: Array, rays: Array, bend: Array) -> Array:
+@entry
+def smooth_columns(by_motion: Array3, rays: Array2, bend: Array2) -> Array:
     """Shifts (n,2,q) in px of points by each coefficient of a smooth error of 1 px.
 
     Args:
@@ -194,8 +194,8 @@ def bend_of(points: Array, inliers: BoolArray, size: float) -> Array:
     return combined
 
 
-@kernel
-def smooth_error(lines: Lines, chosen: BoolArray, bend: Array, log_size: float) -> SmoothError:
+@entry
+def smooth_error(lines: Lines, chosen: BoolArray1, bend: Array2, log_size: float) -> SmoothError:
     """The smooth error at the chosen ones of points (n,), orthogonal columns.
 
     Args:
@@ -226,7 +226,7 @@ def smooth_error(lines: Lines, chosen: BoolArray, bend: Array, log_size: float) 
     return SmoothError(rows, squares, log_size)
 
 
-@kernel
+@entry
 def nothing_shared(count: int) -> SmoothError:
     """The smooth error of so many inliers where there is none."""
     return SmoothError(np.zeros((2 * count, 1)), np.zeros(1), 0.0)

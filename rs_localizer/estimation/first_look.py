@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.arrays import Array1, Array2, BoolArray, BoolArray1, Out
 from rs_localizer.core.state import LINEAR, VELOCITIES
 from rs_localizer.estimation.observations import NEAREST, median_depth
 from rs_localizer.estimation.plane import plane_of
@@ -18,6 +17,7 @@ from rs_localizer.estimation.posterior import LEAST_EIGENVALUE, Best, best_motio
 from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import Lines, linearized
+from rs_localizer.native import entry, inlined, kernel
 
 # Points just outside of the gate that are no chance: shaking may have moved them there. The corners
 # of one marker may, beside four and more others, be misplaced in the map. Beside fewer points, 12
@@ -44,9 +44,10 @@ class Look(NamedTuple):
     moving: bool  # neither rest nor another typical speed would change anything
 
 
-@kernel
+@entry
 def first_look(
-    data: Array, points: Array, start: Array, terms: PriorTerms, threshold: float, rolling: bool,
+    data: Out[Array2], points: Array2, start: Array1, terms: PriorTerms, threshold: float,
+    rolling: bool,
     turn_known: bool,
 ) -> Look:  # fmt: skip
     """The best motion near a state (24,), and what tells whether it is all."""
@@ -67,8 +68,10 @@ def first_look(
     )  # fmt: skip
 
 
-@kernel
-def near_outliers(lines: Lines, squared_errors: Array, inliers: BoolArray, threshold: float) -> int:
+@entry
+def near_outliers(
+    lines: Lines, squared_errors: Array1, inliers: BoolArray1, threshold: float
+) -> int:
     """Points just beyond the gate, where they are too many to be chance and it is the row that
     moves them; else 0.
 

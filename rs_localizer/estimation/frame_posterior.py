@@ -14,9 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2
 from rs_localizer.core.shake import MIDDLE_RATES, shake_at
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, POSE, POSE_SIZE
 from rs_localizer.estimation.correlated import (
     ORDINARY,
@@ -41,6 +40,7 @@ from rs_localizer.estimation.prior import SPEEDS, Assumed, PriorTerms, terms_at
 from rs_localizer.estimation.refine import LEAST_NOISE, apply_step
 from rs_localizer.estimation.residuals import linearized
 from rs_localizer.estimation.turn import TurnFit, fit_turn, hidden_turn
+from rs_localizer.native import entry
 
 # Of the typical speeds.
 _RESTS = np.array([speed == 0.0 for speed in SPEEDS], float)
@@ -155,9 +155,9 @@ def _of_points(
     )
 
 
-@kernel
+@entry
 def _steady(
-    data: Array, points: Array, look: Look, smooth: SmoothError, terms: PriorTerms, odds: Array,
+    data: Array2, points: Array2, look: Look, smooth: SmoothError, terms: PriorTerms, odds: Array1,
     slowest: int, turn_known: bool, focal_length: float,
 ) -> Mixture:  # fmt: skip
     """The mixture of all modes of a camera that does not turn within its frame."""

@@ -14,15 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, Array2, BoolArray
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import MOVE, TURN, step_between
 from rs_localizer.core.types import Failure
 from rs_localizer.estimation.observations import Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior
 from rs_localizer.estimation.residuals import linearized
 from rs_localizer.estimation.searching import GLOBAL_SHUTTER_SCALE, MotionSearch
+from rs_localizer.native import entry
 
 # Three quarters of the inliers say as much as they do. Two fifths of the matches that are
 # shifted alike leave two thirds; with 0.5 they were lost, and 3 of 1,080 wrong cameras less passed.
@@ -173,8 +173,8 @@ def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> i
     return alike * (int(np.count_nonzero(rest)) // len(some))
 
 
-@kernel
-def as_nearest(places: Array, errors: Array, rough: float) -> int:
+@entry
+def as_nearest(places: Array2, errors: Array2, rough: float) -> int:
     """How many of the errors (n,2) of places (n,2) are those of the nearest one, about."""
     count, alike = len(places), 0
     for i in range(count):

@@ -26,9 +26,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, BoolArray, IntArray
 from rs_localizer.core.blocks import write
-from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import PARAMETERS, STATE_SIZE, TURN, step_between
 from rs_localizer.estimation.correlated import (
@@ -44,6 +43,7 @@ from rs_localizer.estimation.correlated import (
 from rs_localizer.estimation.plane import plane_of
 from rs_localizer.estimation.prior import SPEEDS, PriorTerms, add_prior, offset_between, terms_at
 from rs_localizer.estimation.refine import TINY, apply_step, inverted, solve_positive
+from rs_localizer.native import entry, inlined, kernel
 
 # Logarithm of the odds of rest against each typical speed before any frame: errors of maps that no
 # polynomial of the image follows look like motion, and a hundred to one is what surveyed tags ask
@@ -81,9 +81,9 @@ _LEAST_SHARE = 0.25
 _NO_PART = 1e-5
 
 
-@kernel
+@entry
 def along_arcs(
-    covariance: Array, centre: Array, weights: Array, offsets: Array, covariances: Array
+    covariance: Array2, centre: Array1, weights: Array1, offsets: Array2, covariances: Array3
 ) -> Array:
     """The covariance with the second order of the move; that of the turn has none.
 

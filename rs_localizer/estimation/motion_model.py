@@ -14,15 +14,15 @@ import numpy as np
 
 from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2
 from rs_localizer.core.blocks import add_block
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.shake import MIDDLE_RATES, MIDDLE_VALUES
 from rs_localizer.core.shutter import Motion, Numbers, carried, motion_of, numbers_of
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import ANGULAR, PARAMETERS
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.refine import inverted
+from rs_localizer.native import entry, kernel
 
 # Time (s) in which accelerations fade. Of 0.1, 0.05 and 0.03 the last one has the least errors of
 # turn rates of a phone in a car and of Aria's head, and the most of them inside.
@@ -80,7 +80,7 @@ def singer(seconds: float) -> Array:
     return block
 
 
-@kernel
+@entry
 def _singer(angular: float, linear: float, dt: float, readout_time: float) -> Array:
     block, covariance = singer(dt), np.zeros((PARAMETERS, PARAMETERS))
     units = (1.0, readout_time, readout_time * readout_time)
@@ -109,8 +109,8 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
     return motion_of(motion), covariance, swing, jacobian
 
 
-@kernel
-def _unshaken(motion: Numbers, shake: Array, joint: Array) -> tuple[Numbers, Array, Array, Array]:
+@entry
+def _unshaken(motion: Numbers, shake: Array2, joint: Array2) -> tuple[Numbers, Array, Array, Array]:
     values, slopes, unit = MIDDLE_VALUES, MIDDLE_RATES, np.eye(3)
     rotation, translation, angular, linear, change, acceleration = motion
     turn, rate, swing = np.zeros(3), np.zeros(3), np.zeros((PARAMETERS, PARAMETERS))
@@ -158,8 +158,8 @@ def with_mean_turn(motion: Motion, covariance: Array, turn: GyroRotation) -> tup
     return faster, covariance + spread
 
 
-@kernel
-def surprises_of(step: Array, covariance: Array, posterior: Array) -> Array:
+@entry
+def surprises_of(step: Array1, covariance: Array2, posterior: Array2) -> Array:
     """How many times farther than predicted a motion has changed, squared; 1 is as predicted.
 
     The squared step from the prediction to the estimate, in standard deviations of the prediction,

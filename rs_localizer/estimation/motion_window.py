@@ -24,9 +24,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.config import Acceleration
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3
 from rs_localizer.core.shutter import Motion, carried
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import (
     PARAMETERS,
     STATE_ANGULAR,
@@ -42,6 +41,7 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.motion_model import FADING, singer, unshaken, with_mean_turn
 from rs_localizer.estimation.prior import PriorTerms, add_prior, state_in
 from rs_localizer.estimation.refine import apply_step, inverted
+from rs_localizer.native import entry, kernel
 
 LENGTH = 6
 """Frames of the window: at 30 Hz a fifth of a second, in which a hand changes its mind."""
@@ -233,9 +233,9 @@ def _solved(
     )  # fmt: skip
 
 
-@kernel
+@entry
 def _predicted(
-    state: Array, covariance: Array, seconds: float, deviations: Array, readout_share: float
+    state: Array1, covariance: Array2, seconds: float, deviations: Array1, readout_share: float
 ) -> tuple[Array, Array, Array]:
     """State and covariance so much later, and the derivative of the state."""
     numbers = (
@@ -274,10 +274,10 @@ def _noise(seconds: float, deviations: Array) -> Array:
     return noise
 
 
-@kernel
+@entry
 def _back(
-    state: Array, covariance: Array, predicted: Array, prediction: Array, known: Array,
-    transport: Array, smoothed: Array, smoothed_covariance: Array,
+    state: Array1, covariance: Array2, predicted: Array1, prediction: Array2, known: Array2,
+    transport: Array2, smoothed: Array1, smoothed_covariance: Array2,
 ) -> tuple[Array, Array]:  # fmt: skip
     """A filtered motion with what the next sample's smoothed one tells of it.
 
@@ -289,10 +289,10 @@ def _back(
     return back, 0.5 * (spread + spread.T)
 
 
-@kernel
+@entry
 def _solve(
-    times: Array, states: Array, informations: Array, gradients: Array, start: Array,
-    start_covariance: Array, deviations: Array, readout_share: float,
+    times: Array1, states: Array2, informations: Array3, gradients: Array2, start: Array1,
+    start_covariance: Array2, deviations: Array1, readout_share: float,
 ) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array]:  # fmt: skip
     """Filter and smoother: the fields of :class:`_Solved`; times (n,) in s after the start."""
     count = len(times)
@@ -347,8 +347,8 @@ def _solve(
     )  # fmt: skip
 
 
-@kernel
-def _told_by_points(covariance: Array, known: Array) -> Array:
+@entry
+def _told_by_points(covariance: Array2, known: Array2) -> Array:
     """Information (18,18) of a posterior's covariance beside that which was known before.
 
     By the eigenvalues of what was known, in units of the posterior: none of them exceeds 1.
@@ -477,10 +477,10 @@ def errors_ahead(window: MotionWindow, found: Estimate, swing: Array) -> Array:
     return ratios
 
 
-@kernel
+@entry
 def _errors_ahead(
-    state: Array, covariance: Array, seconds: float, deviations: Array, readout_share: float,
-    units: Array, swing: Array, found: Array, joint: Array,
+    state: Array1, covariance: Array2, seconds: float, deviations: Array1, readout_share: float,
+    units: Array1, swing: Array2, found: Array1, joint: Array2,
 ) -> Array:  # fmt: skip
     later, spread, _ = _predicted(state, covariance, seconds, deviations, readout_share)
     for k in range(6, PARAMETERS):

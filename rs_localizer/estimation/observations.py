@@ -12,13 +12,23 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.core.arrays import Array, BoolArray, IntArray, Random
+from rs_localizer.core.arrays import (
+    Array,
+    Array1,
+    Array2,
+    Array3,
+    BoolArray,
+    BoolArray1,
+    IntArray,
+    IntArray1,
+    Out,
+    Random,
+)
 from rs_localizer.core.blocks import median
 from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Mounts, Rig
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Failure
 from rs_localizer.estimation.prior import Assumed, PriorTerms, state_in
@@ -32,13 +42,14 @@ from rs_localizer.estimation.residuals import (
     linearized,
     squared_errors,
 )
+from rs_localizer.native import entry, kernel
 
 if TYPE_CHECKING:
     from rs_localizer.estimation.calibration import ErrorModes
 
 
-@kernel
-def median_depth(data: Array, state: Array, chosen: BoolArray) -> float:
+@entry
+def median_depth(data: Array2, state: Array1, chosen: BoolArray1) -> float:
     depths = np.empty(len(chosen))
     for i in range(len(chosen)):
         block, lane = data[i // LANES], i % LANES
@@ -155,9 +166,9 @@ def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Fai
     return None
 
 
-@kernel
+@entry
 def pack(
-    points: Array, rays: Array, tau: Array, by_ray: Array, camera: IntArray, mounts: Mounts
+    points: Array2, rays: Array2, tau: Array1, by_ray: Array3, camera: IntArray1, mounts: Mounts
 ) -> Array:
     """Points in lanes: (blocks, values, LANES) of points (n,3), rays (n,2), row times (n,),
     derivatives of the pixel by the ray (n,2,2), and of which camera (n,) they are. The last block
@@ -188,8 +199,8 @@ def pack(
     return data
 
 
-@kernel
-def thin(data: Array, chosen: IntArray) -> Array:
+@entry
+def thin(data: Array2, chosen: IntArray1) -> Array:
     """Only the chosen ones of the packed points, packed anew."""
     count = len(chosen)
     blocks = (count + LANES - 1) // LANES
@@ -439,9 +450,9 @@ def _rays(
     return rays, by_ray, side
 
 
-@kernel
+@entry
 def _select(
-    points: Array, pixels: Array, rays: Array, side: IntArray, sizes: Array, keys: Array
+    points: Array2, pixels: Array2, rays: Array2, side: IntArray1, sizes: Array2, keys: Array1
 ) -> tuple[IntArray, BoolArray, Array, float, bool]:
     """Places of points that can be used, but for copies.
 
@@ -495,10 +506,11 @@ def packed(exposure: Exposure, points: Array, usable: Usable) -> Observations:
     return Observations(near, bearing, times, of_camera, mounts, lanes, len(near))
 
 
-@kernel
+@entry
 def _packed(
-    points: Array, rays: Array, tau: Array, by_ray: Array, camera: IntArray, indices: IntArray,
-    centre: Array, mounts: Mounts,
+    points: Out[Array2], rays: Array2, tau: Array1, by_ray: Array3, camera: IntArray1,
+    indices: IntArray1,
+    centre: Array1, mounts: Mounts,
 ) -> tuple[Array, Array, Array, IntArray, Array]:  # fmt: skip
     """Points, bearings, row times and cameras at these indices, and all packed."""
     near, bearing, times, chosen = points[indices], rays[indices], tau[indices], camera[indices]

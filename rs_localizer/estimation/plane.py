@@ -9,8 +9,8 @@ import math
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray1
+from rs_localizer.native import entry, inlined
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.
 _PLANE = 0.1
@@ -18,8 +18,8 @@ _PLANE = 0.1
 _LEAST_LEAN = 0.01
 
 
-@kernel
-def facing(points: Array, inliers: BoolArray, state: Array) -> tuple[bool, Array]:
+@entry
+def facing(points: Array2, inliers: BoolArray1, state: Array1) -> tuple[bool, Array]:
     """True and the state (24,) whose view of the plane faces the camera.
 
     False if the points (n,3) that count are no plane, or face the camera already.
@@ -55,7 +55,7 @@ def facing(points: Array, inliers: BoolArray, state: Array) -> tuple[bool, Array
 
 
 @inlined
-def plane_of(points: Array, inliers: BoolArray) -> tuple[bool, Array, Array]:
+def plane_of(points: Array2, inliers: BoolArray1) -> tuple[bool, Array, Array]:
     """True if the points that count lie on a plane, their centre (3,) and its normal (3,)."""
     centre, spread, count = np.zeros(3), np.zeros((3, 3)), 0
     for i in range(len(points)):
@@ -78,7 +78,7 @@ def plane_of(points: Array, inliers: BoolArray) -> tuple[bool, Array, Array]:
     return extents[0] < _PLANE**2 * extents[1], centre, axes[:, 0].copy()
 
 
-@kernel
-def longest_axis(covariance: Array) -> float:
+@entry
+def longest_axis(covariance: Array2) -> float:
     """Standard deviation (rad) of the turn about the axis that is known worst."""
     return math.sqrt(np.linalg.eigvalsh(covariance[:3, :3].copy())[-1])

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray, BoolArray1, Out
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import weighted
 from rs_localizer.estimation.prior import PriorTerms
@@ -22,6 +21,7 @@ from rs_localizer.estimation.refine import (
     smallest_eigenvalue,
 )
 from rs_localizer.estimation.residuals import squared_errors
+from rs_localizer.native import entry, inlined
 
 # Inliers lie within this many standard deviations of the measured noise (99.8 % of Rayleigh
 # distributed errors); the threshold is widened for them at most twofold.
@@ -42,13 +42,13 @@ _NOISE_ROUNDS = 20
 class Best(NamedTuple):
     """The best motion of a frame, and what the points say of it."""
 
-    state: Array  # (24,)
-    covariance: Array  # (18,18)
+    state: Array1  # (24,)
+    covariance: Array2  # (18,18)
     noise: float  # px, measured standard deviation
     freedom: float  # of the errors
     smallest_eigenvalue: float  # of the information scaled to a unit diagonal, or less
-    inliers: BoolArray  # (n,)
-    squared_errors: Array  # (n,) px^2
+    inliers: BoolArray1  # (n,)
+    squared_errors: Array1  # (n,) px^2
 
 
 class Posterior(NamedTuple):
@@ -93,8 +93,8 @@ class Posterior(NamedTuple):
         return left / (left - 5.0)
 
 
-@kernel
-def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float:
+@entry
+def noise_deviation(squared_errors: Array1, gate: float, freedom: float) -> float:
     """Standard deviation of the pixel noise from the errors within a gate.
 
     Args:
@@ -122,7 +122,7 @@ def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float
 
 
 @inlined
-def decided(inverse: Array, prior: PriorTerms, noise: float) -> float:
+def decided(inverse: Array2, prior: PriorTerms, noise: float) -> float:
     """Number of parameters that the points decide, and not the prior.
 
     Args:
@@ -149,8 +149,10 @@ def _least_eigenvalue(information: Array, inverse: Array) -> float:
     return smallest_eigenvalue(information)
 
 
-@kernel
-def best_motion(data: Array, count: int, start: Array, prior: PriorTerms, threshold: float) -> Best:
+@entry
+def best_motion(
+    data: Out[Array2], count: int, start: Array1, prior: PriorTerms, threshold: float
+) -> Best:
     """Refine a motion, measure the noise, choose the inliers, and again.
 
     Args:

@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, Out
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.shutter import Motion, numbers_of
-from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
     ACCELERATIONS,
@@ -33,6 +32,7 @@ from rs_localizer.core.state import (
     STATE_SIZE,
     VELOCITIES,
 )
+from rs_localizer.native import entry, inlined, kernel
 from rs_localizer.solvers.table import Solver
 
 # What rounding may take of an orthonormal matrix, or of a symmetric one of a unit diagonal.
@@ -65,8 +65,8 @@ def check_motion(motion: Motion) -> None:
         raise ValueError(f"the prior motion's rotation is not orthonormal: {found}")
 
 
-@kernel
-def _is_finite(numbers: Array) -> bool:
+@entry
+def _is_finite(numbers: Array1) -> bool:
     """True if the squares of numbers (n,) have a finite sum."""
     total = 0.0
     for number in numbers:
@@ -74,8 +74,8 @@ def _is_finite(numbers: Array) -> bool:
     return bool(np.isfinite(total))
 
 
-@kernel
-def _is_rotation(matrix: Array) -> bool:
+@entry
+def _is_rotation(matrix: Array2) -> bool:
     """True if a matrix (3,3) is orthonormal, to rounding, and no mirror."""
     off = np.abs(matrix @ matrix.T - np.eye(3)).max()
     return bool(off <= _ROUNDING and np.linalg.det(matrix) > 0.0)
@@ -94,8 +94,8 @@ def check_covariance(covariance: Array) -> None:
         raise ValueError(f"covariance must be {fault}")
 
 
-@kernel
-def _fault_of(covariance: Array) -> int:
+@entry
+def _fault_of(covariance: Array2) -> int:
     """Place in ``_FAULTS`` of what is wrong with a covariance (k,k); 0: nothing."""
     known = np.flatnonzero(~np.isinf(np.diag(covariance)))
     block = covariance[known][:, known].copy()
@@ -209,10 +209,10 @@ SPEEDS = (0.0, 0.1, 1.0)
 class PriorTerms(NamedTuple):
     """A prior as the kernels take it: a sum of Gaussians, and a direction."""
 
-    informations: Array  # (k,18,18)
-    references: Array  # (k,24) states of their means
-    gravity: Array  # (7,) in the map, in the camera, precision
-    pivots: Array  # (k,3) about which they turn, in the axes of the means: see offset_between
+    informations: Array3  # (k,18,18)
+    references: Array2  # (k,24) states of their means
+    gravity: Array1  # (7,) in the map, in the camera, precision
+    pivots: Array2  # (k,3) about which they turn, in the axes of the means: see offset_between
 
 
 _STILL = np.concatenate([np.eye(3).ravel(), np.zeros(STATE_SIZE - 9)])
@@ -236,7 +236,7 @@ def held_terms() -> PriorTerms:
     return _single(np.diag(precisions), _STILL)
 
 
-@kernel
+@entry
 def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
     """The prior of a typical speed, a part of the configured one; 0: of a camera at rest.
 
@@ -259,8 +259,8 @@ def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
     return PriorTerms(informations, references, terms.gravity, terms.pivots[: len(references)])
 
 
-@kernel
-def _with_turn(informations: Array, error: Array) -> Array:
+@entry
+def _with_turn(informations: Array3, error: Array2) -> Array:
     """Prior of a motion beside a known turn; error (6,6): see ``GyroRotation.error``."""
     changed, precision = informations.copy(), np.linalg.inv(error)
     for i in range(6):
@@ -321,9 +321,9 @@ def with_motion(
     return _with_motion(terms, covariance, state_in(prior.motion, centre), turn_known)
 
 
-@kernel
+@entry
 def _with_motion(
-    terms: PriorTerms, covariance: Array, reference: Array, turn_known: bool
+    terms: PriorTerms, covariance: Array2, reference: Array1, turn_known: bool
 ) -> PriorTerms:
     informations, references, count = terms.informations, terms.references, len(terms.informations)
     found = np.empty((count + 1, PARAMETERS, PARAMETERS))
@@ -341,8 +341,8 @@ def _with_motion(
     return PriorTerms(found, of, terms.gravity, pivots)
 
 
-@kernel
-def pivot_of(covariance: Array) -> Array:
+@entry
+def pivot_of(covariance: Array2) -> Array:
     """The point (3,), in camera axes, of which is known best where the camera sees it.
 
     Who turns about it moves by its distance times the turn: that is the part of the move that goes
@@ -384,9 +384,9 @@ def _unit(vector: ArrayLike) -> Array:
     return unit
 
 
-@kernel
+@entry
 def add_prior(
-    terms: PriorTerms, state: Array, weight: float, information: Array, slope: Array
+    terms: PriorTerms, state: Array1, weight: float, information: Out[Array2], slope: Out[Array1]
 ) -> float:
     """Add the prior's part, times ``weight``, to the normal equations; returns its cost.
 
@@ -451,8 +451,8 @@ def _add_posed(
             information[i, j] += weight * half[i, j]
 
 
-@kernel
-def offset_between(reference: Array, state: Array, pivot: Array) -> tuple[Array, Array]:
+@entry
+def offset_between(reference: Array1, state: Array1, pivot: Array1) -> tuple[Array, Array]:
     """The offset (18,) from one state to another, and its derivative (6,3) by a turn from there.
 
     Its turn ``phi`` is that of a step, its move what turns and then sees the pivot ``p`` at ``q``:

@@ -12,16 +12,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray, IntArray, Random
+from rs_localizer.core.arrays import (
+    Array,
+    Array1,
+    Array2,
+    Array3,
+    BoolArray1,
+    IntArray,
+    IntArray1,
+    IntArray2,
+    Out,
+    Random,
+)
 from rs_localizer.core.blocks import write
 from rs_localizer.core.rig import Mounts
-from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.state import STATE_SIZE
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.refine import anneal, refine
 from rs_localizer.estimation.residuals import POINT_SIZE, squared_errors, truncated_cost
+from rs_localizer.native import entry, inlined, kernel
 from rs_localizer.solvers.batch import MODEL_SIZE, into_rig
 from rs_localizer.solvers.table import Solver
 
@@ -45,16 +56,16 @@ class Pools(NamedTuple):
     first of them (PROSAC: Chum, Matas, "Matching with PROSAC", CVPR 2005).
     """
 
-    points: IntArray  # of all pools, one after the other
-    ends: IntArray  # (p,) where each of them ends
-    row_ranges: Array  # (p,) of the row times of its camera's points
-    ranked: BoolArray  # (p,)
-    shares: Array  # (p,) of the points that it was made of
+    points: IntArray1  # of all pools, one after the other
+    ends: IntArray1  # (p,) where each of them ends
+    row_ranges: Array1  # (p,) of the row times of its camera's points
+    ranked: BoolArray1  # (p,)
+    shares: Array1  # (p,) of the points that it was made of
 
 
-@kernel
+@entry
 def pools_of(
-    camera: IntArray, tau: Array, cameras: int, size: int, among: BoolArray, ranking: IntArray,
+    camera: IntArray1, tau: Array1, cameras: int, size: int, among: BoolArray1, ranking: IntArray1,
     also_all: bool,
 ) -> Pools:  # fmt: skip
     """A pool for each camera that has enough points for a sample.
@@ -153,9 +164,9 @@ def draw(pool: Any, prefixes: Any, tau: Array, row_range: float, random: Any, sa
                 break
 
 
-@kernel
+@entry
 def _draw_block(
-    pools: Pools, drawn: IntArray, tau: Array, random: Random, samples: IntArray
+    pools: Pools, drawn: Out[IntArray1], tau: Array1, random: Random, samples: Out[IntArray2]
 ) -> None:
     """Fill the samples from all pools by their shares, and count what each has given."""
     count, size = samples.shape
@@ -226,11 +237,11 @@ def best_models(
     return states, costs
 
 
-@kernel
+@entry
 def optimize(
-    states: Array,
-    costs: Array,
-    data: Array,
+    states: Array2,
+    costs: Array1,
+    data: Array2,
     first_scale: float,
     last_scale: float,
     prior: PriorTerms,
@@ -256,10 +267,10 @@ def optimize(
     return best, best_cost
 
 
-@kernel
+@entry
 def descend(
-    data: Array,
-    start: Array,
+    data: Array2,
+    start: Array1,
     first_scale: float,
     last_scale: float,
     prior: PriorTerms,
@@ -363,11 +374,11 @@ def search(
     return Candidate(state, cost, int(drawn.sum()))
 
 
-@kernel
+@entry
 def _judge(
-    models: Array, camera: IntArray, mounts: Mounts, data: Array, count: int, best: Array,
+    models: Out[Array3], camera: IntArray1, mounts: Mounts, data: Array2, count: int, best: Array1,
     least: float, scales: tuple[float, float, float], bar: float, prior: PriorTerms, pools: Pools,
-    drawn: IntArray, shares: Array, size: int,
+    drawn: IntArray1, shares: Out[Array1], size: int,
 ) -> tuple[Array, float, float, float]:  # fmt: skip
     """Optimise the best of a block's models.
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.arrays import Array, Array1, Array2
 from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
 from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.residuals import normal_equations
+from rs_localizer.native import entry, inlined, kernel
 
 EXPECTED_NOISE = 0.5
 """Standard deviation of the noise before it is measured, in inlier thresholds."""
@@ -35,8 +35,8 @@ _SINGULAR = 1e-15
 _ANNEALING_DAMPING, _ANNEALING_RATIO = 1e-4, 0.6
 
 
-@kernel
-def apply_step(state: Array, step: Array) -> Array:
+@entry
+def apply_step(state: Array1, step: Array1) -> Array:
     """The state moved by a step (18,), or (12,) that leaves the accelerations."""
     turn = exp(-step[0:3])
     moved = np.empty(STATE_SIZE)
@@ -55,8 +55,8 @@ def apply_step(state: Array, step: Array) -> Array:
     return moved
 
 
-@kernel
-def solve_positive(matrix: Array, right: Array) -> tuple[Array, bool]:
+@entry
+def solve_positive(matrix: Array2, right: Array1) -> tuple[Array, bool]:
     """Solution of a symmetric positive definite system by Cholesky, and whether it is one."""
     size = len(right)
     # Scaling to a unit diagonal makes radians and metres comparable.
@@ -109,10 +109,10 @@ def _posterior(
     return cost + add_prior(prior, state, noise * noise, information, slope)
 
 
-@kernel
+@entry
 def refine(
-    data: Array,
-    start: Array,
+    data: Array2,
+    start: Array1,
     scale: float,
     softness: float,
     prior: PriorTerms,
@@ -251,8 +251,8 @@ def half_inverse(matrix: Array) -> tuple[Array, Array, bool]:
     return half, scale, True
 
 
-@kernel
-def inverted(matrix: Array) -> Array:
+@entry
+def inverted(matrix: Array2) -> Array:
     """Inverse of a symmetric positive definite matrix; NaN where it is none."""
     half, scale, positive = half_inverse(matrix)
     return squared(half, scale) if positive else np.full(matrix.shape, np.nan)
@@ -276,8 +276,8 @@ def squared(half: Array, scale: Array) -> Array:
     return inverse
 
 
-@kernel
-def smallest_eigenvalue(information: Array) -> float:
+@entry
+def smallest_eigenvalue(information: Array2) -> float:
     """Least eigenvalue of an information matrix scaled to a unit diagonal; 0 where it is none."""
     size = len(information)
     scaled = np.empty((size, size))

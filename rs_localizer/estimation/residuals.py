@@ -25,12 +25,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, Out
 from rs_localizer.core.blocks import write
 from rs_localizer.core.simd.algebra import cross, dot, multiply
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, select, traced, traced_sums
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
+from rs_localizer.native import entry, kernel
 
 # X (3), ray (2), row time, pixel by ray (4), weight, row time by pixel (2); of the camera in its
 # rig: its axes (9) and its centre (3)
@@ -349,8 +349,8 @@ def spread_state(state: Array, scale: float, softness: float, uniform: Array) ->
         uniform[(STATE_SIZE + 2) * LANES + lane] = softness
 
 
-@kernel
-def squared_errors(data: Array, count: int, state: Array) -> Array:
+@entry
+def squared_errors(data: Array2, count: int, state: Array1) -> Array:
     """Squared reprojection errors (count,) in raw pixels; infinite behind the camera."""
     uniform = np.empty(UNIFORM_SIZE * LANES)
     spread_state(state, 1.0, 0.0, uniform)
@@ -363,8 +363,8 @@ def squared_errors(data: Array, count: int, state: Array) -> Array:
     return errors
 
 
-@kernel
-def truncated_cost(data: Array, state: Array, scale: float, bound: float) -> float:
+@entry
+def truncated_cost(data: Array2, state: Array1, scale: float, bound: float) -> float:
     """Sum of the truncated squared errors, px^2; stops early once it exceeds ``bound``."""
     uniform = np.empty(UNIFORM_SIZE * LANES)
     spread_state(state, scale, 0.0, uniform)
@@ -385,15 +385,15 @@ def truncated_cost(data: Array, state: Array, scale: float, bound: float) -> flo
     return total
 
 
-@kernel
+@entry
 def normal_equations(
-    data: Array,
-    state: Array,
+    data: Array2,
+    state: Array1,
     scale: float,
     softness: float,
     looks: int,
-    information: Array,
-    slope: Array,
+    information: Out[Array2],
+    slope: Out[Array1],
 ) -> float:
     """Fill ``information`` (p,p) = J^T W J and ``slope`` (p,) = J^T W e; returns the cost.
 
@@ -434,15 +434,15 @@ def normal_equations(
 class Lines(NamedTuple):
     """The points of an image, linearized at a motion."""
 
-    errors: Array  # (n,2) px
-    by_motion: Array  # (n,2,18) derivatives by the parameters
-    by_turn: Array  # (n,2,3) and by a turn of the camera at this row alone
-    tau: Array  # (n,) row times
-    image: Array  # (n,2) where the motion sees them, as rays
+    errors: Array2  # (n,2) px
+    by_motion: Array3  # (n,2,18) derivatives by the parameters
+    by_turn: Array3  # (n,2,3) and by a turn of the camera at this row alone
+    tau: Array1  # (n,) row times
+    image: Array2  # (n,2) where the motion sees them, as rays
 
 
-@kernel
-def linearized(data: Array, count: int, state: Array, shake: Array) -> Lines:
+@entry
+def linearized(data: Array2, count: int, state: Array1, shake: Array2) -> Lines:
     """Each point's error and its derivatives at a motion and what the camera turns beside it.
 
     Args:
@@ -478,8 +478,8 @@ def linearized(data: Array, count: int, state: Array, shake: Array) -> Lines:
     return Lines(errors, by_motion, by_turn, tau, image)
 
 
-@kernel
-def likeness(points: Array, numbers: Array, neighbours: int) -> float:
+@entry
+def likeness(points: Array2, numbers: Array1, neighbours: int) -> float:
     """Mean product of numbers (n,) of points (n,3), and of so many nearest neighbours of each."""
     count, total = len(points), 0.0
     far, near = np.empty(neighbours), np.empty(neighbours)

@@ -20,10 +20,9 @@ import math
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array2, Array3
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rate_spline import multiplied
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
     MOTION_PARAMETERS,
@@ -42,6 +41,7 @@ from rs_localizer.estimation.observations import Observations, Observed
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.refine import TINY
 from rs_localizer.estimation.residuals import linearized
+from rs_localizer.native import entry
 
 # Turns (rad) that are not worth the time: a tenth of what a good frame tells of its pose.
 _LEAST_TURN = 3e-5
@@ -113,8 +113,10 @@ def _costs(
     return costs / max(posterior.noise**2, float(costs.min()) / freedom)
 
 
-@kernel
-def _turned(errors: Array, by_turn: Array, shown: Array, rotations: Array, middle: Array) -> Array:
+@entry
+def _turned(
+    errors: Array2, by_turn: Array3, shown: Array3, rotations: Array3, middle: Array2
+) -> Array:
     """Errors (n,2) px with the rows turned as in ``rotations``, not as they are shown."""
     turned = np.empty_like(errors)
     back = middle.T.copy()

@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
-from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.state import STATE_SIZE, rotation_of
 from rs_localizer.estimation.observations import Observed
 from rs_localizer.estimation.plane import facing
@@ -27,6 +26,7 @@ from rs_localizer.estimation.ransac import (
 )
 from rs_localizer.estimation.refine import EXPECTED_NOISE
 from rs_localizer.estimation.residuals import squared_errors
+from rs_localizer.native import entry
 from rs_localizer.solvers.table import Solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
@@ -151,9 +151,9 @@ class MotionSearch:
         return Candidate(optimized, cost)
 
 
-@kernel
+@entry
 def _from_start(
-    data: Array, count: int, start: Array, wide: float, threshold: float, prior: PriorTerms,
+    data: Array2, count: int, start: Array1, wide: float, threshold: float, prior: PriorTerms,
     noise: float,
 ) -> tuple[BoolArray, Array, float, int]:  # fmt: skip
     """Which points may belong to a motion whose global-shutter pose this is; that motion and its

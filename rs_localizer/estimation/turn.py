@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray, BoolArray1
 from rs_localizer.core.shake import (
     COMBINATIONS,
     CYCLES,
@@ -36,7 +36,6 @@ from rs_localizer.core.shake import (
     shake_at,
     shake_basis,
 )
-from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.correlated import (
     SmoothError,
@@ -48,6 +47,7 @@ from rs_localizer.estimation.posterior import GATE, WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.refine import LEAST_NOISE, TINY, apply_step, half_inverse, squared
 from rs_localizer.estimation.residuals import POINT_SIZE, Lines, linearized, squared_errors
+from rs_localizer.native import entry, inlined, kernel
 
 TURNS = 3 * RESOLVED
 """Columns of the in-frame turn."""
@@ -401,9 +401,9 @@ def _joint(turned: _Turned, covariance: Array, variance: float) -> Array:
     return joint
 
 
-@kernel
+@entry
 def hidden_turn(
-    lines: Lines, state: Array, inliers: BoolArray, smooth: SmoothError, size: float,
+    lines: Lines, state: Array1, inliers: BoolArray1, smooth: SmoothError, size: float,
     terms: PriorTerms, noise: float, freedom: float,
 ) -> tuple[float, Array]:  # fmt: skip
     """Effect and evidence of vibration at the best motion without it.
@@ -439,10 +439,10 @@ def _row_times(data: Array, count: int) -> Array:
     return tau
 
 
-@kernel
+@entry
 def fit_turn(
-    data: Array, count: int, start: Array, terms: PriorTerms, threshold: float, first_gate: float,
-    first_noise: float, bend: Array, log_size: float, focal_length: float,
+    data: Array2, count: int, start: Array1, terms: PriorTerms, threshold: float, first_gate: float,
+    first_noise: float, bend: Array2, log_size: float, focal_length: float,
 ) -> TurnFit:  # fmt: skip
     """Fit motion and in-frame turn, the noise and the inliers.
 

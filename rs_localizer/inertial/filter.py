@@ -17,9 +17,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array, Array1, Array2, IntArray
 from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import (
     ANGULAR,
     ANGULAR_ACCELERATION,
@@ -34,6 +33,7 @@ from rs_localizer.inertial.gyroscope_noise import (
     InertialSettings,
 )
 from rs_localizer.inertial.turning import BIAS, OFFSET, GyroscopeErrors, TurnBetween, TurnWithin
+from rs_localizer.native import entry
 
 # An offset that is not estimated is known to this, s.
 _GIVEN_OFFSET_DEVIATION = 1e-4
@@ -221,10 +221,10 @@ class GyroscopeFilter:
         return bool(change[OFFSET] ** 2 <= _MOST_MOVED * max(gained, 0.0) + _ROUNDING)
 
 
-@kernel
+@entry
 def _carried(
-    motion: Numbers, covariance: Array, with_motion: Array, of_parameters: Array,
-    between: tuple[Array, Array, Array], within: tuple[Array, Array], readouts: float,
+    motion: Numbers, covariance: Array2, with_motion: Array2, of_parameters: Array2,
+    between: tuple[Array2, Array2, Array1], within: tuple[Array2, Array1], readouts: float,
     fading: float,
 ) -> tuple[Numbers, Array, Array]:  # fmt: skip
     """A motion, its covariance (18,18), and that with the parameters (18,4), after a turn."""

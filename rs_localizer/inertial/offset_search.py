@@ -24,12 +24,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray, Out
 from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.inertial.gyroscope_noise import BIAS_DEVIATION, OFFSET_DEVIATION, SCALE_DEVIATION
 from rs_localizer.inertial.row_offset_likelihood import RowOffsetLikelihood
+from rs_localizer.native import entry
 
 _EACH = 60  # offsets on either side of the middle one
 # s from one to the next: of frames whose rows count (a vibration of 120 Hz has 16 steps in a
@@ -231,10 +231,11 @@ def _is_whole(times_ns: IntArray) -> bool:
     return len(steps) > 3 and bool(steps.max() < 2.5 * np.median(steps))
 
 
-@kernel
+@entry
 def _row_costs(
-    errors: Array, by_turn: Array, base: Array, to_rotation: Array, rows: Array, turned: Array,
-    times: Array, cubics: Array, knots: Array, offsets: Array,
+    errors: Out[Array2], by_turn: Array3, base: Array3, to_rotation: Array2, rows: Array1,
+    turned: Array3,
+    times: Array1, cubics: Array3, knots: Array3, offsets: Array1,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Cost (k,) of each offset by the rows, and the turn (k,3) of the middle row beside it."""
     count, parameters = len(errors), base.shape[2]

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array, IntArray, IntArray1
 from rs_localizer.core.blocks import median
-from rs_localizer.core.simd.jit import kernel
+from rs_localizer.native import entry
 
 MARGIN = 4
 """Samples before and after an interval that the spline through its samples wants to have: what
@@ -73,8 +73,8 @@ class Span(NamedTuple):
     gap: float  # the longest step in the interval, if that is a gap; else 0
 
 
-@kernel
-def span_of(stamps: IntArray, start_ns: int, end_ns: int) -> Span:
+@entry
+def span_of(stamps: IntArray1, start_ns: int, end_ns: int) -> Span:
     """How readings (n >= 1), which cover an interval, lie about it."""
     count = len(stamps)
     first, last = 0, count

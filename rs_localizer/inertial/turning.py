@@ -24,14 +24,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array, Array1, Array2, IntArray, IntArray1
 from rs_localizer.core.blocks import median, write
 from rs_localizer.core.gyro_rotation import GyroRotation, turn_of
 from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import coefficients, log
 from rs_localizer.inertial.gyroscope_noise import JITTER, SCALE_DEVIATION
 from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.native import entry, kernel
 
 # End of the spectrum, as a part of the sample rate, and noise beside it (variance).
 _BAND, _NOISE = 0.4, 1e-5
@@ -217,10 +217,11 @@ def _relative(times_ns: IntArray, rates: Array, here_ns: int, bias: Array) -> tu
     return times, steady
 
 
-@kernel
+@entry
 def _within(
-    times_ns: IntArray, rates: Array, here_ns: int, bias: Array, readout_time: float, noise: float,
-    of_parameters: Array,
+    times_ns: IntArray1, rates: Array2, here_ns: int, bias: Array1, readout_time: float,
+    noise: float,
+    of_parameters: Array2,
 ) -> tuple[_Turn, Array, Array, Array, float]:  # fmt: skip
     """The turn of a :class:`GyroRotation`, its error and so on; the samples' period (s)."""
     times, steady = _relative(times_ns, rates, here_ns, bias)
@@ -284,9 +285,9 @@ def _halves(rotations: Array) -> Array:
     return found
 
 
-@kernel
+@entry
 def _between(
-    times_ns: IntArray, rates: Array, here_ns: int, bias: Array, length: float, noise: float,
+    times_ns: IntArray1, rates: Array2, here_ns: int, bias: Array1, length: float, noise: float,
     deviation: float,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """The fields of a :class:`TurnBetween`; it ends here."""

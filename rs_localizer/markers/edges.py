@@ -14,8 +14,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.arrays import Array, Array3, ByteArray2, Out
+from rs_localizer.native import entry, inlined, kernel
 
 # px between the samples of a profile; more for one that reaches farther than so many steps.
 _STEP, _MOST_STEPS = 0.5, 7
@@ -355,8 +355,8 @@ def refine(image: NDArray[np.uint8], quads: Array, cells: int) -> NDArray[np.boo
     return refined
 
 
-@kernel
-def _refine(image: NDArray[np.uint8], quads: Array, cells: int) -> NDArray[np.bool_]:
+@entry
+def _refine(image: ByteArray2, quads: Out[Array3], cells: int) -> NDArray[np.bool_]:
     refined = np.zeros((len(quads), 4), np.bool_)
     curves = np.empty((4, 3))
     good = np.empty(4, np.bool_)

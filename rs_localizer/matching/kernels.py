@@ -9,26 +9,36 @@ written into distances (q,2), infinite before, and indices (q,2), -1 before.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 
-from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.arrays import (
+    Array1,
+    Array2,
+    IntArray1,
+    IntArray2,
+    Out,
+    SingleArray2,
+    WordArray2,
+)
+from rs_localizer.native import entry, inlined, kernel
 
 _BLOCK = 256  # landmarks whose words stay in the first cache
 _FAR = 1 << 30
 
 
-def _ctpop(typingctx: Any, word: Any) -> Any:
-    """How many bits of a 64-bit word are set: one instruction, of vectors too."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.ctpop(arguments[0])
-
-    return types.int64(types.uint64), generate
+_PAIRS, _QUADS = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
+_BYTES, _ONES = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
 
 
-_count_bits: Any = intrinsic(_ctpop)
+@kernel
+def _count_bits(word: Any) -> Any:
+    """How many bits of a 64-bit word are set.
+
+    By sums of neighbouring bits, pairs, quads and bytes, as LLVM knows it: one instruction.
+    """
+    word = word - ((word >> np.uint64(1)) & _PAIRS)
+    word = (word & _QUADS) + ((word >> np.uint64(2)) & _QUADS)
+    word = (word + (word >> np.uint64(4))) & _BYTES
+    return np.int64((word * _ONES) >> np.uint64(56))
 
 
 @kernel
@@ -69,8 +79,10 @@ def _hamming(query: Any, columns: Any, start: int, count: int, distances: Any) -
                 )
 
 
-@kernel
-def nearest_binary(queries: Any, columns: Any, distances: Array, indices: Any) -> None:
+@entry
+def nearest_binary(
+    queries: WordArray2, columns: WordArray2, distances: Out[Array2], indices: Out[IntArray2]
+) -> None:
     """Among all landmarks (w,n), for queries (q,w)."""
     block = np.empty(_BLOCK, np.int64)
     for start in range(0, columns.shape[1], _BLOCK):
@@ -91,19 +103,19 @@ def nearest_binary(queries: Any, columns: Any, distances: Array, indices: Any) -
 class Near(NamedTuple):
     """Keypoints, and the landmarks that may be near them."""
 
-    pixels: Array  # (q,2) of the keypoints
-    landmarks: IntArray  # (v,) rows of descriptors
-    predicted: Array  # (v,2) their pixels, in the order of the second coordinate
+    pixels: Array2  # (q,2) of the keypoints
+    landmarks: IntArray1  # (v,) rows of descriptors
+    predicted: Array2  # (v,2) their pixels, in the order of the second coordinate
     gate: float  # px between the two
 
 
 class BestFound(NamedTuple):
     """What a search fills in."""
 
-    distances: Array  # (q,2)
-    indices: IntArray  # (q,2)
-    rivals: Array  # (v,) distance of the nearest keypoint of each landmark
-    owners: IntArray  # (v,) and its index
+    distances: Out[Array2]  # (q,2)
+    indices: Out[IntArray2]  # (q,2)
+    rivals: Out[Array1]  # (v,) distance of the nearest keypoint of each landmark
+    owners: Out[IntArray1]  # (v,) and its index
 
 
 @inlined
@@ -120,8 +132,10 @@ def _is_near(near: Near, q: int, k: int) -> bool:
     return not square > near.gate * near.gate
 
 
-@kernel
-def nearest_binary_within(queries: Any, rows: Any, near: Near, best: BestFound) -> None:
+@entry
+def nearest_binary_within(
+    queries: WordArray2, rows: WordArray2, near: Near, best: BestFound
+) -> None:
     """Among the landmarks of rows (n,w) that are predicted near the keypoint."""
     lines = near.predicted[:, 1].copy()
     for q in range(len(queries)):
@@ -136,8 +150,10 @@ def nearest_binary_within(queries: Any, rows: Any, near: Near, best: BestFound) 
                 _enter(best, near, q, k, float(bits))
 
 
-@kernel
-def nearest_real_within(queries: Any, rows: Any, near: Near, best: BestFound) -> None:
+@entry
+def nearest_real_within(
+    queries: SingleArray2, rows: SingleArray2, near: Near, best: BestFound
+) -> None:
     """As :func:`nearest_binary_within`, by the Euclidean distance of rows of numbers."""
     lines = near.predicted[:, 1].copy()
     for q in range(len(queries)):
@@ -152,8 +168,8 @@ def nearest_real_within(queries: Any, rows: Any, near: Near, best: BestFound) ->
                 _enter(best, near, q, k, np.sqrt(squared))
 
 
-@kernel
-def in_view(points: Array, state: Array, low: Array, high: Array, depths: Array) -> None:
+@entry
+def in_view(points: Array2, state: Array1, low: Array1, high: Array1, depths: Out[Array1]) -> None:
     """Depths (n,) of points (n,3) that some row may see; 0 of the others.
 
     A bearing moves by half its change per readout at most, to first order.
@@ -181,8 +197,8 @@ def in_view(points: Array, state: Array, low: Array, high: Array, depths: Array)
             depths[n] = z
 
 
-@kernel
-def move(points: Array, state: Array, rows: Array, moved: Array) -> None:
+@entry
+def move(points: Array2, state: Array1, rows: Array1, moved: Out[Array2]) -> None:
     """Points (n,3) in the axes of the camera at row times (n,), into (n,3).
 
     ``exp(-tau [omega]x) (R X + t - tau v)``, the turn about one axis by Rodrigues' formula.

@@ -24,7 +24,6 @@ from numba.core.registry import cpu_target
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd import compiler
-from rs_localizer.core.simd.jit import NotCompiled, at_once, cache_directory, digest, make_folder
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.samples import ImuSamples, span_of

@@ -24,7 +24,6 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.core.rig import Rig, RigEstimate
-from rs_localizer.core.simd.jit import NotCompiled
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.camera_info import Calibration

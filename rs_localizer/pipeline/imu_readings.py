@@ -17,7 +17,6 @@ import numpy as np
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.reasons import ImuReason
-from rs_localizer.core.simd.jit import NotCompiled
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.inertial.buffer import LONGEST_PERIOD_NS, ReadingBuffer, Readings
 from rs_localizer.inertial.gyroscope_noise import InertialSettings

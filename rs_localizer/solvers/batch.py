@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array, Array3, Array4, IntArray, Out
 from rs_localizer.core.rig import Mounts
 from rs_localizer.core.simd.algebra import multiply
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES, Vector
+from rs_localizer.native import entry, kernel
 
 MODEL_SIZE = 18
 
@@ -90,9 +90,14 @@ def into_rig(models: Array, camera: IntArray, mounts: Mounts) -> None:
                     models[s, first + step * i, h] = turned[i]
 
 
-@kernel
+@entry
 def unpack(
-    models: Array, first: int, rotations: Array, translations: Array, w: Array, t: Array
+    models: Array3,
+    first: int,
+    rotations: Out[Array4],
+    translations: Out[Array3],
+    w: Out[Array3],
+    t: Out[Array3],
 ) -> None:
     """Models (k,18,h) as rows ``first ...`` of rotations (.,k,3,3) and the vectors (.,k,3)."""
     for s in range(models.shape[0]):

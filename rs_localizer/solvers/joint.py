@@ -8,10 +8,8 @@ first is ahead under pure translation, the second elsewhere. Six points, two sol
 
 from __future__ import annotations
 
-from typing import Any
-
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.arrays import Array1, Array2, Array3, IntArray2, Out
+from rs_localizer.native import entry
 from rs_localizer.solvers import r6p_two_step, r6p_vcwt
 
 SAMPLE_SIZE = 6
@@ -21,15 +19,15 @@ _solve_vct_w = r6p_two_step.solve_vct_w
 _solve_vcwt = r6p_vcwt.solve_batch
 
 
-@kernel
+@entry
 def solve_batch(
-    points: Array,
-    rays: Array,
-    tau: Array,
-    samples: Any,
-    rotations: Array,
+    points: Array2,
+    rays: Array2,
+    tau: Array1,
+    samples: IntArray2,
+    rotations: Array3,
     iterations: int,
-    models: Array,
+    models: Out[Array3],
 ) -> None:
     """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
     _solve_vct_w(points, rays, tau, samples, rotations, iterations, models[0:1])

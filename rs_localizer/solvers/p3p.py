@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array1, Array2, Array3, IntArray2, Out
 from rs_localizer.core.simd.algebra import cross, dot
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, select, sqrt, traced
+from rs_localizer.native import entry
 from rs_localizer.solvers.batch import MODEL_SIZE, Sample, gather, inputs, scatter
 
 SAMPLE_SIZE = 3
@@ -196,15 +196,15 @@ def _solve(values: list[Lanes]) -> Vector:
 _lanes = traced(_solve, _INPUTS)
 
 
-@kernel
+@entry
 def solve_batch(
-    points: Array,
-    rays: Array,
-    tau: Array,
-    samples: Any,
-    rotations: Array,
+    points: Array2,
+    rays: Array2,
+    tau: Array1,
+    samples: IntArray2,
+    rotations: Array3,
     iterations: int,
-    models: Array,
+    models: Out[Array3],
 ) -> None:
     """Arguments and result as in :mod:`rs_localizer.solvers.batch`; takes no initial rotation."""
     work = np.empty(_INPUTS * LANES)

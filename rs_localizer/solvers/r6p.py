@@ -26,12 +26,12 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray2, Out
 from rs_localizer.core.simd.algebra import cross, dot, least_squares, triangularize
 from rs_localizer.core.simd.eigenvalues import real_eigenvalues, reduce_to_hessenberg
-from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, select, traced
 from rs_localizer.core.simd.vectors import lane_array
+from rs_localizer.native import entry, inlined
 from rs_localizer.solvers import linear, rank_drop
 from rs_localizer.solvers.batch import MODEL_SIZE, Sample, gather, inputs, scatter
 from rs_localizer.solvers.rank_drop import RELATIONS, SOLUTIONS
@@ -141,10 +141,10 @@ def _nearest_first(solutions: Array, count: int, lane: int) -> None:
             solutions[one], solutions[other] = solutions[other], solutions[one]
 
 
-@kernel
+@entry
 def _solve(
-    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, bound: float,
-    models: Array, turns: Array,
+    points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3, bound: float,
+    models: Out[Array3], turns: Out[Array3],
 ) -> None:  # fmt: skip
     """As :func:`solve_batch`; ``turns`` (20,3,h) gets v, or is empty (0,3,1)."""
     models[:] = np.nan

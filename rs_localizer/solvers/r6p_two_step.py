@@ -15,14 +15,12 @@ Points are in the frame of the initial rotation; one solution.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array1, Array2, Array3, IntArray2, Out
 from rs_localizer.core.simd.algebra import cross
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
+from rs_localizer.native import entry
 from rs_localizer.solvers import linear
 from rs_localizer.solvers.batch import Sample, gather, inputs, scatter
 
@@ -128,15 +126,15 @@ _vct_wt_lanes = traced(
 )
 
 
-@kernel
+@entry
 def solve_vc_wt(
-    points: Array,
-    rays: Array,
-    tau: Array,
-    samples: Any,
-    rotations: Array,
+    points: Array2,
+    rays: Array2,
+    tau: Array1,
+    samples: IntArray2,
+    rotations: Array3,
     iterations: int,
-    models: Array,
+    models: Out[Array3],
 ) -> None:
     """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty(_SIZE)
@@ -149,15 +147,15 @@ def solve_vc_wt(
         scatter(work, _MODEL, start, models[0])
 
 
-@kernel
+@entry
 def solve_vct_w(
-    points: Array,
-    rays: Array,
-    tau: Array,
-    samples: Any,
-    rotations: Array,
+    points: Array2,
+    rays: Array2,
+    tau: Array1,
+    samples: IntArray2,
+    rotations: Array3,
     iterations: int,
-    models: Array,
+    models: Out[Array3],
 ) -> None:
     """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty(_SIZE)
@@ -170,15 +168,15 @@ def solve_vct_w(
         scatter(work, _MODEL, start, models[0])
 
 
-@kernel
+@entry
 def solve_vct_wt(
-    points: Array,
-    rays: Array,
-    tau: Array,
-    samples: Any,
-    rotations: Array,
+    points: Array2,
+    rays: Array2,
+    tau: Array1,
+    samples: IntArray2,
+    rotations: Array3,
     iterations: int,
-    models: Array,
+    models: Out[Array3],
 ) -> None:
     """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty(_SIZE)

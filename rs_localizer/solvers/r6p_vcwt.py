@@ -15,14 +15,12 @@ starts again from v^ = 0. It costs the same and converges from tens of degrees, 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array1, Array2, Array3, IntArray2, Out
 from rs_localizer.core.simd.algebra import cross, multiply, nearest_rotation
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
+from rs_localizer.native import entry
 from rs_localizer.solvers import linear
 from rs_localizer.solvers.batch import Sample, gather, inputs, scatter
 
@@ -89,15 +87,15 @@ _frozen_lanes = traced(_frozen_step, _INPUTS + _STATE)
 _frozen_end_lanes = traced(_frozen_end, _INPUTS + _STATE)
 
 
-@kernel
+@entry
 def solve_batch(
-    points: Array,
-    rays: Array,
-    tau: Array,
-    samples: Any,
-    rotations: Array,
+    points: Array2,
+    rays: Array2,
+    tau: Array1,
+    samples: IntArray2,
+    rotations: Array3,
     iterations: int,
-    models: Array,
+    models: Out[Array3],
 ) -> None:
     """Relinearised; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty((_INPUTS + _STATE) * LANES)
@@ -109,15 +107,15 @@ def solve_batch(
         scatter(work, _MODEL, start, models[0])
 
 
-@kernel
+@entry
 def solve_batch_frozen(
-    points: Array,
-    rays: Array,
-    tau: Array,
-    samples: Any,
-    rotations: Array,
+    points: Array2,
+    rays: Array2,
+    tau: Array1,
+    samples: IntArray2,
+    rotations: Array3,
     iterations: int,
-    models: Array,
+    models: Out[Array3],
 ) -> None:
     """With v^ frozen, as published; arguments and result as :func:`solve_batch`."""
     work = np.empty((_INPUTS + _STATE) * LANES)

@@ -16,14 +16,12 @@ no rigid motion can follow. Scored by the model above, R9P fits far more points 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array1, Array2, Array3, IntArray2, Out
 from rs_localizer.core.simd.algebra import dot
-from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
+from rs_localizer.native import entry
 from rs_localizer.solvers import linear
 from rs_localizer.solvers.batch import MODEL_SIZE, Sample, gather, inputs, scatter
 
@@ -111,15 +109,15 @@ _lanes = traced(lambda values: _solve(values, fix_trace=True), _INPUTS)
 _lanes_as_published = traced(lambda values: _solve(values, fix_trace=False), _INPUTS)
 
 
-@kernel
+@entry
 def solve_batch(
-    points: Array,
-    rays: Array,
-    tau: Array,
-    samples: Any,
-    rotations: Array,
+    points: Array2,
+    rays: Array2,
+    tau: Array1,
+    samples: IntArray2,
+    rotations: Array3,
     iterations: int,
-    models: Array,
+    models: Out[Array3],
 ) -> None:
     """Trace fixed; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty(_INPUTS * LANES)
@@ -130,15 +128,15 @@ def solve_batch(
         scatter(model, 0, start, models[0])
 
 
-@kernel
+@entry
 def solve_batch_as_published(
-    points: Array,
-    rays: Array,
-    tau: Array,
-    samples: Any,
-    rotations: Array,
+    points: Array2,
+    rays: Array2,
+    tau: Array1,
+    samples: IntArray2,
+    rotations: Array3,
     iterations: int,
-    models: Array,
+    models: Out[Array3],
 ) -> None:
     """With the gauge free, as published; arguments and result as :func:`solve_batch`."""
     work = np.empty(_INPUTS * LANES)

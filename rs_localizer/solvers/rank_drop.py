@@ -23,9 +23,9 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.simd.algebra import least_squares
-from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
 from rs_localizer.core.simd.vectors import load, root, store, uniform, where_less
+from rs_localizer.native import inlined, kernel
 
 SOLUTIONS = 20
 RELATIONS = 10 * SOLUTIONS  # y m + sum_j relation[m, j] basis_j = 0

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.simd.jit import inlined
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.simd.vectors import absolute, load, root, store, uniform, where_less
+from rs_localizer.native import inlined
 
 _EPSILON = 2.0**-52
 _SWEEPS = 8  # per eigenvalue of the slowest lane; the usual number is below two

@@ -17,16 +17,20 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, Union
 
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
+from rs_localizer.native import COMPILES
 
 LANES = 8  # one AVX-512 register of doubles; narrower machines split it
 
-_VECTOR = ir.VectorType(ir.DoubleType(), LANES)
-_get_or_insert_function: Any = cgutils.get_or_insert_function
-_alloca_once: Any = cgutils.alloca_once
+if COMPILES:
+    from llvmlite import ir
+    from numba import types
+    from numba.core import cgutils
+    from numba.extending import intrinsic
+
+    _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+    _get_or_insert_function: Any = cgutils.get_or_insert_function
+    _alloca_once: Any = cgutils.alloca_once
+
 _FLAGS = ("contract", "nsz", "arcp")  # a*b + c may fuse; NaN and infinity keep their meaning
 
 Number = Union["Lanes", float]
@@ -148,7 +152,10 @@ def traced(body: Callable[[list[Lanes]], Sequence[Number]], *inputs: int) -> Any
     Returns:
         a function for use inside kernels; sources and target are flat float64 arrays of ``LANES``
         doubles per value. The target may be one of the sources: all is read before any write.
+        None where kernels come compiled.
     """
+    if not COMPILES:
+        return None
 
     def compile_call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         def element(argument: int, i: int) -> Any:
@@ -190,6 +197,8 @@ def traced_sums(inputs: int, *bodies: tuple[Callable[[list[Lanes]], Sequence[Num
         a function for use inside kernels: the target gets one number for each term of each body,
         its sum over all lanes of the first ``blocks`` blocks.
     """
+    if not COMPILES:
+        return None
 
     @intrinsic
     def sums(typingctx: Any, source: Any, blocks: Any, target: Any) -> Any:

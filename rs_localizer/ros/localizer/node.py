@@ -18,7 +18,6 @@ from visualization_msgs.msg import MarkerArray  # type: ignore[import-untyped]
 
 from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.core.reasons import Notice
-from rs_localizer.core.simd.jit import NotCompiled, at_once
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.simd.jit import NotCompiled, at_once
 from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node.refusals import describe
 from rs_localizer.ros.node.statistics import Statistics

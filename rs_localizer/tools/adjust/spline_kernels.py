@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray1, Out
 from rs_localizer.core.so3 import coefficients, log
+from rs_localizer.native import entry, inlined, kernel
 
 ORDER = 4
 """Controls that act at one instant."""
@@ -97,8 +97,8 @@ def inverse_right_jacobian(v: Array, out: Array) -> None:
     out[1, 2], out[2, 1] = second * y * z - 0.5 * x, second * y * z + 0.5 * x
 
 
-@kernel
-def steps(rotations: Array, vectors: Array, inverses: Array) -> None:
+@entry
+def steps(rotations: Array3, vectors: Out[Array2], inverses: Out[Array3]) -> None:
     """From control to control: rotation vectors (n,3) and inverse right Jacobians (n,3,3).
 
     Row k leads from control k - 1 to k; row 0 stays as it is.
@@ -210,10 +210,11 @@ def pull_back(row: Array, inverses: Array, first: int, work: Array, out: Array) 
     out[2] += z
 
 
-@kernel
+@entry
 def states(
-    rotations: Array, positions: Array, vectors: Array, first: IntArray, u: Array, spacing: float,
-    out_rotations: Array, out_positions: Array, out_rates: Array,
+    rotations: Array3, positions: Out[Array2], vectors: Array2, first: IntArray1, u: Array1,
+    spacing: float,
+    out_rotations: Out[Array3], out_positions: Out[Array2], out_rates: Out[Array3],
 ) -> None:  # fmt: skip
     """Poses and rates (as :func:`rates`) at many places."""
     work = np.empty((8, 3, 3))
@@ -224,10 +225,11 @@ def states(
         rates(positions, vectors, first[k], u[k], spacing, work, out_rotations[k], out_rates[k])
 
 
-@kernel
+@entry
 def jacobians(
-    rotations: Array, positions: Array, vectors: Array, inverses: Array, first: IntArray, u: Array,
-    spacing: float, out: Array,
+    rotations: Array3, positions: Out[Array2], vectors: Array2, inverses: Array3, first: IntArray1,
+    u: Array1,
+    spacing: float, out: Out[Array3],
 ) -> None:  # fmt: skip
     """Derivatives (m,12,24) of turn, position, body rate and velocity by the four controls."""
     work, rotation, position = np.empty((8, 3, 3)), np.empty((3, 3)), np.empty(3)

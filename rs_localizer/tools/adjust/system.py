@@ -33,7 +33,7 @@ from scipy.sparse import bsr_array, csc_array, csr_array, vstack
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.simd.jit import kernel
+from rs_localizer.tools.adjust.row_kernels import accumulate
 from rs_localizer.tools.adjust.spline_kernels import CONTROL, LOCAL
 
 # A motion whose band would be wider than this part of it is solved as a dense one.
@@ -89,45 +89,6 @@ class Groups:
         return self.motion + self.border
 
 
-@kernel
-def _accumulate(
-    values: Array, errors: Array, first: IntArray, others: IntArray, motion: int, kept: int,
-    own: Array, cross: Array, corner: Array, slope: Array,
-) -> None:  # fmt: skip
-    """Add rows (n,r,k) to the lower triangle; unknowns from ``kept`` on are left out.
-
-    ``own[j, i - j]`` is the entry of row i and column j of the motion.
-    """
-    numbers, rest = values.shape[1], others.shape[1]
-    run = values.shape[2] - rest
-    for n in range(len(values)):
-        base = first[n]
-        for q in range(numbers):
-            row, error = values[n, q], errors[n, q]
-            for b in range(run):
-                x = row[b]
-                if x == 0.0:
-                    continue
-                slope[base + b] += x * error
-                line = own[base + b]
-                for a in range(b, run):
-                    line[a - b] += x * row[a]
-                side = cross[base + b]
-                for k in range(rest):
-                    i = others[n, k]
-                    if 0 <= i < kept:
-                        side[i - motion] += x * row[run + k]
-            for k in range(rest):
-                i, x = others[n, k], row[run + k]
-                if i < 0 or i >= kept or x == 0.0:
-                    continue
-                slope[i] += x * error
-                for m in range(rest):
-                    j = others[n, m]
-                    if 0 <= j <= i:
-                        corner[i - motion, j - motion] += x * row[run + m]
-
-
 class _Blocks(NamedTuple):
     """The eliminated blocks, and what couples them with the kept unknowns."""
 
@@ -174,7 +135,7 @@ class System:
             sizes = (groups.motion, reach), (groups.motion, groups.border), (groups.border,) * 2
             self.matrix = Band(*map(np.zeros, sizes))
             for term in rows:
-                _accumulate(
+                accumulate(
                     term.values, term.errors, term.first, term.others, groups.motion, groups.kept,
                     *self.matrix, self.slope,
                 )  # fmt: skip

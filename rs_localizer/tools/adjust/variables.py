@@ -16,8 +16,6 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.tools.adjust.intrinsics import lens_values
 from rs_localizer.tools.adjust.spline import Layout, Spline
 
-EXTRINSICS = 7
-"""Numbers of a camera's mount: turn in its own axes, centre in the body's, offset of its clock."""
 MOUNT, DELAY = 13, 6
 """Numbers of a gyroscope's mount: turn in its own axes, bias, delay, shape; place of the delay."""
 

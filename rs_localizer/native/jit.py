@@ -1,0 +1,206 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels run by Numba: for who edits them, and for the build, which compiles them all.
+
+Nothing of this is imported where the native module fits the sources. Machine code is kept in the
+checkout, in a folder named by the digest of a kernel's file and of all that it imports, because
+Numba itself would run old code after a callee changed in another file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numba
+import numpy as np
+from numba import types
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.registry import CPUDispatcher
+
+from rs_localizer.native import sources
+from rs_localizer.native.declared import (
+    ArrayOf,
+    Declaration,
+    Kind,
+    Scalar,
+    declaration,
+    fits,
+    refuse,
+)
+
+ENTRIES: dict[str, Any] = {}
+"""All entries that have been declared so far, by name."""
+
+_SCALARS = {"d": types.float64, "q": types.int64, "?": types.boolean}
+_OTHERS = stat.S_IWGRP | stat.S_IWOTH
+
+
+class _Kernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
+    """A function that kernels call, and Python does not."""
+
+    def __call__(self, *arguments: Any) -> Any:
+        raise TypeError(uncallable(f"{self.__module__}.{self.__qualname__}"))
+
+
+class _Entry(CPUDispatcher):  # type: ignore[misc]
+    """A kernel that Python calls: with what it declares, and nothing else."""
+
+    declared: Declaration | None
+    native: Callable[..., Any] | None
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self.native is not None:
+            return self.native(*arguments)
+        # Classes that annotations name may come later in a module than the entry.
+        if self.declared is None:
+            self.declared = declaration(self.py_func)
+        if not fits(self.declared, arguments):
+            refuse(self.declared, arguments)
+        return super().__call__(*map(_writable, arguments))
+
+
+def uncallable(name: str) -> str:
+    """Return what a call of a kernel that is no entry is refused with."""
+    return f"{name} is called by kernels alone; Python calls what is declared as @entry"
+
+
+def _writable(argument: Any) -> Any:
+    """An argument whose read-only arrays are copied: to Numba they are of another type."""
+    if isinstance(argument, tuple):
+        parts = [_writable(part) for part in argument]
+        return argument._make(parts) if hasattr(argument, "_make") else tuple(parts)
+    if isinstance(argument, np.ndarray) and not argument.flags.writeable:
+        return argument.copy()
+    return argument
+
+
+def numba_type(kind: Kind) -> Any:
+    """Return Numba's type of what an entry declares."""
+    if isinstance(kind, Scalar):
+        return _SCALARS[kind.code]
+    if isinstance(kind, ArrayOf):
+        return types.Array(numba.from_dtype(np.dtype(kind.element)), kind.dimensions, "C")
+    return types.BaseTuple.from_types(tuple(map(numba_type, kind.fields)), kind.kind)
+
+
+def signature(declared: Declaration) -> tuple[Any, ...]:
+    """Return Numba's types of an entry's arguments."""
+    return tuple(map(numba_type, declared.arguments.values()))
+
+
+def compiled(function: Callable[..., Any], inline: bool, is_built: bool) -> Any:
+    """Return a kernel for Numba.
+
+    Args:
+        inline: compiled as a part of the kernel that calls it.
+        is_built: for the build, which makes its own way from Python to the machine code.
+    """
+    made = numba.njit(
+        nogil=True,
+        inline="always" if inline else "never",
+        no_cfunc_wrapper=True,
+        no_cpython_wrapper=is_built,
+        # Without it every division is checked for zero, which stops vectorization.
+        error_model="numpy",
+        # NaN and infinity keep their meaning: they mark lanes and points without a solution.
+        fastmath={"contract", "reassoc", "nsz", "arcp"},
+    )(function)
+    template = made.get_call_template
+    # Numba would compile a callee for every constant among its arguments, as often with all that
+    # it calls.
+    made.get_call_template = lambda positional, named: template(
+        tuple(map(types.unliteral, positional)),
+        {name: types.unliteral(kind) for name, kind in named.items()},
+    )
+    made.__class__ = _Kernel
+    path = sources.path_of_ours(function.__module__)
+    if not is_built and path is not None and str(path) == function.__code__.co_filename:
+        made._cache = _Cache(function)
+    return made
+
+
+def entry(function: Callable[..., Any], is_built: bool, native: Any) -> Any:
+    """Return an entry for Numba; ``native`` is what Python calls instead where it fits."""
+    made = compiled(function, False, is_built)
+    made.__class__, made.declared, made.native = _Entry, None, native
+    ENTRIES[f"{function.__module__}.{function.__qualname__}"] = made
+    return made
+
+
+# -- machine code in the checkout ------------------------------------------------------------------
+
+
+class _Locator:
+    """Numba's question where the machine code of a function is kept."""
+
+    def __init__(self, function: Any, file: str) -> None:
+        digest = sources.digest(function.__module__)
+        self._py_file = file  # Numba's name, for its warnings
+        self._directory = folder() / digest[:16] / function.__module__
+        self._digest, self._line = digest, function.__code__.co_firstlineno
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> Self:
+        return cls(function, file)
+
+    def ensure_cache_path(self) -> None:
+        self._directory.mkdir(0o700, parents=True, exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        return str(self._directory)
+
+    def get_source_stamp(self) -> str:
+        return self._digest
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+
+class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes: Sequence[type] = [_Locator]
+
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    """Machine code that nobody else can have put there; what is wrong is compiled again."""
+
+    _impl_class = _Implementation
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        with contextlib.suppress(Exception):  # half a file, or one of another program
+            if is_ours(Path(self._cache_path)):
+                return super().load_overload(signature, target)
+        return None
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        if is_ours(Path(self._cache_path)):
+            with contextlib.suppress(OSError):  # a full disk, or a folder that is read-only
+                super().save_overload(signature, compiled)
+
+
+def folder() -> Path:
+    """Return where machine code is kept: beside the package, in the checkout."""
+    return sources.PACKAGE.parent / ".kernels"
+
+
+def is_ours(path: Path) -> bool:
+    """True if nobody else can put files into a folder: what is there runs in this process."""
+    for each in (path, *path.parents):
+        try:
+            about = each.stat()
+        except FileNotFoundError:  # it will be made for this user
+            continue
+        # In /tmp (sticky), nobody can replace what is another's.
+        is_sticky = each != path and about.st_mode & stat.S_ISVTX
+        if about.st_uid not in {0, os.geteuid()} or (about.st_mode & _OTHERS and not is_sticky):
+            warnings.warn(
+                f"kernels in {folder()} are not used, since other users can write to {each}: "
+                "chmod -R go-w, or remove it", RuntimeWarning, 2,
+            )  # fmt: skip
+            return False
+    return True

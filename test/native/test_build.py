@@ -1,0 +1,96 @@
+"""The tool that builds kernels: what it reads, what it refuses, and what its C relies on."""
+
+import ast
+import ctypes
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+
+from rs_localizer.native import build, sources
+
+HERE = Path(__file__).parent
+NUMBERS = 13
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
+def test_our_header_says_what_pythons_says(tmp_path):
+    include = Path(sysconfig.get_paths()["include"])
+    if not (include / "Python.h").is_file():
+        pytest.skip("needs Python's headers")
+    made = tmp_path / "both.so"
+    objects = []
+    for source, folder in (("abi3_theirs.c", include), ("abi3_ours.c", sources.PACKAGE / "native")):
+        objects.append(tmp_path / f"{source}.o")
+        command = ["gcc", "-fPIC", "-c", HERE / source, "-I", folder, "-o", objects[-1]]
+        subprocess.run(command, check=True)
+    subprocess.run(["gcc", "-shared", *objects, "-o", made], check=True)
+    both = ctypes.CDLL(str(made))
+    count = both.their_count()
+    assert count > 10
+    assert [both.our(i) for i in range(count)] == [both.their(i) for i in range(count)]
+    assert [both.our_number(i) for i in range(NUMBERS)] == [
+        both.their_number(i) for i in range(NUMBERS)
+    ]
+
+
+def test_a_digest_follows_callees_in_other_files():
+    assert "rs_localizer.core.so3" in sources.closure("rs_localizer.estimation.refine")
+    assert "rs_localizer.estimation.refine" not in sources.closure("rs_localizer.core.so3")
+
+
+def test_what_is_imported_for_types_alone_is_no_part_of_a_kernel():
+    found = set()
+    text = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import rs_localizer.core.rig\n"
+    sources._collect(ast.parse(text).body, found)
+    assert not found
+
+
+@pytest.mark.parametrize(
+    ("version", "is_known"), [("0.60.0", False), ("0.68.1", True), ("0.99.0", False)]
+)
+def test_a_numba_that_was_not_tried_is_refused_with_what_to_type(monkeypatch, version, is_known):
+    monkeypatch.setattr(build.importlib.metadata, "version", lambda name: version)
+    if is_known:
+        assert build.check_numba() == version
+    else:
+        with pytest.raises(build.CannotBuild, match='pip install "numba>='):
+            build.check_numba()
+
+
+def test_without_eigen_it_says_what_to_type(monkeypatch):
+    monkeypatch.setattr(build.sys, "path", [])
+    monkeypatch.setattr(build.Path, "is_file", lambda path: False)
+    with pytest.raises(build.CannotBuild, match="pip install cmeel-eigen"):
+        build.eigen()
+
+
+def made(folder, tmp_path, seed):
+    """Kernels of two modules, from a checkout in a folder, built by a process of that seed."""
+    shutil.copytree(sources.PACKAGE, folder / "rs_localizer", ignore=shutil.ignore_patterns("*.so"))
+    to = tmp_path / f"made_{seed}"
+    to.mkdir()
+    environment = os.environ | {"PYTHONHASHSEED": seed} | build._environment("v2", True)
+    environment |= {"RS_LOCALIZER_KERNELS": "build", "PYTHONPATH": str(folder)}
+    command = [sys.executable, "-m", "rs_localizer.native.bitcode", to, "x86-64-v2"]
+    command += ["x86_64-unknown-linux-gnu", "rs_localizer.core.bearings", "rs_localizer.core.so3"]
+    subprocess.run(command, env=environment, cwd=tmp_path, check=True)
+    return to
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="compiles for x86-64")
+def test_the_same_bytes_come_from_another_folder_and_seed(tmp_path):
+    folders = tmp_path / "one", tmp_path / "a" / "longer" / "path"
+    for folder in folders:
+        folder.mkdir(parents=True)
+    one, other = (
+        made(folder, tmp_path, seed) for folder, seed in zip(folders, ("1", "77"), strict=True)
+    )
+    for name in ("kernels.o", "table.c"):
+        assert (one / name).read_bytes() == (other / name).read_bytes()
+    assert str(tmp_path).encode() not in (one / "kernels.o").read_bytes()

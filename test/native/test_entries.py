@@ -1,0 +1,231 @@
+"""Entries: what Python may call a kernel with, and what becomes of the answer."""
+
+import gc
+import multiprocessing
+import os
+import pickle
+import resource
+import subprocess
+import sys
+import threading
+import typing
+
+import numpy as np
+import pytest
+
+from rs_localizer import native
+from rs_localizer.core import so3
+from rs_localizer.native import declared, sources
+from rs_localizer.native.declared import ArrayOf, Scalar, TupleOf
+
+JITTED = native.COMPILES
+
+
+def entries():
+    """All entries of the package by name: what Python calls."""
+    import importlib
+
+    found = {}
+    for module in sources.kernel_modules():
+        importlib.import_module(module)
+    if JITTED:
+        from rs_localizer.native import jit
+
+        return {name: entry.py_func for name, entry in jit.ENTRIES.items()}
+    found.update(declared.FUNCTIONS)
+    return found
+
+
+def entry(name):
+    module, _, function = name.rpartition(".")
+    return getattr(sys.modules[module], function)
+
+
+ENTRIES = entries()
+
+
+def some(kind):
+    """An argument that an entry takes by its declaration, as small as can be."""
+    match kind:
+        case Scalar(code):
+            return {"d": 0.5, "q": 1, "?": True}[code]
+        case ArrayOf(element, dimensions):
+            return np.zeros((1,) * dimensions, element)
+        case TupleOf(fields, named):
+            return (named or (lambda *parts: parts))(*map(some, fields))
+
+
+def faults_of(kind):
+    """Arguments that an entry must refuse instead, and a word of what it says."""
+    match kind:
+        case Scalar("d"):
+            yield from [(1, "a float"), (np.float32(1.0), "a float"), (None, "a float")]
+        case Scalar("q"):
+            yield from [(1.0, "an int"), (True, "an int"), (2**63, "an int"), ("1", "an int")]
+        case Scalar():
+            yield from [(1, "a bool"), (np.float64(1.0), "a bool")]
+        case ArrayOf(element, dimensions, is_written):
+            other = "float32" if element == "float64" else "float64"
+            yield np.zeros((1,) * dimensions, other), element
+            yield np.zeros((1,) * (dimensions + 1), element), f"{dimensions} dimensions"
+            yield (
+                np.zeros((4,) * dimensions, element)[(slice(None, None, 2),) * dimensions],
+                "contiguous",
+            )
+            yield [0.0], "a contiguous array"
+            size = np.dtype(element).itemsize
+            if size > 1:
+                raw = np.zeros(size + 1, np.uint8)[1:].view(element)
+                yield raw.reshape((1,) * dimensions), "not aligned"
+            if is_written:
+                fixed = np.zeros((1,) * dimensions, element)
+                fixed.flags.writeable = False
+                yield fixed, "can be written to"
+        case TupleOf(fields, named):
+            yield 1, named.__name__ if named else "a tuple"
+            parts = tuple(map(some, fields))
+            yield parts[:-1], named.__name__ if named else "a tuple"
+            if named is not None:
+                yield parts, named.__name__
+            for k, field in enumerate(fields):
+                for fault, word in faults_of(field):
+                    replaced = (*parts[:k], fault, *parts[k + 1 :])
+                    yield (named._make(replaced) if named else replaced), word
+
+
+@pytest.mark.parametrize("name", sorted(ENTRIES))
+def test_an_entry_refuses_what_it_does_not_declare(name):
+    said = declared.declaration(ENTRIES[name])
+    arguments = [some(kind) for kind in said.arguments.values()]
+    with pytest.raises(TypeError, match=f"takes {len(arguments)} arguments"):
+        entry(name)(*arguments, 1.0)
+    for k, (argument, kind) in enumerate(said.arguments.items()):
+        for fault, word in faults_of(kind):
+            with pytest.raises(TypeError) as refused:
+                entry(name)(*arguments[:k], fault, *arguments[k + 1 :])
+            text = str(refused.value)
+            assert text.startswith(f"{name}: {argument}"), text
+            assert word in text, text
+            assert "got" in text
+
+
+def test_a_kernel_that_is_no_entry_is_not_called():
+    with pytest.raises(TypeError, match=r"so3\.coefficients is called by kernels alone"):
+        so3.coefficients(0.1)
+
+
+def test_a_read_only_array_is_taken_where_nothing_is_written():
+    vector = np.array([0.1, 0.2, 0.3])
+    expected = so3.exp(vector)
+    vector.flags.writeable = False
+    np.testing.assert_array_equal(so3.exp(vector), expected)
+
+
+def test_results_are_arrays_of_their_own():
+    first = so3.exp(np.zeros(3))
+    kept = first.copy()
+    for _ in range(100):
+        so3.exp(np.ones(3))
+    np.testing.assert_array_equal(first, kept)
+    assert first.flags.owndata
+    assert first.flags.writeable
+
+
+def test_memory_does_not_grow():
+    vectors = np.zeros((1000, 3))
+    for _ in range(100):
+        so3._exp_many(vectors)
+    gc.collect()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for _ in range(10_000):
+        so3._exp_many(vectors)  # 72 kB each
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + 4_000
+
+
+def test_refusals_do_not_leak():
+    held = np.zeros(3, np.float32)
+    before = sys.getrefcount(held)
+    for _ in range(100):
+        with pytest.raises(TypeError):
+            so3.exp(held)
+    gc.collect()
+    assert sys.getrefcount(held) == before
+
+
+def test_two_threads_get_the_same():
+    vectors = np.random.default_rng(1).normal(size=(2000, 3))
+    expected, found = so3._exp_many(vectors), []
+    threads = [
+        threading.Thread(target=lambda: found.append(so3._exp_many(vectors))) for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(np.array_equal(each, expected) for each in found)
+
+
+@pytest.mark.parametrize("how", ["fork", "spawn"])
+def test_other_processes_get_the_same(how):
+    with multiprocessing.get_context(how).Pool(1) as pool:
+        found = pool.apply(so3.exp, (np.array([0.1, 0.2, 0.3]),))
+    np.testing.assert_array_equal(found, so3.exp(np.array([0.1, 0.2, 0.3])))
+
+
+@pytest.mark.skipif(JITTED, reason="of the native module")
+def test_an_entry_is_pickled_by_its_name():
+    again = pickle.loads(pickle.dumps(so3.exp))
+    np.testing.assert_array_equal(again(np.ones(3)), so3.exp(np.ones(3)))
+    assert "core.so3.exp" in repr(so3.exp.__self__)
+
+
+@pytest.mark.skipif(JITTED, reason="of the native module")
+def test_a_process_that_localizes_imports_no_compiler():
+    code = (
+        "import sys, numpy as np, rs_localizer as rsl\n"
+        "K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])\n"
+        "camera = rsl.Camera(640, 480, K, readout_time=0.03)\n"
+        "points = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 5], (60, 3))\n"
+        "pixels = points[:, :2] / points[:, 2:] * 500 + (320, 240)\n"
+        "assert rsl.Localizer(camera).localize(points, pixels)\n"
+        "print({'numba', 'llvmlite', 'scipy'} & set(sys.modules))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
+
+
+class Pair(typing.NamedTuple):
+    one: float
+    two: "np.ndarray"
+
+
+def test_an_annotation_that_says_too_little_is_refused():
+    def odd(x: np.ndarray) -> None: ...
+
+    with pytest.raises(TypeError, match="x: .*says too little"):
+        declared.declaration(odd)
+
+    def pair(x: Pair) -> None: ...
+
+    with pytest.raises(TypeError, match="x: .*says too little"):
+        declared.declaration(pair)
+
+    def defaults(x: float = 0.0) -> None: ...
+
+    with pytest.raises(TypeError, match="no defaults|neither defaults"):
+        declared.declaration(defaults)
+
+
+@pytest.mark.parametrize(
+    ("cap", "said"),
+    [("v9", "'v9'; this machine's levels are v2, v3, v4"), ("generic", "levels are")],
+)
+def test_a_level_that_is_none_is_refused_in_a_line(cap, said):
+    environment = os.environ | {"RS_LOCALIZER_LEVEL": cap}
+    environment.pop("RS_LOCALIZER_KERNELS", None)
+    code = "from rs_localizer.core import so3"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment
+    )
+    assert done.returncode != 0
+    assert said in done.stderr.splitlines()[-1]
