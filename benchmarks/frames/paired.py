@@ -16,9 +16,10 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -30,6 +31,8 @@ from benchmarks.frames.conditions import BENCHES
 from benchmarks.frames.judged import Judged, camera_of, far_off
 from benchmarks.frames.paired_set import OTHERS, SPOILT
 from benchmarks.frames.switches import SWITCHES, switched_off
+
+T = TypeVar("T")
 
 _ROOT = Path(__file__).parents[2]
 # Medians of fewer frames that both localize say little.
@@ -87,21 +90,39 @@ class Result:
         return {name: one for name, one in self.judged.items() if name.split("/")[0] in benches}
 
 
-def measured(options: argparse.Namespace) -> Result:
-    """The version that Python finds."""
+def measured(options: argparse.Namespace, *lacking: tuple[str, ...]) -> list[Result]:
+    """The version that Python finds, without some parts each; condition by condition in turns, so
+    that times are of the same minute.
+    """
     rsl.Localizer(camera_of(next(paired_set.benches()), 0)).warm_up()
-    judged, only = dict(paired_set.judged(options.seed, options.only)), options.only or _REAL
-    real: dict[str, float] = {}
+    judged = _in_turns(lambda: paired_set.judged(options.seed, options.only), lacking)
+    real, only = [dict[str, float]() for _ in lacking], options.only or _REAL
     if "boards" in only:
-        with tempfile.TemporaryDirectory() as cache:
-            real |= dict(paired_set.boards(options.boards, options.cache or Path(cache)))
+        with tempfile.TemporaryDirectory() as folder:
+            cache = options.cache or Path(folder)
+            real = _in_turns(lambda: paired_set.boards(options.boards, cache), lacking)
     if "phone" in only:
-        folder = options.phone or paired_set.phone_folder(_ROOT)
-        if folder is None:
+        folder_of_phone = options.phone or paired_set.phone_folder(_ROOT)
+        if folder_of_phone is None:
             sys.stderr.write("the phone is left out: no phone_gyro is here; give --phone FOLDER\n")
         else:
-            real |= dict(paired_set.phone(folder))
-    return Result(options.seed, judged, real)
+            phones = _in_turns(lambda: paired_set.phone(folder_of_phone), lacking)
+            real = [one | other for one, other in zip(real, phones, strict=True)]
+    return [Result(options.seed, *each) for each in zip(judged, real, strict=True)]
+
+
+def _in_turns(
+    stream: Callable[[], Iterator[tuple[str, T]]], lacking: Sequence[tuple[str, ...]]
+) -> list[dict[str, T]]:
+    """What a stream says by name, without some parts each."""
+    streams, found = [stream() for _ in lacking], [dict[str, T]() for _ in lacking]
+    while True:
+        for parts, one, into in zip(lacking, streams, found, strict=True):
+            with switched_off(*parts):
+                said = next(one, None)
+            if said is None:
+                return found
+            into[said[0]] = said[1]
 
 
 def line(versions: Sequence[Mapping[str, Judged]]) -> tuple[str, ...]:
@@ -191,15 +212,15 @@ def paired(options: argparse.Namespace) -> int:
     try:
         if options.against is not None:
             versions.append(Result.load(options.against))
-        elif words:
-            versions.append(measured(options))
+        lacking = [tuple(words[1:])]
+        if words and options.against is None:
+            lacking.insert(0, ())
         start = time.process_time()
-        with switched_off(*words[1:]):
-            result = measured(options)
+        *today, result = measured(options, *lacking)
         sys.stderr.write(f"{time.process_time() - start:.0f} s of CPU\n")
         if options.save is not None:
             result.save(options.save)
-        versions = [*(one.on(result) for one in versions), result]
+        versions = [*(one.on(result) for one in (*versions, *today)), result]
     except (OSError, KeyError, ValueError) as error:
         sys.stderr.write(f"{options.against or options.save}: {error}\n")
         return 2
