@@ -67,6 +67,25 @@ def test_an_opposed_pair_before_a_wall_knows_pose_and_velocity(opposed, pose_tim
     assert {frame.body_frame for frame in frames} == {"rig"}
 
 
+@pytest.mark.parametrize("lag", [0, 2])
+def test_the_last_frame_that_waits_for_a_camera_comes_at_the_end(tmp_path, lag):
+    """An image of the other camera may still come while the recording goes on."""
+    images: list[tuple[str, int]] = []
+
+    def keep(image) -> bool:
+        kept = image.name == "left" or image.stamp_ns < 1_200_000_000
+        images.extend([(image.name, image.stamp_ns)] * kept)
+        return kept
+
+    record(tmp_path / "bag", 0.3, keep=keep)
+    lefts = [stamp for name, stamp in images if name == "left"]
+    rights = [stamp for name, stamp in images if name == "right"]
+    assert 1 <= sum(stamp > rights[-1] + 20_000_000 for stamp in lefts) <= 3  # still awaited
+    frames, refused, _ = localize(tmp_path / "bag", output_lag=lag, max_orientation_deviation=1.0)
+    assert len(frames) + len(refused) == len(lefts)
+    assert frames[-1].input_stamp_ns >= lefts[-1]
+
+
 SIDEWAYS = np.array([0.3, 0.8, -0.5]) / np.linalg.norm([0.3, 0.8, -0.5])
 
 
