@@ -239,6 +239,7 @@ def test_results_of_a_frame_later_know_their_velocities_better():
         results = [tracker.localize(ns(t), *hand.frame(t, 40, WALL)) for t in times(30)]
         assert [str(r.reason) for r in results[:lag]] == ["awaits_frames"] * lag
         found = [*results[lag:], *tracker.flush()]
+        assert tracker.flush() == []
         assert [one.time_ns for one in found] == [ns(t) for t in times(30)]
         truths = [hand.motion(t) for t in times(30)]
         off = [np.linalg.norm(one.angular_velocity - truth.angular_velocity)

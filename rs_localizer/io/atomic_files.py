@@ -283,8 +283,8 @@ def _read_journal(work: Path) -> tuple[Path, list[str], list[str]] | None:
     try:
         said = json.loads((work / _JOURNAL).read_text(encoding="utf-8"))
         folder, names, earlier = said["folder"], said["names"], said["earlier"]
-        inside = all(Path(name).name == name != ".." for name in (*names, *earlier))
-        inside = inside and folder in ("", Path(folder).name) and folder != ".."
+        said_names = (*names, *earlier, *([folder] if folder else []))
+        inside = all(Path(name).name == name not in ("", "..") for name in said_names)
     except (OSError, ValueError, KeyError, TypeError):
         return None
     source = work / folder

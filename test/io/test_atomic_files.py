@@ -303,6 +303,8 @@ def test_workplaces_of_earlier_versions_and_journals_of_strangers(tmp_path):
             {"folder": "away", "names": ["secret"], "earlier": []},
             {"folder": "", "names": [], "earlier": ["../secret"]},
             {"folder": "", "names": [".."], "earlier": []},
+            {"folder": "..", "names": [], "earlier": []},
+            {"folder": "", "names": [], "earlier": [""]},
             ["no", "journal"],
         )
     ):
