@@ -40,7 +40,7 @@ from rs_localizer.estimation.correlated import (
     volume_of,
     weighed,
 )
-from rs_localizer.estimation.plane import plane_of
+from rs_localizer.estimation.plane import leaning_less, plane_of
 from rs_localizer.estimation.prior import SPEEDS, PriorTerms, add_prior, offset_between, terms_at
 from rs_localizer.estimation.refine import TINY, apply_step, inverted, solve_positive
 from rs_localizer.native import entry, inlined, kernel
@@ -426,8 +426,11 @@ def _over_leans(frame: Frame, mode: Mode, terms: PriorTerms) -> Mode:
     sizes, axes = np.linalg.eigh(flat @ mode.covariance[TURN, TURN].copy() @ flat)
     if not (plane and sizes[2] > _KNOWN_LEAN**2):
         return mode
-    used = 2 if sizes[1] > _KNOWN_LEAN**2 else 1
-    axes = axes.T[::-1][:used].copy()
+    # The mirrored lean may lie beyond others that are out of the question.
+    _, twin = leaning_less(frame.points, frame.chosen, mode.state, 2.0)
+    away = axes.T @ step_between(mode.state, twin)[TURN]
+    used = 2 if max(sizes[1], away[1] ** 2) > _KNOWN_LEAN**2 else 1
+    axes, away = axes.T[::-1][:used].copy(), away[::-1][:used].copy()
     steps = _SPACING * np.sqrt(np.maximum(sizes[::-1][:used], TINY))
     taken = taken_by(frame.smooth.squares, mode.size, mode.noise)
     held = _Held(taken, mode.noise, 0.0, mode.freedom)
@@ -466,6 +469,7 @@ def _over_leans(frame: Frame, mode: Mode, terms: PriorTerms) -> Mode:
             if shrunk:
                 first, last, best = 0, 1, -np.inf
                 continue
+            last = _queue(places, starts, last, np.rint(away / steps).astype(np.int64), twin)
         if not evidences[first - 1] > best - _LEAST_PART:
             continue
         near = states[first - 1]

@@ -1,6 +1,11 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Points on a plane: whether they are, its view that faces the camera, and its worst known turn."""
+"""Points on a plane: whether they are, its other views, and the turn that is known worst.
+
+From far away, or on a small marker, a plane that leans to the left and one that leans to the right
+look alike but for perspective (Schweighofer, Pinz, "Robust pose estimation from a planar target",
+PAMI 2006).
+"""
 
 from __future__ import annotations
 
@@ -19,10 +24,13 @@ _LEAST_LEAN = 0.01
 
 
 @entry
-def facing(points: Array2, inliers: BoolArray1, state: Array1) -> tuple[bool, Array]:
-    """True and the state (24,) whose view of the plane faces the camera.
+def leaning_less(
+    points: Array2, inliers: BoolArray1, state: Array1, leans: float
+) -> tuple[bool, Array]:
+    """True and the state (24,) whose view of the plane leans by so many times its lean less.
 
-    False if the points (n,3) that count are no plane, or face the camera already.
+    Twice its lean less it is mirrored, once it faces the camera. False if the points (n,3) that
+    count are no plane, or face the camera.
     """
     plane, centre, axis_of_plane = plane_of(points, inliers)
     if not plane:
@@ -42,7 +50,7 @@ def facing(points: Array2, inliers: BoolArray1, state: Array1) -> tuple[bool, Ar
     lean = np.arcsin(min(length, 1.0))
     if lean < _LEAST_LEAN:
         return False, state
-    flip = so3.exp(-lean / length * axis)
+    flip = so3.exp(-leans * lean / length * axis)
     other = state.copy()
     for i in range(3):
         other[9 + i] = seen[i]

@@ -12,7 +12,7 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.state import STATE_SIZE, rotation_of
 from rs_localizer.estimation.observations import Observed
-from rs_localizer.estimation.plane import facing
+from rs_localizer.estimation.plane import leaning_less
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.ransac import (
     NOTHING,
@@ -131,7 +131,7 @@ class MotionSearch:
         points tell leaning from moving no better.
         """
         observations = observed.observations
-        leans, towards = facing(observations.points, near, start.state)
+        leans, towards = leaning_less(observations.points, near, start.state, 1.0)
         if not leans:
             return found
         state, cost = descend(

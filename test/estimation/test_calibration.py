@@ -156,8 +156,8 @@ def test_regions_hold_before_a_bent_map_that_is_declared(depth, least):
     assert found >= least
 
 
-def test_points_of_a_curled_sheet_are_inliers_beside_its_bend():
-    """A corner stands up by 1.5 cm, 50 times what is declared: a flat sheet leaves out 2 to 13."""
+def test_poses_before_a_curled_sheet_stay_in_their_regions():
+    """A corner stands up by 1.5 cm, 50 times what is declared, and is left out in part."""
     matrix = np.array([[2000.0, 0.0, 960.0], [0.0, 2000.0, 540.0], [0.0, 0.0, 1.0]])
     localizer = rsl.Localizer(
         rsl.Camera(1920, 1080, matrix, readout_time=0.02), map_deviation=0.0003
@@ -175,7 +175,10 @@ def test_points_of_a_curled_sheet_are_inliers_beside_its_bend():
         pixels = 2000.0 * seen[:, :2] / seen[:, 2:] + [960.0, 540.0]
         found = localizer.localize(flat, pixels + rng.normal(0.0, 0.3, pixels.shape))
         assert found, found
-        assert found.inliers.all()
+        off = so3.log(np.ascontiguousarray(found.rotation @ turn.T))
+        spread = found.covariance[:3, :3]
+        assert off @ np.linalg.solve(spread, off) < 7.8  # 95 % of three degrees of freedom
+        assert found.inliers.mean() > 0.9
 
 
 def test_regions_before_a_wall_count_the_smooth_errors_of_all_modes():

@@ -119,9 +119,8 @@ def test_a_vibrating_camera_stays_in_its_region(frames):
     assert (np.mean(np.array(squared) < chi2.ppf(0.95, 6), axis=0) >= 0.85).all()
 
 
-def refused_of(observations, posterior):
-    """Whether it is refused."""
-    failure = refusal(observations, posterior, 0, min_inliers=12, threshold=2.0, rolling=True)
+def is_refused(posterior):
+    failure = refusal(posterior, 0, min_inliers=12, threshold=2.0, rolling=True)
     return failure is not None
 
 
@@ -143,7 +142,7 @@ def test_few_points_of_a_vibrating_camera_are_refused_or_covered(count, wrong, p
         observations, state = shaken(seed, 3.0, 2.0 * SWING, 0.5, wrong, count)
         start = fitted(observations, state, PRIOR, 8.0)
         found = frame_posterior(observations, start.state, PRIOR, 2.0, ASSUMED)
-        if refused_of(observations, found):
+        if is_refused(found):
             continue
         squared.append(distance(found, at_the_middle(state, 3.0, 2.0 * SWING), slice(0, 12)))
     assert len(squared) >= published
