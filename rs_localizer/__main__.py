@@ -1,15 +1,18 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m rs_localizer`` and the executable: takes signals in hand, then imports the rest."""
+"""``python -m rs_localizer`` and the executable: takes signals in hand, then imports the rest.
 
-from __future__ import annotations
+Imports nothing at first but what Python has imported before: it may come from the working folder.
+"""
 
 import os
 import sys
-from contextlib import AbstractContextManager
 
-from rs_localizer.process import limit_threads
-from rs_localizer.process.stopping import StopSignals
+from rs_localizer.process import ignore_working_folder, limit_threads
+
+TYPE_CHECKING = False  # type checkers take it for typing's
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
 
 _PROGRAM = "rs_localizer"
 
@@ -25,10 +28,13 @@ def run() -> int:
     Returns:
         the exit code: 130 after Ctrl-C and 143 after SIGTERM, as of any other program.
     """
+    ignore_working_folder()
     limit_threads()
+    from rs_localizer.process.stopping import StopSignals
+
     with StopSignals() as signals:
 
-        def importing(name: str) -> AbstractContextManager[None]:
+        def importing(name: str) -> "AbstractContextManager[None]":
             signals.last_words = f"{name}: interrupted\n"
             return signals.at_once(None, signals.last_words)
 

@@ -33,7 +33,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "markers": {"core", "io"},
     "features": {"core", "config", "io"},
     "pipeline": {*METHOD, "io", "features", "markers", "matching"},
-    "offline": {*(*METHOD, "io", "features", "markers", "matching", "pipeline", "settings")},
+    "offline": {*METHOD, *"io features markers matching pipeline process settings".split()},
 }
 # What makes a camera or a map known: nothing but the commands imports it.
 MAY_IMPORT["tools"] = {*MAY_IMPORT}

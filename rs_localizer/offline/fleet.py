@@ -33,6 +33,7 @@ from rs_localizer.io.atomic_files import (
     resume_results,
     write_errors,
 )
+from rs_localizer.process import ignore_working_folder
 
 Figures = dict[str, float | int | str]
 """Figures of a recording, by identifiers with their units."""
@@ -146,6 +147,7 @@ def perform(task: Task) -> Outcome:
 
     Whatever goes wrong with the recording is an outcome, not an exception.
     """
+    ignore_working_folder()  # of a worker of Dask, which another program has started
     here = socket.gethostname()
     if program() != task.program:
         return Outcome(None, f"the worker on {here} has another rs_localizer: install the same")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import partial
 
 import rs_localizer
-from rs_localizer.process import limit_threads
+from rs_localizer.process import ignore_working_folder, limit_threads
 from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import StopRequest
 
@@ -83,6 +83,7 @@ def example_matcher(args: list[str] | None = None) -> int:
             "webcam recording, and prints the poses of a localizer.\n"
         )
         return 0
+    ignore_working_folder()
     with StopRequest() as stop:
         try:
             with stop.at_once():
@@ -95,6 +96,7 @@ def example_matcher(args: list[str] | None = None) -> int:
 
 
 def _run(name: str, args: list[str] | None = None) -> int:
+    ignore_working_folder()
     limit_threads()
     with StopRequest() as stop:
         try:

@@ -124,8 +124,8 @@ class _Compiler:
         dumps: Callable[[Any], bytes] = serialize.dumps
         if self._child is None:
             self._child = subprocess.Popen(
-                [sys.executable, "-c", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL, env=os.environ | _SAME_CODE,
+                [sys.executable, "-P", "-c", _PROGRAM], stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=os.environ | _SAME_CODE,
             )  # fmt: skip
             assert self._child.stdin is not None
             assert self._child.stdout is not None

@@ -365,7 +365,8 @@ class _Cache(FunctionCache):
         """True if a signature is there, by its files."""
         with contextlib.suppress(*_DAMAGE, OSError):
             _refresh_once(target)
-            return self._cache_file.load(self._index_key(signature, target.codegen())) is not None
+            key = self._index_key(signature, target.codegen())
+            return _is_ours(Path(self._cache_path)) and self._cache_file.load(key) is not None
         return False
 
     def load_overload(self, signature: Any, target: Any) -> Any:
