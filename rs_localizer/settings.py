@@ -31,6 +31,7 @@ from rs_localizer.io.yaml_text import (
     flat,
     load_yaml,
     parameter_blocks,
+    read_text,
 )
 
 NODE_NAME = "rs_localizer"
@@ -178,7 +179,7 @@ def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
             without parameters for the node.
     """
     with file_faults(path, SettingsError):
-        tree = load_yaml(path.read_text(encoding="utf-8"))
+        tree = load_yaml(read_text(path))
     values: dict[str, Any] = {}
     node = NODES[kind]
     blocks = list(parameter_blocks(tree, node))
@@ -201,8 +202,8 @@ def camera_values(path: Path) -> dict[str, Any]:
     Raises:
         SettingsError: for parameters that cannot be used.
     """
-    with contextlib.suppress(OSError, UnicodeDecodeError):  # told by who reads the lens
-        if "ros__parameters" in path.read_text(encoding="utf-8"):
+    with contextlib.suppress(OSError, UnicodeDecodeError, YamlError):  # told by who reads the lens
+        if "ros__parameters" in read_text(path):
             return load_params_file(path)
     return {}
 

@@ -79,6 +79,7 @@ class DistortionModel(StrEnum):
     DOUBLE_SPHERE = "ds", DOUBLE_SPHERE
 
 
+_WIDEST = 2**16  # pixels: line-scan cameras have 16,384
 _LONGEST_READOUT = 1.0  # s: more than any camera takes for a picture of a moving world
 # Pixels; a lens is neither a needle's eye nor a telescope of the next galaxy.
 _LEAST_FOCAL, _MOST_FOCAL = 1e-3, 1e9
@@ -209,8 +210,11 @@ class Camera:
                     f"D of {model} must lie within {model.law.limits}, got {D.tolist()}"
                 )
         direction = choice("scan_direction", ScanDirection, self.scan_direction)
-        if min(self.width, self.height) < 2:
-            raise ValueError(f"the image must be at least 2x2, got {self.width}x{self.height}")
+        if min(self.width, self.height) < 2 or max(self.width, self.height) > _WIDEST:
+            raise ValueError(
+                f"the image must be at least 2x2 and at most {_WIDEST} pixels wide and high, got "
+                f"{self.width}x{self.height}"
+            )
         if not isinstance(self.readout_time, Real) or not 0.0 <= self.readout_time < math.inf:
             raise ValueError(f"readout_time must be 0 or more seconds, got {self.readout_time!r}")
         if self.readout_time > _LONGEST_READOUT:

@@ -7,7 +7,6 @@ recording was; the readers of this package take them and rclpy's messages alike.
 """
 
 import contextlib
-import importlib
 import shutil
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping
@@ -33,7 +32,8 @@ from rosbags.typesys.store import Typestore
 from rs_localizer.io import detections, video_packets
 from rs_localizer.io.containers import METADATA, ZSTD, data_files, magic, storage
 from rs_localizer.io.topics import TF_STATIC
-from rs_localizer.io.yaml_text import load_yaml
+from rs_localizer.io.unpacking import limit_rosbags, unpack_file, unpack_zstd
+from rs_localizer.io.yaml_text import load_yaml, read_text
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 # Whoever plays a recording offers its topics as it says; on /tf_static everybody listens for what
@@ -53,15 +53,7 @@ class BagError(ValueError):
     """A recording that cannot be read or written; the message names the path and the fault."""
 
 
-def _zstd() -> Any:
-    """The module that rosbags unpacks with: of Python from 3.14 on, else of a package."""
-    return vars(importlib.import_module("rosbags.rosbag2.reader"))["zstd"]
-
-
-def _unpack_file(packed: Path, out: Path) -> None:
-    """Write what a file of Zstandard holds."""
-    with packed.open("rb") as data, _zstd().open(data, "rb") as file, out.open("wb") as target:
-        shutil.copyfileobj(file, target)
+limit_rosbags()
 
 
 @lru_cache(maxsize=1)
@@ -119,7 +111,7 @@ class BagReader:
                 self._check_types({c.msgtype for c in wanted})
             for connection, stamp_ns, data in self._reader.messages(connections=wanted):
                 if data[: len(ZSTD)] == ZSTD and self._reader.is2:  # of a file without metadata
-                    data = _zstd().decompress(data)
+                    data = unpack_zstd(data)
                 kind = normalize_msgtype(connection.msgtype)
                 message = self._reader.deserialize(data, kind)
                 if not self._reader.is2:
@@ -146,7 +138,8 @@ def open_bag(path: Path | str) -> Iterator[BagReader]:
     path = Path(path)
     with contextlib.ExitStack() as stack:
         with _explained(path):
-            opened = stack.enter_context(storage(path, _listed(path), _unpack_file))
+            files, packed = _listed(path)
+            opened = stack.enter_context(storage(path, files, packed, unpack_file))
             reader = stack.enter_context(AnyReader(opened, default_typestore=typestore()))
             bag = BagReader(path, reader)
             if bag.count(bag.topics) == 0:
@@ -172,28 +165,32 @@ def is_bag(path: Path) -> bool:
     return bool(magic(path))
 
 
-def _listed(path: Path) -> list[Path] | None:
-    """The files that a folder's metadata lists; None: there is none that can be used.
+def _listed(path: Path) -> tuple[list[Path] | None, bool]:
+    """The files that a folder's metadata lists, and whether its messages or files are packed.
 
-    A recorder that was killed leaves its data without it, or an empty one.
+    None: there is none that can be used. A recorder that was killed leaves its data without it, or
+    an empty one.
     """
     if not path.exists():
         raise BagError(f"{path} does not exist")
     if not path.is_dir():
-        if path.stat().st_size == 0:
+        if path.is_file() and path.stat().st_size == 0:
             raise BagError(f"{path} is an empty file")
-        if not magic(path):
+        if not path.is_file() or not magic(path):
             raise BagError(
                 f"{path} is not a recording: expected a rosbag2 folder, or a file that is an MCAP, "
                 "a database of rosbag2 or a ROS 1 bag by its first bytes"
             )
-        return None
+        return None, False
     if not (path / METADATA).is_file():
-        return None
-    tree = load_yaml((path / METADATA).read_text(encoding="utf-8"))  # with limits
+        return None, False
+    tree = load_yaml(read_text(path / METADATA))  # with limits
     about = tree.get("rosbag2_bagfile_information") if isinstance(tree, dict) else None
     names = about.get("relative_file_paths") if isinstance(about, dict) else None
-    return [path / Path(str(name)).name for name in names] if isinstance(names, list) else None
+    if not isinstance(about, dict) or not isinstance(names, list):
+        return None, False
+    packed = str(about.get("compression_mode") or "none").lower() != "none"
+    return [path / Path(str(name)).name for name in names], packed
 
 
 @contextlib.contextmanager

@@ -19,7 +19,14 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
-from rs_localizer.io.yaml_text import LENS, YamlError, file_faults, load_yaml, parameter_blocks
+from rs_localizer.io.yaml_text import (
+    LENS,
+    YamlError,
+    file_faults,
+    load_yaml,
+    parameter_blocks,
+    read_text,
+)
 
 # Order of OpenCV's coefficients, by their names.
 _ORDER = {
@@ -90,7 +97,7 @@ def read_calibration(path: Path | str) -> Camera:
     if (match := _CHOICE.fullmatch(str(path))) is not None and not path.exists():
         path, chosen = Path(match[1]), match[2]
     with calibration_faults(path, "YAML or JSON", "not a usable calibration"):
-        camera = _camera(path.read_text(encoding="utf-8-sig"), chosen)
+        camera = _camera(read_text(path, "utf-8-sig"), chosen)
         x, y = camera.K[:2, 2]
         if not (0.0 < x < camera.width and 0.0 < y < camera.height):
             raise ValueError(

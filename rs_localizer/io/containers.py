@@ -9,9 +9,13 @@ that is named otherwise gets a name.
 import contextlib
 import re
 import sqlite3
-from collections.abc import Callable, Iterator
+import struct
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import BinaryIO
+
+from rs_localizer.io.unpacking import most_unpacked
 
 METADATA = "metadata.yaml"
 ZSTD = b"\x28\xb5\x2f\xfd"
@@ -53,27 +57,27 @@ def data_files(folder: Path) -> list[Path]:
 
 @contextlib.contextmanager
 def storage(
-    path: Path, files: list[Path] | None, unpack: Callable[[Path, Path], object]
+    path: Path, files: list[Path] | None, packed: bool, unpack: Callable[[Path, Path], object]
 ) -> Iterator[list[Path]]:
     """Within ``with``, what rosbags opens of a recording: files, or a folder with its metadata.
 
     Args:
         path: of a file, or of a folder.
         files: of the folder, as its metadata lists them; None: it has none that can be used.
+        packed: whether they, or their messages, are packed; rosbags would unpack without a limit.
         unpack: writes what a .zst file holds to another one.
 
     Raises:
-        ValueError: for what is no recording, or an MCAP that is cut off or not of ROS 2.
+        ValueError: for what is no recording, an MCAP that is cut off or not of ROS 2, or a file
+            that claims or computes more than it holds.
     """
-    if not path.is_dir():
-        found = [path]
-    elif files and all(file.is_file() for file in files):
-        for file in files:
-            _check_mcap(file, file.name)
+    listed = files if files and all(file.is_file() for file in files) else None
+    if listed and not packed:
+        for file in listed:
+            _check(file, file.name)
         yield [path]
         return
-    else:
-        found = data_files(path)
+    found = [path] if not path.is_dir() else listed or data_files(path)
     if not found:
         raise ValueError("the folder has neither metadata.yaml nor a file with messages")
     opened: list[Path] = []
@@ -86,7 +90,7 @@ def storage(
                 kind = magic(data)
             if kind not in _SUFFIX:
                 raise ValueError(f"{file.name} is neither an MCAP, a database of rosbag2 nor a bag")
-            _check_mcap(data, file.name)
+            _check(data, file.name)
             if data.suffix != _SUFFIX[kind]:
                 link = Path(folder) / f"link{number}{_SUFFIX[kind]}"
                 link.symlink_to(data.resolve())
@@ -95,15 +99,83 @@ def storage(
         yield opened
 
 
+def _check(path: Path, name: str) -> None:
+    kind = magic(path)
+    if kind == _MCAP:
+        _check_mcap(path, name)
+    elif kind == _SQLITE:
+        _check_tables(path, name)
+
+
+def _check_tables(path: Path, name: str) -> None:
+    """Refuse a database that computes rows or cells: a few bytes would be endlessly many."""
+    with contextlib.closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
+        kinds = db.execute(
+            "SELECT count(*) FROM sqlite_master WHERE type NOT IN ('table', 'index') "
+            "OR sql LIKE 'CREATE VIRTUAL%'"
+        ).fetchone()[0]
+        hidden = db.execute(
+            "SELECT count(*) FROM sqlite_master AS m, pragma_table_xinfo(m.name) AS c "
+            "WHERE m.type = 'table' AND c.hidden"
+        ).fetchone()[0]
+    if kinds or hidden:
+        raise ValueError(f"{name} computes its tables, which no recorder writes")
+
+
 def _check_mcap(path: Path, name: str) -> None:
     """Refuse an MCAP without an end, or of another profile (https://mcap.dev/spec)."""
-    if magic(path) != _MCAP:
-        return
     with path.open("rb") as file:
         start = file.read(64)
         end = file.seek(-len(_MCAP), 2)
         if end == 0 or file.read() != _MCAP:  # else it is the start
             raise ValueError(f"{name} is cut off: mcap recover {name} -o MENDED (https://mcap.dev)")
-    profile = start[21 : 21 + int.from_bytes(start[17:21], "little")].decode(errors="replace")
-    if profile != "ros2":
-        raise ValueError(f"{name} has the profile {profile!r}; record or convert it as ROS 2")
+        profile = start[21 : 21 + int.from_bytes(start[17:21], "little")].decode(errors="replace")
+        if profile != "ros2":
+            raise ValueError(f"{name} has the profile {profile!r}; record or convert it as ROS 2")
+        packed, unpacked = _most_at_a_time(_chunks(file))
+    if unpacked > most_unpacked(packed, most=2**63):
+        raise ValueError(
+            f"{name}: chunks of one time are {unpacked / 1e6:.0f} MB, packed {packed / 1e6:.1f} MB"
+        )
+
+
+_CHUNK_INDEX, _FOOTER = 8, 2  # kinds of records
+_LONGEST_INDEX = 2**20  # bytes, of one with a hundred thousand topics
+_FOOTER_BYTES = 37  # with the end of the file
+_RECORD = struct.Struct("<BQ")
+
+
+def _chunks(file: BinaryIO) -> Iterator[tuple[int, int, int, int]]:
+    """First and last time (ns), and bytes packed and unpacked, of the chunks that the index has."""
+    file.seek(-_FOOTER_BYTES, 2)
+    summary = int.from_bytes(file.read(17)[9:], "little")
+    file.seek(summary)
+    while summary and len(head := file.read(_RECORD.size)) == _RECORD.size:
+        kind, size = _RECORD.unpack(head)
+        if kind == _FOOTER:
+            return
+        if kind != _CHUNK_INDEX or size > _LONGEST_INDEX:
+            file.seek(size, 1)
+            continue
+        data = file.read(size)
+        if len(data) != size or size < 64:
+            return  # rosbags says what is wrong
+        start, end = struct.unpack_from("<QQ", data)
+        # Behind it stand the name of the compression and its length.
+        packed, unpacked = struct.unpack_from("<QQ", data, size - 16)
+        yield start, end, packed, unpacked
+
+
+def _most_at_a_time(chunks: Iterable[tuple[int, int, int, int]]) -> tuple[int, int]:
+    """Bytes, packed and unpacked, of the chunks that are open at once as they are read by time."""
+    changes = sorted(
+        change
+        for start, end, packed, unpacked in chunks
+        for change in ((start, 0, packed, unpacked), (end, 1, -packed, -unpacked))
+    )
+    packed = unpacked = 0
+    most = (0, 0)
+    for _, _, more_packed, more in changes:
+        packed, unpacked = packed + more_packed, unpacked + more
+        most = max(most, (packed, unpacked), key=lambda sizes: sizes[1])
+    return most

@@ -63,8 +63,9 @@ _ENCODINGS = _encodings()
 
 # Name, start and end of what can be decompressed.
 _FORMATS = (("JPEG", b"\xff\xd8", b"\xff\xd9"), ("PNG", b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"))
-# Pixels per byte that nothing can be packed better than: a PNG of one bit per pixel, all alike.
-_DENSEST = 8 * 1032
+# Pixels per byte: of a dark scene, compressed much, and beside that of an image that is all alike.
+# One bit per pixel comes to 8000, and a JPEG to 500, which takes 3 bytes each to decode.
+_DENSEST, _ALIKE = 32, 4_000_000
 MOST_PIXELS = 150_000_000
 """Of an image: no camera has more; decoded they take 8 bytes each at most."""
 # What a gray image depends on; PNG (third edition), section 5.6.
@@ -86,6 +87,11 @@ class Image:
     stamp_ns: int
     frame: str  # the camera's optical frame, or what the message says of it
     pixels: Gray  # (h,w)
+
+
+def most_pixels(packed: int) -> int:
+    """Pixels that an image of a camera may have that is packed to so many bytes."""
+    return min(_ALIKE + _DENSEST * packed, MOST_PIXELS)
 
 
 def read_any_image(message: Any) -> Image:
@@ -198,7 +204,7 @@ def decode(packed: bytes, format_: str) -> Gray:
 
 def check_size(size: tuple[int, int], count: int, what: str) -> None:
     """Refuse an image (``what``) of more pixels than so many bytes can hold, or any camera has."""
-    if math.prod(size) > min(_DENSEST * count, MOST_PIXELS):
+    if math.prod(size) > most_pixels(count):
         raise MessageError(
             f"{what} says that it is {size[0]} x {size[1]}, too much for {count} bytes, or more "
             f"than {MOST_PIXELS // 1_000_000} megapixels"
@@ -265,5 +271,7 @@ def _eight_bits(image: NDArray[Any]) -> Gray:
     unused = max(0, int(image.max()).bit_length() - 8)
     if not _LEVELS <= high - low < _LEVELS << unused:
         return np.ascontiguousarray(image >> unused, np.uint8)
-    scaled = (image.astype(np.float32) - low) * (255.0 / max(255.0, high - low))
-    return np.asarray(np.clip(scaled, 0.0, 255.0), np.uint8)
+    scaled = image.astype(np.float32)  # in place from here on: of 150 megapixels
+    scaled -= low
+    scaled *= 255.0 / max(255.0, high - low)
+    return np.asarray(np.clip(scaled, 0.0, 255.0, out=scaled), np.uint8)

@@ -37,7 +37,7 @@ from rs_localizer.io.camera_files import (
     lens_parameters,
 )
 from rs_localizer.io.transforms import Transform
-from rs_localizer.io.yaml_text import LENS, flat, load_yaml, parameter_blocks
+from rs_localizer.io.yaml_text import LENS, flat, load_yaml, parameter_blocks, read_text
 
 _CHAIN, _IMU, _SHIFT = "T_cn_cnm1", "T_cam_imu", "timeshift_cam_imu"
 _MOUNT = "camera_from_rig"
@@ -63,7 +63,7 @@ def read_camchain(path: Path | str) -> RigParts:
         CalibrationError: for anything else, saying what was found.
     """
     with calibration_faults(path := Path(path), "YAML or JSON", "no usable rig"):
-        tree = load_yaml(path.read_text(encoding="utf-8"))
+        tree = load_yaml(read_text(path))
         own = [parameters for _, parameters in parameter_blocks(tree)]
         return _own(own[0]) if own else _camchain(tree)
 

@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import gzip
 import io
+import math
 import zlib
+from array import array
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -27,6 +29,7 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagError, BagReader, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.unpacking import most_unpacked
 
 # Files round quaternions to four digits or more; what is further from 1 is no rotation.
 _QUATERNION_TOLERANCE = 0.01
@@ -150,7 +153,7 @@ def _open(path: Path, mode: Literal["r", "w"]) -> TextIO:
 
 def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64], Array]:
     """Times in ns and the other columns; comments, headings and empty lines are skipped."""
-    rows: dict[int, list[float]] = {}
+    stamps, numbers, table = array("q"), array("q"), array("d")  # lists take ten times the memory
     for number, line in _lines(path):
         words = line.replace(",", " ").split()
         try:
@@ -167,20 +170,28 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64]
             if not np.isfinite(values).all():
                 raise ValueError
         except (ValueError, IndexError, InvalidOperation):
-            if not rows and "," in line and not line[0].isdigit():
+            if not stamps and "," in line and not line[0].isdigit():
                 continue  # the heading
             raise TrajectoryError(
                 f"{path}, line {number}: expected the finite numbers t {' '.join(columns)} (or, "
                 f"with commas, EuRoC's: ns, then the quaternion as w x y z), found {line[:80]!r}"
             ) from None
-        if rows.setdefault(stamp_ns, values) != values:
-            raise TrajectoryError(
-                f"{path}, line {number}: the time {words[0]} was there before, with other values"
-            )
-    if not rows:
+        stamps.append(stamp_ns)
+        numbers.append(number)
+        table.extend(values)
+    if not stamps:
         raise TrajectoryError(f"{path} holds no line of numbers")
-    stamps = sorted(rows)
-    return np.array(stamps, dtype=np.int64), np.array([rows[stamp] for stamp in stamps])
+    order = np.argsort(np.array(stamps), kind="stable")
+    times, rows = np.array(stamps)[order], np.reshape(table, (-1, len(columns)))[order]
+    again = times[1:] == times[:-1]
+    if len(others := np.flatnonzero(again & np.any(rows[1:] != rows[:-1], axis=1))):
+        other = others[np.argmin(np.array(numbers)[order][1:][others])]
+        raise TrajectoryError(
+            f"{path}, line {numbers[order[other + 1]]}: the time "
+            f"{format_stamp(times[other]).rstrip('0')} was there before, with other values"
+        )
+    first = np.append(True, ~again)
+    return times[first], rows[first]
 
 
 def _stamp(word: str) -> int:
@@ -194,7 +205,10 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
         with _open(path, "r") as file:
             lines = iter(lambda: file.readline(_LONGEST_LINE + 1), "")
+            left = most_unpacked(path.stat().st_size) if path.suffix == ".gz" else math.inf
             for number, line in enumerate(lines, start=1):
+                if (left := left - len(line)) < 0:
+                    raise TrajectoryError(f"{path} unpacks to more text than any trajectory does")
                 if len(line) > _LONGEST_LINE or number > _MOST_LINES:
                     raise TrajectoryError(
                         f"{path}, line {number}: lines have at most {_LONGEST_LINE} characters, "
@@ -246,9 +260,7 @@ def read_motions(
     """
     if (path / POSES_FILE).is_file():
         twists = path / TWISTS_FILE
-        has_twists = twists.is_file() and any(
-            not line.startswith("#") for line in twists.read_text(encoding="utf-8").splitlines()
-        )
+        has_twists = twists.is_file() and next(_lines(twists), None) is not None
         return Motions(read_tum(path / POSES_FILE), read_twists(twists) if has_twists else None)
     if path.is_file() and not is_bag(path):
         return Motions(read_tum(path), None)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.io.images import MOST_PIXELS
+from rs_localizer.io.images import most_pixels
 
 Image = NDArray[np.uint8]
 
@@ -90,8 +90,10 @@ class Video:
         return f"{self.path.name} {said}: it is damaged or cut off"
 
     def _by_pyav(self) -> Iterator[VideoImage]:
+        most = most_pixels(self.path.stat().st_size)
         with _container(self.path) as container:
-            stream = _stream(container)
+            stream = _stream(container, most)
+            stream.codec_context.options = {"max_pixels": str(most)}  # of images that follow
             stream.thread_type = "AUTO"
             timed = not container.format.flags & _NO_TIMES
             # Matroska has no count, but says how long it lasts, of all streams.
@@ -116,6 +118,8 @@ class Video:
     def _by_opencv(self) -> Iterator[VideoImage]:
         # It gives up after so many packets of other streams in a row.
         os.environ.setdefault("OPENCV_FFMPEG_READ_ATTEMPTS", str(2**31 - 1))
+        most = most_pixels(self.path.stat().st_size)
+        os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = f"max_pixels;{most}"
         last = -1.0
         video = cv2.VideoCapture(str(self.path))
         # Raw rows: a note that the picture should be shown upright turns the shutter, too.
@@ -159,12 +163,18 @@ def _container(path: Path) -> Iterator[Any]:
         raise VideoError(f"{path} cannot be read: {error}") from error
 
 
-def _stream(container: Any) -> Any:
-    """The first stream of images that has a decoder."""
-    for stream in container.streams.video:
-        if stream.codec_context is not None and 0 < stream.width * stream.height <= MOST_PIXELS:
+def _stream(container: Any, most: int) -> Any:
+    """The first stream of images that has a decoder and no more than so many pixels."""
+    streams = [stream for stream in container.streams.video if stream.codec_context is not None]
+    for stream in streams:
+        if 0 < stream.width * stream.height <= most:
             return stream
-    raise VideoError(f"{container.name} has no stream of images that can be decoded")
+    large = "".join(
+        f": {stream.width} x {stream.height} are too much for a file of its size"
+        for stream in streams[:1]
+        if stream.width * stream.height > most
+    )
+    raise VideoError(f"{container.name} has no stream of images that can be decoded{large}")
 
 
 def has_times(path: Path | str) -> bool:

@@ -18,6 +18,8 @@ LENS = "lens"
 _MOST_VALUES, _MOST_JSON, _DEEPEST = 100_000, 1_000_000, 50
 # libyaml reads 5 MB a second, PyYAML alone a tenth of that.
 _MOST_CHARACTERS = 2_000_000
+# Characters of a file, of which JSON alone uses so many; /dev/zero and some pipes never end.
+_LONGEST = 30_000_000
 # Of numbers; those of base 60 ("1:0:0 ...", YAML 1.1) take time that grows with its square.
 _LONGEST_NUMBER = 100
 
@@ -35,6 +37,20 @@ def file_faults(path: Path, fault: type[ValueError], kind: str = "YAML") -> Iter
         raise fault(f"{path} cannot be read: {error.strerror}") from error
     except (YamlError, UnicodeDecodeError) as error:
         raise fault(f"{path} is not a {kind} file: {' '.join(str(error).split())}") from error
+
+
+def read_text(path: Path, encoding: str = "utf-8") -> str:
+    """Text of a file that somebody wrote.
+
+    Raises:
+        YamlError: for one that is longer than anybody writes, or does not end.
+        OSError, UnicodeDecodeError: as any file.
+    """
+    with path.open(encoding=encoding) as file:
+        text = file.read(_LONGEST + 1)
+    if len(text) > _LONGEST:
+        raise YamlError(f"it has more than {_LONGEST} characters")
+    return text
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -58,7 +74,7 @@ def load_yaml(text: str) -> Any:
     Raises:
         YamlError: for anything else, saying what was found.
     """
-    if text.lstrip()[:1] in ("{", "["):
+    if text.lstrip()[:1] in ("{", "[") and text.count(",") <= _MOST_JSON:
         try:
             tree = json.loads(text)
         except (ValueError, RecursionError):

@@ -24,7 +24,7 @@ import numpy as np
 import yaml
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.yaml_text import file_faults, load_yaml
+from rs_localizer.io.yaml_text import file_faults, load_yaml, read_text
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation, rotation_of_quaternion
@@ -75,7 +75,7 @@ def read_marker_map(path: Path | str, unsaid: Unsaid | None = None) -> MarkerMap
 def read_any(path: Path, unsaid: Unsaid | None = None) -> tuple[MarkerMap, str]:
     """A marker map of any format, and the name of the format; raises as above."""
     with file_faults(path, MarkerMapError, "YAML or JSON"):
-        tree = load_yaml(path.read_text(encoding="utf-8"))
+        tree = load_yaml(read_text(path))
     try:
         file = _Entry(tree, "the map")
         name = next((name for name, keys in _KEYS.items() if any(key in file for key in keys)), "")
@@ -105,6 +105,8 @@ def _marker(entry: _Entry) -> Marker:
     with entry.named():
         known = [entry.take(f"{of}_deviation", list, None) for of in ("position", "rotation")]
         deviations = None if known == [None, None] else finite(known, (2, 3), "deviations").ravel()
+        if deviations is not None and deviations.min() < 0.0:
+            raise ValueError(f"deviations must be 0 or more, found {deviations.tolist()}")
         corners = entry.take("corners", list, None)
         size = entry.take("size", _NUMBER, *(() if corners is None else (None,)))
         if corners is None:

@@ -131,7 +131,7 @@ def image_files(folder: Path) -> list[Path]:
     Raises:
         SourceError: when there is none.
     """
-    every = list(folder.iterdir())
+    every = [file for file in folder.iterdir() if file.is_file()]  # /dev/zero has no end
     files = [file for file in every if file.suffix.lower() in SUFFIXES]
     if not files:
         foreign = Counter(file.suffix.lower() for file in every if file.suffix.lower() in FOREIGN)

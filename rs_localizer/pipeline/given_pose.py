@@ -60,8 +60,10 @@ def read_given_pose(message: Any) -> GivenPose:
         pose = from_numbers((at.x, at.y, at.z), (q.x, q.y, q.z, q.w))
     except TransformError as error:
         raise MessageError(f"the given pose is none: {error}") from error
-    if not np.isfinite(covariance).all() or (covariance.diagonal() < 0.0).any():
-        raise MessageError("the covariance of the given pose is none: see its diagonal")
+    if not np.isfinite(covariance).all():
+        raise MessageError("the covariance of the given pose holds numbers that are not finite")
+    if (variances := covariance.diagonal()).min() < 0.0:
+        raise MessageError(f"the given pose has variances below zero: {variances.tolist()}")
     return GivenPose(
         stamp_ns(message),
         message.header.frame_id.removeprefix("/"),

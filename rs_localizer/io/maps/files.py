@@ -134,6 +134,8 @@ def read_map_file(path: Path | str, frame: str, database: Path | None = None) ->
     try:
         if file.is_dir():
             return read_colmap(file, frame, database)
+        if not file.is_file():
+            raise MapError("it is no plain file: a pipe or device may have no end")
         if database is not None:
             raise MapError("it is not a folder of COLMAP, which alone has a database")
         return read_npz(file, frame)

@@ -126,6 +126,7 @@ def make_map(
         if covariances.shape != (len(points), 3, 3) or covariances.dtype.kind not in "fiu":
             raise MapError(f"covariances must be ({len(points)},3,3), found {covariances.shape}")
         covariances = np.ascontiguousarray(covariances, dtype=np.float64)
+        _check_covariances(covariances)
     if error_modes is not None:
         shape, kind = error_modes.shape, error_modes.dtype.kind
         if len(shape) != 3 or shape[:2] != points.shape or kind not in "fiu":
@@ -144,6 +145,17 @@ def make_map(
         _check_ids(ids)  # before they are converted, which may wrap them
         ids = np.ascontiguousarray(ids, dtype=np.int64)
     return Map(points, ids, descriptors, frame, dropped, covariances, error_modes)
+
+
+def _check_covariances(covariances: Array) -> None:
+    variances = covariances.diagonal(axis1=1, axis2=2)
+    bad = (variances < 0.0).any(axis=1) | np.isinf(covariances).any(axis=(1, 2))
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise MapError(
+            f"covariances must have finite variances of 0 or more (NaN: not known), found "
+            f"{variances[row].tolist()} m^2 at index {row}"
+        )
 
 
 def _equal(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
