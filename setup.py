@@ -3,6 +3,7 @@
 """The package for colcon (ament_python) and for pip."""
 
 import os
+import runpy
 import sys
 from glob import glob
 from pathlib import Path
@@ -53,11 +54,13 @@ class BuildPython(build_py):
         return [module for module in modules if module[1] not in build_tools]
 
 
+# Where the commands say them, too, to whom lacks one.
+bounds = runpy.run_path("rs_localizer/process/missing.py")["BOUNDS"]
 requirements = [
     "numpy>=1.26",
     "opencv-python-headless>=4.6",
     "PyYAML",
-    "rosbags",
+    f"rosbags{bounds['rosbags']}",
     "tqdm",
 ]
 if os.environ.get("AMENT_PREFIX_PATH"):
@@ -110,8 +113,8 @@ setup(
         "video": ["av", "telemetry-parser; python_version < '3.13'"],
         "test": [
             "build",
-            # Kernels that are edited are run by Numba; numbers as in pyproject.toml.
-            "numba>=0.61,<0.69",
+            # Runs kernels that are edited.
+            f"numba{bounds['numba']}",
             "scipy",
             "cmeel-eigen>=3.4,<4",
             "catkin_pkg",

@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from collections.abc import Callable, Iterator
 from configparser import ConfigParser
@@ -22,6 +23,8 @@ from catkin_pkg.changelog import get_changelog_from_path
 from catkin_pkg.package import parse_package
 
 import rs_localizer
+from rs_localizer.native import build
+from rs_localizer.process import missing
 
 ROOT = Path(__file__).parents[1]
 # Names under which package.xml's dependencies are imported, where they differ.
@@ -163,6 +166,33 @@ def setup_says(monkeypatch) -> Callable[[Path], dict[str, Any]]:
         return said
 
     return says
+
+
+def test_bounds_are_the_same_everywhere(setup_says):
+    """Of what has private or moving parts in use; setup.py says them."""
+    said = setup_says(ROOT)
+    asked = {f"{name}{versions}" for name, versions in missing.BOUNDS.items()}
+    assert f"rosbags{missing.BOUNDS['rosbags']}" in said["install_requires"]
+    numba = f"numba{missing.BOUNDS['numba']}"
+    assert numba in said["extras_require"]["test"]
+    assert numba in tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]
+    low, high = (".".join(map(str, bound)) for bound in build.NUMBA)
+    assert missing.BOUNDS["numba"] == f">={low},<{high}"
+    for file in ("docs/install.md", "packaging/docker/ros.Dockerfile", ".github/workflows/ros.yml"):
+        text = (ROOT / file).read_text()
+        (line,) = re.findall(r"pip install .*--break-system-packages ([^;\n]*)", text)
+        assert {word for word in shlex.split(line) if ">=" in word} == asked, file
+
+
+def test_the_lowest_set_is_within_the_bounds(setup_says):
+    command = [sys.executable, str(ROOT / ".ci" / "versions.py"), "lowest"]
+    done = subprocess.run(command, cwd=ROOT, text=True, capture_output=True, check=True)
+    lowest = dict(line.split("==") for line in done.stdout.split())
+    asked = [line for line in setup_says(ROOT)["install_requires"] if ">=" in line]
+    assert len(lowest) == len(asked)
+    for line in asked:
+        name, version = re.match(r"([\w-]+)>=([\d.]+)", line).groups()
+        assert lowest[name].removesuffix(".*") == version
 
 
 def test_conda_brings_what_pip_brings(setup_says):

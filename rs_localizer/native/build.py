@@ -25,8 +25,8 @@ from pathlib import Path
 
 from rs_localizer.native import levels, sources
 
-# Numba's versions that make what bitcode.py expects; pyproject.toml names the same.
-NUMBA = ((0, 61), (0, 69))
+# Numba's versions that make what bitcode.py expects, as in rs_localizer/process/missing.py.
+NUMBA = ((0, 63), (0, 69))
 OBJECTS = "RS_LOCALIZER_OBJECTS"
 _HERE = Path(__file__).resolve().parent
 _CPUS = {"v2": "x86-64-v2", "v3": "x86-64-v3", "v4": "x86-64-v4", "generic": "generic"}

@@ -12,7 +12,14 @@ _UBUNTU = {
     "tqdm": "python3-tqdm",
     "yaml": "python3-yaml",
 }
-_ONLY_PIP = ("numba", "rosbags")
+BOUNDS = {"numba": ">=0.63,<0.69", "rosbags": ">=0.10.9,<0.12"}
+"""Versions of what has private or moving parts in use: the lowest that work, and the newest tried.
+
+setup.py reads them here; tests hold the pages against them.
+"""
+_ASKED = " ".join(f'"{name}{versions}"' for name, versions in BOUNDS.items())
+BESIDE_ROS = f'pip install --break-system-packages {_ASKED} "numpy<2"'
+"""Beside the ROS of Ubuntu 24.04, which has neither, and whose NumPy this keeps."""
 # Of what only some commands need: the extra that brings it.
 _EXTRAS = {
     "av": "video",
@@ -41,10 +48,10 @@ def explain(error: ImportError) -> str:
             f"the Python package {name} is not installed: sudo apt install {_UBUNTU[name]}, or "
             f"pip install {_PIP.get(name, name)}"
         )
-    if name in _ONLY_PIP:
+    if name in BOUNDS:
         return (
-            f"the Python package {name} is not installed: pip install {name} (beside Ubuntu's ROS "
-            f'with --break-system-packages, and "numpy<2" to keep its NumPy)'
+            f'the Python package {name} is not installed: pip install "{name}{BOUNDS[name]}"; with '
+            f"Ubuntu 24.04's ROS: {BESIDE_ROS}; with 26.04's: sudo apt install python3-{name}"
         )
     if name in _EXTRAS:
         return (

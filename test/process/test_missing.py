@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from rs_localizer.process.missing import BESIDE_ROS, BOUNDS
+
 ROOT = Path(__file__).parents[2]
 COMMAND = "import sys; from rs_localizer.__main__ import run; sys.exit(run())"
 NODE = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
@@ -40,7 +42,8 @@ def run(code: str, environment: dict[str, str], *words: str) -> subprocess.Compl
     ("name", "words", "advice"),
     [
         ("scipy", ("detect", "video.mp4"), "sudo apt install python3-scipy, or pip install scipy"),
-        ("rosbags", ("evaluate", "a", "b"), "pip install rosbags"),
+        ("rosbags", ("evaluate", "a", "b"), f'pip install "rosbags{BOUNDS["rosbags"]}"; '),
+        ("rosbags", ("evaluate", "a", "b"), BESIDE_ROS),
     ],
 )
 def test_a_command_says_it_in_one_line(tmp_path, name, words, advice):
