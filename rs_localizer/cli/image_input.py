@@ -155,7 +155,8 @@ def tell_times(clock: ImageClock | None, readout_time: float = 0.0, period: floa
     """
     if clock is not None:
         print(clock.description())
-    for fault in (clock and clock.fault(), readout_fault(readout_time, period)):
+    of_clock = (clock.fault(), clock.slow_motion()) if clock is not None else ()
+    for fault in (*of_clock, readout_fault(readout_time, period)):
         if fault:
             print(f"warning: {fault}")
 

@@ -9,6 +9,9 @@ DEFAULT_START_NS = 1_000_000_000
 
 # Rates that differ by less are called the same by cameras and by those who give --rate: 29.97, 30.
 _SAME_RATE = 0.02
+# In the dark, phones expose longer and take somewhat fewer images than they note; slow motion is at
+# least half as slow.
+_OTHER_RATE = 1.5
 
 
 class TimesError(ValueError):
@@ -22,10 +25,12 @@ class ImageClock:
     Args:
         rate: images per second instead of the file's own times; None: these.
         missing: what is to be said of images that could not be read.
+        captured: images per second that the camera took, by a note of the file; None: unknown.
     """
 
     rate: float | None = None
     missing: str | None = None
+    captured: float | None = None
     _images: int = 0
     _first_ns: int = 0  # own time of the first image
     _last_ns: int = 0  # own time of the last image that has one
@@ -95,12 +100,32 @@ class ImageClock:
         own_rate = self.own_rate
         if self.missing is not None or self.rate is None or own_rate is None:
             return self.missing
-        if abs(self.rate / own_rate - 1.0) <= _SAME_RATE:
+        known = own_rate if self.captured is None else self.captured
+        if any(abs(self.rate / rate - 1.0) <= _SAME_RATE for rate in (own_rate, known)):
             return None
         return (
             f"--rate {self.rate:g} disagrees with the file, whose own times mean "
             f"{own_rate:.4g} images/s; velocities are wrong by that factor: leave --rate out "
             "unless the file was slowed down or sped up"
+        )
+
+    def slow_motion(self) -> str | None:
+        """Sentence on a video that plays at another rate than it was taken at; None: as it was."""
+        pace = self.rate or self.own_rate
+        if self.captured is None or pace is None:
+            return None
+        factor = self.captured / pace
+        if 1.0 / _OTHER_RATE < factor < _OTHER_RATE:
+            return None
+        off = (
+            f"{factor:.3g} times too small"
+            if factor > 1.0
+            else f"{1.0 / factor:.3g} times too large"
+        )
+        return (
+            f"the camera took {self.captured:.4g} images/s, as the file notes, and its times mean "
+            f"{pace:.4g}: in slow motion or time lapse velocities are {off}; --rate "
+            f"{self.captured:g} gives true times"
         )
 
 

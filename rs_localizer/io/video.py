@@ -5,7 +5,7 @@
 import contextlib
 import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,6 +54,7 @@ class Video:
         self.claimed, self.read = 0, 0  # images by the container (0: it does not say), and read
         self.lasts, self.until = 0.0, 0.0  # s, by the container (0: ...), and of the last image
         self.damaged = 0  # packets that could not be decoded
+        self.captured: float | None = None  # images/s by the note of a phone; None: there is none
         if not self.path.is_file():
             raise VideoError(f"{path} does not exist")
 
@@ -98,6 +99,7 @@ class Video:
             timed = not container.format.flags & _NO_TIMES
             # Matroska has no count, but says how long it lasts, of all streams.
             self.claimed, last = stream.frames, -np.inf
+            self.captured = _captured(container.metadata)
             self.lasts = (container.duration or 0) * 1e-6
             for packet in container.demux(stream):
                 for frame in self._decoded(packet):
@@ -175,6 +177,15 @@ def _stream(container: Any, most: int) -> Any:
         if stream.width * stream.height > most
     )
     raise VideoError(f"{container.name} has no stream of images that can be decoded{large}")
+
+
+def _captured(notes: Mapping[str, str]) -> float | None:
+    """Images per second that a phone took; None: the file does not say."""
+    try:
+        rate = float(notes.get("com.android.capture.fps", "nan"))
+    except ValueError:
+        return None
+    return rate if 0.0 < rate < np.inf else None
 
 
 def has_times(path: Path | str) -> bool:

@@ -80,7 +80,7 @@ def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator
         else:
             compressed = _compressed(now, frame, jpeg, "jpeg")
             yield Shot(Image(now, frame, gray), _info(camera, now, frame), compressed, now)
-    clock.missing = video.fault
+    clock.missing, clock.captured = video.fault, video.captured
 
 
 def with_telemetry(

@@ -14,6 +14,7 @@ import pytest
 from rs_localizer.io import video
 from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.video import Video, has_times
+from rs_localizer.offline.image_sources import from_video
 
 
 def jpegs(count: int) -> list[bytes]:
@@ -96,6 +97,40 @@ def test_images_of_a_variable_rate_have_their_presentation_times(tmp_path):
     assert has_times(tmp_path / "a.mp4")
     (tmp_path / "a.mjpeg").write_bytes(b"".join(jpegs(2)))
     assert not has_times(tmp_path / "a.mjpeg")
+
+
+@pytest.mark.parametrize(
+    ("captured", "rate", "said"),
+    [("80.000000", None, "80 images/s, as the file notes, and its times mean 10: in slow"),
+     ("80.000000", None, "velocities are 8 times too small; --rate 80 gives true times"),
+     ("2", None, "are 5 times too large"), ("80", 80.0, None), ("10", None, None),
+     ("12", None, None), ("ten", None, None), (None, None, None)],
+)  # fmt: skip
+def test_slow_motion_is_said_with_both_rates(tmp_path, captured, rate, said):
+    path, notes = muxed(tmp_path / "a.mp4"), {}
+    if captured is not None:
+        notes["com.android.capture.fps"] = captured
+    noted(path, tmp_path / "noted.mp4", notes)
+    clock = ImageClock(rate)
+    list(from_video(tmp_path / "noted.mp4", None, clock))
+    text = clock.slow_motion()
+    assert (text is None) if said is None else (said in text)
+    # Who gives the rate of the camera is right.
+    assert clock.fault() is None
+
+
+def noted(path: Path, out: Path, notes: dict[str, str]) -> None:
+    """The same video with notes, as phones write them."""
+    import av
+
+    options = {"movflags": "use_metadata_tags"}
+    with av.open(str(path)) as given, av.open(str(out), "w", options=options) as made:
+        made.metadata.update(notes)
+        stream = made.add_stream_from_template(given.streams.video[0])
+        for packet in given.demux(given.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = stream
+                made.mux(packet)
 
 
 def test_an_image_whose_time_is_not_told_has_none(monkeypatch, tmp_path):
