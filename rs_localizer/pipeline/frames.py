@@ -516,7 +516,8 @@ class FrameLocalizer:
             self.readout_watch.reset()
             adopted = config
         if result and not self.readout_watch.wrong_axis:
-            self._stream.pace(time_ns, result, config)
+            ahead = (cloud.points[result.inliers] - result.position) @ result.rotation[2]
+            self._stream.pace(time_ns, result, float(np.median(ahead)), config)
             self._pose_prior.judge(result)
             if self.predicts:
                 without = replace(cloud, table=cloud.table[:0], dropped=0)

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Oddities that stamps and poses of successive frames show, and no single frame does."""
 
+import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -20,6 +21,8 @@ _LATE = 0.5
 # of a map in millimetres poses are a thousand times too far apart, and as much less certain.
 _TOO_FAST, _WINDOW = 20.0, 2.0
 _LONGEST_STEP = 0.5  # s
+# s from pose to pose, of which the speed is measured: noise of some 10 mm is 0.05 m/s.
+_STEP, _ROUNDING = 0.25, 1e-6
 
 
 class Stream:
@@ -70,24 +73,45 @@ class Stream:
             self._notice(name, f"{text}; the previous frames are forgotten")
         return None
 
-    def pace(self, time_ns: int, estimate: Estimate, config: NodeConfig) -> None:
-        """Look whether poses run faster than any camera does."""
+    def pace(self, time_ns: int, estimate: Estimate, depth: float, config: NodeConfig) -> None:
+        """Look whether poses run faster than any camera does.
+
+        Args:
+            time_ns: of the frame.
+            estimate: its pose.
+            depth: m from the camera to the points of the map, median.
+            config: settings.
+        """
         places = self._places
         if places and not 0.0 < 1e-9 * (time_ns - places[-1][0]) < _LONGEST_STEP:
             places.clear()
-        # Noise of poses is no motion.
         places.append((time_ns, estimate.position, estimate.covariance[3:6, 3:6].trace()))
         while 1e-9 * (time_ns - places[0][0]) > _WINDOW:
             places.popleft()
-        seconds = 1e-9 * (time_ns - places[0][0])
         prior = config.velocity_prior.linear
-        if prior == 0.0 or seconds < 0.5 * _WINDOW:
+        if prior == 0.0 or 1e-9 * (time_ns - places[0][0]) < 0.5 * _WINDOW:
             return
-        way = float(np.linalg.norm(places[-1][1] - places[0][1]))
-        speed = (way - 3.0 * float(np.sqrt(places[-1][2] + places[0][2]))) / seconds
+        speed = _speed(places)
         if speed > _TOO_FAST * prior:
             self._notice(
                 Notice.MAP_SCALE,
-                f"by its poses the camera moves at {speed:.0f} m/s, velocity_prior.linear is "
-                f"{prior:g}: are the points of the map in metres (not millimetres)?",
+                f"by its poses the camera moves at {speed:.0f} m/s, {depth:.0f} m from the points, "
+                f"and velocity_prior.linear is {prior:g}: is the map in millimetres? In metres, by "
+                f"a factor of 0.001 (map align --scale), these are {1e-3 * speed:.2g} m/s and "
+                f"{1e-3 * depth:.2g} m",
             )
+
+
+def _speed(places: Sequence[tuple[int, Array, float]]) -> float:
+    """How fast poses of times (ns) and variances (m^2) go, m/s: median of steps of some length.
+
+    A hand goes to and fro: from end to end of the window it comes nowhere.
+    """
+    seconds = 1e-9 * np.array([time_ns - places[0][0] for time_ns, _, _ in places])
+    positions = np.array([position for _, position, _ in places])
+    variances = np.array([variance for _, _, variance in places])
+    first = np.flatnonzero(seconds + _STEP <= seconds[-1])
+    then = np.searchsorted(seconds, seconds[first] + _STEP - _ROUNDING)
+    squared = np.sum((positions[then] - positions[first]) ** 2, axis=1)
+    squared -= variances[then] + variances[first]  # noise of poses is no motion
+    return math.sqrt(max(float(np.median(squared / (seconds[then] - seconds[first]) ** 2)), 0.0))

@@ -19,8 +19,13 @@ class Heard:
 
     def __init__(self) -> None:
         self.notices: list[str] = []
+        self.texts: list[str] = []
         self.forgotten = 0
-        self.stream = Stream(lambda name, _: self.notices.append(name), self._forget)
+        self.stream = Stream(self._hear, self._forget)
+
+    def _hear(self, name: str, text: str) -> None:
+        self.notices.append(name)
+        self.texts.append(text)
 
     def _forget(self) -> None:
         self.forgotten += 1
@@ -56,12 +61,23 @@ def test_no_stamp_is_no_time():
     [(1.0, 1.5, 0.01, False), (1000.0, 0.2, 0.01, True), (1000.0, 0.0, 0.01, False),
      (1.0, 40.0, 0.01, False), (1.0, 0.0, 30.0, False)],
 )  # fmt: skip
-def test_a_map_in_millimetres_is_named(unit, speed, noise, told):
+@pytest.mark.parametrize("to_and_fro", [False, True])
+def test_a_map_in_millimetres_is_named(unit, speed, noise, told, to_and_fro):
     rng = np.random.default_rng(0)
     heard = Heard()
     for i in range(90):
-        place = np.array([speed * i / 30.0, 0.0, 2.0]) + rng.normal(0.0, noise, 3)
+        # A hand at 1 Hz is after a second where it was: its mean speed is the same.
+        way = speed * np.sin(2.0 * np.pi * i / 30.0) / 4.0 if to_and_fro else speed * i / 30.0
+        place = np.array([way, 0.0, 2.0]) + rng.normal(0.0, noise, 3)
         covariance = np.diag(np.full(12, (unit * noise) ** 2))
         estimate: Any = SimpleNamespace(position=unit * place, covariance=covariance)
-        heard.stream.pace(i * SECOND // 30, estimate, NodeConfig())
+        heard.stream.pace(i * SECOND // 30, estimate, unit * 2.0, NodeConfig())
     assert ("map_scale" in heard.notices) == told
+    if told:
+        speeds = [float(text.split(" m/s")[0].split()[-1]) for text in heard.texts]
+        assert np.median(speeds) == pytest.approx(unit * speed, rel=0.25)
+        assert "2000 m from the points" in heard.texts[-1]
+        assert heard.texts[-1].endswith(
+            "by a factor of 0.001 (map align --scale), these are "
+            f"{1e-3 * speeds[-1]:.2g} m/s and 2 m"
+        )
