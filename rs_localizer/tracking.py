@@ -52,6 +52,7 @@ from rs_localizer.estimation.prior import Prior, offset_between, pivot_of, state
 from rs_localizer.integrity import Integrity
 from rs_localizer.localizer import Localizer
 from rs_localizer.prediction_errors import PredictionErrors
+from rs_localizer.repeated_images import RepeatedImages, coasting
 from rs_localizer.solvers.table import find_solver
 
 if TYPE_CHECKING:  # without a gyroscope nobody needs them
@@ -165,6 +166,8 @@ class Tracker:
         self.localizer, self.remembers_motion = localizer, remembers_motion
         self.output_lag, self.max_prediction = int(output_lag), max_prediction
         self._seen: deque[_Seen] = deque(maxlen=LENGTH)  # the newest last
+        self._images = RepeatedImages()
+        self.repeats = False  # whether the last frame shows an image that had come before
         self._track: _Track | None = None
         self._given: tuple[int, Prior] | None = None
         self._integrity = Integrity()
@@ -184,6 +187,7 @@ class Tracker:
         self._integrity.reset()
         self._errors.reset()
         self._seen.clear()
+        self._images, self.repeats = RepeatedImages(), False
         if self._aid is not None:
             self._aid.reset()
 
@@ -268,11 +272,12 @@ class Tracker:
         if track is None:
             return None
         window, swing = track.window, unshaken(track.estimate)[2]
-        if (time_ns - track.time_ns) * 1e-9 > self.max_prediction:
-            return None
         # Of frames that failed since there may be more than are kept.
         frames = [*((seen.time_ns, seen.found) for seen in self._seen if seen.found)]
         frames.append((track.time_ns, track.estimate))
+        # Later than the track, images that rest have come.
+        if (time_ns - max(frames, key=lambda frame: frame[0])[0]) * 1e-9 > self.max_prediction:
+            return None
         nearest_ns, nearest = min(frames, key=lambda frame: abs(frame[0] - time_ns))
         assert isinstance(nearest, Estimate)
         seconds = 1e-9 * (time_ns - nearest_ns)
@@ -363,6 +368,10 @@ class Tracker:
                 self._track = None
         elif self._aid is not None:
             self._aid.reset()
+        again = self._again(time_ns, points, pixels, imu)
+        if again is not None:
+            self._keep(_Seen(time_ns, again, points, pixels, stamps))
+            return self.delayed
         share = 0.0 if self._track is None else self._track.share
 
         def localized(predicted: GyroPrediction | None) -> Found:
@@ -390,11 +399,53 @@ class Tracker:
                 camera = self.localizer.camera
                 assert pixels is not None and not isinstance(points, Mapping)  # noqa: PT018
                 self._aid.seek(camera, points, pixels, result, time_ns)
-        if self._seen and self._seen[-1].time_ns == time_ns:  # the same frame, matched anew
-            self._seen.pop()
-        self._seen.append(_Seen(time_ns, result, points, pixels, stamps))
+        self._keep(_Seen(time_ns, result, points, pixels, stamps))
+        self._images.add(time_ns, points, pixels)
         self._publish()
         return self.delayed
+
+    def _keep(self, seen: _Seen) -> None:
+        if self._seen and self._seen[-1].time_ns == seen.time_ns:  # the same frame, matched anew
+            self._seen.pop()
+        self._seen.append(seen)
+
+    def _again(
+        self, time_ns: int, points: Any, pixels: Any, imu: ImuSamples | None
+    ) -> Estimate | Failure | None:
+        """The result of a frame that repeats the last image; None: it is one like any other.
+
+        A camera that moved since cannot have seen it. Of one that rests, the image says what it
+        said before, and no more: the track stays as it was.
+        """
+        copies = self._images.copies(points, pixels) if self.newest_ns != time_ns else []
+        self.repeats, track = bool(copies), self._track
+        if copies and track is not None:
+            prior = self._foreseen(time_ns, imu)
+            rig, last = self.localizer.rig, track.estimate
+            self._images.judge(copies, rig, last, track.time_ns, prior)
+        if stale := self._images.stale(copies):
+            of = f" of {', '.join(stale)}" if any(stale) else ""
+            return Failure(
+                Reason.REPEATED_IMAGE,
+                f"the pixels{of} are those of an earlier image, bit for bit, and the camera has "
+                "moved since",
+            )
+        found = self._seen[-1].found if self._seen else None
+        if track is None or not found or not self._images.are_all(points, pixels):
+            return None
+        return replace(found, time_ns=time_ns) if self.remembers_motion else found
+
+    def _foreseen(self, time_ns: int, imu: ImuSamples | None) -> Prior | None:
+        """Prediction of what may be a copy: by a gyroscope, by the last velocities, by others."""
+        track, before = self._track, self._before(time_ns)
+        if self._aid is not None and self._aid.agreed and imu and before is not None:
+            known = self._aid.ahead(imu, time_ns, before)
+            if known is not None:
+                return known.prior
+        if track is None or track.window is None:
+            return self.prediction(time_ns)
+        motion, covariance = motion_of(track.window.newest, track.estimate.span)
+        return coasting(motion, covariance, 1e-9 * (time_ns - track.time_ns) / track.estimate.span)
 
     @property
     def newest(self) -> Estimate | Failure | None:

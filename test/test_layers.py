@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[1] / "rs_localizer"
 # What each part may import besides itself; every part has a row.
 METHOD = {
     *("core", "config", "solvers", "estimation", "inertial", "integrity", "localizer"),
-    *("prediction_errors", "tracking"),
+    *("prediction_errors", "repeated_images", "tracking"),
 }
 MAY_IMPORT: dict[str, set[str]] = {
     "process": set(),
@@ -22,9 +22,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     "solvers": {"core"},
     "estimation": {"core", "config", "solvers"},
     "inertial": {"core", "estimation"},
-    "localizer": METHOD - {"inertial", "integrity", "localizer", "prediction_errors", "tracking"},
+    "localizer": METHOD
+    - {"inertial", "integrity", "localizer", "prediction_errors", "repeated_images", "tracking"},
     "integrity": {"core", "estimation"},
     "prediction_errors": {"core", "estimation"},
+    "repeated_images": {"core", "estimation"},
     "tracking": METHOD - {"tracking"},
     "io": {"core"},
     "settings": {"config", "io"},

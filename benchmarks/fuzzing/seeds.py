@@ -157,7 +157,7 @@ def _flight() -> tuple[Map, list[SimulatedFrame]]:
     rng = np.random.default_rng(1)
     world = Map(points, np.arange(len(points)), random_descriptors(len(points), rng), "map")
     seen = FrameSettings(points=30, noise=0.5, outliers=0.1)
-    return world, list(simulate_frames(camera, motion, points, seen))[:3]
+    return world, list(simulate_frames(camera, motion, points, seen))[1:4]  # 0 is no stamp
 
 
 def _message(frame: SimulatedFrame, rows: NDArray[Any]) -> SimpleNamespace:

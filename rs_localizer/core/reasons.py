@@ -33,11 +33,12 @@ class Reason(StrEnum):
     NO_MATCHES = "no_matches"
     BAD_IMU = "bad_imu"
     NO_TRANSFORM = "no_transform"
+    NO_STAMP = "no_stamp"
     REPEATED_STAMP = "repeated_stamp"
+    REPEATED_IMAGE = "repeated_image"
     LATE_FRAME = "late_frame"
     # Images that cannot be searched.
     BAD_IMAGE = "bad_image"
-    NO_TIME = "no_time"
     # What it takes is not compiled yet, at the first start on a machine.
     COMPILING = "compiling"
     # Our own fault.
@@ -74,6 +75,7 @@ class Notice(StrEnum):
     PIXELS_OUTSIDE = "pixels_outside"
     TOO_MANY_POINTS = "too_many_points"
     MAP_SCALE = "map_scale"
+    STILL_IMAGE = "still_image"
     PRIOR_REFUSED = "prior_refused"
     DOUBTFUL = "doubtful"
     READOUT_TIME = "readout_time"

@@ -75,7 +75,7 @@ def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator
     for jpeg, gray, seconds in video:
         now = clock.relative(None if seconds is None else round(1e9 * seconds))
         if now is None:
-            lost = Refusal(Reason.NO_TIME, "it has no presentation time")
+            lost = Refusal(Reason.NO_STAMP, "it has no presentation time")
             yield Shot(lost, _info(camera, 0, frame), None, 0)
         else:
             compressed = _compressed(now, frame, jpeg, "jpeg")

@@ -404,6 +404,7 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
     last: Item | None = None
     for last in messages:
         topic, recorded_ns, message = last
+        localizer.take_zero_for_time(recorded_ns)
         for result in _each(inputs[topic].take(localizer, message)):
             if result or result.reason is not Reason.AWAITS_FRAMES:  # it comes
                 yield answer(recorded_ns, message, result)

@@ -263,6 +263,10 @@ class FrameLocalizer:
         corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
         return self._camera.bearings(corners)
 
+    def take_zero_for_time(self, recorded_ns: int) -> None:
+        """Take a stamp of 0 for a time where a recording has its message at 0, too."""
+        self._stream.zero_is_time = recorded_ns == 0
+
     def reset(self) -> None:
         """Forget the previous frames."""
         self._stream.reset()
@@ -421,6 +425,8 @@ class FrameLocalizer:
         by = self._landmarks.how(keypoints, self.config.matching)
         if isinstance(by, Refusal):
             return by
+        if (cloud := self._landmarks.repeated(keypoints)) is not None:
+            return self._delayed(self._localize(cloud), keypoints.stamp_ns)
         if by == matching.MatchBy.DESCRIPTOR and self._config.matching.gate > 0.0:
             time_ns = self._middle_row_ns(keypoints.stamp_ns)
             if self.map is not None:
@@ -448,6 +454,8 @@ class FrameLocalizer:
             return
         own, camera = self._config.of_cameras[name], self._cameras[name]
         cloud = self._read(name, kind, message, camera)
+        if not isinstance(cloud, Refusal):
+            cloud = self._stream.unset(cloud.stamp_ns) or cloud
         if isinstance(cloud, Refusal):
             yield cloud
             return
@@ -510,11 +518,12 @@ class FrameLocalizer:
         self.imu.track(self._tracker, config, time_ns, frame, self.transforms, localized)
         result = self._tracker.newest
         assert result is not None
+        adopted = config
         try:
-            adopted = self.readout_watch.add(Watched(time_ns, cloud, result, config, camera))
+            if not self._tracker.repeats:  # a copy says nothing of the shutter
+                adopted = self.readout_watch.add(Watched(time_ns, cloud, result, config, camera))
         except NotCompiled:  # what it takes comes, and the next frames tell it more
             self.readout_watch.reset()
-            adopted = config
         if result and not self.readout_watch.wrong_axis:
             ahead = (cloud.points[result.inliers] - result.position) @ result.rotation[2]
             self._stream.pace(time_ns, result, float(np.median(ahead)), config)
@@ -527,6 +536,12 @@ class FrameLocalizer:
             while len(self._waiting) > self._tracker.output_lag + 1:
                 del self._waiting[next(iter(self._waiting))]
         published = self._published(cloud, context.readout_time_deviation, result)
+        if self._tracker.repeats and result:
+            self._notice(
+                Notice.STILL_IMAGE,
+                "the pixels are those of the last image, bit for bit, and nothing says that the "
+                "camera moves: it counts once",
+            )
         if adopted is not config:  # from the next frame on
             self._use(adopted)
         return published

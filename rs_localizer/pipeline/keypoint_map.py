@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map that keypoints are matched with."""
 
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from rs_localizer import matching
 from rs_localizer.config import Matching
@@ -27,6 +30,7 @@ class Landmarks:
         self._notice = notice
         self._matcher: Matcher | None = None
         self.error_modes: ErrorModes | None = None
+        self._last: tuple[Keypoints, Correspondences] | None = None  # of a camera alone
         self.lacking = False
         """Whether keypoints have come before a map, and no frame has been localized since."""
 
@@ -42,7 +46,7 @@ class Landmarks:
             return  # published again
         for name, text in oddities_of_map(landmarks, previous).items():
             self._notice(name, text)
-        self._matcher = Matcher(landmarks)
+        self._matcher, self._last = Matcher(landmarks), None
         modes = landmarks.error_modes
         self.error_modes = None if modes is None else ErrorModes(landmarks.points, modes)
         self.lacking = False
@@ -78,7 +82,20 @@ class Landmarks:
                 f"none of {len(keypoints)} keypoints matches one of {len(self._matcher.map)} "
                 f"landmarks by {matches.by}",
             )
-        return matching.correspondences(matches, keypoints, self._matcher.map)
+        found = matching.correspondences(matches, keypoints, self._matcher.map)
+        self._last = keypoints, found
+        return found
+
+    def repeated(self, keypoints: Keypoints) -> Correspondences | None:
+        """The last correspondences, if the image is the same, bit for bit; else None."""
+        if self._last is None:
+            return None
+        before, found = self._last
+        same = all(
+            np.array_equal(getattr(before, name), getattr(keypoints, name))
+            for name in ("pixels", "ids", "descriptors")
+        )
+        return replace(found, stamp_ns=keypoints.stamp_ns) if same else None
 
 
 def read_landmarks(file: str, frame: str) -> Map:

@@ -118,9 +118,16 @@ REASONS: dict[str, Meaning] = {
     Reason.BAD_IMAGE: Meaning(
         "the image cannot be read", "encodings: mono, color, Bayer, YUV, JPEG, PNG"
     ),
-    Reason.NO_TIME: Meaning("a video's image has no time", "give --rate"),
     Reason.INTERNAL_ERROR: Meaning("a fault of this program", "please report the message"),
+    Reason.NO_STAMP: Meaning(
+        "the image has no time: header.stamp is 0, or a video gives none",
+        "have the driver set header.stamp; of a video, give --rate",
+    ),
     Reason.REPEATED_STAMP: Meaning("this stamp came before", "two publishers?"),
+    Reason.REPEATED_IMAGE: Meaning(
+        "the pixels are those of an earlier image, bit for bit, of a camera that has moved since",
+        "does the stream hang? webcams in the dark repeat images",
+    ),
     Reason.LATE_FRAME: Meaning("a newer frame came before", "nothing, if rare; two publishers?"),
     Reason.COMPILING: Meaning(
         "kernels are being compiled", "wait minutes; `rs_localizer warm` avoids it"

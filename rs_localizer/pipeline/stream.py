@@ -35,6 +35,7 @@ class Stream:
 
     def __init__(self, notice: Notify, forget: Callable[[], None]) -> None:
         self._notice, self._forget = notice, forget
+        self.zero_is_time = False  # a recording's clock starts at 0: elsewhere nobody set a stamp
         self.reset()
 
     def reset(self) -> None:
@@ -42,16 +43,24 @@ class Stream:
         self._last: tuple[int, str] | None = None  # stamp and map frame of the frame before
         self._places: deque[tuple[int, Array, float]] = deque()  # ns, m, m^2
 
+    def unset(self, stamp_ns: int) -> Refusal | None:
+        """A refusal of an image of which the sender gives no time."""
+        if stamp_ns or self.zero_is_time:
+            return None
+        return Refusal(Reason.NO_STAMP, "header.stamp is 0: its sender does not set it")
+
     def follow(self, stamp_ns: int, frame: str) -> Refusal | None:
         """Start afresh where a frame cannot follow the last one; a refusal of one out of order.
 
         Args:
-            stamp_ns: of the image; 0 says nothing of its time.
+            stamp_ns: of the image.
             frame: of the points.
         """
+        if (refusal := self.unset(stamp_ns)) is not None:
+            return refusal
         last_ns, last_frame = self._last or (stamp_ns, frame)
         late = (last_ns - stamp_ns) * 1e-9
-        if self._last is not None and stamp_ns and frame == last_frame and 0.0 <= late < _LATE:
+        if self._last is not None and frame == last_frame and 0.0 <= late < _LATE:
             if late == 0.0:
                 text = f"a frame with the stamp {stamp_ns * 1e-9:.6f} s has come already"
                 return Refusal(Reason.REPEATED_STAMP, text)

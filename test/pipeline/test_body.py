@@ -186,6 +186,7 @@ def localize(
             **({"readout_time": READOUT_TIME, "base_frame": "base_link"} | settings)
         )
         frames = FrameLocalizer(config, transforms=transforms)
+        frames.take_zero_for_time(recorded_ns=0)
         frames.calibrate(
             read_camera_info(make_camera_info(**({} if roi is None else {"roi": roi})))
         )
@@ -331,7 +332,7 @@ def test_a_missing_transform_refuses_the_frame_only(localize):
 
 
 @pytest.mark.parametrize("pose_time", list(PoseTime))
-def test_a_stamp_of_zero(localize, robot, pose_time):
+def test_a_stamp_of_zero_in_a_recording_that_starts_there(localize, robot, pose_time):
     # The mounting is the latest, the pose goes out, and TF, which needs a time, gets nothing.
     robot.add(tf("base_link", "mast", matrix([9.0, 0.0, 0.0], np.eye(3)), 7.0), static=False)
     robot.add(tf("base_link", "mast", BASE_FROM_MAST, 8.0), static=False)

@@ -40,7 +40,7 @@ def frames() -> list[SimulatedFrame]:
     )
     motion = ConstantVelocity(np.array([0.5, -1.0, 1.0]), np.array([0.5, 0.5, -0.5]), 0.4)
     seen = FrameSettings(points=70, noise=0.5, outliers=0.3)
-    return list(simulate_frames(camera, motion, POINTS, seen))
+    return list(simulate_frames(camera, motion, POINTS, seen))[1:]  # a stamp of 0 is none
 
 
 def keypoints(frame: SimulatedFrame, *names: str, landmarks: Map = LANDMARKS) -> Any:
@@ -118,18 +118,18 @@ def test_keypoints_that_give_no_pose(frames, make_camera_info):
         "the keypoints have descriptors of 64 x uint8, the map has descriptors of 32 x uint8"
     )
     strangers = Map(POINTS, IDS + 200_000, None, "map")
-    message = keypoints(frames[0], "id", landmarks=strangers)
+    message = keypoints(frames[1], "id", landmarks=strangers)
     reason, detail = refused(node.localize_keypoints(message))
     assert reason == "no_matches"
     assert detail == "none of 70 keypoints matches one of 4000 landmarks by id"
-    few = keypoints(frames[0], "id")
+    few = keypoints(frames[2], "id")
     few.width = 5
     assert refused(node.localize_keypoints(few))[0] == "too_few_points"
     unknown = FrameLocalizer(NodeConfig())
     unknown.use_map(read_map(map_cloud(LANDMARKS)))
     assert refused(unknown.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_camera_info"
     # None of this left a trace.
-    localized(node.localize_keypoints(keypoints(frames[0], "id")), frames[0])
+    localized(node.localize_keypoints(keypoints(frames[3], "id")), frames[3])
 
 
 def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):

@@ -50,10 +50,16 @@ def test_stamps_out_of_order():
     assert heard.reason(4.7, "other") is None
 
 
-def test_no_stamp_is_no_time():
+def test_a_stamp_of_zero_is_none_and_ends_no_track():
     heard = Heard()
-    assert [heard.reason(0.0) for _ in range(3)] == [None] * 3
-    assert heard.forgotten == 0
+    assert [heard.reason(s) for s in (5.0, 0.0, 5.1, 0.0, 5.1)] == [
+        None, "no_stamp", None, "no_stamp", "repeated_stamp",
+    ]  # fmt: skip
+    assert (heard.forgotten, heard.notices) == (0, [])
+    # Of a recording that starts at 0 it is a time like any other.
+    heard = Heard()
+    heard.stream.zero_is_time = True
+    assert [heard.reason(s) for s in (0.0, 0.0, 0.1)] == [None, "repeated_stamp", None]
 
 
 @pytest.mark.parametrize(

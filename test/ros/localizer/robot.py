@@ -59,7 +59,9 @@ def record(
     """A flight, with a calibration that knows a part of the distortion; its true positions."""
     distortion = np.array([-0.2, 0.05, 0.0, 0.0, 0.0])
     camera = Camera(640, 480, K, distortion, readout_time=READOUT_TIME)
-    motion = ConstantVelocity(np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4)
+    motion = ConstantVelocity(
+        np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4, start_ns=10**9
+    )
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
     settings = FrameSettings(points=100, noise=noise, outliers=outliers)
     frames = list(simulate_frames(camera, motion, world, settings))

@@ -1,0 +1,210 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Images that come again bit for bit: of a camera that rests, or of a stream that hangs.
+
+Frames are projected by the tests' own means, each point at the time of its own row.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rs_localizer as rsl
+from rs_localizer.core.shutter import Motion
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.inertial.gyroscope_noise import InertialSettings
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.repeated_images import displacement
+from rs_localizer.tracking import Memory, Tracker
+
+READOUT, RATE = 0.03, 30.0
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+CAMERA = rsl.Camera(640, 480, K, readout_time=READOUT)
+MAP = np.random.default_rng(0).uniform([-2.0, -1.5, 2.5], [2.0, 1.5, 5.0], (300, 3))
+
+
+def still(t):
+    return np.zeros(3), np.zeros(3)
+
+
+def hand(t):
+    """Rotation vector and place, map_from_camera, at t s: some 0.9 rad/s all the time."""
+    return (
+        0.12 * np.sin(2.0 * np.pi * t + np.arange(3)),
+        0.05 * np.sin(1.6 * np.pi * t + np.array([2.0, 0.0, 1.0])),
+    )
+
+
+def stopping(t):
+    """60 deg/s and 0.5 m/s that end within 30 ms."""
+    gone = min(t, 0.5) + np.clip(t - 0.5, 0.0, 0.03) * (1.0 - 0.5 * np.clip((t - 0.5) / 0.03, 0, 1))
+    return np.radians(60.0) * gone * np.array([0.6, 0.0, 0.8]), 0.5 * gone * np.array([1.0, 0, 0])
+
+
+def shown(moving, t, noise=0.0, seed=0):
+    """Points (n,3) and pixels (n,2) of an image whose middle row is exposed at t."""
+    pixels = np.tile(K[:2, 2], (len(MAP), 1))
+    for _ in range(8):
+        for k, point in enumerate(MAP):
+            turn, place = moving(t + READOUT * (np.clip(pixels[k, 1], 0.0, 479.0) / 479.0 - 0.5))
+            seen = Rotation.from_rotvec(turn).inv().apply(point - place)
+            pixels[k] = K[:2, :2] @ (seen[:2] / seen[2]) + K[:2, 2]
+        if moving is still:
+            break
+    inside = np.flatnonzero(((pixels > 2.0) & (pixels < [637.0, 477.0])).all(axis=1))[:60]
+    pixels = pixels[inside] + noise * np.random.default_rng(seed).normal(size=(len(inside), 2))
+    return MAP[inside], pixels
+
+
+def ns(t):
+    return round((t + 1.0) * 1e9)
+
+
+def results(tracker, times, frames):
+    """Result of each frame, or the reason why there is none."""
+    found = [tracker.localize(ns(t), *frame) for t, frame in zip(times, frames, strict=True)]
+    return [result if result else result.reason for result in found]
+
+
+@pytest.fixture(scope="module")
+def held():
+    """Frames of a hand, some of them twice."""
+    times = np.arange(60) / 20.0
+    return times, [shown(hand, t, 0.3, k) for k, t in enumerate(times)]
+
+
+def angle(result, t):
+    """Error of the orientation, deg."""
+    return np.degrees(
+        (Rotation.from_matrix(result.rotation) * Rotation.from_rotvec(hand(t)[0])).magnitude()
+    )
+
+
+def test_a_still_scene_without_noise_is_used_and_grows_no_surer():
+    times = np.arange(300) / RATE  # 10 s
+    found = results(Tracker(rsl.Localizer(CAMERA)), times, [shown(still, 0.0)] * 300)
+    assert all(isinstance(result, rsl.Estimate) for result in found)
+    deviations = [result.orientation_deviation for result in found]
+    assert min(deviations) > 0.999 * deviations[0]
+    assert [result.time_ns for result in found] == [ns(t) for t in times]
+
+
+def test_noise_that_repeats_counts_once():
+    """The same noisy image for a second; beside it, new ones make the orientation surer."""
+    times = np.arange(30) / RATE
+    tracker = Tracker(rsl.Localizer(CAMERA))
+    found = results(tracker, times, [shown(still, 0.0, 0.3)] * 30)
+    assert tracker.repeats
+    new = results(tracker, times + 1.0, [shown(still, 0.0, 0.3, seed) for seed in range(1, 31)])
+    assert not tracker.repeats
+    # Of what noise does to the orientation; errors of the calibration stay.
+    first, last, newest = (
+        it.joint_covariance[:3, :3].trace() for it in (found[0], found[-1], new[-1])
+    )
+    assert last > 0.999 * first
+    assert newest < 0.5 * first
+
+
+@pytest.mark.parametrize(
+    "source",
+    [lambda i: i - i % 2, lambda i: 20 if 20 <= i < 40 else i, lambda i: min(i, 20)],
+    ids=["each twice", "hung for a second", "hung for ever"],
+)
+def test_a_moving_camera_cannot_see_the_same_image_again(held, source):
+    times, frames = held
+    found = results(Tracker(rsl.Localizer(CAMERA)), times, [frames[source(i)] for i in range(60)])
+    first = [source(i) == i and (i == 0 or source(i - 1) != i) for i in range(60)]
+    assert [reason == "repeated_image" for reason in found] == [not it for it in first]
+    poses = [(result, t) for result, t, new in zip(found, times, first, strict=True) if new]
+    assert max(angle(result, t) for result, t in poses) < 0.3  # 17 deg where they were used
+    # The track goes on over one that is refused.
+    assert sum(result.tracked for result, _ in poses) >= len(poses) - 2
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_sudden_stop_is_no_hanging_stream(noise):
+    """In a simulator without noise, or with noise that is the same as long as nothing moves."""
+    times = np.arange(45) / RATE
+    frames = [shown(stopping, min(t, 0.6), noise, int(min(t, 0.6) * RATE)) for t in times]
+    found = results(Tracker(rsl.Localizer(CAMERA)), times, frames)
+    assert all(isinstance(result, rsl.Estimate) for result in found)
+
+
+def test_a_gyroscope_tells_a_resting_image_from_a_hanging_one():
+    times = np.arange(10) / 20.0
+
+    def run(rate):
+        tracker = Tracker(rsl.Localizer(CAMERA), InertialSettings(1e-4, 1e-5, False))
+        stamps = np.arange(ns(-1.0), ns(1.0), 2_000_000)
+        found = []
+        for k, t in enumerate(times):
+            turning = np.where(stamps[:, None] > ns(times[4] + 0.02), rate, 0.0) * np.array(
+                [0.0, 1.0, 0.0]
+            )
+            until = stamps < ns(t + 0.03)
+            samples = ImuSamples(stamps[until], turning[until])
+            frame = shown(still, 0.0, 0.3, min(k, 4))
+            found.append(bool(tracker.localize(ns(t), *frame, imu=samples)))
+        return found
+
+    assert run(0.0) == [True] * 10
+    assert run(0.3) == [True] * 5 + [False] * 5
+
+
+def test_an_array_that_is_used_again_is_no_image_that_came_before(held):
+    times, frames = held
+    tracker = Tracker(rsl.Localizer(CAMERA))
+    points, pixels = (np.empty_like(part) for part in frames[0])
+    for t, frame in zip(times[:4], frames, strict=False):
+        count = min(len(pixels), len(frame[1]))
+        points[:count], pixels[:count] = frame[0][:count], frame[1][:count]
+        assert tracker.localize(ns(t), points[:count], pixels[:count])
+        assert not tracker.repeats
+
+
+def test_without_a_prediction_nothing_is_refused(held):
+    times, frames = held
+    for memory in (Memory.NOTHING, Memory.MAP_AND_LENS):
+        tracker = Tracker(rsl.Localizer(CAMERA), memory=memory)
+        assert all(results(tracker, times[:4], [frames[0]] * 4))
+    tracker = Tracker(rsl.Localizer(CAMERA))
+    results(tracker, times[:3], [frames[0], frames[1], frames[1]])
+    tracker.reset()
+    assert tracker.localize(ns(5.0), *frames[1])
+
+
+def test_displacement_is_what_samples_of_the_pose_say():
+    """Where the doubt is small: the covariance of a pixel over 4,000 poses drawn at random."""
+    rng = np.random.default_rng(3)
+    half = rng.normal(size=(6, 6)) * 1e-4 * np.array([1.0] * 3 + [5.0] * 3)
+    covariance = np.zeros((18, 18))
+    covariance[:6, :6] = half.T @ half
+    covariance[range(6, 18), range(6, 18)] = 1e-6
+    points = MAP[:5]
+
+    def seen(turn, place):
+        local = Rotation.from_rotvec(turn).inv().apply(points - place)
+        return local[:, :2] / local[:, 2:] @ K[:2, :2].T + K[:2, 2]
+
+    turn, place = np.array([0.01, -0.02, 0.005]), np.array([0.02, 0.01, 0.0])
+    rotation = Rotation.from_rotvec(turn)
+    drawn = rng.multivariate_normal(np.zeros(6), covariance[:6, :6], 4000)
+    pixels = np.array([
+        seen((rotation * Rotation.from_rotvec(r)).as_rotvec(), place + rotation.apply(s))
+        for r, s in drawn.reshape(-1, 2, 3)
+    ])  # fmt: skip
+    noise, moved = 0.2, seen(turn, place) - seen(np.zeros(3), np.zeros(3))
+    expected = max(
+        move @ np.linalg.solve(np.cov(own.T) + noise**2 * np.eye(2), move)
+        for move, own in zip(moved, np.swapaxes(pixels, 0, 1), strict=True)
+    )
+    last = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    there = replace(
+        last, rotation=rotation.inv().as_matrix(), translation=-rotation.inv().apply(place)
+    )
+    prior = Prior(motion=there, covariance=covariance)
+    found = displacement(CAMERA.project, points, last, prior, noise)
+    assert found == pytest.approx(np.sqrt(expected), rel=0.05)
+    assert displacement(CAMERA.project, points, last, Prior(), noise) == 0.0
