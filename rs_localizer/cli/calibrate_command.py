@@ -36,6 +36,7 @@ if WORKING:
     from rs_localizer.io.imu import ImuRecording
     from rs_localizer.io.maps.files import read_map_file
     from rs_localizer.io.rigs import RigParts
+    from rs_localizer.localizer import Localizer
     from rs_localizer.markers.boards import BoardSizes
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
@@ -50,6 +51,7 @@ if WORKING:
     )
     from rs_localizer.offline.replay import find_topics, has_frames
     from rs_localizer.pipeline.marker_detector import FrameDetector
+    from rs_localizer.pipeline.what_fits import mistake_of
     from rs_localizer.settings import write_camera_file
     from rs_localizer.tools import verdict
     from rs_localizer.tools.adjust.intrinsics import LensErrors
@@ -235,6 +237,8 @@ def _correspondences(args: Options, bag: BagReader, config: NodeConfig) -> _Inpu
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     recorded = read_recording(bag, topics, config.matching, landmarks)
     camera = given_lens(args) or recorded.calibration.camera(0.0, config.scan_direction)
+    if mistake := mistake_of(Localizer(camera, config), recorded.clouds):
+        print(f"warning: {mistake}", file=sys.stderr)
     images = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in recorded.clouds]
     return _Input(images, camera)
 
@@ -257,8 +261,9 @@ def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
     shown = sum(len(image.points) > 0 for image in images)
     print(f"{shown} of {len(images)} images show the map")
     image_input.tell_left_out(refused, {})
-    if fault := sizes.fault():
-        print(f"warning: {fault}", file=sys.stderr)
+    for fault in (sizes.fault(), detector.mistake):
+        if fault:
+            print(f"warning: {fault}", file=sys.stderr)
     new_lens = camera is None
     camera = first_lens(size, in_order(images)) if camera is None else camera
     return _Input(images, camera, new_lens, map=marker_map)

@@ -76,6 +76,7 @@ class Notice(StrEnum):
     TOO_MANY_POINTS = "too_many_points"
     MAP_SCALE = "map_scale"
     STILL_IMAGE = "still_image"
+    WOULD_FIT = "would_fit"
     PRIOR_REFUSED = "prior_refused"
     DOUBTFUL = "doubtful"
     READOUT_TIME = "readout_time"

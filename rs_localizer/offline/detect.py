@@ -29,11 +29,11 @@ from rs_localizer.io.recording import (
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.boards import BoardSizes
 from rs_localizer.markers.map_check import MapCheck, Predict, still_residual
-from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.marker_detector import Detected, FrameDetector, correspondences
 from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.what_fits import Mistakes, of_refused
 
 # Fewer corners than this say nothing about how well a pose fits.
 _LEAST_CORNERS = 6
@@ -103,7 +103,7 @@ def record(
         DetectError: when no image shows anything, or images and calibration differ in size.
     """
     found = Extraction()
-    tally = _MarkerTally(detector.map, found)
+    tally = _MarkerTally(detector, found)
     for shot, image, camera in _readable(shots, bag, found, options, done):
         detected = detector.detect(image)
         tally.add(camera, detected)
@@ -151,13 +151,16 @@ def _readable(
 class _MarkerTally:
     """Counts what the images show of a map."""
 
-    def __init__(self, marker_map: MarkerMap, found: Extraction) -> None:
-        self._map, self._found = marker_map, found
+    def __init__(self, detector: FrameDetector, found: Extraction) -> None:
+        marker_map = detector.map
+        self._detector, self._map, self._found = detector, marker_map, found
+        self._mistakes, self._mistake = Mistakes(), ""
+        self._fit = _RollingFit()
         self._others: Counter[str] = Counter()
         self._faults: Counter[str] = Counter()
         self._residuals: list[float] = []
         self._sizes = BoardSizes(marker_map)
-        self._check = MapCheck(marker_map, _RollingFit())
+        self._check = MapCheck(marker_map, self._fit)
 
     def add(self, camera: Camera, detected: Detected) -> None:
         detections = detected.detections
@@ -167,6 +170,10 @@ class _MarkerTally:
         if len(detections.ids):
             self._found.counts.append(len(detections.ids))
             self._residuals.append(static_residual(camera, detected))
+            if self._residuals[-1] > _MOST_STILL:
+                frame = detections.points, detections.pixels, detections.ids
+                localizer = self._fit.localizer(camera)
+                self._mistake = self._mistakes.look(lambda: of_refused(localizer, *frame))
             self._check.add(camera, detections)
 
     @property
@@ -179,6 +186,8 @@ class _MarkerTally:
         families = sorted({marker.family.name for marker in self._map.markers})
         wanted = ", ".join([*families, *(board.name for board in self._map.boards)])
         text = f"shows anything of the map ({wanted})"
+        if self._detector.mistake:
+            return f"{text}; {self._detector.mistake}"
         if self._found.refused:
             text += f"; {'; '.join(self._found.refused.values())}"
         if self._faults:
@@ -192,7 +201,9 @@ class _MarkerTally:
     def recorded(self) -> Extraction:
         known = [value for value in self._residuals if np.isfinite(value)]
         faults = [] if (fault := self._check.misplaced()) is None else [fault]
-        if known and (least := float(np.percentile(known, _STILL_PERCENT))) > _MOST_STILL:
+        if mistake := self._mistake or self._detector.mistake:
+            faults.append(mistake)
+        elif known and (least := float(np.percentile(known, _STILL_PERCENT))) > _MOST_STILL:
             faults.append(
                 f"even the stillest images leave {least:.1f} px rms: the calibration can hardly be "
                 "of this camera in this mode, or the map (sizes, positions) is wrong"
@@ -211,10 +222,14 @@ class _RollingFit:
     def __init__(self) -> None:
         self._last: tuple[Camera, Localizer] | None = None
 
-    def __call__(self, camera: Camera, points: Array, pixels: Array) -> Predict | None:
+    def localizer(self, camera: Camera) -> Localizer:
+        """The localizer of a camera; of the same one as the last time, the same."""
         if self._last is None or self._last[0] is not camera:
             self._last = camera, Localizer(camera, min_inliers=_LEAST_INLIERS)
-        estimate = self._last[1].localize(points, pixels)
+        return self._last[1]
+
+    def __call__(self, camera: Camera, points: Array, pixels: Array) -> Predict | None:
+        estimate = self.localizer(camera).localize(points, pixels)
         if not estimate:
             return None
         return lambda some: project_rolling(camera, estimate.at_rows, some)[0]

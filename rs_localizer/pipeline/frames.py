@@ -10,6 +10,7 @@ where the others are, TF says, at the time of the frame. Poses are those of ``ba
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -39,6 +40,7 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, MAP_POINTS
 from rs_localizer.io.transforms import Transform, TransformError, Transforms, TransformTree
 from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline import what_fits
 from rs_localizer.pipeline.cloud_checks import oddities
 from rs_localizer.pipeline.compiling import note_whole, plain_frames
 from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
@@ -198,6 +200,7 @@ class FrameLocalizer:
         if config.rig != self._config.rig:
             self._assembler = FrameAssembler(config.cameras, config.rig.window, self._notice)
         self._cameras, self._config = seen, config
+        self._mistakes = what_fits.Mistakes()
         self.readout_watch.reset()
         self.rig_watch = RigWatch(config, self._notice)
 
@@ -542,9 +545,24 @@ class FrameLocalizer:
                 "the pixels are those of the last image, bit for bit, and nothing says that the "
                 "camera moves: it counts once",
             )
+        if not published:
+            published = self._explained(published, cloud)
         if adopted is not config:  # from the next frame on
             self._use(adopted)
         return published
+
+    def _explained(self, refusal: Refusal, cloud: Correspondences) -> Refusal:
+        """The refusal of a frame, with what would fit where somebody found that."""
+        if refusal.reason not in what_fits.REASONS:
+            return refusal
+        frame = self._tracker.localizer, cloud.points, cloud.pixels, what_fits.ids_of(cloud)
+        said = ""
+        with contextlib.suppress(NotCompiled):
+            said = self._mistakes.look(lambda: what_fits.what_fits(*frame))
+        if not said:
+            return refusal
+        self._notice(Notice.WOULD_FIT, said)
+        return replace(refusal, detail=f"{refusal.detail}; {said}")
 
     @property
     def _context(self) -> FrameContext:

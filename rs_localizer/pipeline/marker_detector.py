@@ -21,10 +21,14 @@ from rs_localizer.markers.detection import Detections, MarkerDetector, warm_up
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
+from rs_localizer.pipeline.what_fits import Mistakes
 
 # Single precision is what RViz shows: 3e-5 px at the rim of an image, and 0.1 mm at the end of a
 # map of a kilometre. Larger ones (georeferenced) need more.
 _LARGE_MAP = 1000.0  # m
+# Fewer corners than those of three markers may be what is left of a mirrored map: some markers,
+# mirrored, are others. Mirrored back there are twice as many, and two markers more.
+_LITTLE, _TIMES, _MORE = 12, 2, 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +85,10 @@ class FrameDetector:
         self._detector = MarkerDetector(marker_map, config.min_side)
         self._row = _row_type(marker_map.points)
 
+        # What is wrong with all images, as a sentence; empty: unknown.
+        self.mistake = ""
+        self._mistakes = Mistakes()
+
     def warm_up(self) -> None:
         """Compile the kernels."""
         warm_up()
@@ -102,4 +110,20 @@ class FrameDetector:
                 self._notice(name, f"the image shows {shown}, {text}")
         for fault in detections.faults:
             self._notice(Notice.OTHER_BOARD, fault)
+        if len(detections.ids) < _LITTLE or detections.unknown:
+            corners = len(detections.ids)
+            self.mistake = self._mistakes.look(lambda: self._mirrored(image, corners))
+            if self.mistake:
+                self._notice(Notice.WOULD_FIT, self.mistake)
         return Detected(image, detections, self.map, self._row)
+
+    def _mirrored(self, image: Image, shown: int) -> str:
+        """That an image which shows so many corners shows more of them mirrored, or nothing."""
+        detector = MarkerDetector(self.map)  # whose boards lie otherwise
+        corners = len(detector.detect(image.pixels[:, ::-1], image.stamp_ns).ids)
+        if corners < _TIMES * shown + _MORE:
+            return ""
+        return (
+            "the images are mirrored: mirrored back, they show more of the map; take them as the "
+            "sensor reads them"
+        )

@@ -43,7 +43,9 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
 
     task = DETECTOR_NAME
     output = CORRESPONDENCES
-    odd = (Notice.OTHER_BOARD, Notice.REPEATED_MARKERS, Notice.TWO_PUBLISHERS)
+    odd = (
+        Notice.OTHER_BOARD, Notice.REPEATED_MARKERS, Notice.TWO_PUBLISHERS, Notice.WOULD_FIT,
+    )  # fmt: skip
     checked_at_start = False  # the map may come later: on_configure tells
 
     def __init__(self, **options: Any) -> None:

@@ -1,0 +1,144 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Frames that are refused for how their sender counts pixels or corners: what would fit, is said.
+
+Each known mistake is undone on the points at hand. If the frame fits then, that is what is wrong,
+and no figure of residuals says it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.reasons import Reason
+from rs_localizer.io.clouds import Correspondences
+from rs_localizer.localizer import Localizer
+
+REASONS = frozenset({
+    Reason.TOO_FEW_POINTS, Reason.NO_HYPOTHESIS, Reason.TOO_FEW_INLIERS, Reason.BEHIND_CAMERA,
+    Reason.RESIDUAL, Reason.IMPLAUSIBLE, Reason.MODEL_ERROR,
+})  # fmt: skip
+"""Reasons of refusals that such a mistake may have."""
+
+# Of the points: what is wrong with all of them alike has no outliers but those of any frame.
+_MOST = 0.7
+# Single frames are refused for many reasons: one in ever so many times more is tried, so that a day
+# of refusals costs some ten tries.
+_RARER = 4
+# Frames that say the same: one may fit by chance.
+_AGREED = 2
+# Frames of a recording.
+_TRIED = 5
+
+
+class _Frame(NamedTuple):
+    pixels: Array  # (n,2)
+    ids: IntArray | None  # (n,) four in a row are the corners of a marker
+    size: tuple[int, int]  # width and height of the image
+
+
+def _left_right(frame: _Frame) -> Array | None:
+    return frame.pixels * [-1.0, 1.0] + [frame.size[0] - 1.0, 0.0]
+
+
+def _upside_down(frame: _Frame) -> Array | None:
+    return frame.pixels * [1.0, -1.0] + [0.0, frame.size[1] - 1.0]
+
+
+def _exchanged(frame: _Frame) -> Array | None:
+    return frame.pixels[:, ::-1]
+
+
+def _half_turned(frame: _Frame) -> Array | None:
+    """Pixels of which each corner has those of the opposite one; None: there are no such ids."""
+    if frame.ids is None:
+        return None
+    place = {id_: row for row, id_ in enumerate(frame.ids.tolist())}
+    opposite = [place.get(id_ ^ 2, -1) for id_ in frame.ids.tolist()]
+    whole = np.array(opposite) >= 0
+    return np.where(whole[:, None], frame.pixels[opposite], np.nan) if whole.any() else None
+
+
+# What is to be done, and how.
+_MISTAKES: dict[str, Callable[[_Frame], Array | None]] = {
+    "pixels are mirrored left to right: the sender mirrors them (or the map is left-handed)":
+        _left_right,
+    "pixels are mirrored top to bottom: the sender flips them (or the map is left-handed)":
+        _upside_down,
+    "u and v are exchanged: u counts columns, v rows": _exchanged,
+    "corners of markers are turned by half: their order begins at the opposite corner":
+        _half_turned,
+}  # fmt: skip
+
+
+def what_fits(
+    localizer: Localizer, points: Array, pixels: Array, ids: IntArray | None = None
+) -> str:
+    """What is wrong with a frame that was refused, as a sentence; empty: nothing of this kind.
+
+    Args:
+        localizer: of a camera alone, that refused it.
+        points, pixels: (n,3) and (n,2), as they came.
+        ids: (n,) of the points, those of a marker's corners four in a row.
+    """
+    frame = _Frame(pixels, ids, localizer.camera.size)
+    fits: dict[str, tuple[int, float]] = {}
+    for mistake, undone in _MISTAKES.items():
+        if (changed := undone(frame)) is None:
+            continue
+        usable = np.isfinite(changed).all(axis=1)
+        found = localizer.localize(points[usable], changed[usable])
+        if found and (count := int(np.count_nonzero(found.inliers))) >= _MOST * len(points):
+            fits[mistake] = count, -found.residual_rms
+    return f"the points fit if {max(fits, key=fits.__getitem__)}" if fits else ""
+
+
+def of_refused(
+    localizer: Localizer, points: Array, pixels: Array, ids: IntArray | None = None
+) -> str:
+    """The same of a frame of which nobody knows yet whether it is refused; empty if it is not."""
+    found = localizer.localize(points, pixels)
+    refused = not found and found.reason in REASONS
+    return what_fits(localizer, points, pixels, ids) if refused else ""
+
+
+def ids_of(cloud: Correspondences) -> IntArray | None:
+    """The ids of a cloud's points, if it has any."""
+    return cloud.table["id"].astype(np.int64) if "id" in (cloud.table.dtype.names or ()) else None
+
+
+def mistake_of(localizer: Localizer, clouds: Sequence[Correspondences]) -> str:
+    """What is wrong with a recording, by a few of its frames; empty: nothing of this kind."""
+    last = ""
+    for k in np.unique(np.linspace(0, len(clouds) - 1, _TRIED).astype(int)) if clouds else ():
+        found = of_refused(localizer, clouds[k].points, clouds[k].pixels, ids_of(clouds[k]))
+        if found and found == last:
+            return found
+        last = found or last
+    return ""
+
+
+class Mistakes:
+    """Looks for a mistake in refused frames, now and then."""
+
+    def __init__(self) -> None:
+        self._refused, self._next = 0, 1
+        self._agreed, self._said = 0, ""
+
+    def look(self, tried: Callable[[], str]) -> str:
+        """What is wrong with one more; empty: unknown.
+
+        Args:
+            tried: names what fits, as :func:`what_fits`; called now and then.
+        """
+        self._refused += 1
+        if self._agreed < _AGREED and self._refused >= self._next:
+            said = tried()
+            self._agreed = self._agreed * (said == self._said) + 1 if said else 0
+            self._next = self._refused + 1 if said else _RARER * self._refused
+            self._said = said
+        return self._said if self._agreed >= _AGREED else ""

@@ -1,0 +1,148 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Frames refused for how their sender counts pixels or corners: what would fit is named.
+
+Pixels are projected by the tests' own means, each at the time of its row.
+"""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.config import DetectorConfig, NodeConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import make_message
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.clouds import make_cloud, read_correspondences
+from rs_localizer.io.images import Image
+from rs_localizer.localizer import Localizer
+from rs_localizer.markers.dictionaries import pattern
+from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.marker_detector import FrameDetector
+from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.what_fits import Mistakes, mistake_of, of_refused, what_fits
+
+K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
+READOUT = 0.03
+CAMERA = Camera(640, 480, K, readout_time=READOUT)
+RATE, VELOCITY = np.array([0.4, -0.6, 0.5]), np.array([0.3, 0.1, -0.2])
+
+
+def corners():
+    """Corners (40,3) of ten markers of 0.24 m on two walls, in the order of ArUco."""
+    square = 0.12 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    found = []
+    for k in range(5):
+        middle = np.array([-0.7 + 0.35 * k, -0.4 + 0.3 * (k % 3)])
+        flat = middle + square
+        found.append(np.column_stack([flat[:, 0] - 0.5, flat[:, 1], np.full(4, 3.6)]))
+        found.append(np.column_stack([np.full(4, 0.5), flat[:, 1], 2.8 - flat[:, 0]]))
+    return np.concatenate(found)
+
+
+def seen(points, t, noise=0.3):
+    """Pixels (n,2) of points at the stamp t of the middle row."""
+    pixels = np.tile(K[:2, 2], (len(points), 1))
+    for _ in range(10):
+        tau = t + READOUT * (np.clip(pixels[:, 1], 0, 479) / 479.0 - 0.5)
+        turned = Rotation.from_rotvec(tau[:, None] * RATE).inv()
+        local = turned.apply(points - tau[:, None] * VELOCITY)
+        pixels = local[:, :2] / local[:, 2:] * [500.0, 510.0] + K[:2, 2]
+    return pixels + noise * np.random.default_rng(round(1e3 * t)).normal(size=pixels.shape)
+
+
+def opposite(pixels):
+    return pixels.reshape(-1, 4, 2)[:, [2, 3, 0, 1]].reshape(-1, 2)
+
+
+MISTAKES = {
+    "left to right": lambda pixels: pixels * [-1.0, 1.0] + [639.0, 0.0],
+    "top to bottom": lambda pixels: pixels * [1.0, -1.0] + [0.0, 479.0],
+    "exchanged": lambda pixels: pixels[:, ::-1],
+    "turned by half": opposite,
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_each_mistake_is_named_and_no_other(name):
+    points, localizer = corners(), Localizer(CAMERA)
+    pixels = MISTAKES[name](seen(points, 0.1))
+    assert name in of_refused(localizer, points, pixels, np.arange(40))
+
+
+def test_what_is_right_or_otherwise_wrong_has_no_name():
+    points, localizer, rng = corners(), Localizer(CAMERA), np.random.default_rng(0)
+    pixels, ids = seen(points, 0.1), np.arange(40)
+    assert localizer.localize(points, pixels)
+    assert of_refused(localizer, points, pixels, ids) == ""
+    for wrong in (
+        rng.uniform([0, 0], [639, 479], (40, 2)),  # chance
+        rng.permutation(pixels),  # other landmarks
+        0.6 * (pixels - K[:2, 2]) + K[:2, 2] + rng.normal(0.0, 12.0, (40, 2)),  # another lens
+    ):
+        assert not localizer.localize(points, wrong)
+        assert what_fits(localizer, points, wrong, ids) == ""
+    # Ids of landmarks are no corners.
+    assert what_fits(localizer, points, opposite(pixels), 7 * ids) == ""
+
+
+def test_a_day_of_refusals_costs_ten_tries():
+    tries = []
+    mistakes = Mistakes()
+    for _ in range(30 * 86_400):
+        assert mistakes.look(lambda: tries.append(1) or "") == ""
+    assert len(tries) == 11
+    # Two frames have to agree, then nothing is tried any more.
+    said, answers = Mistakes(), iter(["a", "b", "b"])
+    assert [said.look(lambda: next(answers)) for _ in range(5)] == ["", "", "b", "b", "b"]
+
+
+def cloud(t, pixels):
+    rows = np.empty(40, [(name, "<f8") for name in "xyzuv"])
+    for name, column in zip("xyzuv", [*corners().T, *pixels.T], strict=True):
+        rows[name] = column
+    return make_cloud(make_message, round((5.0 + t) * 1e9), "map", rows)
+
+
+def test_node_and_replay_say_it(make_camera_info):
+    told = []
+    frames = FrameLocalizer(NodeConfig(readout_time=READOUT), lambda *notice: told.append(notice))
+    info = {"k": K.ravel(), "width": 640, "height": 480, "d": []}
+    frames.calibrate(read_camera_info(make_camera_info(**info)))
+    mirror, times = MISTAKES["left to right"], np.arange(4) / 30.0
+    results = [frames.localize(cloud(t, mirror(seen(corners(), t)))) for t in times]
+    assert all(isinstance(result, Refusal) for result in results)
+    assert ["mirrored left to right" in result.detail for result in results[1:]] == [True] * 3
+    assert {name for name, _ in told} >= {"would_fit"}
+    assert frames.localize(cloud(1.0, seen(corners(), 0.2)))
+    clouds = [read_correspondences(cloud(t, mirror(seen(corners(), t)))) for t in times]
+    assert "mirrored left to right" in mistake_of(Localizer(CAMERA), clouds)
+    clouds = [read_correspondences(cloud(t, seen(corners(), t))) for t in times]
+    assert mistake_of(Localizer(CAMERA), clouds) == mistake_of(Localizer(CAMERA), []) == ""
+
+
+def test_mirrored_images_of_markers():
+    """Most markers are none, mirrored, some are others: their pixels tell nothing."""
+    marker_map = MarkerMap(wall("4x4_50", (4, 2), 0.12, 0.06), map_frame="hall")
+    image = np.full((300, 560), 220, np.uint8)
+    for k, marker in enumerate(marker_map.markers):
+        cells = np.kron(pattern(marker.family, marker.id), np.ones((14, 14)))
+        drawn = cv2.resize(np.where(cells > 0, 220, 20).astype(np.uint8), (80, 80))
+        row, column = divmod(k, 4)
+        image[40 + 120 * row : 120 + 120 * row, 40 + 120 * column : 120 + 120 * column] = drawn
+    told = []
+    detector = FrameDetector(DetectorConfig(), lambda *notice: told.append(notice), marker_map)
+    assert len(detector.detect(Image(1, "camera", image)).detections.ids) == 32
+    assert (detector.mistake, told) == ("", [])
+    for flipped in (image[:, ::-1], image[::-1]):
+        detector = FrameDetector(DetectorConfig(), lambda *notice: told.append(notice), marker_map)
+        for k in range(3):
+            detector.detect(Image(k, "camera", np.ascontiguousarray(flipped)))
+        assert "the images are mirrored" in detector.mistake
+    assert "would_fit" in dict(told)
+    detector = FrameDetector(DetectorConfig(), marker_map=marker_map)
+    for k in range(3):
+        detector.detect(Image(k, "camera", np.full((300, 560), 220, np.uint8)))
+    assert detector.mistake == ""
