@@ -348,7 +348,9 @@ class Tracker:
         """Localize the frame whose middle row was exposed at ``time_ns``.
 
         Arguments, result and errors otherwise as :meth:`Localizer.localize`. A time that does not
-        follow the last one (a bag that starts over) or a gap of a second ends the track.
+        follow the last one (a bag that starts over) or a gap of a second ends the track. Pixels
+        that are those of the last image, bit for bit, count once, and are refused where the camera
+        has moved since; :attr:`repeats` tells of them.
 
         Args:
             imu: samples from before the last frame with a pose, if there are any, until after the
@@ -437,9 +439,10 @@ class Tracker:
 
     def _foreseen(self, time_ns: int, imu: ImuSamples | None) -> Prior | None:
         """Prediction of what may be a copy: by a gyroscope, by the last velocities, by others."""
-        track, before = self._track, self._before(time_ns)
-        if self._aid is not None and self._aid.agreed and imu and before is not None:
-            known = self._aid.ahead(imu, time_ns, before)
+        track = self._track
+        if self._aid is not None and self._aid.agreed and imu:
+            before = self._before(time_ns)
+            known = None if before is None else self._aid.ahead(imu, time_ns, before)
             if known is not None:
                 return known.prior
         if track is None or track.window is None:

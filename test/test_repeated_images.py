@@ -43,13 +43,16 @@ def stopping(t):
     return np.radians(60.0) * gone * np.array([0.6, 0.0, 0.8]), 0.5 * gone * np.array([1.0, 0, 0])
 
 
-def shown(moving, t, noise=0.0, seed=0):
-    """Points (n,3) and pixels (n,2) of an image whose middle row is exposed at t."""
+def shown(moving, t, noise=0.0, seed=0, shift=(0.0, 0.0, 0.0)):
+    """Points (n,3) and pixels (n,2) of an image whose middle row is exposed at t.
+
+    ``shift``: of points, from the axes that move to the camera's.
+    """
     pixels = np.tile(K[:2, 2], (len(MAP), 1))
     for _ in range(8):
         for k, point in enumerate(MAP):
             turn, place = moving(t + READOUT * (np.clip(pixels[k, 1], 0.0, 479.0) / 479.0 - 0.5))
-            seen = Rotation.from_rotvec(turn).inv().apply(point - place)
+            seen = Rotation.from_rotvec(turn).inv().apply(point - place) + shift
             pixels[k] = K[:2, :2] @ (seen[:2] / seen[2]) + K[:2, 2]
         if moving is still:
             break
@@ -151,6 +154,18 @@ def test_a_gyroscope_tells_a_resting_image_from_a_hanging_one():
 
     assert run(0.0) == [True] * 10
     assert run(0.3) == [True] * 5 + [False] * 5
+
+
+def test_a_camera_of_a_rig_that_hangs_is_named():
+    shifts = {"left": np.array([0.1, 0.0, 0.0]), "right": np.array([-0.1, 0.0, 0.0])}
+    rig = rsl.Rig(dict.fromkeys(shifts, CAMERA), {k: (np.eye(3), s) for k, s in shifts.items()})
+    tracker, times = Tracker(rsl.Localizer(rig)), np.arange(4) / 20.0
+    frames = [{k: shown(hand, t, 0.3, 0, s) for k, s in shifts.items()} for t in times]
+    frames[2] = frames[2] | {"right": frames[1]["right"]}
+    found = [tracker.localize(ns(t), frame) for t, frame in zip(times, frames, strict=True)]
+    assert [bool(result) for result in found] == [True, True, False, True]
+    assert found[2].reason == "repeated_image"
+    assert "the pixels of right are those" in found[2].detail
 
 
 def test_an_array_that_is_used_again_is_no_image_that_came_before(held):
