@@ -73,6 +73,12 @@ _MISTAKES: dict[str, Callable[[_Frame], Array | None]] = {
     "corners of markers are turned by half: their order begins at the opposite corner":
         _half_turned,
 }  # fmt: skip
+# The two differ by a half turn of the camera, which only the direction of a known shutter tells.
+_MIRRORED = tuple(_MISTAKES)[:2]
+_EITHER = (
+    "pixels are mirrored, left to right or top to bottom: the sender mirrors them (or the map is "
+    "left-handed)"
+)
 
 
 def what_fits(
@@ -94,7 +100,12 @@ def what_fits(
         found = localizer.localize(points[usable], changed[usable])
         if found and (count := int(np.count_nonzero(found.inliers))) >= _MOST * len(points):
             fits[mistake] = count, -found.residual_rms
-    return f"the points fit if {max(fits, key=fits.__getitem__)}" if fits else ""
+    if not fits:
+        return ""
+    best = max(fits, key=fits.__getitem__)
+    if best in _MIRRORED and not localizer.camera.readout_time > 0.0:
+        best = _EITHER
+    return f"the points fit if {best}"
 
 
 def of_refused(
