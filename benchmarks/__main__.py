@@ -33,6 +33,7 @@ from benchmarks.experiments.results import (
     write_result,
     write_summary,
 )
+from benchmarks.real import __main__ as real
 
 T = TypeVar("T")
 
@@ -49,7 +50,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   frames                           regions, errors and times of frames; two versions compared
   integrity                        the chance of a wrong pose or map: reliability, ROC
   rigs                             several cameras, against their bounds
-  real                             videos of real cameras
+  real                             videos of real cameras; real gyro FOLDER: your own recording
   gross                            grossly wrong lenses and maps: what is published
   mutants                          planted bugs, and whether tests catch them
   mapping                          refined maps and surveyed markers
@@ -64,6 +65,9 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run experiments; the exit code: 0 done, 1 the work failed, 2 wrong usage."""
+    argv = sys.argv[1:] if argv is None else argv
+    if argv and argv[0] == "real":
+        return real.main(argv[1:])
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks",
         description="The experiments of the literature and ours: curves, figures, a verdict on "

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``python -m benchmarks.real FOLDER``: real videos of boards, together; each in OUT/real.csv.
 
-``python -m benchmarks.real gyro RECORDING --gyroscope FILE``: turn rates before a gyroscope.
+``python -m benchmarks real gyro FOLDER``: turn rates before a gyroscope, of your own recording.
 
 FOLDER holds videos and ``index.csv``, a line for each: file, inner corners, side of a square (m),
 as ``walk.mp4,8x6,0.025``. Settings of the method as everywhere: ``-p map_deviation:=0.0005``.
@@ -30,11 +30,19 @@ JUDGES = {"gyro": gyro.main, "aria": motion.main}
 """Beside the boards, by the first argument."""
 
 
-def main(argv: Sequence[str]) -> None:
-    """Run it."""
-    if argv and argv[0] in JUDGES:
-        JUDGES[argv[0]](argv[1:])
-        return
+def main(argv: Sequence[str]) -> int:
+    """Run it; the exit code: 0 done, 1 the recording cannot be used, 2 wrong usage."""
+    try:
+        judge = JUDGES.get(argv[0], boards) if argv else boards
+        judge(argv[1:] if judge is not boards else argv)
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"python -m benchmarks real: {error}\n")
+        return 1
+    return 0
+
+
+def boards(argv: Sequence[str]) -> None:
+    """Videos of boards, together."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.real", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, default=Path("real"), help="table")
@@ -98,4 +106,4 @@ def _number(value: float | None) -> str:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

@@ -1,16 +1,19 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m benchmarks.real gyro RECORDING --gyroscope FILE``: turn rates before a real truth.
+"""``python -m benchmarks real gyro FOLDER``: turn rates before a real gyroscope, and a picture.
 
-RECORDING is a bag with ``camera_info`` and correspondences, FILE a text of lines ``t wx wy wz`` (s
-by the clock of the stamps, rad/s in the camera's optical axes) that no estimator sees; with
-``--align`` by another clock and in other axes. Beside twists there are the turns from pose to pose,
-of which estimators without a shutter have some, too. Of a video with a gyroscope inside, before a
-printed board, nothing else is needed:
+FOLDER is what people record at home (:mod:`benchmarks.real.footage`): a folder of Stray Scanner,
+one of images with ``frames.csv`` and ``imu.csv``, or a video with a gyroscope inside. Points are
+those of a printed board (``--board 9x6``), of the phone's depths, or of COLMAP. Or it is a bag
+with ``camera_info`` and correspondences, and ``--gyroscope FILE`` a text of lines ``t wx wy wz`` (s
+by the clock of the stamps, rad/s in the camera's optical axes; with ``--align`` by another clock
+and in other axes). No estimator sees the gyroscope. Beside twists there are the turns from pose to
+pose, of which estimators without a shutter have some, too:
 
-    python -m benchmarks.real gyro rec --gyroscope gyroscope.txt -p readout_time:=0.0318 \\
+    python -m benchmarks real gyro 71de12f9 -p readout_time:=0.015
+    python -m benchmarks real gyro GX010042.MP4 --board 9x6 --square 0.025
+    python -m benchmarks real gyro rec --gyroscope gyroscope.txt -p readout_time:=0.0318 \\
         -p stamp_offset:=-0.0028
-    python -m benchmarks.real gyro GX010042.MP4 --board 9x6 --square 0.025
 """
 
 from __future__ import annotations
@@ -25,18 +28,22 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.experiments.results import Table
-from benchmarks.real.gyroscopes import Gyroscope, aligned, read_board_video
+from benchmarks.real.footage import read_footage
+from benchmarks.real.gyroscopes import Gyroscope, aligned, best_offset, in_images
 from benchmarks.real.motion import AHEAD
 from benchmarks.real.peers import PEERS, GlobalPose, solve_pnp_ransac
 from benchmarks.real.recordings import Recording, add_settings, read_bag
+from benchmarks.real.tracks import record, record_board
 from rs_localizer.cli.settings_args import given_settings
-from rs_localizer.config import LocalizerConfig
+from rs_localizer.config import LocalizerConfig, NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import ANGULAR
 from rs_localizer.core.types import Estimate
+from rs_localizer.io.camera_files import read_calibration
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.prints import Chessboard
+from rs_localizer.tools.errors import BLUE, ORANGE
 from rs_localizer.tracking import Tracker
 
 _INSIDE = 7.815  # 95 % quantile of chi-squared with three degrees of freedom
@@ -158,6 +165,23 @@ def predicted(recording: Recording, gyroscope: Gyroscope, config: LocalizerConfi
     return lines
 
 
+def agreement(judged: Judged, gyroscope: Gyroscope, readout_time: float) -> str:
+    """A line: how like the gyroscope the tracked twists are, and at which offset of the clocks.
+
+    Twists are of single images: stamps of a neighbouring image, which turns from pose to pose let
+    pass as a slow clock, show here.
+    """
+    found = {k: one for k, one in judged.poses[_LATER].items() if isinstance(one, Estimate)}
+    rates, _ = rates_of(found, readout_time)
+    times, half = judged.times[list(found)], 0.5 * readout_time
+    offset, likeness = best_offset(
+        rates, lambda later: gyroscope.mean_rate(times - half - later, times + half - later)
+    )
+    return (
+        f"twists are most like the gyroscope at {in_images(offset, judged.times)}: {likeness:.3f}"
+    )
+
+
 def rates_of(estimates: Mapping[int, Estimate], readout_time: float) -> tuple[Array, Array]:
     """Turn rates (n,3) rad/s of estimates, and their covariances (n,3,3)."""
     rates = np.array([one.angular_velocity for one in estimates.values()]) / readout_time
@@ -219,24 +243,38 @@ def table(judged: Judged) -> Table:
 
 
 def draw(judged: Judged, gyroscope: Gyroscope, readout_time: float, file: Path) -> None:
-    """Turn rates of single images, with 95 % bars, and of tracked ones over the gyroscope's."""
+    """Turn rates of tracked images with their 95 % bars on the gyroscope's line; single ones small.
+
+    The bars of single images would hide the line: the table has what they claim.
+    """
     start, times = judged.times[0], gyroscope.times
     shown = (times > start) & (times < judged.times[-1])
     figure = Figure(figsize=(9, 6), layout="constrained", dpi=100)
     panels = figure.subplots(3, 1, sharex=True)
+    rates, covariances = {}, {}
+    found = {
+        name: {k: one for k, one in judged.poses[name].items() if isinstance(one, Estimate)}
+        for name in (SINGLE, _LATER)
+    }
+    for name, of in found.items():
+        rates[name], covariances[name] = rates_of(of, readout_time)
+    bars = _QUANTILE * np.sqrt(np.diagonal(covariances[_LATER], axis1=1, axis2=2))
     for k, panel in enumerate(panels):
-        rates = np.rad2deg(gyroscope.rates[shown, k])
-        panel.plot(times[shown] - start, rates, label="gyroscope (no estimator sees it)")
-    for name, label in ((SINGLE, "one image each"), (_LATER, "tracked, one image later")):
-        found = {k: x for k, x in judged.poses[name].items() if isinstance(x, Estimate)}
-        rates, covariances = rates_of(found, readout_time)
-        bars = _QUANTILE * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-        for k, panel in enumerate(panels):
-            panel.errorbar(
-                judged.times[list(found)] - start, np.rad2deg(rates[:, k]), np.rad2deg(bars[:, k]),
-                fmt=".", linewidth=0.7, label=f"{label}, with 95 %",
-            )  # fmt: skip
-            panel.set_ylabel(f"{'xyz'[k]} (deg/s)")
+        panel.plot(
+            times[shown] - start, np.rad2deg(gyroscope.rates[shown, k]), color="0.35",
+            linewidth=1.0, label="gyroscope (no estimator sees it)",
+        )  # fmt: skip
+        panel.plot(
+            judged.times[list(found[SINGLE])] - start, np.rad2deg(rates[SINGLE][:, k]), ".",
+            color=ORANGE, markersize=4, label="one image alone",
+        )  # fmt: skip
+        panel.errorbar(
+            judged.times[list(found[_LATER])] - start, np.rad2deg(rates[_LATER][:, k]),
+            np.rad2deg(bars[:, k]), fmt="o", color=BLUE, markersize=4, linewidth=1.0, capsize=2,
+            label="tracked, one image later, with 95 %",
+        )  # fmt: skip
+        panel.set_ylabel(f"{'xyz'[k]} (deg/s)")
+        panel.spines[["top", "right"]].set_visible(False)
     panels[0].legend(loc="upper right", fontsize="small", ncols=3)
     panels[-1].set_xlabel("time (s)")
     figure.savefig(file)
@@ -248,25 +286,37 @@ def main(argv: Sequence[str]) -> None:
         prog="python -m benchmarks.real gyro", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("recording", type=Path, help="a bag, or a video of a board")
+    parser.add_argument("recording", type=Path, help="a folder, a video, or a bag")
     parser.add_argument("--gyroscope", type=Path, help="t wx wy wz, held back (bags need it)")
     parser.add_argument("--align", action="store_true", help="find its clock, axes and bias")
-    parser.add_argument("--board", default="9x6", help="inner corners, of a video")
+    parser.add_argument("--board", help="inner corners of a printed board, as 9x6")
     parser.add_argument("--square", type=float, default=0.025, help="m, its side")
+    parser.add_argument("--camera", type=Path, help="file of the lens, where it is known")
+    parser.add_argument("--images", type=int, default=300, help="most, the first ones")
     parser.add_argument("--out", type=Path, default=Path("real"), help="picture")
     add_settings(parser)
     args = parser.parse_args(argv)
     config = given_settings(args)
     args.out.mkdir(parents=True, exist_ok=True)
-    if args.gyroscope is None:
-        columns, lines = (int(word) for word in args.board.split("x"))
-        board = Chessboard(columns, lines, args.square)
-        recording, gyroscope = read_board_video(args.recording, board, config, args.out)
-    else:
-        recording, gyroscope = read_bag(args.recording, config), Gyroscope.read(args.gyroscope)
+    recording, gyroscope = _read(args, config)
     if args.align or args.gyroscope is None:
         gyroscope, said = aligned(gyroscope, recording)
         print(said, file=sys.stderr)
     judged = judge(recording, gyroscope, config)
+    readout_time = recording.camera.readout_time
     print(table(judged).text(), *predicted(recording, gyroscope, config), sep="\n")
-    draw(judged, gyroscope, recording.camera.readout_time, args.out / "gyro.png")
+    print(agreement(judged, gyroscope, readout_time))
+    draw(judged, gyroscope, readout_time, args.out / "gyro.png")
+
+
+def _read(args: argparse.Namespace, config: NodeConfig) -> tuple[Recording, Gyroscope]:
+    if args.gyroscope is not None:
+        return read_bag(args.recording, config), Gyroscope.read(args.gyroscope)
+    footage = read_footage(args.recording)
+    camera = None if args.camera is None else read_calibration(args.camera)
+    if args.board is None:
+        return record(footage, camera, config, args.images, args.out), footage.gyroscope
+    columns, lines = (int(word) for word in args.board.split("x"))
+    board = Chessboard(columns, lines, args.square)
+    recording = record_board(footage, board, camera, config, args.images, args.out)
+    return recording, footage.gyroscope

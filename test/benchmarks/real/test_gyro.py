@@ -12,10 +12,12 @@ from benchmarks.independent.cameras import Camera as TrueCamera
 from benchmarks.independent.frames import Frames, simulate
 from benchmarks.independent.scenes import Rich
 from benchmarks.real import __main__ as command
+from benchmarks.real.footage import read_footage
 from benchmarks.real.gyro import judge
-from benchmarks.real.gyroscopes import Gyroscope, aligned, read_board_video
+from benchmarks.real.gyroscopes import Gyroscope, aligned
 from benchmarks.real.peers import PEERS, solve_pnp
 from benchmarks.real.recordings import Frame, Recording, read_bag
+from benchmarks.real.tracks import record_board
 from rs_localizer.config import CalibrationErrors, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
@@ -88,11 +90,12 @@ def test_the_command_prints_a_table_and_draws_a_picture(recording, gyroscope, tm
     command.main(["gyro", str(recording), "--gyroscope", str(text), "--out", str(tmp_path),
                   "-p", f"readout_time:={TRUE.readout_time}"])  # fmt: skip
     lines = capsys.readouterr().out.splitlines()
-    rows, ahead = lines[:-3], lines[-3:]
+    rows, ahead = lines[:-4], lines[-4:-1]
     assert len(rows) == 1 + len(PEERS) + 4  # single, and tracked at once, one later, two later
     assert [line.split(":")[0] for line in ahead] == [
         f"predicted {ms} ms ahead" for ms in (10, 30, 100)
     ]
+    assert "like the gyroscope at " in lines[-1]
     assert (tmp_path / "gyro.png").stat().st_size > 10_000
 
 
@@ -107,8 +110,8 @@ def test_clock_axes_and_bias_of_a_gyroscope_are_found():
     moved = Gyroscope(truth.times - 0.037, mount.apply(truth.rates) + np.array([0.01, -0.02, 0.03]))
     found, said = aligned(moved, Recording("mini", camera, images))
     assert "+3" in said
-    np.testing.assert_allclose(found.times, truth.times, atol=2e-3)
-    assert np.degrees(np.median(np.linalg.norm(found.rates - truth.rates, axis=1))) < 1.5
+    np.testing.assert_allclose(found.times, truth.times, atol=1e-3)
+    assert np.degrees(np.median(np.linalg.norm(found.rates - truth.rates, axis=1))) < 0.5
     with pytest.raises(ValueError, match="7 pairs of neighbours are localized, 20 are needed"):
         aligned(moved, Recording("short", camera, images[:8]))
 
@@ -119,7 +122,7 @@ def test_a_video_brings_its_gyroscope_and_readout_time(tmp_path):
         (Chessboard(9, 6, 0.025)),
     )
     with pytest.raises(ValueError, match="has no gyroscope inside"):
-        read_board_video(video, board, NodeConfig(), tmp_path)
+        read_footage(video)
     seconds = np.arange(0.0, 2.0, 0.005)
     add_telemetry(video, seconds, np.outer(np.sin(seconds), [0.5, 0.2, -0.4]), 0.016)
     camera = Camera(640, 480, K=TRUE.matrix)
@@ -132,12 +135,13 @@ def test_a_video_brings_its_gyroscope_and_readout_time(tmp_path):
         pixels.append(camera.project(seen))
     np.savez(tmp_path / "walk_corners.npz", times=np.arange(40) / 30.0, pixels=pixels,
              size=(640, 480))  # fmt: skip
-    recording, gyroscope = read_board_video(video, board, NodeConfig(), tmp_path)
+    footage = read_footage(video)
+    recording = record_board(footage, board, None, NodeConfig(), 600, tmp_path)
     assert len(recording.frames) == 40
     assert recording.camera.readout_time == pytest.approx(0.016)
     assert recording.frames[3].middle_ns == pytest.approx(1e8 + 8e6, abs=1e5)
     assert recording.camera.focal_length == pytest.approx(camera.focal_length, rel=0.01)
-    assert len(gyroscope.times) > 350
+    assert len(footage.gyroscope.times) > 350
 
 
 @pytest.mark.parametrize("name", PEERS)
