@@ -18,10 +18,13 @@ from typing import TypeVar
 from tqdm import tqdm
 
 from benchmarks.experiments import (
+    convergence,
+    from_p3p,
     linearisation,
     motion,
     noise,
     readout_time,
+    sequences,
     timings,
     translation,
 )
@@ -41,7 +44,10 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "motion": motion.run,
     "translation": translation.run,
     "noise": noise.run,
+    "convergence": convergence.run,
     "linearisation": linearisation.run,
+    "from-p3p": from_p3p.run,
+    "sequences": sequences.run,
     "timings": timings.run,
     "readout-time": readout_time.run,
 }

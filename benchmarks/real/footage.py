@@ -165,7 +165,7 @@ def read_video(path: Path) -> Footage:
         return ((round(1e9 * seconds), image) for seconds, image in video_images(path))
 
     gyroscope = Gyroscope(telemetry.times, telemetry.rates)
-    return Footage(path.stem, images, gyroscope, readout_time=telemetry.readout_time)
+    return Footage(path.stem, images, gyroscope, readout_time=telemetry.readout_time or 0.0)
 
 
 def _gyroscope(path: Path, time: str, names: Sequence[str]) -> Gyroscope:

@@ -9,21 +9,23 @@ velocities and the scale prove nothing; turn rates do, before a gyroscope.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.real.clips import clip_of, opencv_lens, shutter_of
 from benchmarks.real.footage import Footage, Gray
 from benchmarks.real.recordings import Frame, Recording
 from rs_localizer.config import FeatureConfig, NodeConfig
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.images import Image
 from rs_localizer.markers.prints import Chessboard
@@ -36,6 +38,7 @@ from rs_localizer.tools.mapping.shutter_fit import likely_axes, refine_with_shut
 from rs_localizer.tools.mapping.structure import Effort
 from rs_localizer.tools.mapping.triangulation import triangulate
 
+Pixels = NDArray[np.float32]
 _CORNERS = 150  # of an image
 _SPACING = 0.02  # of the image's width, between two corners
 _QUALITY = 0.01  # of the best corner's
@@ -68,7 +71,8 @@ def tracked(footage: Footage, most: int) -> Tracks:
         ValueError: for footage without images.
     """
     stamps, rows, before = [], [], None
-    pixels, ids, fresh = np.zeros((0, 2), np.float32), np.zeros(0, np.int64), 0
+    pixels: Pixels = np.zeros((0, 2), np.float32)
+    ids, fresh = np.zeros(0, np.int64), 0
     for stamp, image in islice(footage.images(), most):
         if before is not None:
             pixels, ids = _followed(before, image, pixels, ids)
@@ -91,12 +95,17 @@ def tracked(footage: Footage, most: int) -> Tracks:
     )
 
 
-def _followed(before: Gray, image: Gray, pixels: Array, ids: IntArray) -> tuple[Array, IntArray]:
+def _followed(before: Gray, image: Gray, pixels: Pixels, ids: IntArray) -> tuple[Pixels, IntArray]:
     if not len(ids):
         return pixels, ids
-    how = {"winSize": _WINDOW, "maxLevel": _LEVELS}
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, image, pixels, None, **how)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(image, before, there, None, **how)
+
+    def flow(one: Gray, other: Gray, start: Pixels) -> tuple[Any, Any]:
+        return cv2.calcOpticalFlowPyrLK(
+            one, other, start, np.empty_like(start), winSize=_WINDOW, maxLevel=_LEVELS
+        )[:2]
+
+    there, found = flow(before, image, pixels)
+    back, again = flow(image, before, there)
     size = np.array(image.shape[::-1]) - 1.0
     kept = (found[:, 0] == 1) & (again[:, 0] == 1)
     kept &= np.linalg.norm(back - pixels, axis=1) < _THERE_AND_BACK
@@ -104,7 +113,7 @@ def _followed(before: Gray, image: Gray, pixels: Array, ids: IntArray) -> tuple[
     return there[kept], ids[kept]
 
 
-def _fresh(image: Gray, pixels: Array) -> Array:
+def _fresh(image: Gray, pixels: Pixels) -> Pixels:
     wanted, apart = _CORNERS - len(pixels), _SPACING * image.shape[1]
     free = np.full(image.shape, 255, np.uint8)
     for u, v in pixels:
@@ -112,7 +121,7 @@ def _fresh(image: Gray, pixels: Array) -> Array:
     found = None
     if wanted > 0:
         found = cv2.goodFeaturesToTrack(image, wanted, _QUALITY, apart, mask=free)
-    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+    return np.asarray([] if found is None else found, np.float32).reshape(-1, 2)
 
 
 def record(
@@ -140,7 +149,7 @@ def record(
     if not found.readout_time > 0.0:
         raise ValueError("the images do not tell the readout time: give -p readout_time:=0.02")
     timing = replace(config, readout_time=found.readout_time)
-    known = np.isfinite(points).all(axis=1)
+    known: BoolArray = np.isfinite(points).all(axis=1)
     frames = []
     for k, stamp in enumerate(tracks.stamps_ns.tolist()):
         of = (tracks.images == k) & known[tracks.points]
@@ -231,6 +240,6 @@ def _by_colmap(
 
 
 @contextmanager
-def _quiet(name: str, total: int) -> Iterator[object]:
+def _quiet(name: str, total: int) -> Iterator[Callable[[int], object]]:
     del name, total
     yield lambda _: None

@@ -13,9 +13,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.__main__ import EXPERIMENTS
-from benchmarks.experiments import readout_time
+from benchmarks.experiments import convergence, methods, readout_time
 from benchmarks.experiments.results import Context, Result
 from benchmarks.experiments.trials import Setting, Trials, draw_trials
+from rs_localizer.solvers.table import SOLVERS
 
 TRIALS = 300
 # Of many recordings; what they measure is held by tests of their own.
@@ -35,6 +36,12 @@ HELD = _names(
             "few_inliers_seen_4 few_inliers_seen_8"
         ),
         "linearisation": "r6p_vcwt_equals_r6p useful_orientation useful_centre relinearized_flat",
+        "convergence": (
+            "exact_at_rest exact_in_translation vcwt_solves least_squares vcwt_once two_step_slow "
+            "two_step_falls two_step_solves"
+        ),
+        "from-p3p": "vcwt_once_matches_r6p vcwt_beats_p3p r6p_vcwt_equals_r6p",
+        "sequences": "vcwt_equals_r6p beat_p3p",
         "readout-time": "direction global",
     }
 )
@@ -42,6 +49,7 @@ NOT_HELD = _names(
     {
         "motion": "r9p_ahead_noisy r9p_no_velocity",
         "noise": "all_alike",
+        "sequences": "r9p_best",
     }
 )
 
@@ -56,6 +64,29 @@ def result(name: str) -> Result:
         patch.setattr(readout_time, "_LEAST", 4)
         patch.setattr(readout_time, "_GLOBAL", 4)  # one of them
         return EXPERIMENTS[name](context)
+
+
+FAULTS = {"first bearing": (1.01, 1.0), "row time": (1.0, 1.05)}
+"""What the rays' x and the row times are multiplied with in the equations of one solver."""
+
+
+@pytest.mark.parametrize(
+    ("fault", "solver"),
+    [(fault, name) for fault in FAULTS for name in SOLVERS if (fault, name) != ("row time", "p3p")],
+)
+def test_a_wrong_coefficient_in_any_solver_fails_a_claim(fault, solver, monkeypatch):
+    context, solve = Context(40, 0, untracked), methods.solve_minimal
+    if (fault, solver) == ("first bearing", "p3p"):  # once
+        assert all(claim.held for claim in convergence.exactness(context))
+    by_ray, by_tau = FAULTS[fault]
+
+    def wrong(name, points, rays, tau, *others):
+        if name == solver:
+            rays, tau = rays * [by_ray, 1.0], by_tau * tau
+        return solve(name, points, rays, tau, *others)
+
+    monkeypatch.setattr(methods, "solve_minimal", wrong)
+    assert [claim.name for claim in convergence.exactness(context) if not claim.held]
 
 
 @pytest.mark.bench
