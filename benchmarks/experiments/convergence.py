@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatterSciNotation
 from scipy.spatial.transform import Rotation
 
 from benchmarks.experiments import charts
@@ -239,5 +240,6 @@ def _figure(by_count: dict[int, Curves], algebraic: dict[str, Array]) -> Figure:
         charts.line(axes, np.array(_STEPS, float), algebraic[method.name], method)
     axes.set_title("at 15 deg per frame", fontsize="medium")
     charts.tidy(axes, "iterations", "algebraic error", logarithmic=True)
+    axes.yaxis.set_major_formatter(LogFormatterSciNotation())
     charts.legend(drawn, panels[0][0])
     return drawn

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What frames cost beside PoseLib's global-shutter estimate; and the gate of CI."""
+"""What frames cost beside global-shutter estimates of PoseLib and fastpose; and the gate of CI."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import Any
 
 import cv2
@@ -91,19 +92,15 @@ def localizer_of(condition: Condition) -> rsl.Localizer:
 
 def times(options: argparse.Namespace) -> int:
     """The command: CPU time of both in turns, and of frames under lenses and maps as real ones."""
-    try:
-        poselib: Any = importlib.import_module("poselib")
-    except ImportError:
-        poselib = None
-        sys.stdout.write("PoseLib is not installed (pip install poselib): no ratios\n")
-    heads = ("median, ms", "mean", "95 %", "PoseLib", "ratio")
+    peers = {name: make for name, make in _PEERS.items() if find_spec(name.lower()) is not None}
+    for name in _PEERS.keys() - peers:
+        sys.stdout.write(f"{name} is not installed (pip install {name.lower()}): no ratio\n")
+    heads = ["median, ms", "mean", "95 %", *(head for name in peers for head in (name, "ratio"))]
     sys.stdout.write(f"{'':42}" + "".join(f"{head:>11}" for head in heads) + "\n")
     for condition in CONDITIONS:
         localizer = localizer_of(condition)
-        methods: list[Callable[[Frame], object]] = [_ours(localizer)]
-        if poselib is not None:
-            methods.append(_poselib(poselib, localizer.camera))
-        _timed(condition, methods, options)
+        theirs = [make(localizer.camera) for make in peers.values()]
+        _timed(condition, [_ours(localizer), *theirs], options)
     for condition in IMPERFECT:
         localizer = rsl.Localizer(camera_of(condition, 0))
         tracks = condition.sequence.length > 1
@@ -115,7 +112,7 @@ def times(options: argparse.Namespace) -> int:
 def _timed(
     condition: Condition, methods: list[Callable[[Frame], object]], options: argparse.Namespace
 ) -> None:
-    """Print a row: the first method, and its median over that of the second."""
+    """Print a row: the first method, and its median over those of the others."""
     frames = list(generate(condition, options.frames, _SEED))
     ours, *theirs = (1e3 * np.array(one) for one in in_turns(methods, frames, options.rounds))
     figures = [np.median(ours), np.mean(ours), np.quantile(ours, 0.95)]
@@ -184,8 +181,8 @@ def _tracked(localizer: rsl.Localizer, rounds: int) -> Callable[[Frame], object]
     return tracked
 
 
-def _poselib(poselib: Any, camera: rsl.Camera) -> Callable[[Frame], object]:
-    K = camera.K
+def _poselib(camera: rsl.Camera) -> Callable[[Frame], object]:
+    poselib, K = importlib.import_module("poselib"), camera.K
     model = {
         "model": "PINHOLE",
         "width": camera.width,
@@ -195,6 +192,20 @@ def _poselib(poselib: Any, camera: rsl.Camera) -> Callable[[Frame], object]:
     return lambda frame: poselib.estimate_absolute_pose(
         frame.pixels, frame.points, model, _OPTIONS, {}
     )
+
+
+def _fastpose(camera: rsl.Camera) -> Callable[[Frame], object]:
+    fastpose = importlib.import_module("fastpose.estimators.absolute")
+    error, most = _OPTIONS["max_reproj_error"], _OPTIONS["max_iterations"]
+    return lambda frame: fastpose.estimate_absolute_pose(
+        frame.pixels, frame.points, camera.K, most, error
+    )
+
+
+_PEERS: dict[str, Callable[[rsl.Camera], Callable[[Frame], object]]] = {
+    "PoseLib": _poselib,
+    "fastpose": _fastpose,
+}
 
 
 def in_turns(

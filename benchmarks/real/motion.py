@@ -40,6 +40,7 @@ _INSIDE = 12.592  # 95 % quantile of chi-squared with six degrees of freedom
 _RATE = 30.0  # Hz
 HELD = ", held"  # poses without a prediction
 AHEAD = (0.01, 0.03, 0.1)  # s after the middle of an image, for which the tracker is asked
+EPOCH_NS = 10**12  # of times of motions, by the clock of the stamps
 _EVERY = 0.001  # s, within rows and between images
 # Of a gyroscope: rad/s/sqrt(Hz); rad/s; s; ns from a reading to who asks for it.
 _GYROSCOPE_NOISE, _BIAS, _EARLY = math.radians(0.01), math.radians(0.5), 0.004
@@ -150,7 +151,7 @@ def simulated(
         inside = np.all((pixels > _MARGIN) & (pixels < size - _MARGIN), axis=1)
         kept = np.flatnonzero(inside)[:count]
         shown = pixels[kept] + noise * rng.normal(size=(len(kept), 2))
-        middle = round(1e9 * (stamp + 0.5 * camera.readout_time)) + 10**12
+        middle = round(1e9 * (stamp + 0.5 * camera.readout_time)) + EPOCH_NS
         frames.append(Frame(middle, points[chosen[kept]], shown))
     own = Camera(
         camera.width, camera.height, K=camera.matrix, D=np.array(camera.distortion),
@@ -196,7 +197,7 @@ def gyroscope(motion: Motion, rate: float, seed: int = 0) -> ImuSamples:
     rng, times = np.random.default_rng(seed), np.arange(motion.start, motion.end, 1.0 / rate)
     noise = _GYROSCOPE_NOISE * math.sqrt(rate) * rng.normal(size=(len(times), 3))
     rates = np.array([motion.twist(time)[0] for time in times])
-    stamps = np.rint(1e9 * (times - _EARLY)).astype(np.int64) + 10**12
+    stamps = np.rint(1e9 * (times - _EARLY)).astype(np.int64) + EPOCH_NS
     return ImuSamples(stamps, rates + _BIAS * rng.normal(size=3) + noise)
 
 
@@ -249,7 +250,7 @@ def at_any_time(
 
 
 def _seconds(middle_ns: int) -> float:
-    return 1e-9 * (middle_ns - 10**12)
+    return 1e-9 * (middle_ns - EPOCH_NS)
 
 
 def _pose_error(

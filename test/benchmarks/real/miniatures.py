@@ -75,10 +75,13 @@ def with_board(columns: int, lines: int) -> Room:
     return room
 
 
-def film(count: int, camera: Camera, room: Room, motion: motions.Motions) -> Film:
+def film(
+    count: int, camera: Camera, room: Room, motion: motions.Motions, period: float = PERIOD,
+    samples: int = 2,
+) -> Film:  # fmt: skip
     """A clip of a room."""
-    seconds = PERIOD * np.arange(count)
-    shots = [filmed(camera, motion, room, time) for time in seconds]
+    seconds = period * np.arange(count)
+    shots = [filmed(camera, motion, room, time, samples) for time in seconds]
     return Film(camera, motion, seconds, [image for image, _ in shots], [d for _, d in shots])
 
 
@@ -165,3 +168,59 @@ def write_lens(path: Path, camera: Camera) -> Path:
         f"distortion_coefficients: {{rows: 1, cols: 5, data: {list(camera.distortion)}}}\n"
     )
     return path
+
+
+@dataclass(frozen=True, eq=False)
+class Mounted:
+    """The motion of a camera on a body that moves."""
+
+    body: motions.Motions
+    rotation: np.ndarray  # (3,3) body_from_camera
+    place: np.ndarray  # (3,) of the camera on the body
+
+    def poses(self, which: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rotations, places = self.body.poses(which, time)
+        return rotations @ self.rotation, places + rotations @ self.place
+
+
+def write_tum_rs(folder: Path, body: motions.Motions, films: dict[str, Film]) -> None:
+    """As the TUM rolling-shutter dataset has it: EuRoC's layout, body poses, Kalibr's camchain."""
+    since = 1_536_000_000.0  # s
+    chain = []
+    for name, clip in films.items():
+        (folder / "mav0" / name / "data").mkdir(parents=True)
+        rows = []
+        for time, image in zip(clip.seconds, clip.images, strict=True):
+            stamp = round(1e9 * since) + round(1e9 * time)
+            cv2.imwrite(str(folder / "mav0" / name / "data" / f"{stamp}.png"), image)
+            rows.append((stamp, f"{stamp}.png"))
+        write_csv(folder / "mav0" / name / "data.csv", "#timestamp [ns],filename", rows)
+        camera, mount = clip.camera, np.eye(4)
+        mount[:3, :3] = clip.motion.rotation.T
+        mount[:3, 3] = -clip.motion.rotation.T @ clip.motion.place
+        u, v = camera.centre
+        chain += [
+            f"{name}:", "  T_cam_imu:", *(f"  - {row.tolist()}" for row in mount),
+            "  camera_model: pinhole", "  distortion_model: radtan",
+            f"  distortion_coeffs: {list(camera.distortion[:4])}",
+            f"  intrinsics: [{camera.focal}, {camera.focal}, {u}, {v}]",
+            f"  resolution: [{camera.width}, {camera.height}]",
+        ]  # fmt: skip
+    (folder / "dso").mkdir()
+    (folder / "dso" / "camchain.yaml").write_text("\n".join(chain) + "\n")
+    last = max(clip.seconds[-1] for clip in films.values())
+    seconds = np.arange(-0.3, last + 0.4, 1.0 / 120.0)
+    rotations, places = body.poses(np.zeros(len(seconds), int), seconds)
+    rng = np.random.default_rng(1)
+    places = places + 1e-4 * rng.normal(size=places.shape)
+    noise = Rotation.from_rotvec(3e-4 * rng.normal(size=places.shape))
+    quaternions = (Rotation.from_matrix(rotations) * noise).as_quat()
+    rows = [
+        (round(1e9 * since) + round(1e9 * t), *p, q[3], *q[:3])
+        for t, p, q in zip(seconds, places, quaternions, strict=True)
+    ]
+    (folder / "mav0" / "mocap0").mkdir()
+    heading = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m]," + ",".join(
+        f"q_RS_{axis} []" for axis in "wxyz"
+    )
+    write_csv(folder / "mav0" / "mocap0" / "data.csv", heading, rows)
