@@ -26,10 +26,10 @@ from rs_localizer.tools.adjust.cluster_robust import cluster_robust
 from rs_localizer.tools.adjust.fit import Fit, solve
 from rs_localizer.tools.adjust.intrinsics import with_lens
 from rs_localizer.tools.adjust.problem import Problem
+from rs_localizer.tools.adjust.row_kernels import EXTRINSICS
 from rs_localizer.tools.adjust.spline import Spline, refined
 from rs_localizer.tools.adjust.system import Undetermined
 from rs_localizer.tools.adjust.variables import (
-    EXTRINSICS,
     CameraView,
     Extrinsics,
     Freedom,

@@ -16,7 +16,8 @@ from rs_localizer.tools.adjust.gyro import Gyroscope
 from rs_localizer.tools.adjust.intrinsics import lens_prior
 from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
 from rs_localizer.tools.adjust.priors import Floating, block_rows, known
-from rs_localizer.tools.adjust.reprojection import LIMIT, Curve, Projections, Reprojection
+from rs_localizer.tools.adjust.reprojection import LIMIT, Reprojection
+from rs_localizer.tools.adjust.row_kernels import EXTRINSICS, Curve, Projections
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import (
     Factored,
@@ -26,7 +27,7 @@ from rs_localizer.tools.adjust.system import (
     System,
     Undetermined,
 )
-from rs_localizer.tools.adjust.variables import EXTRINSICS, MOUNT, CameraView, Unknowns
+from rs_localizer.tools.adjust.variables import MOUNT, CameraView, Unknowns
 
 # Errors beyond so many standard deviations do not count for the scale of the noise.
 _SCALE_LIMIT = 4.0

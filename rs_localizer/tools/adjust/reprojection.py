@@ -18,6 +18,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.tools.adjust.bodies import Pieces
 from rs_localizer.tools.adjust.intrinsics import project
 from rs_localizer.tools.adjust.row_kernels import (
+    EXTRINSICS,
     Curve,
     Projections,
     Terms,
@@ -27,7 +28,7 @@ from rs_localizer.tools.adjust.row_kernels import (
 )
 from rs_localizer.tools.adjust.spline_kernels import CONTROL, LOCAL
 from rs_localizer.tools.adjust.system import Rows
-from rs_localizer.tools.adjust.variables import EXTRINSICS, CameraView, Unknowns
+from rs_localizer.tools.adjust.variables import CameraView, Unknowns
 
 LIMIT = 6.0
 """Tukey's limit in standard deviations: 97 % efficient on Gaussian noise in two dimensions."""

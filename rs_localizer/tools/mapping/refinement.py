@@ -24,11 +24,11 @@ from rs_localizer.tools.adjust.fit import inflation_of, left_over, steepness
 from rs_localizer.tools.adjust.intrinsics import with_lens
 from rs_localizer.tools.adjust.problem import Problem, settle
 from rs_localizer.tools.adjust.reprojection import LIMIT
+from rs_localizer.tools.adjust.row_kernels import EXTRINSICS
 from rs_localizer.tools.adjust.spline import LONGEST_GAP, Spline
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import Factored, Undetermined
 from rs_localizer.tools.adjust.variables import (
-    EXTRINSICS,
     CameraView,
     Freedom,
     SplineKeypoints,

@@ -29,10 +29,10 @@ from rs_localizer.tools.adjust.cluster_robust import by_seconds, cluster_robust
 from rs_localizer.tools.adjust.fit import Fit, solve
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.reprojection import LIMIT
+from rs_localizer.tools.adjust.row_kernels import EXTRINSICS
 from rs_localizer.tools.adjust.spline import Spline
 from rs_localizer.tools.adjust.system import System, Undetermined
 from rs_localizer.tools.adjust.variables import (
-    EXTRINSICS,
     CameraView,
     Freedom,
     SplineKeypoints,
