@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.limited import LimitedError, run_limited
@@ -162,9 +161,14 @@ def _of_orientations(rows: Array) -> tuple[Array, Array]:
     times, first = np.unique(1e-3 * rows[:, 0], return_index=True)
     if len(times) < 2:
         return np.zeros(0), np.zeros((0, 3))
-    turns = Rotation.from_quat(rows[first, 1:])
-    steps = (turns[:-1].inv() * turns[1:]).as_rotvec() / np.diff(times)[:, None]
-    return 0.5 * (times[1:] + times[:-1]), steps * [1.0, -1.0, -1.0]
+    unit = rows[first, 1:] / np.linalg.norm(rows[first, 1:], axis=1)[:, None]
+    before, after, w, later = unit[:-1, :3], unit[1:, :3], unit[:-1, 3:], unit[1:, 3:]
+    sines = w * after - later * before - np.cross(before, after)  # of half the angles, about axes
+    cosines = w * later + np.sum(before * after, axis=1)[:, None]
+    sizes = np.linalg.norm(sines, axis=1)[:, None]
+    angles = 2.0 * np.arctan2(sizes, np.abs(cosines)) * np.where(cosines < 0.0, -1.0, 1.0)
+    steps = sines * np.divide(angles, sizes, out=np.full_like(sizes, 2.0), where=sizes > 0.0)
+    return 0.5 * (times[1:] + times[:-1]), steps / np.diff(times)[:, None] * [1.0, -1.0, -1.0]
 
 
 def _number(value: Any) -> float:

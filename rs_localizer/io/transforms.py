@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.messages import Make, make_header, make_quaternion, make_vector
 from rs_localizer.io.messages import stamp_ns as stamp_of
@@ -176,10 +177,8 @@ class _Links:
 
 
 def _between(older: Transform, newer: Transform, ratio: float) -> Transform:
-    from scipy.spatial.transform import Rotation, Slerp  # late: live, tf2 does this
-
-    both = Rotation.from_matrix(np.stack([older.rotation, newer.rotation]))
-    rotation = Slerp([0.0, 1.0], both)(ratio).as_matrix()
+    turned = so3.log(np.ascontiguousarray(older.rotation.T @ newer.rotation))
+    rotation = older.rotation @ so3.exp(ratio * turned)
     return Transform(rotation, (1.0 - ratio) * older.translation + ratio * newer.translation)
 
 

@@ -31,7 +31,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
@@ -76,6 +75,29 @@ _LONGEST = 0.2  # s
 # one-sided, and that is off by more than this share.
 _CHANCE, _LEAST_DIFFERENCE = 3.2e-5, 0.06
 _LAGS = 6  # triples that share frames, and errors of the map
+# Of Student's quantile: the last term of its series is less than exp(-36). Each round is ten times
+# nearer. So many terms are enough for 10,000 degrees of freedom.
+_DIGITS, _ROUNDS, _MOST_TERMS = 36.0, 10, 20_000
+
+
+def student_quantile(freedom: float, chance: float) -> float:
+    """Number that Student's t exceeds with this small chance; infinite where there is none.
+
+    With ``x = f / (f + t^2)`` and ``a = f / 2`` the chance is ``x^a S(x) / (2 a B(a, 1/2))``
+    (Abramowitz, Stegun, 26.5.4 and 26.7.1). The power series S changes little with x, so x is found
+    by putting it into S again and again, from ``S = 1``.
+    """
+    if not freedom > 0.0:
+        return math.inf
+    a = 0.5 * freedom
+    log_beta = math.lgamma(a) + math.lgamma(0.5) - math.lgamma(a + 0.5)
+    first = log_x = (math.log(2.0 * chance * a) + log_beta) / a
+    n = np.arange(1.0, min(_MOST_TERMS, math.ceil(_DIGITS / -first)))  # S is least accurate there
+    series = np.cumprod((n - 0.5) / n) * a / (a + n)
+    for _ in range(_ROUNDS):
+        log_x = first - math.log1p(float(series @ np.exp(log_x * n))) / a
+    with np.errstate(over="ignore"):
+        return float(np.sqrt(freedom * np.expm1(-log_x)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,8 +114,9 @@ class MeasuredReadout:
         """True if this readout time (s, of the assumed direction) must be wrong."""
         off = abs(self.readout_time - readout_time)
         largest = max(abs(self.readout_time), readout_time)
-        deviations = float(stdtrit(self._freedom, 1.0 - _CHANCE))
-        return off > max(deviations * self.deviation, _LEAST_DIFFERENCE * largest)
+        if off <= _LEAST_DIFFERENCE * largest:
+            return False
+        return off > student_quantile(self._freedom, _CHANCE) * self.deviation
 
     def odds(self, one: float, other: float) -> float:
         """Logarithm of the odds for one readout time (s) against another."""

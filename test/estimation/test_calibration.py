@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 import rs_localizer as rsl
@@ -127,6 +128,23 @@ def test_regions_hold_in_a_map_that_tells_which_errors_its_landmarks_share():
         inside(localizer, 2.0, 15, lambda points, seed: mapped(points, seed, False), least=0.9)
         < 0.6
     )
+
+
+def test_errors_of_a_map_are_those_of_the_nearest_landmark_if_it_is_near():
+    """Also of two that are near, of walls and rows, and of none."""
+    rng = np.random.default_rng(0)
+    wall, row = rng.uniform(0.0, 3.0, (500, 3)), np.linspace([0.0, 0.0, 1.0], [0.0, 0.0, 9.0], 90)
+    wall[:, 1] = 2.0
+    landmarks = np.vstack([wall, wall[:100] + rng.normal(0.0, 4e-4, (100, 3)), row])
+    modes = rng.normal(size=(len(landmarks), 3, 4)).astype(np.float32)
+    points = np.vstack([landmarks, landmarks + rng.normal(0.0, 6e-4, landmarks.shape)])
+    points = np.vstack([points, points.astype(np.float32), np.full((1, 3), 50.0)])
+    distances, nearest = cKDTree(landmarks).query(points)
+    expected = np.where((distances < 1e-3)[:, None, None], modes[nearest], 0.0)
+    assert 300 < np.count_nonzero(distances > 1e-3) < len(points) / 2
+    of_map = ErrorModes(landmarks, modes)
+    np.testing.assert_array_equal(of_map.at(points), expected)
+    assert of_map.at(points[:0]).shape == (0, 3, 4)
 
 
 @pytest.mark.parametrize(

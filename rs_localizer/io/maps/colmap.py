@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import colmap_camera, colmap_parameters
@@ -131,14 +132,12 @@ def write_model(
     Raises:
         ValueError: for a lens that COLMAP has no name for.
     """
-    from scipy.spatial.transform import Rotation
-
     lens = colmap_parameters(camera)
     width, height = camera.size
     tracks: dict[int, list[str]] = {point: [] for point in points.ids.tolist()}
     rows = []
     for name, image in images.items():
-        x, y, z, w = Rotation.from_matrix(image.rotation).as_quat(canonical=True)
+        x, y, z, w = so3.quaternion(np.ascontiguousarray(image.rotation))
         rows.append(f"{image.number} {_line([w, x, y, z, *image.translation])} 1 {name}\n")
         shown = list(zip(image.pixels.tolist(), image.points.tolist(), strict=True))
         rows.append(" ".join(f"{u!r} {v!r} {point}" for (u, v), point in shown) + "\n")

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation, Slerp
 
 from rs_localizer.io.transforms import TransformError, TransformTree, from_numbers
 
@@ -164,3 +165,21 @@ def test_a_gap_of_garbage_between_frames_is_named():
     assert tree.lookup("map", "camera", None).translation.tolist() == [0.0, 0.0, 0.0]
     with pytest.raises(TransformError, match="'no' does not exist; there are base, camera, map, o"):
         tree.lookup("map", "no", None)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, 3.0, np.pi - 1e-7])
+def test_between_two_samples_it_turns_evenly(angle):
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        axis = rng.normal(size=3)
+        older = Rotation.random(random_state=rng.integers(1000))
+        newer = older * Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+        tree = TransformTree()
+        for stamp_ns, rotation in ((10, older), (110, newer)):
+            tree.add(
+                tf("odom", "base", (0.0, 0.0, 0.0), rotation.as_quat(), stamp_ns), static=False
+            )
+        both = Rotation.concatenate([older, newer])
+        expected = Slerp([10.0, 110.0], both)(40.0).as_matrix()
+        found = tree.lookup("odom", "base", 40).rotation
+        np.testing.assert_allclose(found, expected, atol=1e-12 + 1e-8 * (angle > 3.1))
