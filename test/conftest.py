@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages for the tests, written from the definitions of ROS and not by the package's code."""
 
+import functools
 import signal
 import struct
 from collections.abc import Callable, Iterator, Sequence
@@ -11,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
+
+from rs_localizer.native import COMPILES
 
 # How long an example takes says nothing on a machine that compiles, or does something else.
 settings.register_profile(
@@ -31,6 +34,16 @@ def signal_handlers() -> Iterator[None]:
     yield
     for number, handler in zip(numbers, before, strict=True):
         signal.signal(number, handler)
+
+
+@pytest.fixture(scope="session")
+def as_python() -> Callable[[Any], Callable[..., Any]]:
+    """Makes callable what only kernels call; without Numba at work, the test is skipped."""
+    if not COMPILES:
+        pytest.skip("calls a kernel that is no entry: RS_LOCALIZER_KERNELS=numba runs it")
+    from numba.core.registry import CPUDispatcher
+
+    return lambda kernel: functools.partial(CPUDispatcher.__call__, kernel)
 
 
 # sensor_msgs/PointField: number of a type -> code of struct.

@@ -20,9 +20,9 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.state import STATE_SIZE
-from rs_localizer.estimation.observations import Observations, weighted
+from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.prior import assumptions
-from rs_localizer.estimation.ransac import best_models, optimize, state_of_model
+from rs_localizer.estimation.ransac import optimize
 from rs_localizer.estimation.refine import EXPECTED_NOISE, refine
 from rs_localizer.solvers.minimal import solve_minimal
 from rs_localizer.solvers.table import find_solver
@@ -145,9 +145,10 @@ def _best(models: Array, trials: Trials, scale: float) -> Motions:
     """Of the solutions (h,k,18) of each frame the one with the least truncated error."""
     found = np.full((len(models), STATE_SIZE), np.nan)
     for i, frame in enumerate(observed(trials)):
-        kept, costs = best_models(models[i][:, :, None], frame.packed, scale, 1, np.inf)
-        if np.isfinite(costs[0]):
-            found[i] = kept[0]
+        states = _states(models[i][~np.isnan(models[i][:, 0])])
+        costs = [np.minimum(frame.squared_errors(state), scale**2).sum() for state in states]
+        if costs:
+            found[i] = states[np.argmin(costs)]
     return _of_states(found)
 
 
@@ -161,15 +162,25 @@ def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
     for i, frame in enumerate(observed(trials)):
         if np.isnan(models[i, 0]):
             continue
-        start = state_of_model(models[i])[None]
         state, cost = optimize(
-            start, np.zeros(1), frame.packed, 8.0 * threshold, threshold, prior, noise
+            _states(models[i : i + 1]),
+            np.zeros(1),
+            frame.packed,
+            8.0 * threshold,
+            threshold,
+            prior,
+            noise,
         )
         if np.isfinite(cost):
-            near = (frame.squared_errors(state) < 4.0 * threshold**2).astype(np.float64)
-            inliers = weighted(frame.packed, near)
-            found[i] = refine(inliers, state, 1e6, 0.0, prior, noise, 2, 10, 1e-6)[0]
+            near = frame.only(np.flatnonzero(frame.squared_errors(state) < 4.0 * threshold**2))
+            found[i] = refine(near.packed, state, 1e6, 0.0, prior, noise, 2, 10, 1e-6)[0]
     return _of_states(found)
+
+
+def _states(models: Array) -> Array:
+    """States (k,24) of models (k,18), the other way round."""
+    c, w, t = models[:, 9:12], models[:, 12:15], models[:, 15:18]
+    return np.hstack([models[:, :12], -w, np.cross(w, c) - t, np.zeros((len(models), 6))])
 
 
 def _of_states(found: Array) -> Motions:

@@ -101,7 +101,7 @@ def log(matrix: Array2) -> Array:
 
 def hat(vector: Array) -> Array:
     """Skew matrices (..., 3, 3) with ``hat(v) @ x == cross(v, x)`` of vectors (..., 3)."""
-    vector = np.asarray(vector, float)
+    vector = np.ascontiguousarray(vector, float)
     if vector.ndim == 1:
         return hat_of(vector)
     matrix = np.zeros((*vector.shape, 3))
@@ -116,7 +116,7 @@ def right_jacobian(vector: Array) -> Array:
 
     ``exp(a + d) = exp(a) exp(right_jacobian(a) d)`` to first order.
     """
-    return right_jacobian_of(np.asarray(vector, float))
+    return right_jacobian_of(np.ascontiguousarray(vector, float))
 
 
 @entry

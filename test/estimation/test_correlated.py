@@ -25,7 +25,7 @@ SIZES = np.linspace(-2.5, 5.5, 11)  # as the module has them
 TERMS = terms_at(PRIOR, 0.1, False)
 
 
-def everything(bent):
+def everything(bent, as_python):
     observations, truth = frame(3, 0.05, NOISE, count=30)
     chosen = np.ones(30, bool)
     chosen[[4, 17]] = False
@@ -39,14 +39,15 @@ def everything(bent):
 
 
 @pytest.mark.parametrize("bent", [False, True])
-def test_sizes_are_integrated_as_over_dense_matrices(bent):
-    observations, truth, chosen, lines, smooth, columns = everything(bent)
-    products = products_at(observations.packed, 30, truth, chosen, smooth.rows)
+def test_sizes_are_integrated_as_over_dense_matrices(as_python, bent):
+    observations, truth, chosen, lines, smooth, columns = everything(bent, as_python)
+    products = as_python(products_at)(observations.packed, 30, truth, chosen, smooth.rows)
     information, slope = np.zeros((18, 18)), np.zeros(18)
     prior_cost = add_prior(TERMS, truth, 1.0, information, slope)
     # One noise for all sizes: it is held, but for rounding.
     noise = Noise(NOISE, 1.0, 12.0)
-    found = over_sizes(products, smooth, information, slope, prior_cost, volume_of(TERMS), noise)
+    volume = as_python(volume_of)(TERMS)
+    found = as_python(over_sizes)(products, smooth, information, slope, prior_cost, volume, noise)
     dense, errors = lines.by_motion[chosen].reshape(56, 18), lines.errors[chosen].ravel()
     if not bent:
         np.testing.assert_allclose(
@@ -88,7 +89,7 @@ def test_sizes_are_integrated_as_over_dense_matrices(bent):
     np.testing.assert_allclose(found.step / deviations, mean / deviations, atol=0.02)
     scaled = found.covariance / np.outer(deviations, deviations)
     np.testing.assert_allclose(scaled, spread / np.outer(deviations, deviations), atol=0.02)
-    expected = logsumexp(logs) - logsumexp(-0.5 * SIZES**2) + volume_of(TERMS)
+    expected = logsumexp(logs) - logsumexp(-0.5 * SIZES**2) + volume
     assert found.evidence == pytest.approx(expected, abs=0.05)
     sizes = 0.2 * np.exp(SIZES)
     assert found.size == pytest.approx(np.sqrt(weights @ sizes**2), rel=0.05)

@@ -59,7 +59,7 @@ def beside(points, pixels, rotation, translation, axes):
 
 
 @pytest.mark.parametrize(("tilt", "noise"), [(0.0, 0.5), (12.0, 1.0)])
-def test_leans_are_integrated_as_on_a_fine_grid(tilt, noise):
+def test_leans_are_integrated_as_on_a_fine_grid(as_python, tilt, noise):
     observations, points, pixels, truth = plane_frame(3, tilt, noise)
     terms = held_terms()
     best = fitted(observations, truth, terms, 4.0)
@@ -67,9 +67,11 @@ def test_leans_are_integrated_as_on_a_fine_grid(tilt, noise):
     smooth = nothing_shared(COUNT)
     noise = Noise(best.noise, 1.0, 2.0 * COUNT - best.freedom)
     seen = Frame(observations.packed, points, best.inliers, smooth, noise, 590.0, 1.6)
-    products = products_at(observations.packed, COUNT, best.state, best.inliers, smooth.rows)
-    mode, _, _ = _mode(seen, best.state, products, terms, 0.0)
-    found = _over_leans(seen, mode, terms)
+    products = as_python(products_at)(
+        observations.packed, COUNT, best.state, best.inliers, smooth.rows
+    )
+    mode, _, _ = as_python(_mode)(seen, best.state, products, terms, 0.0)
+    found = as_python(_over_leans)(seen, mode, terms)
     rotation, translation = mode.state[:9].reshape(3, 3), mode.state[9:12]
     normal = rotation[:, 2]
     across = np.linalg.svd(normal[None])[2][1:]

@@ -43,19 +43,20 @@ def information(seed=0, points=1.0):
     return points * factor @ factor.T
 
 
-def test_points_decide_what_the_prior_leaves_to_them():
+def test_points_decide_what_the_prior_leaves_to_them(as_python):
+    share_of = as_python(decided)
     noise, of_points = 0.5, information()
     nothing = motion_terms((0.0, 0.0), (0.0, 0.0))
-    assert decided(inverted(of_points), nothing, noise) == pytest.approx(18.0)
+    assert share_of(inverted(of_points), nothing, noise) == pytest.approx(18.0)
     held = of_points + noise**2 * held_terms().informations[0]
-    assert decided(inverted(held), held_terms(), noise) == pytest.approx(6.0)
+    assert share_of(inverted(held), held_terms(), noise) == pytest.approx(6.0)
     both = of_points + noise**2 * PRIOR.informations[0]
     # Trace of the gain: each direction counts by the share of it that is the points'.
     share = np.trace(np.linalg.solve(both, of_points))
     assert 6.0 < share < 18.0
-    assert decided(inverted(both), PRIOR, noise) == pytest.approx(share)
+    assert share_of(inverted(both), PRIOR, noise) == pytest.approx(share)
     weak = information(points=1e-9) + noise**2 * PRIOR.informations[0]
-    assert decided(inverted(weak), PRIOR, noise) == pytest.approx(6.0, abs=1e-3)
+    assert share_of(inverted(weak), PRIOR, noise) == pytest.approx(6.0, abs=1e-3)
 
 
 def test_the_noise_of_few_points_is_not_lowered_by_what_they_fit(scene):

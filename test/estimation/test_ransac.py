@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop with mock solvers: what it draws, when it stops, what it keeps."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -96,16 +97,21 @@ def test_good_pools_stop_the_search_early_and_all_are_drawn_from(problem):
     assert outliers[samples[25:]].any()
 
 
-def samples_of(pool, count, size, tau=None, seed=0, prefixes=None):
+@pytest.fixture(scope="session")
+def samples_of(as_python):
+    return functools.partial(_samples_of, as_python(draw))
+
+
+def _samples_of(drawn, pool, count, size, tau=None, seed=0, prefixes=None):
     tau = np.linspace(-0.5, 0.5, 1000) if tau is None else tau
     samples = np.full((count, size), -1, dtype=np.int64)
     if prefixes is None:
         prefixes = np.full(count, len(pool), dtype=np.int64)
-    draw(np.asarray(pool, np.int64), prefixes, tau, float(np.ptp(tau)), generator(seed), samples)
+    drawn(np.asarray(pool, np.int64), prefixes, tau, float(np.ptp(tau)), generator(seed), samples)
     return samples
 
 
-def test_all_points_are_drawn_equally_often():
+def test_all_points_are_drawn_equally_often(samples_of):
     pool = np.random.default_rng(0).permutation(1000)[:50]
     counts = np.bincount(samples_of(pool, 20000, 6).ravel(), minlength=1000)[pool]
     expected = 20000 * 6 / 50
@@ -113,7 +119,7 @@ def test_all_points_are_drawn_equally_often():
     assert np.abs(counts - expected).max() < 5 * np.sqrt(expected)
 
 
-def test_samples_spread_over_the_rows_where_they_can():
+def test_samples_spread_over_the_rows_where_they_can(samples_of):
     tau = np.concatenate([np.full(90, 0.1), np.linspace(-0.5, 0.5, 10)])
     spread = np.ptp(tau[samples_of(np.arange(100), 1000, 6, tau)], axis=1)
     without = np.ptp(
@@ -124,8 +130,8 @@ def test_samples_spread_over_the_rows_where_they_can():
     assert (samples_of(np.arange(10), 5, 6, np.zeros(10)) >= 0).all()
 
 
-def test_models_become_states_by_the_motion_model(scene):
+def test_models_become_states_by_the_motion_model(as_python, scene):
     model = np.random.default_rng(0).normal(size=18)
     rotation, c, w, drift = model[:9].reshape(3, 3), model[9:12], model[12:15], model[15:18]
     motion = Motion(rotation, c, -w, np.cross(w, c) - drift)
-    np.testing.assert_allclose(state_of_model(model), scene.state_of(motion), atol=1e-15)
+    np.testing.assert_allclose(as_python(state_of_model)(model), scene.state_of(motion), atol=1e-15)

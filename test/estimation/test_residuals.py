@@ -27,7 +27,8 @@ def test_robust_cost_and_its_slope_belong_together(scene, softness):
         assert derivative == pytest.approx(2 * slope[k], rel=1e-3, abs=1.0)
 
 
-def test_truncated_costs_are_those_of_the_formulas(scene):
+def test_truncated_costs_are_those_of_the_formulas(as_python, scene):
+    truncated_cost = as_python(residuals.truncated_cost)
     # A search's cost is that of its one look, which knows no accelerations.
     camera, motion, points, _, measured = scene.frame(noise=2.0, seed=5)
     data = scene.pack(camera, points, measured, np.zeros(2))
@@ -35,7 +36,7 @@ def test_truncated_costs_are_those_of_the_formulas(scene):
     squared, c2 = residuals.squared_errors(data, len(points), state), 9.0
     assert (squared > c2).any()
     assert (squared < c2).any()
-    truncated = residuals.truncated_cost(data, state, 3.0, np.inf)
+    truncated = truncated_cost(data, state, 3.0, np.inf)
     assert truncated == pytest.approx(np.minimum(squared, c2).sum())
     information, slope = np.empty((18, 18)), np.empty(18)
     tukey = c2 / 3 * (1 - (1 - np.minimum(squared / c2, 1)) ** 3)
@@ -43,7 +44,7 @@ def test_truncated_costs_are_those_of_the_formulas(scene):
         assert residuals.normal_equations(
             data, state, 3.0, softness, 2, information, slope
         ) == pytest.approx(expected)
-    bounded = residuals.truncated_cost(data, state, 3.0, 0.1 * truncated)
+    bounded = truncated_cost(data, state, 3.0, 0.1 * truncated)
     assert 0.1 * truncated <= bounded < truncated
 
 

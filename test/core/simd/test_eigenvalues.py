@@ -9,6 +9,7 @@ import pytest
 from rs_localizer.core.simd.eigenvalues import real_eigenvalues, reduce_to_hessenberg
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.simd.vectors import lane_array
+from rs_localizer.native import COMPILES
 
 
 @numba.njit
@@ -28,6 +29,8 @@ def _find(matrices, bound, counts, found):
 
 def find(matrices, bound=np.inf):
     """Sorted real eigenvalues of each of ``LANES`` matrices."""
+    if not COMPILES:
+        pytest.skip("only kernels call it: RS_LOCALIZER_KERNELS=numba runs it")
     n = matrices.shape[1]
     counts, found = np.zeros(LANES, np.int64), np.zeros((LANES, n))
     _find(np.ascontiguousarray(matrices, dtype=float), float(bound), counts, found)
