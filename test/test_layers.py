@@ -3,12 +3,20 @@
 """Imports inside the package go down only."""
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import pytest
+
+from rs_localizer.native import COMPILES
+
 PACKAGE = Path(__file__).parents[1] / "rs_localizer"
 
+# Code in LLVM's own terms, imported while kernels are compiled.
+TRACED = ("core/simd/tracing.py", "core/simd/vector_type.py")
 # What each part may import besides itself; every part has a row.
 METHOD = {
     *("core", "config", "solvers", "estimation", "inertial", "integrity", "localizer"),
@@ -17,11 +25,12 @@ METHOD = {
 MAY_IMPORT: dict[str, set[str]] = {
     "process": set(),
     "data": set(),
-    "core": set(),
+    "native": set(),
+    "core": {"native"},
     "config": {"core", "solvers"},
-    "solvers": {"core"},
-    "estimation": {"core", "config", "solvers"},
-    "inertial": {"core", "estimation"},
+    "solvers": {"core", "native"},
+    "estimation": {"core", "config", "native", "solvers"},
+    "inertial": {"core", "estimation", "native"},
     "localizer": METHOD
     - {"inertial", "integrity", "localizer", "prediction_errors", "repeated_images", "tracking"},
     "integrity": {"core", "estimation"},
@@ -31,8 +40,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "io": {"core"},
     "settings": {"config", "io"},
     "readout": {"data"},
-    "matching": {"core", "config", "estimation", "io"},
-    "markers": {"core", "io"},
+    "matching": {"core", "config", "estimation", "io", "native"},
+    "markers": {"core", "io", "native"},
     "features": {"core", "config", "io"},
     "pipeline": {*METHOD, "io", "features", "markers", "matching"},
     "offline": {*METHOD, *"io features markers matching pipeline process settings".split()},
@@ -82,6 +91,53 @@ def test_imports_go_down_only():
             for bad in sorted(used - MAY_IMPORT[part])
         ]
     assert wrong == []
+
+
+# Where packages are imported that a localizer does without: what begins so may.
+ONLY_IN = {
+    ("numba", "llvmlite"): ("native/jit.py", "native/bitcode.py", *TRACED),
+    ("scipy",): ("tools/", "cli/"),
+    ("matplotlib", "evo"): ("tools/",),
+    ("pycolmap",): ("tools/", "io/maps/colmap_process.py"),
+    ("av",): ("io/video.py",),
+    ("telemetry_parser",): ("io/telemetry_process.py",),
+    ("dask", "distributed"): ("offline/fleet.py",),
+    ("pyarrow",): ("offline/frame_table.py", "cli/replay_command.py"),
+}
+
+
+def test_what_few_need_is_imported_where_they_need_it():
+    packages = {name: places for names, places in ONLY_IN.items() for name in names}
+    wrong = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        where = str(path.relative_to(PACKAGE))
+        used = {name.partition(".")[0] for name in imported(path.read_text(), "")}
+        wrong += [
+            f"{where} imports {name}"
+            for name in sorted(used & packages.keys())
+            if not where.startswith(packages[name])
+        ]
+    assert wrong == []
+
+
+@pytest.mark.skipif(COMPILES, reason="kernels are not those of the native module, Numba runs them")
+def test_a_localizer_loads_nothing_that_few_need():
+    """No module but of what makes cameras and maps known, of commands, and of extras."""
+    apart = ("tools/", "cli/", "ros/", "native/", "__main__", *TRACED, "io/maps/colmap_process.py")
+    modules = [
+        ".".join(("rs_localizer", *path.relative_to(PACKAGE).with_suffix("").parts))
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if not str(path.relative_to(PACKAGE)).startswith(apart)
+    ]
+    names = [name for names in ONLY_IN for name in names]
+    code = (
+        f"import importlib, sys\nfor name in {modules}:\n    importlib.import_module(name)\n"
+        f"print(*[name for name in {names} if name in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout == "\n"
 
 
 # What each folder of ros may import of the others; every folder has a row.
@@ -135,7 +191,7 @@ def test_every_module_has_a_client() -> None:
 MOST = 6
 
 # Compiled code takes arrays one by one, and so does what stands in for a kernel.
-COMPILED = {"kernel", "inlined", "error_model"}
+COMPILED = {"entry", "kernel", "inlined"}
 INSTEAD_OF_KERNELS = {"solvers/r6p.py: solve_batch"}
 # What is called with keywords: declarations, and the library's own entrance for cameras and rigs.
 BY_KEYWORDS = {
@@ -180,13 +236,13 @@ def test_no_function_takes_many_parameters():
 
 
 def test_each_module_and_class_has_a_name_of_its_own():
-    """But for ``__init__``, ``__main__``, and the ``Options`` of each command."""
+    """But for ``__init__``, ``__main__``, ``build`` of kernels and of maps, and ``Options``."""
     homes: dict[str, list[str]] = {}
     for file in PACKAGE.rglob("*.py"):
         tree = ast.parse(file.read_text(encoding="utf-8"))
         names = [node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
         for name in (*(name for name in names if name != "Options"), f"{file.stem}.py"):
             homes.setdefault(name, []).append(str(file.relative_to(PACKAGE)))
-    excepted = ("__init__.py", "__main__.py")
+    excepted = ("__init__.py", "__main__.py", "build.py")
     shared = {name: of for name, of in homes.items() if len(of) > 1 and name not in excepted}
     assert shared == {}

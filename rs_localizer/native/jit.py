@@ -41,14 +41,14 @@ _SCALARS = {"d": types.float64, "q": types.int64, "?": types.boolean}
 _OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
-class _Kernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
+class _CompiledKernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
     """A function that kernels call, and Python does not."""
 
     def __call__(self, *arguments: Any) -> Any:
         raise TypeError(uncallable(f"{self.__module__}.{self.__qualname__}"))
 
 
-class _Entry(CPUDispatcher):  # type: ignore[misc]
+class _CompiledEntry(CPUDispatcher):  # type: ignore[misc]
     """A kernel that Python calls: with what it declares, and nothing else."""
 
     declared: Declaration | None
@@ -118,7 +118,7 @@ def compiled(function: Callable[..., Any], inline: bool, is_built: bool) -> Any:
         tuple(map(types.unliteral, positional)),
         {name: types.unliteral(kind) for name, kind in named.items()},
     )
-    made.__class__ = _Kernel
+    made.__class__ = _CompiledKernel
     path = sources.path_of_ours(function.__module__)
     if not is_built and path is not None and str(path) == function.__code__.co_filename:
         made._cache = _Cache(function)
@@ -128,7 +128,7 @@ def compiled(function: Callable[..., Any], inline: bool, is_built: bool) -> Any:
 def entry(function: Callable[..., Any], is_built: bool, native: Any) -> Any:
     """Return an entry for Numba; ``native`` is what Python calls instead where it fits."""
     made = compiled(function, False, is_built)
-    made.__class__, made.declared, made.native = _Entry, None, native
+    made.__class__, made.declared, made.native = _CompiledEntry, None, native
     ENTRIES[f"{function.__module__}.{function.__qualname__}"] = made
     return made
 
