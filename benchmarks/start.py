@@ -1,124 +1,136 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m benchmarks.start``: memory and time of a start of the node.
+"""``python -m benchmarks.start``: processor time and memory of a start, in an empty home.
 
-Each row starts the node once and sends it the frames of a bundled recording until it has a pose:
-with an empty cache of kernels, and with what that start has left.
+Each row is a new process that gets frames of a bundled recording until it has a pose: the library,
+and the node without and with an IMU, with wrong matches among the frame's. It fails where a process
+has loaded what only a compiler or a tool needs.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import subprocess
+import sys
 import tempfile
-import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from rs_localizer import data
-from rs_localizer.cli.demo_command import read_frames
+from rs_localizer.cli.demo_command import FrameMessages, read_frames
+from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.recording import make_correspondences
 from rs_localizer.ros.graph.live import LiveNode
 from rs_localizer.ros.node.conversion import message_class
 
+FOREIGN = ("numba", "llvmlite", "scipy", "matplotlib")
+"""What no localizer loads."""
+_WRONG = 0.3  # share of the matches
+_READOUT_TIME = 0.03
 _SETTLED = 3.0  # s: then diagnostics and timers have run
-_POLLED = 0.2  # s between two looks at the memory
 _IMU_RATE, _AROUND_NS = 200, 200_000_000
 _TICK = os.sysconf("SC_CLK_TCK")
+_STARTS = 3
+
+# Before NumPy is imported, as of any user.
+_LIBRARY = f"""
+import json, sys, time
+import rs_localizer as rsl
+rsl.Localizer
+imported = time.process_time()
+import numpy as np
+points, pixels, K, size = (np.array(value) for value in json.loads(sys.stdin.readline()))
+camera = rsl.Camera(width=int(size[0]), height=int(size[1]), K=K, readout_time={_READOUT_TIME})
+before = time.process_time()
+assert rsl.Localizer(camera).localize(points, pixels)
+first = imported + time.process_time() - before
+print(json.dumps([imported, first, [name for name in {FOREIGN} if name in sys.modules]]))
+sys.stdout.flush()
+sys.stdin.readline()
+"""
 
 
 class Start(NamedTuple):
-    """What a start cost; the processor's time and the peak are those of all its processes."""
+    """Cost of a start."""
 
-    active: float  # s until then
-    work: float  # s of the processor until then
-    first: float  # s until the first pose
-    first_work: float
+    begun: float  # s of the processor until it is imported, or active
+    first: float  # s of the processor until the first pose
     refused: int  # frames before it
-    resident: float  # MB of the node when it has settled
-    peak: float  # MB until active, what processes share counted once
-    later_peak: float  # MB, while the rest is compiled
+    memory: float  # MB of the process, its share of what several use
+    foreign: tuple[str, ...]  # of :data:`FOREIGN`, what has been loaded
 
 
-def tree(pid: int) -> Iterator[tuple[int, float]]:
-    """A process and those below it, and s of the processor of each and of its ended children."""
-    parents: dict[int, list[int]] = {}
-    work = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        one = int(path.parent.name)
-        if fields[0] == "Z":  # it has ended, and its parent has not asked
-            continue
-        parents.setdefault(int(fields[1]), []).append(one)
-        work[one] = sum(map(int, fields[11:15])) / _TICK
-    waiting = [pid]
-    while waiting:
-        one = waiting.pop()
-        if one in work:
-            yield one, work[one]
-            waiting += parents.get(one, [])
+def work(pid: int) -> float:
+    """Seconds of the processor that a process and its ended children have taken."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, fields[11:15])) / _TICK
 
 
-def memory(pid: int, name: str) -> float:
-    """MB of a process by /proc: ``Pss`` or ``Rss``."""
-    try:
-        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-    except OSError:
-        return 0.0
-    return sum(float(line.split()[1]) / 1e3 for line in lines if line.startswith(f"{name}:"))
+def memory(pid: int) -> float:
+    """MB of a process, its share of what several use."""
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    return sum(float(line.split()[1]) / 1e3 for line in lines if line.startswith("Pss:"))
 
 
-class Watch:
-    """Looks at the processes of a node until it is closed."""
-
-    def __init__(self, pid: int) -> None:
-        self.pid, self.peak, self._ends = pid, 0.0, threading.Event()
-        self._thread = threading.Thread(target=self._look)
-        self._thread.start()
-
-    def work(self) -> float:
-        """Seconds of the processor so far."""
-        return sum(work for _, work in tree(self.pid))
-
-    def _look(self) -> None:
-        while not self._ends.wait(_POLLED):
-            self.peak = max(self.peak, sum(memory(pid, "Pss") for pid, _ in tree(self.pid)))
-
-    def close(self) -> None:
-        """Look no more."""
-        self._ends.set()
-        self._thread.join()
+def loaded(pid: int) -> tuple[str, ...]:
+    """Packages of :data:`FOREIGN` whose libraries a process has loaded."""
+    maps = Path(f"/proc/{pid}/maps").read_text()
+    return tuple(name for name in FOREIGN if f"-packages/{name}" in maps)
 
 
-def measure(settings: Mapping[str, Any], imu: bool) -> Start:
+def spoiled(frame: FrameMessages) -> FrameMessages:
+    """A frame with wrong matches."""
+    cloud, rng = read_correspondences(frame.cloud), np.random.default_rng(frame.stamp_ns)
+    pixels = cloud.pixels.copy()
+    wrong = rng.choice(len(pixels), round(_WRONG * len(pixels)), replace=False)
+    pixels[wrong] = rng.uniform([0, 0], [frame.info.width, frame.info.height], (len(wrong), 2))
+    ids = np.arange(len(pixels))
+    return frame._replace(cloud=make_correspondences(frame.stamp_ns, cloud.points, pixels, ids))
+
+
+def start_library(frame: FrameMessages) -> Start:
+    """Localize a frame by the library, with as many threads as its user has."""
+    cloud = read_correspondences(frame.cloud)
+    K, size = np.reshape(frame.info.k, (3, 3)), [frame.info.width, frame.info.height]
+    given = json.dumps([cloud.points.tolist(), cloud.pixels.tolist(), K.tolist(), size])
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    with subprocess.Popen(
+        [sys.executable, "-c", _LIBRARY], env=environment, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(f"{given}\n")
+        process.stdin.flush()
+        begun, first, foreign = json.loads(process.stdout.readline())
+        resident = memory(process.pid)
+        process.stdin.write("\n")
+    return Start(begun, first, 0, resident, tuple(foreign))
+
+
+def start_node(frames: list[FrameMessages], settings: Mapping[str, Any], imu: bool) -> Start:
     """Start the localizer and send it frames until it has a pose."""
-    frames = read_frames(data.path(data.WEBCAM))
-    with tempfile.TemporaryDirectory() as place:
-        began = time.monotonic()
-        with LiveNode(settings, Path(place) / "log", 0) as node:
-            watch = Watch(node.pid)
-            try:
-                node.wait(lambda line: None)
-                active, work, peak = time.monotonic() - began, watch.work(), watch.peak
-                refused, pose = 0, None
-                while pose is None:
-                    stamp_ns, info, cloud = frames[refused % len(frames)]
-                    if imu:
-                        _send_imu(node, stamp_ns)
-                    pose = node.localize(info, cloud)
-                    refused += pose is None
-                first, first_work = time.monotonic() - began, watch.work()
-                time.sleep(_SETTLED)
-                resident = memory(node.pid, "Pss")
-                while len(list(tree(node.pid))) > 1:  # what compiles the rest
-                    time.sleep(_POLLED)
-            finally:
-                watch.close()
-    return Start(active, work, first, first_work, refused, resident, peak, watch.peak)
+    with (
+        tempfile.TemporaryDirectory() as place,
+        LiveNode(settings, Path(place) / "log", 0) as node,
+    ):
+        node.wait(lambda line: None)
+        begun, refused, pose = work(node.pid), 0, None
+        while pose is None:
+            stamp_ns, info, cloud = frames[refused % len(frames)]
+            if imu:
+                _send_imu(node, stamp_ns)
+            pose = node.localize(info, cloud)
+            refused += pose is None
+        first = work(node.pid)
+        time.sleep(_SETTLED)
+        return Start(begun, first, refused, memory(node.pid), loaded(node.pid))
 
 
 def _send_imu(node: LiveNode, stamp_ns: int) -> None:
@@ -132,26 +144,32 @@ def _send_imu(node: LiveNode, stamp_ns: int) -> None:
         publisher.publish(message)
 
 
-def main() -> None:
+def main() -> int:
     argparse.ArgumentParser(prog="python -m benchmarks.start", description=__doc__).parse_args()
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 100 + 1)
-    os.environ.pop("NUMBA_CACHE_DIR", None)
-    head = ("active s", "CPU s", "pose s", "CPU s", "refused", "node MB", "peak MB", "later MB")
-    print(f"{'':34}" + "".join(f"{name:>10}" for name in head))
-    rows: tuple[tuple[str, dict[str, Any], bool], ...] = (
-        ("no readout_time", {"solver": "r6p_vcwt"}, False),
-        ("readout_time", {"readout_time": 0.03}, False),
-        ("readout_time, IMU", {"readout_time": 0.03}, True),
-    )
-    for name, settings, imu in rows:
-        with tempfile.TemporaryDirectory() as cache:
-            os.environ["XDG_CACHE_HOME"] = cache
-            for kind in ("cold", "warm", "warm"):
-                it = measure(settings, imu)
-                cells = "".join(f"{value:10.1f}" for value in it)
-                print(f"{f'{kind}, {name}':34}{cells}", flush=True)
+    frames = [spoiled(frame) for frame in read_frames(data.path(data.WEBCAM))]
+    head = ("begun CPU s", "pose CPU s", "refused", "MB")
+    print(f"{'':26}" + "".join(f"{name:>13}" for name in head))
+    foreign = set[str]()
+    known = {"readout_time": _READOUT_TIME}
+    for name, start in (
+        ("library", lambda: start_library(frames[0])),
+        ("node, no readout_time", lambda: start_node(frames, {}, False)),
+        ("node, readout_time", lambda: start_node(frames, known, False)),
+        ("node, readout_time, IMU", lambda: start_node(frames, known, True)),
+    ):
+        for _ in range(_STARTS):
+            with tempfile.TemporaryDirectory() as home:
+                os.environ |= {"HOME": home, "XDG_CACHE_HOME": f"{home}/cache"}
+                it = start()
+            cells = (f"{it.begun:13.2f}", f"{it.first:13.2f}", f"{it.refused:13}")
+            print(f"{name:26}" + "".join(cells) + f"{it.memory:13.0f}", flush=True)
+            foreign.update(it.foreign)
+    if foreign:
+        print(f"loaded, and not needed: {', '.join(sorted(foreign))}", file=sys.stderr)
+    return 1 if foreign else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
