@@ -7,7 +7,7 @@
 # make wheel  wheels for other machines, in dist/
 # make jit    the kernels' own tests under Numba, and the native module against what they gave
 # make bench  the statistical tests, which take longer: coverage of regions, verdicts of experiments
-# make coverage  the tests once more, and which lines they run: without what Numba compiles, and
+# make coverage  the tests once more, and which lines they run: without kernels, and
 #                without what runs in processes of its own (nodes, some commands); COVERAGE is
 #                what pytest is told instead, as by .ci/run
 # make docs   the pages as a site, in out/docs; a link that leads nowhere is an error

@@ -58,8 +58,8 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all others
-    # Numba and OpenCV take a second to import. Who imports this package only to start a program
-    # does not wait for them, and the program can take Ctrl-C in hand before they come (PEP 562).
+    # NumPy and OpenCV take tenths of a second to import. Who imports this package only to start a
+    # program does not wait for them, and it can take Ctrl-C in hand before they come (PEP 562).
     _HOMES = {
         "config": ("Acceleration", "LocalizerConfig", "VelocityPrior"),
         "core.camera": ("Camera", "DistortionModel", "Roi"),

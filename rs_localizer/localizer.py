@@ -14,21 +14,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, localizer_config
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.bearings import seen_at
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
-from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation import motion_model, motion_window, observations, ransac
 from rs_localizer.estimation.acceptance import refusal, speeding, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
-from rs_localizer.estimation.left_out import LeftOut, as_nearest, left_out
+from rs_localizer.estimation.left_out import LeftOut, left_out
 from rs_localizer.estimation.observations import (
     NEAREST,
     Observed,
@@ -46,12 +43,10 @@ from rs_localizer.estimation.prior import (
     PriorTerms,
     assumptions,
     of_frame,
-    pivot_of,
     state_in,
     with_motion,
 )
 from rs_localizer.estimation.ransac import Candidate, generator
-from rs_localizer.estimation.residuals import likeness
 from rs_localizer.estimation.result import estimate_of
 from rs_localizer.estimation.searching import MotionSearch
 from rs_localizer.solvers.table import find_solver, start_solver
@@ -139,43 +134,6 @@ class Localizer:
         if len(self.rig.cameras) > 1:
             raise ValueError(f"the rig has several cameras: {', '.join(self.rig.cameras)}")
         return next(iter(self.rig.cameras.values()))
-
-    def warm_up(self) -> None:
-        """Compile every kernel of :meth:`localize` and of tracking, or load it from the cache."""
-        if not self._alone:
-            Localizer(next(iter(self.rig.cameras.values())), self.config).warm_up()
-            return
-        for part in (motion_model, motion_window, observations, ransac):
-            part.warm_up()
-        # A still camera before a scene that is no plane; with half a prediction, which is dropped.
-        count = max(160, self.config.min_inliers)
-        pixels = np.random.default_rng(0).uniform(0.3, 0.7, (count, 2)) * self.camera.size
-        rays = np.nan_to_num(self.camera.rays(pixels))
-        depth = 2.0 + np.arange(count) % 3
-        points = depth[:, None] * np.column_stack([rays, np.ones(count)])
-        still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-        prior = Prior(motion=still, covariance=1e-4 * np.eye(18), gravity=(0.0, 0.0, 1.0),
-                      gravity_deviation=1.0, gravity_in_map=(0.0, 0.0, 1.0))  # fmt: skip
-        self.localize(points, pixels, np.arange(count, dtype=np.float64), prior=prior)
-        self.localize(points, pixels)
-        pivot_of(np.eye(18))  # by a tracker
-        as_nearest(np.zeros((2, 2)), np.zeros((2, 2)), 0.0)  # where points are left out
-        so3.exp_many(np.zeros((1, 3)))  # of rows that shake
-        likeness(np.zeros((2, 3)), np.zeros(2), 1)  # of inliers, for integrity
-        # And with one that shakes, rows to and fro.
-        swing = 2.0 * self.config.inlier_threshold * np.sin(12.0 * self.camera.row_time(pixels))
-        self.localize(points, pixels + np.outer(swing, self.camera.row_time_gradient[::-1] != 0.0))
-        # Errors that are smooth over the image.
-        self.localize(points, pixels + 2.0 * np.outer((rays**2).sum(axis=1), [1.0, 1.0]))
-        # And before a plane whose points agree with nothing.
-        flat = points * (2.0 / points @ [0.1, 0.0, 1.0])[:, None]
-        strewn = np.random.default_rng(1).normal(size=(count, 2))
-        self.localize(flat, pixels + 4.0 * self.config.inlier_threshold * strewn)
-        # And beside the turn that a gyroscope knows, of which the delay is in doubt.
-        tau = np.linspace(-0.7, 0.7, 29)
-        rates = 0.1 * np.column_stack([np.sin(20.0 * tau)] * 3)
-        turn = GyroRotation.of(tau, rates, 1e-4 * np.eye(6), delay=0.01)
-        self.localize(points, pixels, turn=turn)
 
     def localize(
         self,

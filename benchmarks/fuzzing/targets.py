@@ -203,7 +203,6 @@ class _Localizer:
     """Answers any message, and raises nothing."""
 
     def __init__(self, landmarks: Any) -> None:
-        FrameLocalizer(NodeConfig(readout_time=0.03)).warm_up()
         self._landmarks = landmarks
         self._good = seeds.frames()[landmarks is not None][0]
 

@@ -34,7 +34,7 @@ from rs_localizer.settings import NODE_NAME
 
 _NODE = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
 
-# The first start on a machine compiles all kernels.
+# s: only what hangs takes an hour, on whatever machine.
 _START_TIMEOUT = 3600.0
 # Frames that are still on their way when the last one has been sent, in s.
 _REST_TIME = 1.5

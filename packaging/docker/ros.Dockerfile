@@ -10,7 +10,7 @@ FROM ros:${ROS_DISTRO}
 ARG ROS_DISTRO
 WORKDIR /workspace
 COPY . src/rs_localizer
-# Numba and rosbags: pip's where Ubuntu has none (24.04), beside Ubuntu's NumPy.
+# Numba, for the build, and rosbags: pip's where Ubuntu has none (24.04), beside Ubuntu's NumPy.
 RUN apt-get update \
     && rosdep update --rosdistro ${ROS_DISTRO} \
     && rosdep install --from-paths src --ignore-src --default-yes --dependency-types=exec \
@@ -22,10 +22,6 @@ RUN apt-get update \
     fi \
     && rm -rf /var/lib/apt/lists/*
 RUN . "/opt/ros/${ROS_DISTRO}/setup.sh" && colcon build --packages-select rs_localizer
-# Kernels are compiled for the CPU of the machine that builds; another one compiles its own.
-ENV XDG_CACHE_HOME=/opt/cache
-RUN . install/setup.sh && ros2 run rs_localizer rs_localizer warm --solver r6p_vcwt \
-    && chmod -R a+rX,go-w /opt/cache
 RUN printf '#!/bin/sh\n. /workspace/install/setup.sh\nexec "$@"\n' >/entrypoint && chmod +x /entrypoint
 ENTRYPOINT ["/entrypoint"]
 CMD ["ros2", "run", "rs_localizer", "localizer"]

@@ -5,9 +5,7 @@
 from __future__ import annotations
 
 import importlib
-import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -112,21 +110,3 @@ def stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
     """A progress bar for a person who waits, none in a log; what counts."""
     with tqdm(total=total, desc=name, disable=None) as bar:
         yield bar.update
-
-
-# s between two lines that say what is compiled, where no terminal shows it.
-_PERIOD = 15.0
-
-
-class Compiling:
-    """Says which kernel is compiled: on a terminal in one line, elsewhere now and then."""
-
-    def __init__(self) -> None:
-        self._last = -_PERIOD
-
-    def __call__(self, count: int, name: str) -> None:
-        if sys.stderr.isatty():
-            print(f"\r\033[Kcompiling {count}: {name}\r", end="", file=sys.stderr, flush=True)
-        elif time.monotonic() - self._last > _PERIOD:
-            self._last = time.monotonic()
-            print(f"compiling {count}: {name}", flush=True)

@@ -246,7 +246,6 @@ def _correspondences(args: Options, bag: BagReader, config: NodeConfig) -> _Inpu
 def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
     marker_map = find_map(args)
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
-    detector.warm_up()
     sizes = BoardSizes(marker_map)
     images: list[ImagePoints] = []
     camera: Camera | None = None

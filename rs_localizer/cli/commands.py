@@ -111,7 +111,6 @@ COMMANDS = {
             "room.npz level.npz --up 0 -1 0 --origin 7",
         ),
         ("map info", "describe a map, and name sizes in other units", "wall.yaml"),
-        ("warm", "compile all kernels now; the first start is then as any other", ""),
     )
 }  # fmt: skip
 

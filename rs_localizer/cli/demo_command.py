@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rs_localizer.cli import WORKING, Compiling, import_ros, stage
+from rs_localizer.cli import WORKING, import_ros, stage
 from rs_localizer.cli.options import option
 from rs_localizer.cli.typed import typed
 from rs_localizer.config import NodeConfig
@@ -27,8 +27,6 @@ if WORKING:
     from rs_localizer import data
     from rs_localizer.core.camera import Camera
     from rs_localizer.core.shutter import Motion
-    from rs_localizer.core.simd import compiler
-    from rs_localizer.core.simd.jit import cache_directory
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import open_bag
     from rs_localizer.io.camera_info import read_camera_info
@@ -90,12 +88,10 @@ def run(options: Options) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     most = _QUICK_FRAMES if options.quick else None
     print(
-        "about 4 min at the first time on a machine, 1 min later; 0.5 GB of memory, 40 MB of disk "
-        f"for compiled code in {cache_directory()}, 5 MB in {options.out}. If it is stopped, the "
-        "same command goes on with what has been compiled.",
+        f"about 1 min; 0.5 GB of memory, 5 MB in {options.out}",
         flush=True,
     )
-    with tempfile.TemporaryDirectory() as directory, compiler.told(Compiling()):
+    with tempfile.TemporaryDirectory() as directory:
         camera, hand = cube_clip.CAMERA, read_tum(data.path(data.HAND_MOTION))
         motion = RecordedMotion(hand)
         flight = _fly(camera, motion, most)
@@ -168,7 +164,6 @@ def _localized(
     answers, rows = dict[str, dict[int, Localized]](), dict[str, np.ndarray]()
     for solver in _METHODS:
         localizer = FrameLocalizer(build(_settings(solver, readout_time)))
-        localizer.warm_up()
         answers[solver] = found = dict[int, Localized]()
         with stage(f"{title}, {solver}", len(frames)) as step:
             for stamp, info, cloud in frames:

@@ -156,7 +156,6 @@ def _of_markers(args: Options) -> tuple[Mapping[str, float], Look]:
     ) -> Extraction:
         notices: Counter[str] = Counter()
         detector = FrameDetector(config, lambda _, text: notices.update([text]), marker_map)
-        detector.warm_up()
         found = record(
             shots, detector, bag, options, done=bar.update,
             tell=lambda text: bar.write(f"note: {text}", file=sys.stderr),

@@ -231,7 +231,6 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
             print(f"no IMU is used: choose {' or '.join(several)} with -r imu:=TOPIC")
         if options.smooth and config.readout_time == 0.0 and not config.of_cameras:
             raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
-        localizer.warm_up()
         tally = Tally(bag.count([topics.frames]), notices)
         if options.parquet is not None:
             tally.table = frame_table.FrameTable(recording, localizer, options.smooth)

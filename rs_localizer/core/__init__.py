@@ -1,3 +1,3 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Geometry: rotations, camera, shutter and state; imports NumPy, Numba and OpenCV, never ROS."""
+"""Geometry: rotations, camera, shutter and state; imports NumPy and OpenCV, never ROS."""

@@ -39,8 +39,6 @@ class Reason(StrEnum):
     LATE_FRAME = "late_frame"
     # Images that cannot be searched.
     BAD_IMAGE = "bad_image"
-    # What it takes is not compiled yet, at the first start on a machine.
-    COMPILING = "compiling"
     # Our own fault.
     INTERNAL_ERROR = "internal_error"
 
@@ -60,7 +58,6 @@ class ImuReason(StrEnum):
     NOT_TRACKING = "imu_not_tracking"
     DOUBTED = "imu_doubted"
     DISAGREES = "imu_disagrees"
-    COMPILING = "imu_compiling"
 
 
 class Notice(StrEnum):

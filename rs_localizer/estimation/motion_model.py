@@ -196,13 +196,3 @@ def _place_of(i: int, part: int) -> int:
     """Place in a step of the i-th number of what turns (0) or moves (1)."""
     place: int = 6 * (i // 3) + 3 * part + i % 3
     return place
-
-
-def warm_up() -> None:
-    """Compile the kernels, or load them from the cache."""
-    still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    identity = np.eye(PARAMETERS)
-    predict(still, identity, 1.0, 1.0)
-    acceleration_covariance(Acceleration(1.0, 1.0), 1.0, 1.0)
-    _unshaken(numbers_of(still), np.zeros((0, 3)), identity)
-    surprises_of(np.zeros(PARAMETERS), identity, identity)

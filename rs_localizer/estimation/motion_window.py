@@ -500,18 +500,3 @@ def _errors_ahead(
                 second = joint[row, column] + step[row] * step[column]
                 ratios[part] += known[i, j] * second / 3.0
     return ratios
-
-
-def warm_up() -> None:
-    """Compile the kernels, or load them from the cache."""
-    still = np.concatenate([np.eye(3).ravel(), np.zeros(STATE_SIZE - 9)])
-    unit = np.eye(PARAMETERS)
-    start = Gaussian(0, still, unit)
-    sample = MotionSample(10**7, still, unit, np.zeros(PARAMETERS))
-    window = MotionWindow.begin(start, Acceleration(1.0, 1.0)).joined(sample)
-    window.before(1)
-    later = window.after(2 * 10**7)
-    _errors_ahead(
-        still, unit, 0.01, window.deviations, 0.0, _per_second(0.01), unit, later.state, unit
-    )
-    _told_by_points(unit, 0.5 * unit)

@@ -224,11 +224,6 @@ def weighted(data: Array, weights: Array | BoolArray) -> Array:
     return data
 
 
-def warm_up() -> None:
-    """Compile what frames with many points come to."""
-    thin(np.zeros((1, POINT_SIZE * LANES)), np.zeros(1, np.int64))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
     """The points of one frame, ready for the kernels."""

@@ -26,12 +26,11 @@ from rs_localizer.core.arrays import (
 )
 from rs_localizer.core.blocks import write
 from rs_localizer.core.rig import Mounts
-from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.state import STATE_SIZE
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.prior import PriorTerms, held_terms
+from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.refine import anneal, refine
-from rs_localizer.estimation.residuals import POINT_SIZE, squared_errors, truncated_cost
+from rs_localizer.estimation.residuals import squared_errors, truncated_cost
 from rs_localizer.native import entry, inlined, kernel
 from rs_localizer.solvers.batch import MODEL_SIZE, into_rig
 from rs_localizer.solvers.table import Solver
@@ -286,12 +285,6 @@ def descend(
         scale, iterations = _RATIO * scale, _STEPS
     state, _, _, _ = refine(data, state, last_scale, 1.0, prior, noise, 1, _FIRST_STEPS, _TOLERANCE)
     return state, truncated_cost(data, state, last_scale, np.inf)
-
-
-def warm_up() -> None:
-    """Compile what a plane comes to that faces the camera."""
-    nothing = np.zeros((0, POINT_SIZE * LANES))
-    descend(nothing, np.zeros(STATE_SIZE), 1.0, 1.0, held_terms(), 1.0)
 
 
 # Of every block this many hypotheses are optimised: a six-point model of inliers alone is often

@@ -189,11 +189,6 @@ class MarkerDetector:
         return np.arange(len(corners)), corners
 
 
-def warm_up() -> None:
-    """Compile the kernels of detection."""
-    refine(np.zeros((8, 8), np.uint8), np.zeros((1, 4, 2)), 6)
-
-
 def _finders(marker_map: MarkerMap) -> list[tuple[MarkerFinder, MarkerFinder]]:
     """For each kind of family, one that knows the map's ids, if that is faster, and one of all."""
     families: dict[str, Family] = {}

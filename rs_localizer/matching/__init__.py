@@ -417,18 +417,6 @@ def correspondences(matches: Matches, keypoints: Keypoints, landmarks: Map) -> C
     )
 
 
-def warm_up() -> None:
-    """Compile all kernels of matching."""
-    camera = Camera(width=2, height=2, K=np.eye(3))
-    motion = Motion(np.eye(3), np.array([0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
-    prior = Prior(motion=motion, covariance=np.eye(12))
-    for descriptors in (np.zeros((1, 1), np.uint8), np.zeros((1, 1), np.float32)):
-        matcher = Matcher(Map(np.zeros((1, 3)), None, descriptors, "map"))
-        keypoints = Keypoints(0, np.zeros((1, 2)), None, descriptors, None, 0)
-        for tracked in (None, prior):
-            matcher.match(keypoints, Matching(), camera, tracked)
-
-
 def _best(keypoints: Keypoints, most: int) -> IntArray:
     """The best keypoints, in their own order."""
     count = len(keypoints)

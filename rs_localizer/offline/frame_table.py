@@ -242,7 +242,6 @@ def localize_recording(
         raise ValueError("a table is of one camera: leave the setting cameras out")
     with open_bag(Path(source)) as bag:
         topics, localizer = prepare(bag, config)
-        localizer.warm_up()
         rows = FrameTable(source, localizer)
         for frame in replay(bag, topics, localizer):
             if frame.result or frame.result.reason not in NO_FRAMES:

@@ -10,7 +10,6 @@ where the others are, TF says, at the time of the frame. Poses are those of ``ba
 
 from __future__ import annotations
 
-import contextlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -20,7 +19,6 @@ import numpy as np
 
 from rs_localizer import matching
 from rs_localizer.config import CameraSettings, Imu, ImuUse, NodeConfig, PoseTime
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice, Reason
@@ -42,7 +40,6 @@ from rs_localizer.io.transforms import Transform, TransformError, Transforms, Tr
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline import what_fits
 from rs_localizer.pipeline.cloud_checks import oddities
-from rs_localizer.pipeline.compiling import note_whole, plain_frames
 from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
 from rs_localizer.pipeline.imu_readings import ImuInput, inertial_settings
 from rs_localizer.pipeline.inputs import INPUTS
@@ -284,31 +281,6 @@ class FrameLocalizer:
         self.readout_watch.reset()
         self._tracker.reset()
 
-    def warm_up(self, patient: bool = True) -> None:
-        """Have compiled, or load, what a plain frame needs, from points to messages.
-
-        ``patient``: what joins frames, too; else it is loaded if it is there, and ordered if not.
-        """
-        if not self._alone:
-            matching.warm_up()
-        plain_frames(self._tracker.localizer, patient=patient)
-
-    def warm_up_rest(self) -> None:
-        """The same of what any frame may need but for an IMU's; notes that it is there.
-
-        Raises:
-            OSError: when it could not be kept.
-        """
-        self.warm_up()
-        self._tracker.localizer.warm_up()
-        so3.log(np.eye(3))
-        matching.warm_up()
-        note_whole(self._config.solver)
-
-    def warm_up_imu(self) -> None:
-        """The same of what plain frames beside an IMU need."""
-        plain_frames(self._tracker.localizer, inertial_settings(self._config))
-
     def calibrate(self, calibration: Calibration, name: str = "") -> None:
         """Use this calibration of a camera from the next frame on.
 
@@ -512,21 +484,14 @@ class FrameLocalizer:
 
         def localized(samples: ImuSamples | None) -> Estimate | Failure:
             matches = cloud.points, cloud.pixels, cloud.scores
-            try:
-                return self._tracker.localize(time_ns, *matches, imu=samples, context=context)
-            except NotCompiled:  # what joins frames, perhaps: this one may stand alone
-                self._tracker.reset()
-                return self._tracker.localize(time_ns, *matches, imu=samples, context=context)
+            return self._tracker.localize(time_ns, *matches, imu=samples, context=context)
 
         self.imu.track(self._tracker, config, time_ns, frame, self.transforms, localized)
         result = self._tracker.newest
         assert result is not None
         adopted = config
-        try:
-            if not self._tracker.repeats:  # a copy says nothing of the shutter
-                adopted = self.readout_watch.add(Watched(time_ns, cloud, result, config, camera))
-        except NotCompiled:  # what it takes comes, and the next frames tell it more
-            self.readout_watch.reset()
+        if not self._tracker.repeats:  # a copy says nothing of the shutter
+            adopted = self.readout_watch.add(Watched(time_ns, cloud, result, config, camera))
         if result and not self.readout_watch.wrong_axis:
             ahead = (cloud.points[result.inliers] - result.position) @ result.rotation[2]
             self._stream.pace(time_ns, result, float(np.median(ahead)), config)
@@ -556,9 +521,7 @@ class FrameLocalizer:
         if refusal.reason not in what_fits.REASONS:
             return refusal
         frame = self._tracker.localizer, cloud.points, cloud.pixels, what_fits.ids_of(cloud)
-        said = ""
-        with contextlib.suppress(NotCompiled):
-            said = self._mistakes.look(lambda: what_fits.what_fits(*frame))
+        said = self._mistakes.look(lambda: what_fits.what_fits(*frame))
         if not said:
             return refusal
         self._notice(Notice.WOULD_FIT, said)

@@ -24,7 +24,6 @@ from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialStatus, Unused
 from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.transforms import TransformError, Transforms
-from rs_localizer.pipeline.compiling import plain_frames
 from rs_localizer.pipeline.refusal import IMU_REASONS, Notify
 from rs_localizer.tracking import Tracker
 
@@ -87,7 +86,6 @@ class ImuInput:
         self._reported: ImuReason | None = None
         self._status: InertialStatus | None = None
         self._given_offset = 0.0
-        self._prepared = False
 
     def add(self, reading: ImuReading) -> None:
         """Take a reading."""
@@ -188,21 +186,10 @@ class ImuInput:
             result = localized(None)
             self._count(config, tracker, samples)
         else:
-            try:
-                self._prepare(tracker, config)
-            except NotCompiled:
-                self._count(config, tracker, Unused(ImuReason.COMPILING))
-                return localized(None)
             result = localized(samples)
             self._count(config, tracker, tracker.inertial.unused)
             self._compare_gravity(config, samples, result)
         return result
-
-    def _prepare(self, tracker: Tracker, config: NodeConfig) -> None:
-        """Have compiled what an IMU takes, when its first readings are there."""
-        if not self._prepared:
-            plain_frames(tracker.localizer, inertial_settings(config))
-            self._prepared = True
 
     def _compare_gravity(
         self, config: NodeConfig, samples: ImuSamples, result: Estimate | Failure

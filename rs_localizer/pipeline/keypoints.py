@@ -54,9 +54,6 @@ class FrameExtractor:
     def __init__(self, config: FeatureConfig) -> None:
         self._extractor = FeatureExtractor(config.features, config.max_keypoints)
 
-    def warm_up(self) -> None:
-        """Nothing is compiled: OpenCV does the work."""
-
     def take(self, message: Any) -> Extracted | Refusal:
         """Look for keypoints in a sensor_msgs/Image or CompressedImage."""
         image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)

@@ -17,7 +17,7 @@ from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.messages import Make
-from rs_localizer.markers.detection import Detections, MarkerDetector, warm_up
+from rs_localizer.markers.detection import Detections, MarkerDetector
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
@@ -88,10 +88,6 @@ class FrameDetector:
         # What is wrong with all images, as a sentence; empty: unknown.
         self.mistake = ""
         self._mistakes = Mistakes()
-
-    def warm_up(self) -> None:
-        """Compile the kernels."""
-        warm_up()
 
     def take(self, message: Any) -> Detected | Refusal:
         """Look for markers in a sensor_msgs/Image or CompressedImage."""

@@ -129,9 +129,6 @@ REASONS: dict[str, Meaning] = {
         "does the stream hang? webcams in the dark repeat images",
     ),
     Reason.LATE_FRAME: Meaning("a newer frame came before", "nothing, if rare; two publishers?"),
-    Reason.COMPILING: Meaning(
-        "kernels are being compiled", "wait minutes; `rs_localizer warm` avoids it"
-    ),
     Reason.NO_TRANSFORM: Meaning(
         "TF has no transform from camera to base_frame",
         "record /tf_static; robot_state_publisher",
@@ -170,10 +167,6 @@ IMU_REASONS: dict[str, Meaning] = {
     ImuReason.DISAGREES: Meaning(
         "the gyroscope's rates are not the camera's",
         "one body? imu.time_offset, the transform of the frame_ids, units",
-    ),
-    ImuReason.COMPILING: Meaning(
-        "kernels for an IMU are being compiled",
-        "wait minutes; `rs_localizer warm` avoids it",
     ),
 }
 """Why an image was localized by the camera alone."""

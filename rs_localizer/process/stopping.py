@@ -20,16 +20,11 @@ _SIGNALLED = 128
 INTERRUPTED = _SIGNALLED + signal.SIGINT
 """Exit code after Ctrl-C."""
 
-# Packages whose Python is called back from C: an exception there is lost, comes out as a
-# SystemError, or leaves machine code half loaded (SIGSEGV, 11 of 147 random signals). An import
-# that breaks off leaves half a module.
-_FRAGILE = ("numba", "llvmlite", "importlib", "_frozen_importlib")
-# So is the module that the constructor of a named tuple believes to be in: machine code calls it
-# for its results (a SystemError, 1 of 194 random signals).
-_NAMED_TUPLE = "namedtuple_"
+# An import that breaks off leaves half a module.
+_FRAGILE = ("importlib", "_frozen_importlib")
 # A child that has been started but not been returned is nobody's: nobody would end it.
 _STARTS = "Popen.__init__"
-# s: how often it is tried to interrupt them; so long compiling may take, of which nothing stays.
+# s: how often it is tried to interrupt them; so long an import may take, of which nothing stays.
 _PERIOD, _PATIENCE = 0.02, 2.0
 # s until an exception that nobody handles counts as lost, as in a finalizer; unwinding takes less.
 _LOST = 0.5
@@ -66,11 +61,10 @@ class StopRequest:
 
     @contextlib.contextmanager
     def at_once(self, code: int | None = 0, text: str = "") -> Iterator[None]:
-        """While importing or compiling: a signal ends the process here and now.
+        """While importing: a signal ends the process here and now.
 
-        Both take long. Compiling cannot be interrupted, and an exception inside an import may be
-        lost or come out as another one. No results exist meanwhile, and the caches on disk are
-        written atomically.
+        An import takes long, and an exception inside it may be lost or come out as another one. No
+        results exist meanwhile.
 
         Args:
             code: exit code; None: :attr:`code`.
@@ -149,7 +143,7 @@ class StopSignals(StopRequest):
 def _is_fragile(frame: FrameType | None) -> bool:
     while frame is not None:
         name = str(frame.f_globals.get("__name__"))
-        if name.partition(".")[0] in _FRAGILE or name.startswith(_NAMED_TUPLE):
+        if name.partition(".")[0] in _FRAGILE:
             return True
         if name == "subprocess" and frame.f_code.co_qualname == _STARTS:
             return True

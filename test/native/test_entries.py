@@ -202,17 +202,17 @@ class Pair(typing.NamedTuple):
 def test_an_annotation_that_says_too_little_is_refused():
     def odd(x: np.ndarray) -> None: ...
 
-    with pytest.raises(TypeError, match="x: .*says too little"):
+    with pytest.raises(TypeError, match=r"x: .*says too little"):
         declared.declaration(odd)
 
     def pair(x: Pair) -> None: ...
 
-    with pytest.raises(TypeError, match="x: .*says too little"):
+    with pytest.raises(TypeError, match=r"x: .*says too little"):
         declared.declaration(pair)
 
     def defaults(x: float = 0.0) -> None: ...
 
-    with pytest.raises(TypeError, match="no defaults|neither defaults"):
+    with pytest.raises(TypeError, match="neither defaults"):
         declared.declaration(defaults)
 
 

@@ -13,8 +13,6 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.config import NodeConfig, PoseTime, VelocityPrior
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.core.simd.jit import NotCompiled, at_once
-from rs_localizer.estimation import motion_window
 from rs_localizer.io.camera_files import lens_parameters
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
@@ -190,24 +188,3 @@ def test_the_lenses_of_a_rig_are_those_of_its_file(tmp_path, make_camera_info):
     for name, camera in cameras.items():
         frames.calibrate(read_camera_info(make_camera_info(width=640, height=480)), name)
         assert tuple(camera.K.ravel()) == frames.calibrations[name].K
-
-
-def test_while_what_joins_frames_is_compiled_each_stands_alone(make_camera_info, monkeypatch):
-    """Its pose and its covariance are those of a tracker's first frame."""
-    simulation = simulated()[:3]
-    alone = FrameLocalizer(NodeConfig(readout_time=READOUT_TIME))
-    compiling = FrameLocalizer(NodeConfig(readout_time=READOUT_TIME))
-
-    def is_compiled_later(*_: Any) -> None:
-        raise NotCompiled("_steady")
-
-    monkeypatch.setattr(motion_window.MotionWindow, "joined", is_compiled_later)
-    for frame in simulation:
-        alone.reset()
-        results = []
-        for frames in (alone, compiling):
-            frames.calibrate(read_camera_info(make_camera_info()))
-            with at_once():
-                results.append(localized(frames.localize(message_of(frame))).estimate)
-        for name in ("rotation", "translation", "covariance"):
-            np.testing.assert_array_equal(*(getattr(result, name) for result in results))

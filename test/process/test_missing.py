@@ -16,7 +16,7 @@ COMMAND = "import sys; from rs_localizer.__main__ import run; sys.exit(run())"
 NODE = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
 DETECTOR = "import sys; from rs_localizer.ros.main import marker_detector as m; sys.exit(m())"
 # Nobody waits for what only commands need.
-NOT_FOR_NODES = ("rosbags", "matplotlib", "PIL", "tqdm")
+NOT_FOR_NODES = ("rosbags", "matplotlib", "scipy", "PIL", "tqdm")
 
 
 def without(tmp_path: Path, *names: str) -> dict[str, str]:
@@ -41,7 +41,11 @@ def run(code: str, environment: dict[str, str], *words: str) -> subprocess.Compl
 @pytest.mark.parametrize(
     ("name", "words", "advice"),
     [
-        ("scipy", ("detect", "video.mp4"), "sudo apt install python3-scipy, or pip install scipy"),
+        (
+            "scipy",
+            ("calibrate", "video.mp4"),
+            "sudo apt install python3-scipy, or pip install scipy",
+        ),
         ("rosbags", ("evaluate", "a", "b"), f'pip install "rosbags{BOUNDS["rosbags"]}"; '),
         ("rosbags", ("evaluate", "a", "b"), BESIDE_ROS),
     ],
@@ -62,7 +66,7 @@ PACKAGE = "the Python package {} is not installed: sudo apt install "
 @pytest.mark.parametrize(
     ("name", "code", "said"),
     [
-        ("scipy", NODE, f"localizer: {PACKAGE}"),
+        ("numpy", NODE, f"localizer: {PACKAGE}"),
         ("yaml", DETECTOR, f"marker_detector: {PACKAGE}"),
         ("rclpy", NODE, "localizer: No module named '{}'; source a ROS 2 workspace"),
     ],

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-# What is interrupted in the middle of code that Numba calls, or in a finalizer.
+# What is interrupted in the middle of an import, or in a finalizer.
 PROGRAM = """
 import os, signal, sys, time
 sys.path.insert(0, {folder!r})
@@ -53,22 +53,19 @@ with StopSignals():
 
 
 @pytest.mark.parametrize(
-    ("body", "number"), [("import numba.fake", signal.SIGINT), ("Finalized()", signal.SIGHUP)]
+    ("body", "number"), [("import slow", signal.SIGINT), ("Finalized()", signal.SIGHUP)]
 )
 def test_no_interrupt_is_lost(tmp_path, number, body):
-    """Nor raised where code from C would lose it, or be left half done."""
+    """Nor raised where it would be lost, or leave half a module."""
     folder = f"{tmp_path}"
-    package = tmp_path / "numba"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    (package / "fake.py").write_text(
+    (tmp_path / "slow.py").write_text(
         f"import os, time\nos.kill(os.getpid(), {number:d})\ntime.sleep(0.1)\nprint('whole')\n"
     )
     program = PROGRAM.format(folder=folder, number=int(number), body=body)
     ended = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False
     )
-    expected = ["whole", "interrupted"] if "numba" in body else ["interrupted"]
+    expected = ["whole", "interrupted"] if "slow" in body else ["interrupted"]
     assert ended.stdout.split() == expected
     assert (ended.returncode, ended.stderr) == (0, "")
 
@@ -90,21 +87,21 @@ with StopRequest() as stop:
     assert said.stdout == f"{heard}\n"
 
 
-# Compiles until it is ended, or for longer than a signal is patient.
+# Imports until it is ended, or for longer than a signal is patient.
 LONG = "import os, time\nos.kill(os.getpid(), 15)\ntime.sleep(9999)\n"
 SHORT = "import time\ntime.sleep(1)\n"
-CLEAN_UP = "try: os.kill(os.getpid(), 15); time.sleep(9)\n        finally: import numba"
+CLEAN_UP = "try: os.kill(os.getpid(), 15); time.sleep(9)\n        finally: import slow"
 
 
 @pytest.mark.parametrize(
-    ("compiler", "body", "ended"),
+    ("module", "body", "ended"),
     [
-        (LONG, "import numba", (143, "", "interrupted\n")),
+        (LONG, "import slow", (143, "", "interrupted\n")),
         (SHORT, CLEAN_UP, (0, "interrupted\n", "")),
     ],
 )
-def test_who_compiles_for_long_is_ended_unless_to_clean_up(tmp_path, compiler, body, ended):
-    (tmp_path / "numba.py").write_text(compiler)
+def test_who_imports_for_long_is_ended_unless_to_clean_up(tmp_path, module, body, ended):
+    (tmp_path / "slow.py").write_text(module)
     program = PROGRAM.format(folder=f"{tmp_path}", number=15, body=body)
     program = program.replace(
         "class", "StopSignals._interrupt.__globals__['_PATIENCE'] = 0.1\nclass"

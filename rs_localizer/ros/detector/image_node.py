@@ -123,13 +123,6 @@ class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
 
     # -- as every managed node ---------------------------------------------------------------
 
-    def kernels(self) -> Callable[[], None]:
-        try:
-            warm_up: Callable[[], None] = self.make_finder(self.config).warm_up
-            return warm_up
-        except ValueError:  # of which on_configure tells, at once
-            return lambda: None
-
     def check(self, config: Settings) -> None:
         self.make_finder(config)
 

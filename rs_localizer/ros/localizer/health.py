@@ -118,7 +118,6 @@ class Condition:
     """The node's knowledge of itself."""
 
     life_cycle: str  # label of the state
-    changing: bool  # new settings compile kernels
     missing: Sequence[str]  # inputs without which no frame can be localized
     silence: Mapping[str, Silence]  # by input topic
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
@@ -150,9 +149,9 @@ def _of_frames(silence: Mapping[str, Silence]) -> list[Silence]:
 def diagnose(condition: Condition, summary: Summary) -> Health:
     """Judge the node.
 
-    The states are ``inactive``, ``compiling``, ``waiting for`` what is missing or for frames,
-    ``busy``, ``lost``, ``localized`` (by a search) and ``tracking``. What is odd is a warning where
-    nothing worse is to be said.
+    The states are ``inactive``, ``waiting for`` what is missing or for frames, ``busy``, ``lost``,
+    ``localized`` (by a search) and ``tracking``. What is odd is a warning where nothing worse is to
+    be said.
     """
     return _judge(condition, summary).with_values(_values(condition, summary))
 
@@ -160,9 +159,6 @@ def diagnose(condition: Condition, summary: Summary) -> Health:
 def _judge(condition: Condition, summary: Summary) -> Health:
     if (idle := out_of_service(condition.life_cycle)) is not None:
         return idle
-    if condition.changing:
-        message = "the kernels for the new settings are being compiled"
-        return Health(Level.WARN, State.COMPILING, message)
     if summary.busy is not None and summary.busy > _LONG_WORK:
         message = f"a frame has been worked on for {summary.busy:.1f} s"
         return Health(Level.WARN, State.BUSY, message)

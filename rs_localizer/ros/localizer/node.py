@@ -5,7 +5,6 @@
 import contextlib
 import functools
 import math
-import time
 from collections.abc import Callable, Collection
 from typing import Any
 
@@ -22,7 +21,6 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
 from rs_localizer.io.topics import CAMERA_MARKER, GIVEN_POSES, INLIERS, INTEGRITY, LIVE
-from rs_localizer.pipeline.compiling import compile_rest, give_back_compiler
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.given_pose import read_given_pose
 from rs_localizer.pipeline.inputs import Input, Results, Role, inputs_of
@@ -51,7 +49,7 @@ from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import WINDOW
 from rs_localizer.ros.node.subscriptions import FAST_DATA, LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.views import MapView, camera_marker
-from rs_localizer.ros.node.worker import Need, Worker, in_thread
+from rs_localizer.ros.node.worker import Need, Worker
 from rs_localizer.settings import NODE_NAME
 
 
@@ -79,7 +77,6 @@ class Feed:
         self._refusals = refusals
         self._say = say
         self._needs_tf: Callable[[], None] | None = needs_tf
-        self._wanted: NodeConfig | None = None  # settings whose kernels are being loaded
 
     def topics(self, config: NodeConfig) -> dict[str, Topic]:
         """The inputs of these settings; what changes the state comes before the frames."""
@@ -100,27 +97,9 @@ class Feed:
             }
         return found
 
-    @property
-    def changing(self) -> bool:
-        """True while kernels of new settings are being loaded or compiled."""
-        return self._wanted is not None
-
     def take_config(self, config: NodeConfig) -> None:
-        """Use these settings as soon as their kernels are there; frames have the old ones before.
-
-        Of several changes that wait the last one counts.
-        """
-        waits, self._wanted = self.changing, config
-        if not waits:
-            in_thread(self._prepare)
-
-    def _prepare(self) -> None:
-        while (config := self._wanted) is not None:
-            load_kernels(FrameLocalizer(config))
-            if self._wanted is config:
-                self._wanted = None
-                # Bound now: the worker may come to it after this loop has ended with None.
-                self._worker.update("settings", functools.partial(self._change, config=config))
+        """Use these settings from the next frame on."""
+        self._worker.update("settings", lambda frames: self._change(frames, config))
 
     def reset(self) -> None:
         """Forget the previous frames."""
@@ -210,14 +189,6 @@ def described(landmarks: Map) -> str:
     return f"the map has {len(landmarks)} landmarks in frame {landmarks.frame!r}"
 
 
-def load_kernels(frames: FrameLocalizer) -> float:
-    """Load what a plain frame needs, compiled where it has to be; how many seconds it took."""
-    started = time.monotonic()
-    frames.warm_up(patient=False)
-    give_back_compiler()
-    return time.monotonic() - started
-
-
 class Outputs:
     """Publishes frames on the topics of :data:`rs_localizer.io.outputs.TYPES`.
 
@@ -270,17 +241,6 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized]):
         # Triggered by the inputs' thread: subscriptions are the executor's.
         self._imu_came = self.create_guard_condition(lambda: self._broadcaster.tf.listen("the IMU"))
 
-    def kernels(self) -> Callable[[], None]:
-        frames = FrameLocalizer(self.config)
-
-        def load() -> None:
-            with contextlib.suppress(ValueError):  # of which on_configure tells, at once
-                frames.load_files()
-                seconds = load_kernels(frames)
-                self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
-
-        return load
-
     def check(self, config: NodeConfig) -> None:
         FrameLocalizer(config)
         tf.check(config)
@@ -325,11 +285,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized]):
             now_ns = self.get_clock().now().nanoseconds
             if now_ns == newest_ns or self._ticks is None:  # a simulated clock rests
                 return
-            try:
-                with at_once():
-                    frame = frames.at(now_ns)
-            except NotCompiled:
-                return
+            frame = frames.at(now_ns)
             if not frame:
                 return
             newest_ns = now_ns
@@ -338,10 +294,6 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized]):
                 self._broadcaster.publish(frame, frames.config)
 
         self._publish_now = publish_now
-        if compile_rest(config.solver):
-            self.get_logger().info(
-                "compiling what few frames need, beside them; they are refused meanwhile: compiling"
-            )
         self._localizer = frames
         worker = self.employ(frames, publish_all)
         say, needs_tf = self.get_logger().info, self._imu_came.trigger
@@ -406,7 +358,6 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized]):
         }
         condition = Condition(
             life_cycle=self.state,
-            changing=self._feed is not None and self._feed.changing,
             missing=missing,
             silence=of_interest(inputs, missing),
             oddities=oddities,

@@ -20,8 +20,6 @@ SOME = 0.05
 class State(StrEnum):
     """THE list of states of nodes; docs/reasons.md says what each means and what to do."""
 
-    COMPILING = "compiling"
-    LOADING = "loading"
     INACTIVE = "inactive"
     WAITING = "waiting for"  # what, is the subject
     # Of the localizer.
@@ -36,12 +34,6 @@ class State(StrEnum):
 
 # What a node that is not active needs, by the label of its state.
 _STEPS = {"unconfigured": "configure and activate it", "finalized": "start it again"}
-
-_PREPARING = {
-    "configuring": (State.LOADING, "loaded"),
-    "compiling": (State.COMPILING, "compiled"),
-    "loading": (State.LOADING, "loaded"),
-}
 
 
 class Level(IntEnum):
@@ -70,9 +62,6 @@ class Health:
 
 def out_of_service(life_cycle: str) -> Health | None:
     """Diagnosis of a node that is not active, by the label of its state; None if it is."""
-    if life_cycle in _PREPARING:
-        state, what = _PREPARING[life_cycle]
-        return Health(Level.WARN, state, f"the node is being configured: kernels are {what}")
     if life_cycle == "active":
         return None
     # Somebody wants it so: no fault, which an aggregator would make of STALE.

@@ -19,48 +19,28 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
 import rclpy
-from lifecycle_msgs.msg import State as Label
-from lifecycle_msgs.msg import Transition
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
-from rclpy.task import Future
 
-from rs_localizer.core.simd import compiler
 from rs_localizer.process.stopping import StopRequest
 from rs_localizer.ros.node import parameters
 from rs_localizer.ros.node.diagnostics import Diagnostics, Health
 from rs_localizer.ros.node.refusals import Refusals, describe
 from rs_localizer.ros.node.statistics import Statistics, Told
 from rs_localizer.ros.node.subscriptions import Inputs, Silence, Topic
-from rs_localizer.ros.node.worker import State, Worker, in_thread, wait_for_workers
+from rs_localizer.ros.node.worker import State, Worker, wait_for_workers
 from rs_localizer.settings import Config
 
 _ON_CHANGE_STATE = "_LifecycleNodeMixin__on_change_state"
-
-
-def _failure(function: Callable[[], None]) -> str:
-    try:
-        function()
-    except Exception:
-        return traceback.format_exc()
-    return ""
-
-
-# Kernels between two lines of the log that say how far the compiler is.
-_TOLD = 10
 Result = TypeVar("Result")
 
 
 class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
     """Only while active it takes and publishes messages.
 
-    A node says what it does by overriding :meth:`kernels`, :meth:`check`, :meth:`open`,
-    :meth:`close`, :meth:`begin`, :meth:`end`, :meth:`change` and :meth:`examine`.
-
-    Before it is configured, a thread loads what it needs (see :meth:`prepare`), which is compiled
-    at the first start on a machine; services and diagnostics answer meanwhile.
+    A node says what it does by overriding :meth:`check`, :meth:`open`, :meth:`close`,
+    :meth:`begin`, :meth:`end`, :meth:`change` and :meth:`examine`.
 
     Args:
         name: of the node.
@@ -84,13 +64,6 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
         **options: Any,
     ) -> None:
         super().__init__(name, **options)
-        self._prepared: Future | None = None
-        self.compiled = 0  # kernels that were not in the cache
-        # A request to configure waits; others shall not wait for it.
-        group = ReentrantCallbackGroup()
-        for service in self.services:
-            service.callback_group = group
-            group.add_entity(service)
         self._kind: type[Config] = kind
         # From configuring to cleaning up.
         self.worker: Worker[State, Result] | None = None
@@ -118,10 +91,6 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
         )
 
     # -- what a node does --------------------------------------------------------------------
-
-    def kernels(self) -> Callable[[], None]:
-        """A function that calls the kernels of the present settings, for another thread."""
-        raise NotImplementedError
 
     def check(self, config: Config) -> None:
         """Raise ``ValueError`` for settings that cannot be used."""
@@ -194,55 +163,16 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
 
     @property
     def state(self) -> str:
-        """Label of the present state; ``compiling`` or ``loading`` while kernels are prepared."""
+        """Label of the present state."""
         label: str = self._state_machine.current_state[1]
-        if self._prepared is not None and not self._prepared.done() and label == "unconfigured":
-            return "compiling" if self.compiled else "loading"
         return label
-
-    def prepare(self) -> Future:
-        """Load kernels in a thread, and compile those that lack; the result is what failed."""
-        if self._prepared is None or self._prepared.done():
-            self._prepared = prepared = Future()
-            load = self.kernels()
-            self.get_logger().info("loading kernels")
-            in_thread(lambda: prepared.set_result(_failure(functools.partial(self._load, load))))
-        return self._prepared
-
-    def _load(self, load: Callable[[], None]) -> None:
-        with compiler.told(self._compiling):
-            load()
-
-    def _compiling(self, count: int, _: str) -> None:
-        if self.compiled == 0:
-            self.get_logger().info("compiling kernels (once on this machine, a minute of a core)")
-        elif count % _TOLD == 0:
-            self.get_logger().info(f"compiling kernels: {count} so far")
-        self.compiled = count
-
-    def configure(self, failure: str) -> bool:
-        """Configure after :meth:`prepare`, if nobody else has; whether that worked."""
-        if failure:
-            self.get_logger().error(f"not configured:\n{failure}")
-            return False
-        if self._unconfigured():
-            self.trigger_configure()
-        return not self._unconfigured()
-
-    def _unconfigured(self) -> bool:
-        return bool(self._state_machine.current_state[0] == Label.PRIMARY_STATE_UNCONFIGURED)
 
     # rclpy (7.x, Jazzy) lets the error of a transition that the present state does not have out of
     # the service's callback: the client waits for ever and the executor stops. This is the name,
     # private to its class, under which it registers the callback; where there is none of this name
     # the override does nothing, and the node's loop still survives the error.
-    async def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
+    def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
         wanted = request.transition.label or request.transition.id
-        if wanted in ("configure", Transition.TRANSITION_CONFIGURE) and self._unconfigured():
-            failure = await self.prepare()
-            if failure:
-                response.success = self.configure(failure)
-                return response
         try:
             return getattr(super(), _ON_CHANGE_STATE)(request, response)
         except RuntimeError:  # RCLError; what callbacks raise does not come here
@@ -378,18 +308,15 @@ def _start(node: Any, stop: StopRequest) -> int:
     if stop.requested:
         return 0
     if node.autostart:
-        prepared = node.prepare()
-        spin(node, lambda: stop.requested or prepared.done())
+        if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
+            return 1
         if stop.requested:
             return 0
-        if not node.configure(prepared.result()):
-            return 1
-    # What has been compiled stays; to look through it for garbage takes some tenths of a second,
+    # What has been imported stays; to look through it for garbage takes some tenths of a second,
     # and must not come between frames.
     gc.collect()
     gc.freeze()
-    waits = node.autostart and node.state == "inactive"  # a client may have been faster
-    if waits and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
+    if node.autostart and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
         return 1
     # Other threads than the worker have little to do and give the GIL back soon.
     sys.setswitchinterval(_SWITCH_INTERVAL)

@@ -95,7 +95,7 @@ class Worker(Generic[State, Result]):
         self._late: deque[_Late[State, Result]] = deque()
         # Held while publishing: after pause() nothing comes any more.
         self._publishing = threading.Lock()
-        in_thread(self._run)
+        threading.Thread(target=self._run, name=_NAME, daemon=True).start()
 
     def update(self, kind: str, update: Update[State]) -> None:
         """Have this done before the next frame, after all updates of other kinds so far.
@@ -225,12 +225,9 @@ class Worker(Generic[State, Result]):
             self._finish(item.arrival, result)
 
     def _attempt(self, function: Callable[[], Any]) -> Any:
-        """The function's value; if it fails, or waits for a compiler, a refusal."""
+        """The function's value, or a refusal where it fails."""
         try:
-            with at_once():
-                return function()
-        except NotCompiled as missing:
-            return Refusal(Reason.COMPILING, f"{missing} is being compiled")
+            return function()
         except Exception as error:  # of one message: the others go on
             return Refusal(Reason.INTERNAL_ERROR, describe(error))
 
@@ -251,13 +248,8 @@ class Worker(Generic[State, Result]):
             self._statistics.answered(result, arrival.received)
 
 
-def in_thread(function: Callable[[], None]) -> None:
-    """Run what may take minutes, which must not keep the process alive."""
-    threading.Thread(target=function, name=_NAME, daemon=True).start()
-
-
 def wait_for_workers(seconds: float) -> bool:
-    """Wait for the end of all threads of :func:`in_thread`; whether it came in time."""
+    """Wait for the end of the threads of all workers; whether it came in time."""
     deadline = time.monotonic() + seconds
     threads = [thread for thread in threading.enumerate() if thread.name == _NAME]
     for thread in threads:

@@ -51,7 +51,7 @@ def test_quick_demo(tmp_path):
     assert "has answered 12 of 12 frames, 12 as above to the last bit" in demo.stdout
     # What it takes is said before, and what to do with an own camera at the end.
     first, *_, last = demo.stdout.strip().splitlines()
-    assert re.match(r"about \d+ min at the first time .* of memory, .* of disk", first)
+    assert re.match(r"about \d+ min; .* of memory, .* in .*out", first)
     assert "localizer --ros-args" in last
 
 

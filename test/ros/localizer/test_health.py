@@ -23,7 +23,7 @@ from rs_localizer.ros.node.subscriptions import Silence
 
 COMES = Silence("/camera_info", 0.1, heard=True, cause="", mismatch=False)
 FRAMES = replace(COMES, topic="/correspondences")
-GOOD = Condition("active", False, (), {"camera_info": COMES, "correspondences": FRAMES})
+GOOD = Condition("active", (), {"camera_info": COMES, "correspondences": FRAMES})
 
 
 def frame(stamp: float = 0.0, tracked: bool = False, rig: bool = False) -> Any:
@@ -151,7 +151,6 @@ NOBODY = silent("/camera_info", "it has no publisher")
     ("change", "level", "state", "message"),
     [
         ({"life_cycle": "inactive"}, Level.OK, "inactive", "the node is inactive: activate it"),
-        ({"life_cycle": "compiling"}, Level.WARN, "compiling", "the node is being configured: ker"),
         # Frames come, so that the other one is what is wrong.
         (
             {"missing": ("camera_info",), "silence": {"camera_info": NOBODY, "keypoints": FRAMES}},

@@ -58,7 +58,7 @@ def test_node_and_replay_say_the_same_to_the_last_byte(recording, tmp_path, star
     )
     service = "/rs_localizer/set_parameters_atomically"
     assert peer.call(SetParametersAtomically, service, request).result.successful
-    # A setting is answered before frames have it: its kernels are loaded first.
+    # A setting is answered before frames have it: the worker takes it between two frames.
     assert peer.spin_until(lambda: twists_of_one_more() == 0)  # p3p knows none
     assert robot.set("solver", "r6p_vcwt") == robot.set("readout_time", 0.0) == (True, "")
     assert peer.spin_until(lambda: twists_of_one_more() == 0)
