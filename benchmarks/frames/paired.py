@@ -23,12 +23,11 @@ from typing import TypeVar
 
 import numpy as np
 
-import rs_localizer as rsl
 from benchmarks.experiments.results import Table
 from benchmarks.frames import paired_set
 from benchmarks.frames.compared import read, totals, write
 from benchmarks.frames.conditions import BENCHES
-from benchmarks.frames.judged import Judged, camera_of, far_off
+from benchmarks.frames.judged import Judged, far_off
 from benchmarks.frames.paired_set import OTHERS, SPOILT
 from benchmarks.frames.switches import SWITCHES, switched_off
 
@@ -94,7 +93,6 @@ def measured(options: argparse.Namespace, *lacking: tuple[str, ...]) -> list[Res
     """The version that Python finds, without some parts each; condition by condition in turns, so
     that times are of the same minute.
     """
-    rsl.Localizer(camera_of(next(paired_set.benches()), 0)).warm_up()
     judged = _in_turns(lambda: paired_set.judged(options.seed, options.only), lacking)
     real, only = [dict[str, float]() for _ in lacking], options.only or _REAL
     if "boards" in only:

@@ -15,6 +15,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from rs_localizer.estimation.calibration import NO_EFFECT
+from rs_localizer.estimation.correlated import nothing_shared
 from rs_localizer.estimation.left_out import LeftOut
 
 _TINY = -20.0  # logarithm of a size, px
@@ -47,9 +48,9 @@ _REFUSAL = "rs_localizer.localizer:refusal"
 SWITCHES: dict[str, tuple[Switch, ...]] = {
     # Blocks of the model.
     "smooth-error": (
-        Switch(f"{_FRAME}:_size_of", _always((0.0, 0.0))),
-        Switch(f"{_FRAME}:fit_turn", lambda old: lambda *args: old(
-            *args[:9], _TINY, _TINY, *args[11:])),
+        Switch(f"{_FRAME}:smooth_error",
+               lambda old: lambda lines, inliers, *_: nothing_shared(int(inliers.sum()))),
+        Switch(f"{_FRAME}:fit_turn", lambda old: lambda *args: old(*args[:8], _TINY, *args[9:])),
     ),
     "in-frame-turn": (
         Switch(f"{_FRAME}:_with_turn",
@@ -57,7 +58,7 @@ SWITCHES: dict[str, tuple[Switch, ...]] = {
     ),
     "calibration-effect": (
         Switch("rs_localizer.localizer:calibration_effect", lambda old: lambda *args: old(
-            *args)._replace(covariance=NO_EFFECT.covariance, shifts=NO_EFFECT.shifts)),
+            *args)._replace(covariance=NO_EFFECT.covariance)),
     ),
     # Hypotheses.
     "typical-speeds": (

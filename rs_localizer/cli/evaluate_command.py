@@ -33,7 +33,8 @@ class Options:
     )  # fmt: skip
     offset: float = option("add this to the times of EST, s", "S", 0.0)
     ate: bool = option(
-        "also ATE and RPE after alignment, by evo (pip install 'rs_localizer[evo]')", default=False
+        "also ATE and RPE after alignment, by evo (pip install 'rs_localizer[evaluate]')",
+        default=False,
     )
     plot: Path | None = option("draw the errors over time", "FILE.png")
 

@@ -139,7 +139,7 @@ def by_evo(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
         from evo.core import metrics, trajectory
         from evo.core.geometry import GeometryException
     except ImportError as error:
-        raise ValueError("--ate needs evo: pip install 'rs_localizer[evo]'") from error
+        raise ValueError("--ate needs evo: pip install 'rs_localizer[evaluate]'") from error
     rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns)
     true, estimated = (
         trajectory.PoseTrajectory3D(
