@@ -20,8 +20,10 @@ def main() -> None:
             path = Path(folder) / storage
             with BagWriter(path, storage) as bag:
                 bag.write("/a", make_message("std_msgs/msg/String", data="b"), 1)
-            with open_bag(path) as bag:
-                assert [message.data for _, _, message in bag.messages(["/a"])] == ["b"]
+            (lone,) = (file for file in path.iterdir() if file.suffix != ".yaml")
+            for place in (path, lone):
+                with open_bag(place) as bag:
+                    assert [message.data for _, _, message in bag.messages(["/a"])] == ["b"]
     assert abs(so3.exp(np.array([0.0, 0.0, np.pi / 2]))[1, 0] - 1.0) < 1e-12
     names = ("numpy", "opencv-python-headless", "rosbags")
     print("  " + ", ".join(f"{name} {version(name)}" for name in names))

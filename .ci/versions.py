@@ -25,11 +25,9 @@ def requirements() -> list[str]:
 
 def main() -> None:
     asked = requirements()
-    if sys.argv[1] == "newest":
-        print(*asked)
-        return
-    bounds = [match for line in asked if (match := re.match(r"([\w-]+)>=([\d.]+)", line))]
-    print(*(f"{bound[1]}=={bound[2]}.*" for bound in bounds))
+    if sys.argv[1] == "lowest":  # "4.6" is 4.6.0 and what is built of it, as 4.6.0.66
+        asked = [re.sub(r">=([\d.]+).*", r"==\1.0.*", line) for line in asked]
+    print(*asked)
 
 
 if __name__ == "__main__":

@@ -187,12 +187,11 @@ def test_bounds_are_the_same_everywhere(setup_says):
 def test_the_lowest_set_is_within_the_bounds(setup_says):
     command = [sys.executable, str(ROOT / ".ci" / "versions.py"), "lowest"]
     done = subprocess.run(command, cwd=ROOT, text=True, capture_output=True, check=True)
-    lowest = dict(line.split("==") for line in done.stdout.split())
-    asked = [line for line in setup_says(ROOT)["install_requires"] if ">=" in line]
-    assert len(lowest) == len(asked)
-    for line in asked:
-        name, version = re.match(r"([\w-]+)>=([\d.]+)", line).groups()
-        assert lowest[name].removesuffix(".*") == version
+    lowest, asked = done.stdout.split(), setup_says(ROOT)["install_requires"]
+    assert [line.replace("==", ">=").removesuffix(".0.*") for line in lowest] == [
+        line.partition(",")[0] for line in asked
+    ]
+    assert sum("==" in line for line in lowest) == sum(">=" in line for line in asked) >= 4
 
 
 def test_conda_brings_what_pip_brings(setup_says):

@@ -16,7 +16,7 @@ RUN apt-get update \
     && rosdep install --from-paths src --ignore-src --default-yes --dependency-types=exec \
     && if [ "${ROS_DISTRO}" = jazzy ]; then \
         apt-get install --yes --no-install-recommends python3-pip \
-        && pip install --no-cache-dir --break-system-packages "numba>=0.63,<0.69" "rosbags>=0.10.9,<0.12" "numpy<2"; \
+        && pip install --no-cache-dir --break-system-packages "numba>=0.63,<0.69" "rosbags>=0.11,<0.12" "numpy<2"; \
     else \
         apt-get install --yes --no-install-recommends python3-rosbags; \
     fi \

@@ -12,7 +12,7 @@ _UBUNTU = {
     "tqdm": "python3-tqdm",
     "yaml": "python3-yaml",
 }
-BOUNDS = {"numba": ">=0.63,<0.69", "rosbags": ">=0.10.9,<0.12"}
+BOUNDS = {"numba": ">=0.63,<0.69", "rosbags": ">=0.11,<0.12"}
 """Versions of what has private or moving parts in use: the lowest that work, and the newest tried.
 
 setup.py reads them here; tests hold the pages against them.
