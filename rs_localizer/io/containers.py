@@ -133,7 +133,7 @@ def _check_mcap(path: Path, name: str) -> None:
         if profile != "ros2":
             raise ValueError(f"{name} has the profile {profile!r}; record or convert it as ROS 2")
         packed, unpacked = _most_at_a_time(_chunks(file))
-    if unpacked > most_unpacked(packed, most=2**63):
+    if unpacked > most_unpacked(packed):
         raise ValueError(
             f"{name}: chunks of one time are {unpacked / 1e6:.0f} MB, packed {packed / 1e6:.1f} MB"
         )

@@ -19,9 +19,10 @@ import rosbags.rosbag2.reader
 import rosbags.rosbag2.storage_mcap
 import rosbags.rosbag2.storage_sqlite3
 
-# Rendered images without noise, the best packed of all that anybody records, come to 40 times;
-# a single small message may be all alike. Nobody records messages of more than a gigabyte.
-_BEST, _ALIKE, _MOST = 50, 2**24, 2**30
+# Rendered images without noise, the best packed of all that anybody records, come to 40 times, and
+# a single small message may be all alike. What is large is measured, and comes to 4 times.
+_BEST, _ALIKE = 50, 2**24
+_MEASURED, _LARGE = 8, 2**27
 # Of whole files, which go to the disk.
 _FILE_ALIKE = 2**28
 _STEP = 2**20
@@ -34,9 +35,9 @@ class UnpackingError(ValueError):
     """What is packed is more than anybody records, or damaged."""
 
 
-def most_unpacked(packed: int, alike: int = _ALIKE, most: int = _MOST) -> int:
-    """Bytes that so many packed bytes may become."""
-    return min(_BEST * packed + alike, most)
+def most_unpacked(packed: int) -> int:
+    """Bytes that so many packed bytes of a message or a text may become."""
+    return min(_BEST * packed + _ALIKE, max(_LARGE, _MEASURED * packed))
 
 
 def _read(file: IO[bytes], packed: int) -> bytes:
@@ -77,11 +78,11 @@ def _unpack_bz2(data: bytes) -> bytes:
 def unpack_file(packed: Path, out: Path) -> None:
     """Write what a file of Zstandard holds."""
     size = packed.stat().st_size
-    most = written = most_unpacked(size, _FILE_ALIKE, 2**63)
+    most = left = _BEST * size + _FILE_ALIKE
     with packed.open("rb") as data, _zstd().open(data, "rb") as file, out.open("wb") as target:
         while part := file.read(_STEP):
-            written -= len(part)
-            if written < 0:
+            left -= len(part)
+            if left < 0:
                 raise _too_large(size, most)
             target.write(part)
 
