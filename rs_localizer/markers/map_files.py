@@ -105,8 +105,6 @@ def _marker(entry: _Entry) -> Marker:
     with entry.named():
         known = [entry.take(f"{of}_deviation", list, None) for of in ("position", "rotation")]
         deviations = None if known == [None, None] else finite(known, (2, 3), "deviations").ravel()
-        if deviations is not None and deviations.min() < 0.0:
-            raise ValueError(f"deviations must be 0 or more, found {deviations.tolist()}")
         corners = entry.take("corners", list, None)
         size = entry.take("size", _NUMBER, *(() if corners is None else (None,)))
         if corners is None:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import make_message
-from rs_localizer.io.messages import make_header, make_quaternion, make_vector
+from rs_localizer.io.messages import MessageError, make_header, make_quaternion, make_vector
 from rs_localizer.io.transforms import Transform, TransformTree, make_transform
 from rs_localizer.pipeline.given_pose import PosePrior, read_given_pose
 
@@ -101,3 +101,16 @@ def test_a_click_counts_once_and_a_filter_again_and_again(body, lasts):
     assert notices[0].startswith(
         "prior_refused: the points disagree with the given pose, by 5.00 m"
     )
+
+
+@pytest.mark.parametrize(
+    ("variance", "fault"),
+    [
+        (np.nan, "numbers that are not finite"),
+        (np.inf, "numbers that are not finite"),
+        (-0.25, r"variances below zero: \[0.25, -0.25, "),
+    ],
+)
+def test_covariances_that_are_none_are_named(variance, fault):
+    with pytest.raises(MessageError, match=fault):
+        read_given_pose(given(variances=(0.25, variance, 0, 0, 0, 0.0685)))
