@@ -250,3 +250,14 @@ def test_what_users_mistake_is_named():
 def test_wrong_arrays_are_refused_with_what_was_found(arguments, said):
     with pytest.raises(ValueError, match=said):
         rsl.Localizer(camera()).localize(*arguments)
+
+
+def test_points_that_a_map_of_known_deviation_has_elsewhere_are_inliers():
+    """The map's deviation, as it is seen from here, widens the gate."""
+    cam, deviation, rng = camera(), 0.02, np.random.default_rng(5)
+    points, pixels, _ = frame(cam, Path(), count=120, noise=0.3, depth=(2.5, 4.0))
+    localizer = rsl.Localizer(cam, rsl.LocalizerConfig(map_deviation=deviation))
+    result = localizer.localize(points + deviation * rng.normal(size=points.shape), pixels)
+    assert result
+    # 3.7 px of each coordinate: a gate of 3 px, or of twice that, would keep a half of them.
+    assert result.inliers.mean() > 0.95

@@ -70,6 +70,14 @@ def test_windows_say_what_one_piece_says(
         assert squared < 0.5**2
 
 
+def test_the_last_frame_is_smoothed_though_its_stamp_is_beyond_all(recorded: Recorded) -> None:
+    """As in a rig whose first camera has lost its last image."""
+    localizer, frames, stamps = recorded
+    parts = smooth_frames(localizer, frames, [ns for ns in stamps if ns < stamps[-1]], None)
+    found = [frame.input_stamp_ns for part in parts for frame in part.frames]
+    assert found[-1] == frames[-1].input_stamp_ns == stamps[-1]
+
+
 def test_frames_of_a_vibrating_camera_keep_their_own_poses(tmp_path: Path) -> None:
     """0.3 deg at 60 Hz: knots follow none of it, and would ruin all poses, sure of them."""
     path = tmp_path / "shaken"

@@ -87,3 +87,14 @@ def test_a_map_in_millimetres_is_named(unit, speed, noise, told, to_and_fro):
             "by a factor of 0.001 (map align --scale), these are "
             f"{1e-3 * speeds[-1]:.2g} m/s and 2 m"
         )
+
+
+
+
+def test_what_happened_while_nothing_was_seen_is_no_speed():
+    """A robot that was carried elsewhere, or a map that was exchanged."""
+    heard, covariance = Heard(), np.diag(np.full(12, 1e-4))
+    for i in range(6):
+        estimate: Any = SimpleNamespace(position=np.full(3, 1e3 * i), covariance=covariance)
+        heard.stream.pace(round(0.6 * i * SECOND), estimate, 2.0, NodeConfig())
+    assert heard.notices == []
