@@ -80,10 +80,11 @@ class World(Robot):
         message = PointCloud2(
             **{name: getattr(good, name) for name in good.get_fields_and_field_types()}
         )
-        if table is not None:
-            message.width, message.row_step = len(table), table.nbytes
-            message.data = array.array("B", table.tobytes())
         self.stamp += SECOND // 30
+        if table is None:  # in another order: the same image again would be a stream that hangs
+            table = np.roll(self.table(), self.stamp // (SECOND // 30))
+        message.width, message.row_step = len(table), table.nbytes
+        message.data = array.array("B", table.tobytes())
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.stamp, SECOND)
         return message
 
