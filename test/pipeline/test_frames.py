@@ -108,6 +108,24 @@ def test_without_a_readout_time_there_is_a_pose_but_no_twist(make_camera_info, p
     np.testing.assert_allclose(frame.pose.position, seen.first_row.positions[0], atol=1e-6)
 
 
+@pytest.mark.parametrize(("bend", "told"), [(0.0, set()), (4.0, {"lens"})])
+def test_a_lens_that_is_off_is_noticed_after_a_second(make_camera_info, bend, told):
+    notices: list[tuple[str, str]] = []
+    config = NodeConfig(readout_time=READOUT_TIME)
+    frames = FrameLocalizer(config, lambda *words: notices.append(words))
+    frames.calibrate(read_camera_info(make_camera_info()))
+    seen, rng = simulated(motion=STILL)[0], np.random.default_rng(1)
+    away = (seen.pixels - [319.5, 239.5]) / 500.0
+    bent = seen.pixels + bend * (away**2).sum(axis=1)[:, None] * away  # px
+    for k in range(32):
+        stamp_ns = seen.stamp_ns + k * 33_000_000
+        noisy = bent + rng.normal(0.0, 0.2, bent.shape)
+        localized(frames.localize(cloud_of(stamp_ns, seen.points, noisy)))
+        if k < 29:
+            assert notices == []
+    assert {name for name, _ in notices} == told
+
+
 def test_a_new_camera_counts_from_the_next_frame_on(make_camera_info):
     notices: list[tuple[str, str]] = []
     settings = {"readout_time": READOUT_TIME, "scan_direction": "left_to_right"}
