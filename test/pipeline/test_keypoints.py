@@ -13,7 +13,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import make_cloud, read_map
+from rs_localizer.io.clouds import make_cloud, read_keypoints, read_map
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Localized
 from rs_localizer.matching import Matcher
@@ -130,6 +130,25 @@ def test_keypoints_that_give_no_pose(frames, make_camera_info):
     assert refused(unknown.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_camera_info"
     # None of this left a trace.
     localized(node.localize_keypoints(keypoints(frames[3], "id")), frames[3])
+
+
+@pytest.mark.parametrize("names", [("id",), ("descriptor",)])
+def test_keypoints_that_repeat_are_an_image_that_does(frames, make_camera_info, names):
+    """Matched near a prediction, the same keypoints would not give the same matches."""
+    node = localizer(make_camera_info)
+    node.use_map(read_map(map_cloud(LANDMARKS)))
+    messages = [keypoints(frame, *names) for frame in frames[:6]]
+    for k in (3, 4):  # hung
+        stamp = messages[k].header.stamp
+        messages[k] = keypoints(frames[2], *names)
+        messages[k].header.stamp = stamp
+    found = [node.localize_keypoints(message) for message in messages]
+    assert [bool(result) for result in found] == [True, True, True, False, False, True]
+    assert {found[3].reason, found[4].reason} == {"repeated_image"}
+    # Another map is matched anew.
+    assert node._landmarks.repeated(read_keypoints(messages[5])) is not None
+    node.use_map(Map(POINTS + 1.0, IDS, LANDMARKS.descriptors, "map"))
+    assert node._landmarks.repeated(read_keypoints(messages[5])) is None
 
 
 def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
