@@ -1,15 +1,22 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m benchmarks.demo``: the medians of ``rs_localizer demo``, ours beside P3P's."""
+"""``python -m benchmarks.demo``: the medians of ``rs_localizer demo``, ours beside P3P's.
+
+With ``--pictures docs`` its pictures become those of README, so that they and the figures are of
+one run.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
 import textwrap
+from pathlib import Path
 
 from benchmarks.experiments.results import Table, rounded
 
@@ -17,11 +24,21 @@ _TITLE = re.compile(r"(.+), (\d+) frames  .*median")
 _ROW = re.compile(r"(.+), (\w+) +(\d+) +([\d.]+)")
 
 
+PICTURES = {"flight_errors.png": "errors.png", "cube.gif": "cube.gif"}
+"""Of the demo, and their names in docs."""
+
+
 def main() -> int:
     """Run the demo and print its table; the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.demo", description=__doc__)
+    parser.add_argument("--pictures", type=Path, help="folder for its pictures")
+    pictures = parser.parse_args().pictures
     with tempfile.TemporaryDirectory() as out:
         words = ["-m", "rs_localizer", "demo", "--json", "--out", out]
         demo = subprocess.run([sys.executable, *words], check=True, stdout=subprocess.PIPE)
+        if pictures is not None:
+            for name, there in PICTURES.items():
+                shutil.copyfile(Path(out) / name, pictures / there)
     print(summary(json.loads(demo.stdout)["text"]))
     return 0
 

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -187,7 +187,8 @@ def _missed(found: Motions, trials: Trials) -> Array:
     local = turned + tau * np.cross(found.w[:, None], turned)
     local += found.translation[:, None] + tau * found.t[:, None]
     missed = trials.rays[:, :_SIX] * local[..., 2:] - local[..., :2]
-    return missed.reshape(len(trials), -1)
+    errors: Array = missed.reshape(len(trials), -1)
+    return errors
 
 
 def _over(
@@ -225,7 +226,7 @@ def _short(value: float) -> str:
 
 def _figure(by_count: dict[int, Curves], algebraic: dict[str, Array]) -> Figure:
     drawn = charts.figure(12.0, 6.6)
-    panels: Sequence[Sequence[charts.Axes]] = drawn.subplots(2, 4, squeeze=False)
+    panels: Any = drawn.subplots(2, 4, squeeze=False)
     labels = list(METRICS.values())
     for column, (count, curves) in enumerate(by_count.items()):
         for row, metric in enumerate((ORIENTATION, POSITION)):

@@ -18,7 +18,7 @@ from benchmarks.experiments.results import Context, Result, Table, limited
 from benchmarks.real.gyroscopes import Gyroscope
 from benchmarks.real.recordings import Frame, Recording, read_bag
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.settings import build, load_params_file
 from rs_localizer.solvers.minimal import solve_minimal
@@ -37,7 +37,7 @@ class Sequence:
     """The images, and which of them are fast."""
 
     recording: Recording
-    fastest: Array  # (12,) places
+    fastest: IntArray  # (12,) places
 
 
 def run(context: Context) -> Result:
@@ -150,10 +150,11 @@ def _read() -> Sequence:
     times = 1e-9 * np.array([frame.middle_ns for frame in recording.frames])
     half = 0.5 * recording.camera.readout_time
     rates = Gyroscope.read(PHONE_GYROSCOPE).mean_rate(times - half, times + half)
-    return Sequence(recording, np.argsort(-np.linalg.norm(rates, axis=1))[:_FASTEST])
+    order = np.argsort(-np.linalg.norm(rates, axis=1)).astype(np.int64)
+    return Sequence(recording, order[:_FASTEST])
 
 
-def _shown(found: Mapping[str, Array], fast: Array) -> str:
+def _shown(found: Mapping[str, Array], fast: BoolArray) -> str:
     rows = [
         (name, *(f"{x:.3f}" for x in (*of[fast].mean(axis=0), *of.mean(axis=0))))
         for name, of in found.items()

@@ -149,7 +149,7 @@ def record(
     if not found.readout_time > 0.0:
         raise ValueError("the images do not tell the readout time: give -p readout_time:=0.02")
     timing = replace(config, readout_time=found.readout_time)
-    known: BoolArray = np.isfinite(points).all(axis=1)
+    known: BoolArray = np.isfinite(points[:, 0])
     frames = []
     for k, stamp in enumerate(tracks.stamps_ns.tolist()):
         of = (tracks.images == k) & known[tracks.points]

@@ -34,10 +34,10 @@ from benchmarks.real.gyroscopes import best_offset, in_images
 from benchmarks.real.motion import EPOCH_NS, Motion, judge, table
 from benchmarks.real.recordings import Frame, Recording, add_settings, read_bag
 from rs_localizer.cli.settings_args import given_settings
-from rs_localizer.config import FeatureConfig, Matching, NodeConfig
+from rs_localizer.config import FeatureConfig, FeatureKind, Matching, NodeConfig
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.features.extraction import FeatureExtractor, FeatureKind, Features
+from rs_localizer.features.extraction import FeatureExtractor, Features
 from rs_localizer.io.camera_files import read_calibration
 from rs_localizer.io.clouds import Keypoints
 from rs_localizer.io.maps.landmarks import Map
@@ -71,7 +71,7 @@ class Mounted:
 
     def motion(self, body: Motion) -> tuple[Array, Array]:
         """Rotations map_from_camera and positions at its stamps."""
-        return self.poses(body, 1e-9 * (self.stamps_ns - EPOCH_NS))
+        return self.poses(body, _seconds(self.stamps_ns))
 
     def poses(self, body: Motion, times: Array) -> tuple[Array, Array]:
         """Likewise at times (n,), s."""
@@ -91,8 +91,11 @@ def smoothed(path: Path) -> Motion:
     quaternions[1:] *= np.cumprod(np.where(signs == 0.0, 1.0, signs))[:, None]
     values = np.column_stack([quaternions, part.positions])
     smooth = savgol_filter(values, _SMOOTHED, _CUBIC, axis=0)
-    times = 1e-9 * (part.stamps_ns - EPOCH_NS)
-    return Motion.of(times, Rotation.from_quat(smooth[:, :4]), smooth[:, 4:])
+    return Motion.of(_seconds(part.stamps_ns), Rotation.from_quat(smooth[:, :4]), smooth[:, 4:])
+
+
+def _seconds(stamps_ns: IntArray) -> Array:
+    return np.asarray(1e-9 * (stamps_ns - EPOCH_NS), np.float64)
 
 
 def read_camera(folder: Path, name: str, chain: Path) -> Mounted:
@@ -220,9 +223,10 @@ def read_sequence(
 
 
 def _within(camera: Mounted, first: float, last: float) -> Mounted:
-    times = 1e-9 * (camera.stamps_ns - EPOCH_NS)
+    times = _seconds(camera.stamps_ns)
     rows = np.flatnonzero((times >= first) & (times <= last))
-    return replace(camera, stamps_ns=camera.stamps_ns[rows], files=[camera.files[k] for k in rows])
+    files = [camera.files[k] for k in rows.tolist()]
+    return replace(camera, stamps_ns=camera.stamps_ns[rows], files=files)
 
 
 def agreement(recording: Recording, motion: Motion) -> str:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """joint: both ``r6p_vct_w`` and ``r6p_vcwt`` on every sample; the robust score picks.
 
-The suggestion of Kukelova, Albl, Sugimoto, Pajdla, ACCV 2018, sec. 5, for unknown motion: the
+The suggestion of Kukelova, Albl, Sugimoto, Pajdla, ACCV 2018, sec. 4.1, for unknown motion: the
 first is ahead under pure translation, the second elsewhere. Six points, two solutions.
 """
 

@@ -3,7 +3,7 @@
 """The equations that all linear rolling-shutter solvers share.
 
 Double-linearised model of Kukelova, Albl, Sugimoto, Pajdla, "Linear solution to the minimal
-absolute pose rolling shutter problem", ACCV 2018, eq. (3), with ``r`` the row time:
+absolute pose rolling shutter problem", ACCV 2018, eq. (5), with ``r`` the row time:
 
     lambda x = (I + r [w]x) (I + [v]x) X + C + r t
 

@@ -4,7 +4,7 @@
 
     lambda x = (I + [v]x) X + r R_RS X + C + r t
 
-of Kukelova, Albl, Sugimoto, Pajdla, ACCV 2018, sec. 4: eighteen linear equations in v, C, t and
+of Kukelova, Albl, Sugimoto, Pajdla, ACCV 2018, sec. 3.4: eighteen linear equations in v, C, t and
 the nine entries of R_RS. Points are in the frame of the initial rotation; one solution.
 
 At zero motion ``R_RS = I, t = C`` solves the homogeneous equations (all points scaled with the

@@ -6,10 +6,11 @@ By the poses of P3P and by those of the localizer: an animation for the eye.
 """
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image as Pillow
 
 from rs_localizer.core.arrays import Array
@@ -25,6 +26,7 @@ from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.tools.simulation.walls import three_walls
 
+PosesAt = Callable[[Array], tuple[Array, Array]]
 CAMERA = Camera(
     640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]),
     readout_time=0.03,
@@ -44,10 +46,11 @@ _CORNERS = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)]) - np.array(
 _EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
 # Binary digits of a pixel that OpenCV's drawing takes.
 _SHIFT, _OPACITY = 4, 0.35
-# Every second image, pictures per second, each px wide, and colors.
-_EVERY, _SHOWN_RATE, _WIDTH, _PALETTE = 2, 10.0, 360, 64
-# Blue first. Orange and blue differ for everyone, and in lightness.
-_COLORS = ((36, 138, 240), (190, 84, 10))
+# The images of the fastest second, pictures per second (slower than it was, for the eye), each px
+# wide, and colors.
+_SHOWN, _SHOWN_RATE, _WIDTH, _PALETTE = 30, 10.0, 360, 64
+# Blue first. Orange and blue differ for everyone, and in lightness; the true outline is white.
+_COLORS, _TRUE = ((36, 138, 240), (190, 84, 10)), (255, 255, 255)
 
 
 class Walls:
@@ -76,10 +79,22 @@ class Walls:
 
         return in_order(frame, stamps_ns)
 
+    def true_poses(self, stamp_ns: int) -> PosesAt:
+        """The true poses of an image by row times."""
+        return true_poses_at(CAMERA, self.motion, middle_stamp(CAMERA, stamp_ns))
+
+    def fastest(self, stamps_ns: Sequence[int]) -> slice:
+        """Those of the images in a row that are shown: in which the camera turns fastest."""
+        still = np.zeros(1)
+        states = [self.motion.state(middle_stamp(CAMERA, stamp), still) for stamp in stamps_ns]
+        speeds = np.array([np.linalg.norm(state.angular[0]) for state in states])
+        count = min(_SHOWN, len(speeds))
+        start = int(np.argmax(np.convolve(speeds, np.ones(count), "valid")))
+        return slice(start, start + count)
+
     def off(self, stamp_ns: int, motion: Motion | None) -> float:
         """How far the cube's farthest corner is off in the image, px; NaN where it is cut off."""
-        middle_ns = middle_stamp(CAMERA, stamp_ns)
-        true = project_rolling(CAMERA, true_poses_at(CAMERA, self.motion, middle_ns), self.cube)[0]
+        true = project_rolling(CAMERA, self.true_poses(stamp_ns), self.cube)[0]
         if not np.all(CAMERA.inside(true)):
             return np.nan
         if motion is None:
@@ -97,33 +112,46 @@ def draw_cube(
     picture: Image, camera: Camera, motion: Motion, corners: Array, color: tuple[int, int, int]
 ) -> None:
     """Draw a cube into a picture (height, width, 3), each of its points at its own row's pose."""
-    points = [corners[a] + _SHARES * (corners[b] - corners[a]) for a, b in _EDGES]
-    pixels = project_rolling(camera, motion.at_rows, np.concatenate(points))[0]
-    if not np.all(np.isfinite(pixels)):
-        return  # partly behind the camera
-    fixed = np.rint(pixels * 2**_SHIFT).astype(np.int32)
+    edges = _edges(camera, motion.at_rows, corners)
+    if edges is None:
+        return
     filled = picture.copy()
-    cv2.fillConvexPoly(filled, cv2.convexHull(fixed), color, cv2.LINE_AA, _SHIFT)
+    cv2.fillConvexPoly(filled, cv2.convexHull(edges.reshape(-1, 2)), color, cv2.LINE_AA, _SHIFT)
     cv2.addWeighted(filled, _OPACITY, picture, 1.0 - _OPACITY, 0.0, dst=picture)
-    edges = fixed.reshape(len(_EDGES), -1, 1, 2)
     cv2.polylines(picture, list(edges), False, color, 2, cv2.LINE_AA, _SHIFT)
+
+
+def _edges(camera: Camera, poses_at: PosesAt, corners: Array) -> NDArray[np.int32] | None:
+    """Edges (e,k,1,2) as OpenCV's drawing takes them; None partly behind the camera."""
+    points = [corners[a] + _SHARES * (corners[b] - corners[a]) for a, b in _EDGES]
+    pixels = project_rolling(camera, poses_at, np.concatenate(points))[0]
+    if not np.all(np.isfinite(pixels)):
+        return None
+    fixed = np.rint(pixels * 2**_SHIFT).astype(np.int32)
+    return fixed.reshape(len(_EDGES), -1, 1, 2)
 
 
 def clip(
     walls: Walls, images: Sequence[Image], stamps_ns: Sequence[int],
     methods: Mapping[str, Sequence[Motion | None]],
 ) -> tuple[bytes, dict[str, Array]]:  # fmt: skip
-    """An animated GIF of the cube by two methods, and by how many px it is off in the images."""
+    """An animated GIF of the cube by two methods, and by how many px it is off in the images.
+
+    The GIF shows the fastest second, with the true outline; the figures are of all images.
+    """
     off = {
         name: np.array([walls.off(*pair) for pair in zip(stamps_ns, motions, strict=True)])
         for name, motions in methods.items()
     }
     pictures = [
         np.hstack([
-            _picture(images[k], walls.cube, motions[k], f"{name}  {_said(off[name][k])}", color)
+            _picture(
+                images[k], (walls.cube, walls.true_poses(stamps_ns[k])), motions[k],
+                f"{name}  {_said(off[name][k])}", color,
+            )
             for (name, motions), color in zip(methods.items(), _COLORS, strict=True)
         ])
-        for k in range(0, len(images), _EVERY)
+        for k in range(len(images))[walls.fastest(stamps_ns)]
     ]  # fmt: skip
     return _gif(pictures), {name: each[~np.isnan(each)] for name, each in off.items()}
 
@@ -133,12 +161,17 @@ def _said(off: float) -> str:
 
 
 def _picture(
-    image: Image, cube: Array, motion: Motion | None, text: str, color: tuple[int, int, int]
-) -> Image:
-    """The image with its cube, and what it is off by."""
+    image: Image, true: tuple[Array, PosesAt], motion: Motion | None, text: str,
+    color: tuple[int, int, int],
+) -> Image:  # fmt: skip
+    """The image with its cube, the outline of the true one, and what it is off by."""
+    cube, poses_at = true
     picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
     if motion is not None:
         draw_cube(picture, CAMERA, motion, cube, color)
+    outline = _edges(CAMERA, poses_at, cube)
+    if outline is not None:
+        cv2.polylines(picture, list(outline), False, _TRUE, 1, cv2.LINE_AA, _SHIFT)
     size = (_WIDTH, round(_WIDTH * image.shape[0] / image.shape[1]))
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     small = cv2.copyMakeBorder(small, 30, 0, 0, 6, cv2.BORDER_CONSTANT, value=(255, 255, 255))

@@ -103,7 +103,10 @@ def summary(values: Array) -> dict[str, float]:
 
 
 def draw(methods: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
-    """Errors of one or two methods over time, on logarithmic scales, with running medians."""
+    """Errors of one or two methods over time, on logarithmic scales, with running medians.
+
+    The file's description holds the medians, so that a page can be compared with its picture.
+    """
     from matplotlib.figure import Figure  # half a second
 
     kinds = [kind for kind in UNITS if any(kind in of for of in methods.values())]
@@ -126,7 +129,11 @@ def draw(methods: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
             loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False, borderaxespad=0.1
         )
     panels[-1].set_xlabel("time (s)")
-    figure.savefig(path)
+    medians = [
+        f"{kind} ({UNITS[kind]}), {name}: {np.median(of[kind].values):.3g}"
+        for name, of in methods.items() for kind in kinds if kind in of and len(of[kind].values)
+    ]  # fmt: skip
+    figure.savefig(path, metadata={"Description": "; ".join(medians)})
 
 
 def by_evo(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:

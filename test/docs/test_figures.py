@@ -5,6 +5,7 @@
 import re
 
 import pages
+import PIL.Image
 import pytest
 
 from benchmarks.page import PAGE, RESULTS, blocks, filled
@@ -38,6 +39,35 @@ def test_every_figure_of_readme_is_in_the_block_that_it_links_to(row):
         digits = len(number.partition(".")[2])
         near = [x for value in known for x in (value, 100.0 * value)]
         assert float(number) in {round(x, digits) for x in near}, number
+
+
+def test_the_picture_of_errors_is_of_the_run_whose_medians_are_printed():
+    rows = (RESULTS / "demo.txt").read_text(encoding="utf-8").splitlines()
+    columns = rows[0].split()[1:]
+    with PIL.Image.open(pages.ROOT / "docs" / "errors.png") as picture:
+        drawn = picture.text["Description"].split("; ")
+    assert len(drawn) == 6
+    for each in drawn:
+        quantity, solver, median = re.fullmatch(r"(.+), (\w+): (\S+)", each).groups()
+        name, scale = quantity.replace("(m)", "(mm)"), 1e3 if "(m)" in quantity else 1.0
+        (row,) = [row for row in rows if re.match(rf"Simulated flight.*: {re.escape(name)} ", row)]
+        printed = row.rsplit(")", 1)[1].split()[columns.index(solver)]
+        # The picture has three digits, the page two.
+        assert float(printed) == pytest.approx(scale * float(median), rel=0.035)
+
+
+def test_the_words_below_the_picture_of_errors_are_its_medians():
+    alt = re.search(r"!\[(Errors of position[^]]*)\]\(docs/errors\.png\)", pages.text("README.md"))[
+        1
+    ]
+    millimetres, degrees = map(float, re.search(r"(\S+) mm and (\S+) deg", alt).groups())
+    with PIL.Image.open(pages.ROOT / "docs" / "errors.png") as picture:
+        drawn = dict(each.rsplit(": ", 1) for each in picture.text["Description"].split("; "))
+    assert millimetres == round(1e3 * float(drawn["position (m), r6p_vcwt"]))
+    assert degrees == round(float(drawn["orientation (deg), r6p_vcwt"]), 2)
+    for kind in ("position (m)", "orientation (deg)"):
+        times = float(drawn[f"{kind}, p3p"]) / float(drawn[f"{kind}, r6p_vcwt"])
+        assert 15.0 < times < 25.0  # "about twenty times as much"
 
 
 def section(anchor: str) -> str:

@@ -89,8 +89,6 @@ def test_a_map_in_millimetres_is_named(unit, speed, noise, told, to_and_fro):
         )
 
 
-
-
 def test_what_happened_while_nothing_was_seen_is_no_speed():
     """A robot that was carried elsewhere, or a map that was exchanged."""
     heard, covariance = Heard(), np.diag(np.full(12, 1e-4))
