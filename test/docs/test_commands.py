@@ -12,6 +12,7 @@ import pages
 import pytest
 
 from benchmarks.__main__ import EXPERIMENTS
+from benchmarks.real.__main__ import JUDGES
 from rs_localizer.cli.commands import COMMANDS, parse
 from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.io.topics import GIVEN_POSES
@@ -66,8 +67,11 @@ def test_modules_exist(page, module, words):
         for word in shlex.split(words):
             assert not word.startswith("test/") or (pages.ROOT / word).exists(), word
     if module == "benchmarks":
-        names = itertools.takewhile(lambda word: word[0] not in "-#", words.split())
-        assert set(names) <= set(EXPERIMENTS), words
+        names = list(itertools.takewhile(lambda word: word[0] not in "-#", words.split()))
+        if names[0] == "real":
+            assert names[1] in JUDGES, words
+        else:
+            assert set(names) <= set(EXPERIMENTS), words
 
 
 @pytest.mark.parametrize(("page", "line"), _LAUNCHES)

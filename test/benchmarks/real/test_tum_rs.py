@@ -8,10 +8,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.__main__ import main
+from benchmarks.independent import motions
 from benchmarks.independent.cameras import Camera as TrueCamera
+from benchmarks.independent.frames import simulate
+from benchmarks.independent.scenes import Rich
 from benchmarks.real.motion import EPOCH_NS
 from benchmarks.real.tum_rs import read_sequence
 from rs_localizer.config import NodeConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.recording import write_frame
 
 READOUT, PERIOD, LENGTH = 0.03, 1.0 / 20.0, 30
 SINCE = 1_536_000_000.0
@@ -80,6 +86,35 @@ def test_ours_and_p3p_stand_beside_each_other(sequence, capsys):
     assert float(later[5]) < 6.0  # deg/s, of up to 84
     assert lines[-2].startswith(f"{LENGTH} images")
     assert "another one" not in lines[-1]
+
+
+def test_motion_capture_of_your_own(tmp_path, capsys):
+    true, length = TrueCamera(), 8
+    frames = simulate(true, motions.hand, Rich(80), 1, length, seed=3)
+    camera = Camera(true.width, true.height, K=true.matrix, D=np.array(true.distortion))
+    with BagWriter(tmp_path / "rec") as bag:
+        for k in range(length):
+            points, pixels = frames.seen(k, 0.1)
+            write_frame(
+                bag, camera, int(frames.stamp_ns[k]), points, pixels, np.arange(len(points))
+            )
+    # Motions are made of the same seed as the frames; their time 0 is the middle of the recording.
+    first = -0.5e-9 * (frames.stamp_ns[-1] - frames.stamp_ns[0]) - 0.5 * true.readout_time
+    local = np.arange(first - 0.3, -first + 0.3, 1.0 / 120.0)
+    rotations, places = motions.hand(1, np.random.default_rng(3)).poses(
+        np.zeros(len(local), int), local
+    )
+    times = local - first + 1e-9 * frames.stamp_ns[0]
+    poses = np.column_stack([times, places, Rotation.from_matrix(rotations).as_quat()])
+    np.savetxt(tmp_path / "poses.txt", poses, fmt="%.9f")
+    words = ["real", "mocap", str(tmp_path / "rec"), "--truth", str(tmp_path / "poses.txt")]
+    assert main([*words, "-p", f"readout_time:={true.readout_time}"]) == 0
+    rows = {line[:16].strip(): line[16:].replace(",", "").split()
+            for line in capsys.readouterr().out.splitlines()}  # fmt: skip
+    single, solvepnp = rows["single"], rows["solvepnp"]
+    assert int(single[0]) == length
+    assert float(single[1]) < 0.3 * float(solvepnp[1])  # deg
+    assert float(single[5]) < 5.0  # deg/s
 
 
 def test_what_is_missing_is_said(sequence, tmp_path, capsys):
