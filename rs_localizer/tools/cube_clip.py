@@ -49,8 +49,9 @@ _SHIFT, _OPACITY = 4, 0.35
 # The images of the fastest second, pictures per second (slower than it was, for the eye), each px
 # wide, and colors.
 _SHOWN, _SHOWN_RATE, _WIDTH, _PALETTE = 30, 10.0, 360, 64
-# Blue first. Orange and blue differ for everyone, and in lightness; the true outline is white.
-_COLORS, _TRUE = ((36, 138, 240), (190, 84, 10)), (255, 255, 255)
+# Blue first. Orange and blue differ for everyone, and in lightness; the true outline is magenta,
+# which neither the walls nor the cubes have.
+_COLORS, _TRUE = ((36, 138, 240), (190, 84, 10)), (200, 0, 200)
 
 
 class Walls:
@@ -84,23 +85,28 @@ class Walls:
         return true_poses_at(CAMERA, self.motion, middle_stamp(CAMERA, stamp_ns))
 
     def fastest(self, stamps_ns: Sequence[int]) -> slice:
-        """Those of the images in a row that are shown: in which the camera turns fastest."""
-        still = np.zeros(1)
-        states = [self.motion.state(middle_stamp(CAMERA, stamp), still) for stamp in stamps_ns]
-        speeds = np.array([np.linalg.norm(state.angular[0]) for state in states])
+        """Those in a row that are shown: the camera turns fastest while it sees the whole cube."""
+        still, speeds = np.zeros(1), np.zeros(len(stamps_ns))
+        for k, stamp in enumerate(stamps_ns):
+            if np.all(CAMERA.inside(self._true_corners(stamp))):
+                state = self.motion.state(middle_stamp(CAMERA, stamp), still)
+                speeds[k] = np.linalg.norm(state.angular[0])
         count = min(_SHOWN, len(speeds))
         start = int(np.argmax(np.convolve(speeds, np.ones(count), "valid")))
         return slice(start, start + count)
 
     def off(self, stamp_ns: int, motion: Motion | None) -> float:
         """How far the cube's farthest corner is off in the image, px; NaN where it is cut off."""
-        true = project_rolling(CAMERA, self.true_poses(stamp_ns), self.cube)[0]
+        true = self._true_corners(stamp_ns)
         if not np.all(CAMERA.inside(true)):
             return np.nan
         if motion is None:
             return np.inf
         seen = project_rolling(CAMERA, motion.at_rows, self.cube)[0]
         return float(np.nan_to_num(np.linalg.norm(seen - true, axis=1).max(), nan=np.inf))
+
+    def _true_corners(self, stamp_ns: int) -> Array:
+        return project_rolling(CAMERA, self.true_poses(stamp_ns), self.cube)[0]
 
 
 def cube_on(marker: Marker) -> Array:
