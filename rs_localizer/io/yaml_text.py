@@ -19,7 +19,7 @@ _MOST_VALUES, _MOST_JSON, _DEEPEST = 100_000, 1_000_000, 50
 # libyaml reads 5 MB a second, PyYAML alone a tenth of that.
 _MOST_CHARACTERS = 2_000_000
 # Characters of a file, of which JSON alone uses so many; /dev/zero and some pipes never end.
-_LONGEST = 30_000_000
+_LONGEST = 20_000_000
 # Of numbers; those of base 60 ("1:0:0 ...", YAML 1.1) take time that grows with its square.
 _LONGEST_NUMBER = 100
 
