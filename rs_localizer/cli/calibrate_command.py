@@ -51,7 +51,7 @@ if WORKING:
     )
     from rs_localizer.offline.replay import find_topics, has_frames
     from rs_localizer.pipeline.marker_detector import FrameDetector
-    from rs_localizer.pipeline.what_fits import mistake_of
+    from rs_localizer.pipeline.what_fits import ids_of, mistake_of
     from rs_localizer.settings import write_camera_file
     from rs_localizer.tools import verdict
     from rs_localizer.tools.adjust.intrinsics import LensErrors
@@ -237,7 +237,8 @@ def _correspondences(args: Options, bag: BagReader, config: NodeConfig) -> _Inpu
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     recorded = read_recording(bag, topics, config.matching, landmarks)
     camera = given_lens(args) or recorded.calibration.camera(0.0, config.scan_direction)
-    if mistake := mistake_of(Localizer(camera, config), recorded.clouds):
+    frames = [(cloud.points, cloud.pixels, ids_of(cloud)) for cloud in recorded.clouds]
+    if mistake := mistake_of(Localizer(camera, config), frames):
         print(f"warning: {mistake}", file=sys.stderr)
     images = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in recorded.clouds]
     return _Input(images, camera)
@@ -248,6 +249,7 @@ def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
     sizes = BoardSizes(marker_map)
     images: list[ImagePoints] = []
+    frames = []
     camera: Camera | None = None
     size = (0, 0)
     refused = dict[str, str]()
@@ -257,6 +259,7 @@ def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
         found = detector.detect(image).detections
         sizes.look(image.pixels, len(found.points) > 0)
         images.append(ImagePoints(image.stamp_ns, found.points, found.pixels))
+        frames.append((found.points, found.pixels, found.ids))
     shown = sum(len(image.points) > 0 for image in images)
     print(f"{shown} of {len(images)} images show the map")
     image_input.tell_left_out(refused, {})
@@ -265,6 +268,9 @@ def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
             print(f"warning: {fault}", file=sys.stderr)
     new_lens = camera is None
     camera = first_lens(size, in_order(images)) if camera is None else camera
+    shows = [frame for frame in frames if len(frame[0])]
+    if not detector.mistake and (mistake := mistake_of(Localizer(camera), shows)):
+        print(f"warning: {mistake}", file=sys.stderr)
     return _Input(images, camera, new_lens, map=marker_map)
 
 

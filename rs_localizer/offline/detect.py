@@ -170,7 +170,8 @@ class _MarkerTally:
         if len(detections.ids):
             self._found.counts.append(len(detections.ids))
             self._residuals.append(static_residual(camera, detected))
-            if self._residuals[-1] > _MOST_STILL:
+            few = len(detections.ids) < _LEAST_CORNERS
+            if not (few or self._residuals[-1] <= _MOST_STILL):  # NaN: a pose behind the camera
                 frame = detections.points, detections.pixels, detections.ids
                 localizer = self._fit.localizer(camera)
                 self._mistake = self._mistakes.look(lambda: of_refused(localizer, *frame))

@@ -31,6 +31,8 @@ _MOST = 0.7
 _RARER = 4
 # Frames that say the same: one may fit by chance.
 _AGREED = 2
+# Of their extent, how far points are beside a plane.
+_FLAT = 0.02
 # Frames of a recording.
 _TRIED = 5
 
@@ -92,9 +94,10 @@ def what_fits(
         ids: (n,) of the points, those of a marker's corners four in a row.
     """
     frame = _Frame(pixels, ids, localizer.camera.size)
+    flat = _is_flat(points)
     fits: dict[str, tuple[int, float]] = {}
     for mistake, undone in _MISTAKES.items():
-        if (changed := undone(frame)) is None:
+        if (flat and undone is not _half_turned) or (changed := undone(frame)) is None:
             continue
         usable = np.isfinite(changed).all(axis=1)
         found = localizer.localize(points[usable], changed[usable])
@@ -106,6 +109,14 @@ def what_fits(
     if best in _MIRRORED and not localizer.camera.readout_time > 0.0:
         best = _EITHER
     return f"the points fit if {best}"
+
+
+def _is_flat(points: Array) -> bool:
+    """Whether points lie in a plane: mirrored, it is one that is seen from behind, and fits."""
+    if len(points) < 4:
+        return True
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(extents[2] < _FLAT * extents[0])
 
 
 def of_refused(
@@ -122,11 +133,16 @@ def ids_of(cloud: Correspondences) -> IntArray | None:
     return cloud.table["id"].astype(np.int64) if "id" in (cloud.table.dtype.names or ()) else None
 
 
-def mistake_of(localizer: Localizer, clouds: Sequence[Correspondences]) -> str:
-    """What is wrong with a recording, by a few of its frames; empty: nothing of this kind."""
+def mistake_of(localizer: Localizer, frames: Sequence[tuple[Array, Array, IntArray | None]]) -> str:
+    """What is wrong with a recording, by a few of its frames; empty: nothing of this kind.
+
+    Args:
+        localizer: of a camera alone.
+        frames: points, pixels and ids of each, as of :func:`what_fits`.
+    """
     last = ""
-    for k in np.unique(np.linspace(0, len(clouds) - 1, _TRIED).astype(int)) if clouds else ():
-        found = of_refused(localizer, clouds[k].points, clouds[k].pixels, ids_of(clouds[k]))
+    for k in np.unique(np.linspace(0, len(frames) - 1, _TRIED).astype(int)) if frames else ():
+        found = of_refused(localizer, *frames[k])
         if found and found == last:
             return found
         last = found or last

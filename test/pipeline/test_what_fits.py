@@ -14,7 +14,7 @@ from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import make_cloud, read_correspondences
+from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.images import Image
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.dictionaries import pattern
@@ -90,6 +90,14 @@ def test_what_is_right_or_otherwise_wrong_has_no_name():
     ):
         assert not localizer.localize(points, wrong)
         assert what_fits(localizer, points, wrong, ids) == ""
+    # A plane that is mirrored is one that is seen from behind.
+    wall_alone = points[:, 2] == 3.6
+    flat, mirrored = points[wall_alone], MISTAKES["left to right"](pixels[wall_alone])
+    assert localizer.localize(flat, mirrored)
+    assert (
+        what_fits(localizer, flat, mirrored) == what_fits(localizer, flat, pixels[wall_alone]) == ""
+    )
+    assert [what_fits(localizer, points[:n], pixels[:n], ids[:n]) for n in range(5)] == [""] * 5
     # Ids of landmarks are no corners.
     assert what_fits(localizer, points, opposite(pixels), 7 * ids) == ""
 
@@ -123,10 +131,10 @@ def test_node_and_replay_say_it(make_camera_info):
     assert ["mirrored left to right" in result.detail for result in results[1:]] == [True] * 3
     assert {name for name, _ in told} >= {"would_fit"}
     assert frames.localize(cloud(1.0, seen(corners(), 0.2)))
-    clouds = [read_correspondences(cloud(t, mirror(seen(corners(), t)))) for t in times]
-    assert "mirrored left to right" in mistake_of(Localizer(CAMERA), clouds)
-    clouds = [read_correspondences(cloud(t, seen(corners(), t))) for t in times]
-    assert mistake_of(Localizer(CAMERA), clouds) == mistake_of(Localizer(CAMERA), []) == ""
+    wrong = [(corners(), mirror(seen(corners(), t)), None) for t in times]
+    assert "mirrored left to right" in mistake_of(Localizer(CAMERA), wrong)
+    right = [(corners(), seen(corners(), t), None) for t in times]
+    assert mistake_of(Localizer(CAMERA), right) == mistake_of(Localizer(CAMERA), []) == ""
 
 
 def test_mirrored_images_of_markers():
