@@ -92,7 +92,7 @@ class Video:
 
     def _by_pyav(self) -> Iterator[VideoImage]:
         most = most_pixels(self.path.stat().st_size)
-        with _container(self.path) as container:
+        with _container(self.path, most) as container:
             stream = _stream(container, most)
             stream.codec_context.options = {"max_pixels": str(most)}  # of images that follow
             stream.thread_type = "AUTO"
@@ -153,11 +153,12 @@ _UNCOUNTED, _NEAR, _UNTIMED = 1, 3.0, 2.0
 
 
 @contextlib.contextmanager
-def _container(path: Path) -> Iterator[Any]:
+def _container(path: Path, most: int) -> Iterator[Any]:
     import av
 
     try:
-        with av.open(str(path)) as container:
+        # FFmpeg decodes the first images as it opens a file.
+        with av.open(str(path), options={"max_pixels": str(most)}) as container:
             yield container
     except (av.FFmpegError, ValueError, UnicodeDecodeError) as error:
         if isinstance(error, VideoError):
