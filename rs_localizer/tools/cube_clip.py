@@ -133,8 +133,8 @@ def _edges(camera: Camera, poses_at: PosesAt, corners: Array) -> NDArray[np.int3
     pixels = project_rolling(camera, poses_at, np.concatenate(points))[0]
     if not np.all(np.isfinite(pixels)):
         return None
-    fixed = np.rint(pixels * 2**_SHIFT).astype(np.int32)
-    return fixed.reshape(len(_EDGES), -1, 1, 2)
+    fixed = np.rint(pixels * 2**_SHIFT)
+    return np.asarray(fixed.reshape(len(_EDGES), -1, 1, 2), np.int32)
 
 
 def clip(
