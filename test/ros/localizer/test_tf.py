@@ -168,8 +168,9 @@ def test_without_tf2_ros_only_what_needs_it_is_refused(monkeypatch):
         check(NodeConfig(publish_tf="map_to_odom"))
 
 
-def test_who_forgets_waits_until_what_is_being_sent_is_out(made, peer, robot, monkeypatch):
-    """Afterwards nothing of the frames so far is sent: the node may be cleaned up."""
+@pytest.mark.parametrize("other", ["forget", "_tick"])
+def test_others_wait_until_what_is_being_sent_is_out(made, peer, robot, monkeypatch, other):
+    """Who forgets, as after it nothing of the frames so far is sent; and the timer."""
     node = made(publish_tf="map_to_odom", transform_tolerance=0.2)
     for tenth in range(50, 61):
         robot.send("odom", "base_link", 0.1 * tenth, tenth * 10**8, NO_TURN)
@@ -178,7 +179,7 @@ def test_who_forgets_waits_until_what_is_being_sent_is_out(made, peer, robot, mo
     send = broadcaster.sendTransform
 
     def sending(item: Any) -> None:
-        waited.append(waits(node.broadcaster.forget))
+        waited.append(waits(getattr(node.broadcaster, other)))
         send(item)
 
     monkeypatch.setattr(broadcaster, "sendTransform", sending)

@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 from sensor_msgs.msg import Image
 
-from rs_localizer.pipeline.refusal import Waiting
+from rs_localizer.core.reasons import Reason
+from rs_localizer.pipeline.refusal import Refusal, Waiting
+from rs_localizer.ros.node import worker as worker_module
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
 from rs_localizer.ros.node.worker import Need, Worker, wait_for_workers
@@ -184,13 +186,44 @@ def test_a_pause_just_before_something_is_published_still_counts(fake):
     assert (total["received"], total["dropped"]) == (2, 1)
 
 
-def test_a_worker_that_is_closed_takes_nothing_more(fake):
-    fake.go_on.release(10)
+def test_a_worker_that_is_closed_publishes_nothing_more(fake):
+    """Neither what it works on nor what comes."""
     fake.send("one")
-    fake.wait(fake.done)
+    fake.wait(fake.started)
     fake.worker.close()
+    fake.go_on.release(10)
     assert wait_for_workers(PATIENCE)
     fake.send("two")
+    assert fake.published == []
+
+
+def test_all_results_of_a_message_are_published_as_they_come(fake):
+    """As of a rig's image, which may complete two frames; one refusal ends none of them."""
+    refusal = Refusal(Reason.NO_TIME, "none")
+    fake.worker.process("frames", "one", lambda *_: iter(["a", refusal, "b", "c"]))
+    for _ in "abc":
+        fake.wait(fake.done)
+    fake.go_on.release()
+    fake.send("next")
+    fake.wait(fake.done)
+    assert fake.published == ["a", "b", "c", "next old"]
+    total = fake.statistics.summary().total
+    assert (total["received"], total["answered"], total["refused"]) == (2, 4, 1)
+
+
+def test_what_a_frame_waited_for_wakes_the_worker(monkeypatch, fake):
+    monkeypatch.setattr(worker_module, "_LATE_PERIOD", PATIENCE)  # it does not look by itself
+    fake.go_on.release()
+    fake.awaited = {"one"}
+    fake.send("one")
+    changed = threading.Semaphore(0)
+    fake.worker.update("settings", lambda frames: changed.release())
+    fake.wait(changed)
+    while not fake.worker._early:
+        time.sleep(0.001)
+    fake.awaited.clear()
+    fake.worker.look()
+    fake.wait(fake.done)
     assert fake.published == ["one old"]
 
 
