@@ -22,10 +22,10 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
+import numba.np.ufunc.array_exprs as array_exprs
 from numba import types
 from numba.core import codegen, ir
 from numba.core.compiler_lock import global_compiler_lock
-from numba.np.ufunc import array_exprs
 
 from rs_localizer.native import jit, sources
 from rs_localizer.native.declared import CODES, declaration, encode

@@ -41,14 +41,14 @@ _SCALARS = {"d": types.float64, "q": types.int64, "?": types.boolean}
 _OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
-class _CompiledKernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
+class _CompiledKernel(CPUDispatcher):
     """A function that kernels call, and Python does not."""
 
     def __call__(self, *arguments: Any) -> Any:
         raise TypeError(uncallable(f"{self.__module__}.{self.__qualname__}"))
 
 
-class _CompiledEntry(CPUDispatcher):  # type: ignore[misc]
+class _CompiledEntry(CPUDispatcher):
     """A kernel that Python calls: with what it declares, and nothing else."""
 
     declared: Declaration | None
@@ -162,11 +162,11 @@ class _Locator:
         return str(self._line)
 
 
-class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
+class _Implementation(CompileResultCacheImpl):
     _locator_classes: Sequence[type] = [_Locator]
 
 
-class _Cache(FunctionCache):  # type: ignore[misc]
+class _Cache(FunctionCache):
     """Machine code that nobody else can have put there; what is wrong is compiled again."""
 
     _impl_class = _Implementation

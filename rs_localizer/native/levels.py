@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import platform
+from importlib import import_module
 from pathlib import Path
 
 LEVELS = {"x86_64": ("v2", "v3", "v4"), "aarch64": ("generic",)}
@@ -45,9 +46,7 @@ def of_machine() -> str:
     if len(LEVELS[machine]) == 1:
         return LEVELS[machine][0]
     # Compiled for any processor of the kind: this one may know none of the instructions.
-    from rs_localizer.native import _cpu
-
-    level: str = _cpu.level()
+    level: str = import_module("rs_localizer.native._cpu").level()
     if level not in LEVELS[machine]:
         raise ImportError(
             "the kernels of rs_localizer need x86-64-v2 (SSE 4.2), which this processor lacks"

@@ -12,7 +12,7 @@ Arrays are flat float64 arrays with ``LANES`` doubles per value, as :func:`traci
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -29,9 +29,8 @@ if COMPILES:
         uniform,
         where_less,
     )
-else:
-    load: Any = None
-    absolute = root = store = uniform = where_less = load
+else:  # kernels come compiled, and nobody calls these
+    absolute = load = root = store = uniform = where_less = cast(Any, None)
 
 __all__ = ["absolute", "lane_array", "load", "root", "store", "uniform", "where_less"]
 
