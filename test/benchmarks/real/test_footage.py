@@ -121,15 +121,16 @@ def test_an_oak_camera_before_a_board_and_the_stamps_of_other_images(board, late
 
 
 @pytest.mark.bench
+@pytest.mark.timeout(1800)
 def test_an_oak_camera_before_anything(tmp_path, capsys):
-    """Without a board and a lens: COLMAP's structure."""
+    """Without a board and a lens: COLMAP's structure, three minutes of CPU."""
     motion = miniatures.in_hand((1.0, 0.3, 1.0), 3, 2.0)
     film = miniatures.film(40, STRAIGHT, miniatures.papered(), motion)
     miniatures.write_oak(tmp_path / "oak", film)
     words = ["-p", f"readout_time:={READOUT}", "--out", str(tmp_path)]
     assert main(["real", "gyro", str(tmp_path / "oak"), *words]) == 0
     later = rows(capsys.readouterr().out)["tracked, 1 later"]
-    assert float(later[5].strip(",")) < 4.0  # deg/s
+    assert float(later[5].strip(",")) < 2.0  # deg/s
 
 
 def test_what_cannot_be_used_is_said_in_one_line(stray, tmp_path, capsys):
