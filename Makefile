@@ -78,7 +78,7 @@ ros:
 	. $(OUT)/ros/install/setup.sh && ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST python3 -m pytest -q -rs test/real_ros
 
 docs: $(ready)
-	@$(progress) --quiet docs $(pip) --editable '.[docs]'
+	@$(progress) --quiet docs $(pip) --no-build-isolation --editable '.[docs]'
 	@$(progress) docs $(python) -m sphinx -q -W --keep-going -c docs . $(OUT)/docs
 	@echo $(OUT)/docs/README.html
 
@@ -97,7 +97,7 @@ wheel: $(ready)
 
 # The kernels under Numba: their own tests, and whether the native module answers as they do.
 jit: kernels
-	@RS_LOCALIZER_KERNELS=numba RS_LOCALIZER_CALLS=$(VENV)/calls.pkl PYTHONPATH=test/native \
+	@env RS_LOCALIZER_KERNELS=numba RS_LOCALIZER_CALLS=$(VENV)/calls.pkl PYTHONPATH=test/native \
 	    $(native) OPENBLAS_NUM_THREADS=1 $(progress) "running kernels by Numba" \
 	    $(python) -m pytest -q -p recorder $(JIT)
 	@$(python) test/native/compare.py $(VENV)/calls.pkl

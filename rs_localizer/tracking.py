@@ -124,6 +124,7 @@ class _Seen:
     points: Any
     pixels: Any
     stamps: Mapping[str, float] | None = None
+    gate: float = 0.0  # px, of inliers; by its own fit, however often it is published anew
 
 
 class Tracker:
@@ -409,6 +410,9 @@ class Tracker:
     def _keep(self, seen: _Seen) -> None:
         if self._seen and self._seen[-1].time_ns == seen.time_ns:  # the same frame, matched anew
             self._seen.pop()
+        if isinstance(seen.found, Estimate):
+            fitted = seen.found.residuals[seen.found.inliers].max(initial=0.0)
+            seen.gate = max(self.localizer.config.inlier_threshold, fitted)
         self._seen.append(seen)
 
     def _again(
@@ -537,9 +541,7 @@ class Tracker:
         residuals = np.where(np.isnan(found.residuals), np.nan, errors)
         if isinstance(found.residuals, ByCamera):
             residuals = found.residuals.like(residuals)
-        fitted = found.residuals[found.inliers].max(initial=0.0)
-        gate = max(self.localizer.config.inlier_threshold, fitted)
-        return replace(found, residuals=residuals, inliers=residuals <= gate)
+        return replace(found, residuals=residuals, inliers=residuals <= seen.gate)
 
     def _remember(
         self, time_ns: int, prior: Prior | None, result: Estimate, context: FrameContext

@@ -3,8 +3,10 @@
 """Messages for the tests, written from the definitions of ROS and not by the package's code."""
 
 import functools
+import os
 import signal
 import struct
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
+from rs_localizer import native
 from rs_localizer.native import COMPILES
 
 # How long an example takes says nothing on a machine that compiles, or does something else.
@@ -20,6 +23,17 @@ settings.register_profile(
     "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("any machine")
+
+
+def pytest_report_header() -> str:
+    return f"kernels: {native.LEVEL or 'by Numba'}, {len(native.EDITED)} modules edited since"
+
+
+def pytest_sessionstart() -> None:
+    """CI tests what users get: no kernel that Numba compiles here, unless it was asked for."""
+    if COMPILES and os.environ.get("CI") and "RS_LOCALIZER_KERNELS" not in os.environ:
+        pytest.exit("kernels are not those of the native module: make kernels", returncode=3)
+
 
 # The shell of a background job and nohup pass on ignored signals, which our processes respect.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -34,6 +48,17 @@ def signal_handlers() -> Iterator[None]:
     yield
     for number, handler in zip(numbers, before, strict=True):
         signal.signal(number, handler)
+
+
+@pytest.fixture(autouse=True)
+def search_path() -> Iterator[None]:
+    """A command that runs in this process leaves no path to its children, nor to later tests."""
+    path, safe = list(sys.path), os.environ.get("PYTHONSAFEPATH")
+    yield
+    sys.path[:] = path
+    os.environ.pop("PYTHONSAFEPATH", None)
+    if safe is not None:
+        os.environ["PYTHONSAFEPATH"] = safe
 
 
 @pytest.fixture(scope="session")

@@ -221,9 +221,11 @@ def phone_folder(root: Path) -> Path | None:
 def phone(folder: Path) -> Iterator[tuple[str, float]]:
     """Errors of turn rates before a phone's gyroscope, deg/s, and points within 1 px.
 
-    ``folder`` holds ``rec`` and ``gyroscope.txt`` (:mod:`benchmarks.real.gyro`).
+    ``folder`` holds ``gyroscope.txt`` and ``recording``, as bundled, or all of it as ``rec``
+    (:mod:`benchmarks.real.gyro`).
     """
-    recording = read_bag(folder / "rec", _PHONE)
+    whole = folder / "rec"
+    recording = read_bag(whole if whole.is_dir() else folder / "recording", _PHONE)
     rows = gyro.judge(recording, Gyroscope.read(folder / "gyroscope.txt"), _PHONE).rows
     for name in (gyro.SINGLE, gyro.TRACKED):
         row = rows[name]

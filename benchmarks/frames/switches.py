@@ -36,9 +36,7 @@ def _always(value: Any) -> Callable[[Any], Any]:
 def _with_posterior(**changed: Any) -> Callable[[Any], Any]:
     """The refusal by a posterior with other values."""
     return lambda old: (
-        lambda observations, posterior, *args, **known: old(
-            observations, posterior._replace(**changed), *args, **known
-        )
+        lambda posterior, *args, **known: old(posterior._replace(**changed), *args, **known)
     )
 
 

@@ -26,6 +26,7 @@ import numba.np.ufunc.array_exprs as array_exprs
 from numba import types
 from numba.core import codegen, ir
 from numba.core.compiler_lock import global_compiler_lock
+from numba.np import linalg
 
 from rs_localizer.native import jit, sources
 from rs_localizer.native.declared import CODES, declaration, encode
@@ -39,7 +40,7 @@ _POINTER = 8
 
 
 def main(folder: Path, cpu: str, triple: str, modules: Sequence[str] = ()) -> None:
-    """Write ``kernels.o``, ``table.c`` and ``about.json`` into a folder.
+    """Write ``kernels.o``, ``kernels.bc``, ``table.c`` and ``about.json`` into a folder.
 
     Args:
         cpu, triple: LLVM's names of the processor and the machine.
@@ -62,6 +63,8 @@ def _prepare() -> None:
     codegen.JITCodeLibrary._finalize_specific = lambda self: None
     codegen.JITCPUCodegen.set_env = lambda self, name, env: None
     codegen.CPUCodeLibrary._verify_declare_only_symbols = lambda self: None
+    # Numba asks for SciPy, whose BLAS it would call: linear_algebra.cpp takes its place.
+    linalg.ensure_blas = linalg.ensure_lapack = lambda: None
     # Names of files enter by messages, and the address of an expression by its name.
     made, root = ir.Loc.__init__, str(sources.PACKAGE.parent) + os.sep
 
@@ -262,13 +265,23 @@ def _functions(module: Any) -> Iterator[Any]:
     return (function for function in module.functions if not function.is_declaration)
 
 
-def _emit(merged: Any, folder: Path, cpu: str, triple: str) -> None:
-    """Write one object, and its assembler text."""
+def _machine(cpu: str, triple: str) -> Any:
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
-    machine = llvm.Target.from_triple(triple).create_target_machine(
+    return llvm.Target.from_triple(triple).create_target_machine(
         cpu=cpu, features="", opt=3, reloc="pic", codemodel="default"
     )
+
+
+def assembler_text(bitcode: bytes, cpu: str, triple: str) -> str:
+    """Return the assembler text of ``kernels.bc``."""
+    text: str = _machine(cpu, triple).emit_assembly(llvm.parse_bitcode(bitcode))
+    return text
+
+
+def _emit(merged: Any, folder: Path, cpu: str, triple: str) -> None:
+    """Write one module of LLVM, and one object."""
+    machine = _machine(cpu, triple)
     merged.triple, merged.data_layout = triple, str(machine.target_data)
     for function in _functions(merged):
         if not function.name.startswith("rs_entry_"):
@@ -281,6 +294,7 @@ def _emit(merged: Any, folder: Path, cpu: str, triple: str) -> None:
         if function.linkage == llvm.Linkage.external:
             function.visibility = "hidden"
     merged.verify()
+    (folder / "kernels.bc").write_bytes(merged.as_bitcode())
     (folder / "kernels.o").write_bytes(machine.emit_object(merged))
     count = sum(1 for _ in _functions(merged))
     (folder / "about.json").write_text(json.dumps({"functions": count, "cpu": cpu}))

@@ -51,8 +51,9 @@ class _CompiledKernel(CPUDispatcher):
 class _CompiledEntry(CPUDispatcher):
     """A kernel that Python calls: with what it declares, and nothing else."""
 
-    declared: Declaration | None
-    native: Callable[..., Any] | None
+    # Of one that was unpickled in another process, too.
+    declared: Declaration | None = None
+    native: Callable[..., Any] | None = None
 
     def __call__(self, *arguments: Any) -> Any:
         if self.native is not None:

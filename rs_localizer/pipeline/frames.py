@@ -581,7 +581,7 @@ class FrameLocalizer:
             self._smooth_errors.append(result.model_error)
         off = float(np.median(self._smooth_errors)) if self._smooth_errors else 0.0
         known = len(self._smooth_errors) == _FRAMES
-        if known and off > _MUCH and not watch.axis.doubtful:
+        if known and off > _MUCH and not watch.axis.wrong:
             self._notice(
                 Notice.LENS,
                 f"residuals vary smoothly over the image ({off:.1f} px rms): recalibrate the lens, "

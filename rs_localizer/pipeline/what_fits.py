@@ -75,7 +75,8 @@ _MISTAKES: dict[str, Callable[[_Frame], Array | None]] = {
     "corners of markers are turned by half: their order begins at the opposite corner":
         _half_turned,
 }  # fmt: skip
-# The two differ by a half turn of the camera, which only the direction of a known shutter tells.
+# The two differ by a half turn of the camera and the direction of the shutter, which one image
+# hardly shows: a reversed motion looks alike.
 _MIRRORED = tuple(_MISTAKES)[:2]
 _EITHER = (
     "pixels are mirrored, left to right or top to bottom: the sender mirrors them (or the map is "
@@ -106,7 +107,7 @@ def what_fits(
     if not fits:
         return ""
     best = max(fits, key=fits.__getitem__)
-    if best in _MIRRORED and not localizer.camera.readout_time > 0.0:
+    if all(each in fits for each in _MIRRORED) and best in _MIRRORED:
         best = _EITHER
     return f"the points fit if {best}"
 

@@ -14,32 +14,39 @@ import os
 import pickle
 
 CALLS = 3  # of an entry; the first may be of an empty array
+MOST = 1_000_000  # bytes of the arguments of a call
 _kept = {}
+
+
+def size(value):
+    """Bytes of all arrays in a value."""
+    if isinstance(value, tuple):
+        return sum(map(size, value))
+    return getattr(value, "nbytes", 0)
 
 
 def pytest_configure(config):
     from rs_localizer.native import jit
 
-    call = jit._Entry.__call__
+    call = jit._CompiledEntry.__call__
 
     def recorded(self, *arguments):
         name = f"{self.__module__}.{self.__qualname__}"
-        if len(_kept.setdefault(name, [])) >= CALLS:
+        if len(_kept.setdefault(name, [])) >= CALLS or size(arguments) > MOST:
             return call(self, *arguments)
-        before = copy.deepcopy(arguments)
+        before, result, error = copy.deepcopy(arguments), None, None
         try:
-            result, error = call(self, *arguments), None
-        except TypeError:  # of the declaration: each entry is tried with each fault elsewhere
-            raise
+            result = call(self, *arguments)
         except Exception as fault:
-            result, error = None, (type(fault), str(fault))
-            raise
-        finally:
-            if "error" in locals():
-                _kept[name].append((before, copy.deepcopy(arguments), copy.deepcopy(result), error))
+            error = fault
+        if not isinstance(error, TypeError):  # of the declaration: test_entries.py tries them
+            said = error and (type(error), str(error))
+            _kept[name].append((before, copy.deepcopy(arguments), copy.deepcopy(result), said))
+        if error is not None:
+            raise error
         return result
 
-    jit._Entry.__call__ = recorded
+    jit._CompiledEntry.__call__ = recorded
 
 
 def pytest_unconfigure(config):

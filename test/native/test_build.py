@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The tool that builds kernels: what it reads, what it refuses, and what its C relies on."""
 
 import ast
@@ -94,3 +96,22 @@ def test_the_same_bytes_come_from_another_folder_and_seed(tmp_path):
     for name in ("kernels.o", "table.c"):
         assert (one / name).read_bytes() == (other / name).read_bytes()
     assert str(tmp_path).encode() not in (one / "kernels.o").read_bytes()
+
+
+@pytest.mark.skipif(shutil.which("objdump") is None, reason="needs objdump")
+@pytest.mark.parametrize(("level", "unwanted"), [("v2", ("%ymm", "%zmm")), ("v3", ("%zmm",))])
+def test_a_level_has_no_instructions_of_a_higher_one(level, unwanted, tmp_path):
+    if platform.machine() != "x86_64":
+        pytest.skip("levels of x86-64")
+    environment = os.environ | build._environment(level, True) | {"RS_LOCALIZER_KERNELS": "build"}
+    command = [sys.executable, "-m", "rs_localizer.native.bitcode", tmp_path, build._CPUS[level]]
+    command += ["x86_64-unknown-linux-gnu", "rs_localizer.core.bearings"]
+    subprocess.run(command, env=environment, cwd=sources.PACKAGE.parent, check=True)
+    listed = subprocess.run(
+        ["objdump", "--disassemble", tmp_path / "kernels.o"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "%xmm" in listed.stdout
+    assert not any(register in listed.stdout for register in unwanted)

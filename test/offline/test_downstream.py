@@ -155,7 +155,7 @@ def test_odometry_is_that_of_the_body_in_the_map(flight, frames):
         [position - flight.position[SETTLED], turns(rotation, flight.rotation[SETTLED])]
     )
     covariances = np.array([m.pose.covariance.reshape(6, 6) for m in odometry])
-    assert 0.4 < squared(of_pose, covariances) < 2.0
+    assert 0.3 < squared(of_pose, covariances) < 2.0
     twists = [m.twist.twist for m in odometry]
     velocity = (
         np.array([[*vars_of(t.linear), *vars_of(t.angular)] for t in twists])
@@ -188,7 +188,7 @@ def test_px4_gets_the_same_in_its_axes(flight, frames):
         "velocity": column("velocity") - flight.linear[SETTLED] @ FLU_TO_FRD.T,
     }
     for name, error in errors.items():
-        assert 0.2 < np.mean(error**2 / column(f"{name}_variance")) < 2.0, name
+        assert 0.1 < np.mean(error**2 / column(f"{name}_variance")) < 2.0, name
     rates = column("angular_velocity") - flight.angular[SETTLED] @ FLU_TO_FRD.T
     assert np.median(np.abs(rates)) < np.deg2rad(5.0)
 

@@ -4,6 +4,7 @@
 
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -28,9 +29,11 @@ class Payload:
 
 @pytest.fixture
 def home() -> Iterator[Path]:
-    """A folder that everybody can enter; pytest's own is nobody else's."""
+    """A checkout that everybody can enter; pytest's own folder is nobody else's."""
     with tempfile.TemporaryDirectory(dir="/tmp") as folder:
         Path(folder).chmod(0o755)
+        unwanted = shutil.ignore_patterns("*.so", "__pycache__", "data")
+        shutil.copytree(ROOT / "rs_localizer", Path(folder) / "rs_localizer", ignore=unwanted)
         yield Path(folder)
 
 
@@ -38,7 +41,7 @@ def use(home: Path) -> str:
     """What ran of the payloads when a process used a kernel, whose result is right anyway."""
     mark = home / "RAN"
     mark.write_text("")
-    environment = os.environ | {"XDG_CACHE_HOME": str(home / "cache"), "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"RS_LOCALIZER_KERNELS": "numba", "PYTHONPATH": str(home)}
     done = subprocess.run(
         [sys.executable, "-P", "-c", USE], env=environment, cwd=home, capture_output=True,
         text=True, check=True,
@@ -48,7 +51,7 @@ def use(home: Path) -> str:
 
 
 def plant(home: Path) -> None:
-    for path in (home / "cache").rglob("*"):
+    for path in (home / ".kernels").rglob("*"):
         if path.is_file() and path.stat().st_size:
             path.write_bytes(pickle.dumps(Payload(home / "RAN")))
 
@@ -61,7 +64,7 @@ def test_nothing_of_a_folder_of_others_runs(home, theirs):
     plant(home)
     assert use(home) != "", "the control: nobody reads what was planted"
     plant(home)
-    for path in (home / "cache", *(home / "cache").rglob("*")):
+    for path in (home / ".kernels", *(home / ".kernels").rglob("*")):
         if theirs == "they own it":
             os.chown(path, NOBODY, NOBODY)
         path.chmod(0o755 if theirs == "they own it" else 0o777)

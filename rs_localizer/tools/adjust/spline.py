@@ -178,6 +178,10 @@ class Spline:
     rotations: Array  # (n,3,3) map_from_camera
     positions: Array  # (n,3) m
 
+    def __post_init__(self) -> None:
+        for name in ("rotations", "positions"):  # as kernels take them
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
+
     def moved(self, step: Array) -> Spline:
         """With the controls changed by a step (6 n,)."""
         step = step.reshape(-1, 6)

@@ -43,7 +43,7 @@ def test_quick_demo(tmp_path):
     assert said is not None
     assert float(said[1]) < 1.0 < float(said[2])
     with PIL.Image.open(out / "cube.gif") as animation:
-        assert animation.n_frames == 6
+        assert animation.n_frames == 12
     assert cv2.imread(str(out / "flight_errors.png")).std() > 5.0
     assert {file.name for file in out.iterdir()} == {"flight_errors.png", "cube.gif"}
     # Offline first, the node last: it says the same, bit for bit.

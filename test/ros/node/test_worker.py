@@ -199,7 +199,7 @@ def test_a_worker_that_is_closed_publishes_nothing_more(fake):
 
 def test_all_results_of_a_message_are_published_as_they_come(fake):
     """As of a rig's image, which may complete two frames; one refusal ends none of them."""
-    refusal = Refusal(Reason.NO_TIME, "none")
+    refusal = Refusal(Reason.NO_STAMP, "none")
     fake.worker.process("frames", "one", lambda *_: iter(["a", refusal, "b", "c"]))
     for _ in "abc":
         fake.wait(fake.done)
