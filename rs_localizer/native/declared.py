@@ -10,7 +10,7 @@ module reads at each call; a call that does not fit is explained here, in whatev
 
 from __future__ import annotations
 
-import sys
+import importlib
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NamedTuple, NoReturn, get_args, get_origin
 
@@ -78,7 +78,7 @@ def _kind(annotation: Any, module: str) -> Kind | None:
     """The kind of an annotation, or of its text in a module that postpones evaluation."""
     annotation = getattr(annotation, "__forward_arg__", annotation)  # of a named tuple's field
     if isinstance(annotation, str):
-        annotation = eval(annotation, vars(sys.modules[module]))
+        annotation = eval(annotation, vars(importlib.import_module(module)))
     if get_origin(annotation) is Annotated:
         _, known, *more = get_args(annotation)
         return known._replace(is_written=WRITTEN in more) if isinstance(known, ArrayOf) else None
