@@ -38,7 +38,7 @@ DEFINITIONS = {
         "std_msgs/Header header\nisaac_ros_apriltag_interfaces/AprilTagDetection[] detections"
     ),
 }
-"""For recordings that do not describe their types, as those of ROS 2 before Iron."""
+"""Message types, for recordings of ROS 2 before Iron, which do not describe their types."""
 
 _FIRST_PIXEL = 0.5  # where apriltag has the centre of the first pixel
 _MOST = 10_000  # tags of an image

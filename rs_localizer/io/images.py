@@ -67,7 +67,7 @@ _FORMATS = (("JPEG", b"\xff\xd8", b"\xff\xd9"), ("PNG", b"\x89PNG\r\n\x1a\n", b"
 # One bit per pixel comes to 8000, and a JPEG to 500, which takes 3 bytes each to decode.
 _DENSEST, _ALIKE = 32, 4_000_000
 MOST_PIXELS = 150_000_000
-"""Of an image: no camera has more; decoded they take 8 bytes each at most."""
+"""No camera has more pixels; a decoded pixel takes 8 bytes at most."""
 # What a gray image depends on; PNG (third edition), section 5.6.
 _STILL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 # JPEG's markers of frames, by which the size is given.

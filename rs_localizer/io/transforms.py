@@ -137,7 +137,7 @@ class UnusableTransforms:
         return link
 
     def of(self, frame: str) -> str:
-        """What is wrong with a transform of this frame; empty: nothing has come that is."""
+        """Say what is wrong with a transform of this frame; an empty text if none was wrong."""
         faults = (fault for names, fault in list(self._faults.items()) if frame in names)
         return next(faults, "")
 

@@ -32,7 +32,7 @@ _WITH_QOS = (
 
 
 class UnpackingError(ValueError):
-    """What is packed is more than anybody records, or damaged."""
+    """A packed message is damaged, or larger than anybody records."""
 
 
 def most_unpacked(packed: int) -> int:
@@ -60,7 +60,7 @@ def _zstd() -> Any:
 
 
 def unpack_zstd(data: bytes) -> bytes:
-    """What a message or chunk of Zstandard holds."""
+    """Return the bytes that a message or chunk of Zstandard holds, up to a limit."""
     with _zstd().open(io.BytesIO(data), "rb") as file:
         return _read(file, len(data))
 
@@ -76,7 +76,7 @@ def _unpack_bz2(data: bytes) -> bytes:
 
 
 def unpack_file(packed: Path, out: Path) -> None:
-    """Write what a file of Zstandard holds."""
+    """Write a file of Zstandard unpacked to ``out``."""
     size = packed.stat().st_size
     most = left = _BEST * size + _FILE_ALIKE
     with packed.open("rb") as data, _zstd().open(data, "rb") as file, out.open("wb") as target:

@@ -29,7 +29,7 @@ DEFINITIONS = {
         "uint8 flags\nbool is_bigendian\nuint8[] data"
     ),
 }
-"""For recordings that do not describe their types, as those of ROS 2 before Iron."""
+"""Message types, for recordings of ROS 2 before Iron, which do not describe their types."""
 
 # Parts of names of encoders and formats (libx264, h264_nvenc, "hevc;yuv420p;..."): the decoder.
 _DECODERS = {
@@ -42,7 +42,7 @@ _MOST_HELD_BACK = 32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Packet:
-    """What a message says beside its data."""
+    """The stamp and frame of a packet of video, without its data."""
 
     stamp_ns: int
     frame: str  # the camera's optical frame, or what the message says of it

@@ -219,7 +219,7 @@ class _Result:
         self._classes, self._name = classes, name
 
     def encode(self, kind: Any, start: int = 0) -> str:
-        """As :func:`rs_localizer.native.declared.encode`; four digits of a place behind each."""
+        """Encode a kind as ``declared.encode`` does, with a place in four digits behind each."""
         size, _ = self._layout(kind)
         if start == 0 and size > _MOST_RESULT:
             raise TypeError(f"{self._name}: a result of {size} bytes is more than {_MOST_RESULT}")

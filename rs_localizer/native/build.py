@@ -205,7 +205,7 @@ def _all_files() -> set[Path]:
 
 
 def _environment(level: str, is_host: bool) -> dict[str, str]:
-    """What has Numba compile for a level, and in one order whenever it does."""
+    """Return the environment in which Numba compiles for a level, always in one order."""
     return {
         "NUMBA_CPU_NAME": _CPUS[level] if is_host else "x86-64-v2",
         "NUMBA_CPU_FEATURES": "",

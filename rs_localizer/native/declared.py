@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What an entry takes: read from the annotations of its function, and checked when it is called.
+"""Read the arguments of an entry from its annotations, and check them when it is called.
 
 An entry is declared by its annotations alone. ``Array2`` is a contiguous array of two dimensions,
 ``Out[Array2]`` one that the kernel writes to, a class that derives from ``NamedTuple`` stands for
@@ -20,7 +20,7 @@ CODES = {"float64": "d", "int64": "q", "bool": "?", "uint8": "B", "uint64": "Q",
 """How the buffer protocol writes the types of elements."""
 _SCALARS = {float: "d", int: "q", bool: "?"}
 WRITTEN = "written"
-"""In an annotation: the kernel writes to the array."""
+"""A mark in the annotation of an array: the kernel writes to it."""
 _WORDS = {"d": "a float", "q": "an int", "?": "a bool"}
 
 

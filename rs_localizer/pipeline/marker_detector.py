@@ -114,7 +114,7 @@ class FrameDetector:
         return Detected(image, detections, self.map, self._row)
 
     def _mirrored(self, image: Image, shown: int) -> str:
-        """That an image which shows so many corners shows more of them mirrored, or nothing."""
+        """Return a warning if the mirrored image shows more corners than this one, or ``""``."""
         detector = MarkerDetector(self.map)  # whose boards lie otherwise
         corners = len(detector.detect(image.pixels[:, ::-1], image.stamp_ns).ids)
         if corners < _TIMES * shown + _MORE:

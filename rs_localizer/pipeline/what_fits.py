@@ -87,7 +87,7 @@ _EITHER = (
 def what_fits(
     localizer: Localizer, points: Array, pixels: Array, ids: IntArray | None = None
 ) -> str:
-    """What is wrong with a frame that was refused, as a sentence; empty: nothing of this kind.
+    """Say in a sentence what is wrong with a refused frame; an empty text if nothing is found.
 
     Args:
         localizer: of a camera alone, that refused it.
@@ -123,7 +123,7 @@ def _is_flat(points: Array) -> bool:
 def of_refused(
     localizer: Localizer, points: Array, pixels: Array, ids: IntArray | None = None
 ) -> str:
-    """The same of a frame of which nobody knows yet whether it is refused; empty if it is not."""
+    """Localize a frame, and say what is wrong with it if it is refused; else an empty text."""
     found = localizer.localize(points, pixels)
     refused = not found and found.reason in REASONS
     return what_fits(localizer, points, pixels, ids) if refused else ""
@@ -135,7 +135,7 @@ def ids_of(cloud: Correspondences) -> IntArray | None:
 
 
 def mistake_of(localizer: Localizer, frames: Sequence[tuple[Array, Array, IntArray | None]]) -> str:
-    """What is wrong with a recording, by a few of its frames; empty: nothing of this kind.
+    """Say in a sentence what is wrong with a recording, by a few of its frames; else an empty text.
 
     Args:
         localizer: of a camera alone.
@@ -158,7 +158,7 @@ class Mistakes:
         self._agreed, self._said = 0, ""
 
     def look(self, tried: Callable[[], str]) -> str:
-        """What is wrong with one more; empty: unknown.
+        """Say what is wrong with one more frame; an empty text if nothing is found.
 
         Args:
             tried: names what fits, as :func:`what_fits`; called now and then.

@@ -91,7 +91,7 @@ def store(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
 
 @_inline
 def uniform(typingctx: Any, number: Any) -> Any:
-    """The same number in all lanes."""
+    """Return a vector with one number in all lanes."""
 
     def emit(context: Any, builder: Any, call: Any, args: Any) -> Any:
         lane = context.cast(builder, args[0], call.args[0], types.float64)
