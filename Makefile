@@ -13,6 +13,7 @@
 # make docs   the pages as a site, in out/docs; a link that leads nowhere is an error
 # make ros    the package as a workspace of an installed ROS 2 has it: launch files, tf2, life cycle,
 #             bags; fetches nothing, and says so where there is no ROS
+# make release  checks what a release needs, and prints what a person still has to do
 # make clean  removes everything that make has made
 #
 # Both prepare a virtual environment first (once). PYTHON chooses the interpreter, VENV the place.
@@ -49,7 +50,7 @@ progress := $(PYTHON) .ci/progress.py
 native = $$($(python) -m rs_localizer.native.build --environment)
 pip := $(python) -m pip install --disable-pip-version-check --no-input --progress-bar off
 
-.PHONY: demo test bench ros coverage docs collect kernels wheel jit lint clean
+.PHONY: demo test bench ros coverage docs collect kernels wheel jit lint release clean
 .DELETE_ON_ERROR:
 
 demo: kernels
@@ -94,6 +95,9 @@ kernels: $(ready)
 wheel: $(ready)
 	@$(progress) --quiet "installing packages" $(pip) build ziglang auditwheel
 	@bash .ci/portable_wheels dist
+
+release:
+	@bash .ci/release
 
 # The kernels under Numba: their own tests, and whether the native module answers as they do.
 jit: kernels
