@@ -71,7 +71,7 @@ if os.environ.get("AMENT_PREFIX_PATH"):
 
 setup(
     name=package_name,
-    version="1.0.0",
+    version="0.9.0",
     description="Pose and velocity of a rolling-shutter camera from a single image",
     maintainer="rs_localizer maintainers",
     maintainer_email="maintainers@users.noreply.h-seed-b0484be4.example",

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rs_localizer.solvers.minimal import solve_minimal
     from rs_localizer.tracking import Tracker
 
-__version__ = "1.0.0"
+__version__ = "0.9.0"
 
 __all__ = [
     "Acceleration",
