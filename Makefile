@@ -1,7 +1,7 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
 #
-# make demo   the whole thing on the bundled recording: a table on the screen, pictures in out/
+# make demo   the whole thing on the bundled recording: a table on the screen, a picture in out/
 # make test   lint, types and tests
 # make kernels  compiles what has been edited of the kernels; the others do that first
 # make wheel  wheels for other machines, in dist/

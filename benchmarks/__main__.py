@@ -65,7 +65,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   load.robot                       a live node on a robot: occlusions, odometry at 200 Hz
   simulation                       bags as of simulate, of more sensors
   start                            memory and time of a start of the node
-  demo, page                       the demo's medians; what a bench prints, into the docs
+  page                             what a bench prints, into the docs
 """
 
 

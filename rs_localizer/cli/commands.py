@@ -58,7 +58,7 @@ COMMANDS = {
     )
     for name, summary, words in (
         (
-            "demo", "play the bundled recordings through the real node; a table and pictures",
+            "demo", "localize the bundled recordings; a table, and a picture of the errors",
             "--out out",
         ),
         (

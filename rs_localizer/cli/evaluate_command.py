@@ -46,23 +46,26 @@ def run(options: Options) -> Figures:
     for part in (estimate.poses, estimate.twists):
         if part is not None:
             part.stamps_ns[:] += round(options.offset * 1e9)
-    found = errors.errors_of(estimate, truth)
-    count = len(found["position"].values)
-    if count == 0:
+    rows, true_rows = errors.associate(estimate.poses.stamps_ns, truth.poses.stamps_ns)
+    if len(rows) == 0:
         raise ValueError(
             f"no pose of {options.estimate} is within {1e-9 * errors.TOLERANCE_NS:g} s of one of "
             f"{options.truth}: {_span(estimate.poses)} against {_span(truth.poses)}"
         )
-    print(f"{count} of {len(estimate.poses)} poses compared")
-    rows, true_rows = errors.associate(estimate.poses.stamps_ns, truth.poses.stamps_ns)
+    print(f"{len(rows)} of {len(estimate.poses)} poses compared")
     print(_coverage(options.truth, len(rows), len(np.unique(true_rows)), len(truth.poses)))
-    of = {f"{kind} ({errors.UNITS[kind]})": each.values for kind, each in found.items()}
-    print(f"\n{errors.table(of)}")
-    figures: Figures = {"poses": count}
-    for kind, each in found.items():
-        known, suffix = kind.replace(" ", "_"), errors.UNITS[kind].replace("/", "_per_")
-        median, _, p95, _ = errors.summary(each.values).values()
-        figures |= {f"{known}_median_{suffix}": median, f"{known}_p95_{suffix}": p95}
+    found, figures = errors.errors_of(estimate, truth), Figures(poses=len(rows))
+    print(f"\n{'error':26}{'count':>6}{'median':>11}{'mean':>11}{'95 %':>11}{'largest':>11}")
+    for kind, (_, values) in found.items():
+        unit = errors.UNITS[kind]
+        cells = np.nan, np.nan, np.nan, np.nan
+        if len(values):
+            median, p95 = np.percentile(values, [50, 95]).tolist()
+            cells = median, float(np.mean(values)), p95, float(np.max(values))
+        columns = "".join(f"{value:11.5f}" for value in cells)
+        print(f"{f'{kind} ({unit})':26}{len(values):6}{columns}")
+        known, suffix = kind.replace(" ", "_"), unit.replace("/", "_per_")
+        figures |= {f"{known}_median_{suffix}": cells[0], f"{known}_p95_{suffix}": cells[2]}
     if options.ate:
         for name, value in errors.by_evo(estimate.poses, truth.poses).items():
             print(f"{name:34}{value:11.5f}")

@@ -50,7 +50,7 @@ if WORKING:
 _ANGULAR_VELOCITY, _LINEAR_VELOCITY = (0.0, 1.0, 0.0), (0.3, 0.0, 0.0)
 _DURATION = 10.0
 _START_NS = 1_000_000_000  # a time of 0 means "none" to ROS
-_BUNDLED = "tum_vi_room5"  # stands for the bundled trajectory
+BUNDLED = "tum_vi_room5"  # stands for the bundled trajectory
 _READOUT_TIME = 0.03  # s, of a webcam
 _POINTS, _PICTURES = FrameSettings(), ImageSettings()
 _POSITIVE = (0.0, math.inf)
@@ -64,7 +64,7 @@ class MotionOptions:
 
     trajectory: Path | None = option(
         "follow recorded poses: TUM text, also .gz; gaps are left out, never bridged "
-        f"({_BUNDLED}: the bundled motion of a hand-held rig)", "FILE",
+        f"({BUNDLED}: the bundled motion of a hand-held rig)", "FILE",
     )  # fmt: skip
     angular_velocity: tuple[float, float, float] | None = option(
         "rad/s in camera axes (x right, y down, z forward); without any motion given: 0 1 0",
@@ -139,7 +139,7 @@ def motion_of(args: Options) -> TrueMotion:
     if args.trajectory is not None:
         if (angular, linear) != (None, None):
             raise UsageError("give either --trajectory or velocities, not both")
-        bundled = args.trajectory == Path(_BUNDLED) and not args.trajectory.exists()
+        bundled = args.trajectory == Path(BUNDLED) and not args.trajectory.exists()
         return RecordedMotion(read_tum(data.path(data.HAND_MOTION) if bundled else args.trajectory))
     if angular is None and linear is None:
         angular, linear = _ANGULAR_VELOCITY, _LINEAR_VELOCITY

@@ -25,6 +25,7 @@ _EXTRAS = {
     "av": "video",
     "dask": "fleet",
     "distributed": "fleet",
+    "evo": "evaluate",
     "pyarrow": "table",
     "pycolmap": "mapping",
     "telemetry_parser": "video",

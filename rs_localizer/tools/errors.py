@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of poses and twists against the truth: a table, a picture, and ATE and RPE by evo."""
+"""Errors of poses and twists against the truth, a picture of them, and ATE and RPE by evo."""
 
 from __future__ import annotations
 
@@ -20,14 +20,10 @@ Stamps = NDArray[np.int64]
 TOLERANCE_NS = 1_000_000
 """Largest difference of times that are compared: rounding, where both are of one image."""
 UNITS = {
-    "position": "m",
-    "orientation": "deg",
-    "angular velocity": "deg/s",
-    "linear velocity": "m/s",
-}
+    "position": "m", "orientation": "deg", "angular velocity": "deg/s", "linear velocity": "m/s"
+}  # fmt: skip
 # They differ for everyone, and in lightness.
 BLUE, ORANGE = "#0b3c8c", "#b8540a"
-_STYLES = ((BLUE, "."), (ORANGE, "x"))
 # Frames of the running median that is drawn through the single errors; zero has no logarithm.
 _WINDOW, _LEAST = 15, 1e-9
 
@@ -56,50 +52,23 @@ def errors_of(estimate: Motions, truth: Motions) -> dict[str, Errors]:
     """Errors by what they are of, in :data:`UNITS`; of twists where both have them."""
     rows, true_rows = associate(estimate.poses.stamps_ns, truth.poses.stamps_ns)
     poses, true = estimate.poses.part(rows), truth.poses.part(true_rows)
-    found = {
-        "position": Errors(poses.stamps_ns, _lengths(poses.positions - true.positions)),
-        "orientation": Errors(poses.stamps_ns, angles(poses.quaternions, true.quaternions)),
-    }
+    turns = np.zeros(0)
+    if len(rows):
+        between = Rotation.from_quat(poses.quaternions).inv() * Rotation.from_quat(true.quaternions)
+        turns = np.degrees(between.magnitude())
+    values = {"position": _lengths(poses.positions - true.positions), "orientation": turns}
+    found = {kind: Errors(poses.stamps_ns, each) for kind, each in values.items()}
     if estimate.twists is not None and truth.twists is not None:
         rows, true_rows = associate(estimate.twists.stamps_ns, truth.twists.stamps_ns)
         twists, moving = estimate.twists.part(rows), truth.twists.part(true_rows)
-        turns = np.degrees(_lengths(twists.angular - moving.angular))
-        found["angular velocity"] = Errors(twists.stamps_ns, turns)
+        rates = np.degrees(_lengths(twists.angular - moving.angular))
+        found["angular velocity"] = Errors(twists.stamps_ns, rates)
         found["linear velocity"] = Errors(twists.stamps_ns, _lengths(twists.linear - moving.linear))
     return found
 
 
 def _lengths(vectors: Array) -> Array:
     return np.asarray(np.linalg.norm(vectors, axis=1), np.float64)
-
-
-def angles(quaternions: Array, others: Array) -> Array:
-    """Angles (n,) in degrees between rotations given as quaternions (n,4), x y z w."""
-    if len(quaternions) == 0:
-        return np.zeros(0)
-    between = Rotation.from_quat(quaternions).inv() * Rotation.from_quat(others)
-    return np.degrees(np.asarray(between.magnitude(), np.float64))
-
-
-def table(series: Mapping[str, Array], title: str = "error") -> str:
-    """Count, median, mean, 95 % and largest of values (n,), by name."""
-    width = max(26, *(len(name) + 2 for name in (title, *series)))
-    lines = [f"{title:{width}}{'count':>6}" + "".join(f"{name:>11}" for name in SUMMARY)]
-    for name, values in series.items():
-        columns = "".join(f"{value:11.5f}" for value in summary(values).values())
-        lines.append(f"{name:{width}}{len(values):6}{columns}")
-    return "\n".join(lines)
-
-
-SUMMARY = ("median", "mean", "95 %", "largest")
-
-
-def summary(values: Array) -> dict[str, float]:
-    """Figures of errors (n,) by :data:`SUMMARY`; NaN for none."""
-    if len(values) == 0:
-        return dict.fromkeys(SUMMARY, np.nan)
-    of = np.median(values), np.mean(values), np.percentile(values, 95), np.max(values)
-    return dict(zip(SUMMARY, map(float, of), strict=True))
 
 
 def draw(methods: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
@@ -110,29 +79,24 @@ def draw(methods: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
     from matplotlib.figure import Figure  # half a second
 
     kinds = [kind for kind in UNITS if any(kind in of for of in methods.values())]
-    start = min(stamp for of in methods.values() for stamp in of["position"].stamps_ns[:1])
     figure = Figure((10.0, 0.6 + 2.1 * len(kinds)), dpi=130, layout="constrained")
     panels = figure.subplots(len(kinds), 1, sharex=True, subplot_kw={"yscale": "log"})
-    for axes, kind in zip(panels, kinds, strict=True):
-        for (name, of), (color, marker) in zip(methods.items(), _STYLES, strict=False):
-            if kind not in of or len(of[kind].values) == 0:
-                continue
-            t = (of[kind].stamps_ns - start) * 1e-9
+    start, medians = min(of["position"].stamps_ns[0] for of in methods.values()), list[str]()
+    for (name, of), color, marker in zip(methods.items(), (BLUE, ORANGE), ".x", strict=False):
+        for kind in (kind for kind in kinds if kind in of and len(of[kind].values)):
+            axes, t = panels[kinds.index(kind)], (of[kind].stamps_ns - start) * 1e-9
             values = np.maximum(of[kind].values, _LEAST)
             axes.plot(t, values, marker, color=color, markersize=3.0, alpha=0.35)
             running = median_filter(values, min(_WINDOW, len(values)), mode="mirror")
             label = f"{name}: median {np.median(values):.3g}, largest {values.max():.3g}"
             axes.plot(t, running, color=color, label=label)
-        axes.set_ylabel(f"{kind}\n({UNITS[kind]})")
-        axes.grid(color="#e6e6e6")
-        axes.legend(
-            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False, borderaxespad=0.1
-        )
+            axes.set_ylabel(f"{kind}\n({UNITS[kind]})")
+            axes.legend(
+                loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False,
+                borderaxespad=0.1,
+            )  # fmt: skip
+            medians.append(f"{kind} ({UNITS[kind]}), {name}: {np.median(values):.3g}")
     panels[-1].set_xlabel("time (s)")
-    medians = [
-        f"{kind} ({UNITS[kind]}), {name}: {np.median(of[kind].values):.3g}"
-        for name, of in methods.items() for kind in kinds if kind in of and len(of[kind].values)
-    ]  # fmt: skip
     figure.savefig(path, metadata={"Description": "; ".join(medians)})
 
 
@@ -140,13 +104,12 @@ def by_evo(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
     """ATE and RPE after Umeyama's alignment of the positions, by name and unit.
 
     Raises:
-        ValueError: where evo is not installed, or the positions lie on a line.
+        ImportError: without evo.
+        ValueError: where the positions lie on a line.
     """
-    try:
-        from evo.core import metrics, trajectory
-        from evo.core.geometry import GeometryException
-    except ImportError as error:
-        raise ValueError("--ate needs evo: pip install 'rs_localizer[evaluate]'") from error
+    from evo.core import metrics, trajectory
+    from evo.core.geometry import GeometryException
+
     rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns)
     true, estimated = (
         trajectory.PoseTrajectory3D(
@@ -160,15 +123,11 @@ def by_evo(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
         estimated.align(true)
     except GeometryException as error:
         raise ValueError(f"--ate: positions on a line determine no alignment: {error}") from error
-    found = {}
+    parts = metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_deg
+    found = dict[str, float]()
     for name, metric in (("ATE", metrics.APE), ("RPE, next frame", metrics.RPE)):
-        for unit, part in (
-            ("m", metrics.PoseRelation.translation_part),
-            ("deg", metrics.PoseRelation.rotation_angle_deg),
-        ):
+        for unit, part in zip(("m", "deg"), parts, strict=True):
             measured = metric(part)
             measured.process_data((true, estimated))
-            found[f"{name} ({unit} rms)"] = float(
-                measured.get_statistic(metrics.StatisticsType.rmse)
-            )
+            found[f"{name} ({unit} rms)"] = float(np.sqrt(np.mean(measured.error**2)))
     return found
