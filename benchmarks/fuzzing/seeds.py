@@ -68,13 +68,10 @@ _JSON = (
     b'0, 0, 0], "distortion_model": "fisheye"}'
 )
 
-_PHOTONVISION = b"""{"resolution": {"width": 640.0, "height": 480.0}, "cameraIntrinsics":
-{"rows": 3, "cols": 3, "data": [500.0, 0, 319.5, 0, 500.0, 239.5, 0, 0, 1]}, "distCoeffs":
-{"rows": 1, "cols": 8, "data": [0.1, 0, 0, 0, 0, 0, 0, 0]}, "lensmodel": "LENSMODEL_OPENCV"}"""
 _GYROFLOW = b"""{"calib_dimension": {"w": 640, "h": 480}, "fisheye_params": {"camera_matrix":
 [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], "distortion_coeffs": [0.1, 0, 0, 0]},
 "distortion_model": "opencv_fisheye", "frame_readout_time": 9.6}"""
-CALIBRATIONS = (_ROS, _OPENCV, _KALIBR, _COLMAP, _JSON, _PHOTONVISION, _GYROFLOW)
+CALIBRATIONS = (_ROS, _OPENCV, _KALIBR, _COLMAP, _JSON, _GYROFLOW)
 """Of every program whose files are read."""
 
 _COUNT = 5

@@ -28,7 +28,7 @@ from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum, read_twists
 from rs_localizer.io.video import Video, VideoError
-from rs_localizer.markers.map_files import Unsaid, read_any, read_marker_map
+from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import build, load_params_file, parse_assignment
@@ -53,10 +53,6 @@ rs_localizer:
 _ASSIGNMENTS = (b"readout_time:=0.03", b"solver:=p3p", b"tracking:=false", b"map_file:=''")
 _TUM = b"# t x y z qx qy qz qw\n1.5 0 0 1 0 0 0 1\n2.5 1 0 1 0 0 0.6 0.8\n"
 _TWISTS = b"# t wx wy wz vx vy vz\n1.5 0 0 1 0 0 0\n2.5 1 0 1 0 0 0.6\n"
-_WPILIB = b"""{"tags": [{"ID": 1, "pose": {"translation": {"x": 1.0, "y": 0.0, "z": 1.5},
-"rotation": {"quaternion": {"W": 0.5, "X": 0.5, "Y": 0.5, "Z": 0.5}}}}],
-"field": {"length": 16.5, "width": 8.1}}"""
-_EUROC = b"#timestamp,px,py,pz,qw,qx,qy,qz\n1403636579763555584,1,2,3,1,0,0,0,0.1,0.2\n"
 _TARGET = b"target_type: aprilgrid\ntagCols: 4\ntagRows: 3\ntagSize: 0.05\ntagSpacing: 0.3\n"
 _MARKERS = b"""# markers of a room, surveyed with a tape measure; lengths in metres, poses of each
 map_frame: map
@@ -124,7 +120,7 @@ def targets(folder: Path) -> dict[str, Target]:
         ),
         "name:=value": Target(_bytes(_ASSIGNMENTS), _assign, (ValueError,)),
         "trajectory": Target(
-            _bytes((_TUM, _EUROC)), _file(folder / "poses.txt", read_tum), (TrajectoryError,)
+            _bytes((_TUM,)), _file(folder / "poses.txt", read_tum), (TrajectoryError,)
         ),
         "calibration": Target(
             _bytes(seeds.CALIBRATIONS),
@@ -169,9 +165,6 @@ def _more_files(folder: Path) -> dict[str, Target]:
             _file(folder / "v.mjpeg", _read_film),
             (VideoError,),
         ),
-        "markers .json": Target(
-            _bytes((_WPILIB,)), _file(folder / "field.json", _read_field), (MarkerMapError,)
-        ),
     }
 
 
@@ -189,10 +182,6 @@ def _packed(good: Sequence[bytes]) -> Callable[[Random], bytes]:
 def _read_bag(path: Path) -> object:
     with open_bag(path) as bag:
         return sum(1 for _ in bag.messages(list(bag.topics)))
-
-
-def _read_field(path: Path) -> object:
-    return read_any(path, Unsaid(size=0.165))
 
 
 def _read_film(path: Path) -> object:

@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration files of other programs -> Camera.
 
-Which program wrote a file, what it holds tells; what each calls a lens is a row of
-:data:`_PROGRAMS`. Of a file of several cameras, the wanted one's name stands behind a ``#``:
-``camchain.yaml#cam1``.
+Which program wrote a file, what it holds tells. Of a file of several cameras, the wanted one's name
+stands behind a ``#``: ``camchain.yaml#cam1``.
 """
 
 from __future__ import annotations
@@ -12,8 +11,9 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -39,42 +39,25 @@ _RATIONAL = len(_ORDER["rational_polynomial"])
 _MODELS = {
     "fisheye": "equidistant", "opencv_fisheye": "equidistant",
     "radtan": "plumb_bob", "pinhole": "plumb_bob", "none": "plumb_bob",
-    "opencv_standard": "plumb_bob", "lensmodel_opencv": "plumb_bob",
+    "opencv_standard": "plumb_bob",
     "double_sphere": str(DistortionModel.DOUBLE_SPHERE),
 }  # fmt: skip
 
 
-class _Program(NamedTuple):
-    """Places of a lens in a program's files: dotted paths in the tree, the first that is there.
-
-    ``K`` is a matrix and ``D`` a list, or each a mapping with ``data``; an empty path is the tree.
-    """
-
-    K: tuple[str, ...]
-    D: tuple[str, ...]
-    size: tuple[str, ...] = ("", "image_size", "imageSize", "img_size", "resolution", "size")
-    model: tuple[str, ...] = ("distortion_model", "camera_model", "model", "model_type")
-    default: str = ""  # model of files that do not say it; empty: OpenCV's, by the number
-    readout_ms: str = ""  # for all rows
-
-
-_PROGRAMS = (
-    _Program(  # Gyroflow
-        ("fisheye_params.camera_matrix",), ("fisheye_params.distortion_coeffs",),
-        ("calib_dimension",), default="opencv_fisheye", readout_ms="frame_readout_time",
-    ),
-    _Program(("cameraIntrinsics",), ("distCoeffs",), model=("lensmodel",)),  # PhotonVision
-    _Program(  # ROS' camera_calibration, OpenCV, and whatever has the usual names
-        ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "mtx"),
-        ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs",
-         "dist_coeff", "distortion", "dist", "D"),
-    ),
+# What ROS, OpenCV's programs and their users call the parts of a lens.
+_K = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "mtx")
+_D = (
+    "distortion_coefficients", "Distortion_Coefficients", "distortion_coeffs", "dist_coeffs",
+    "distCoeffs", "dist", "D",
 )  # fmt: skip
-_WIDTH = ("image_width", "image_Width", "width", "w")
-_HEIGHT = ("image_height", "image_Height", "height", "h")
+_SIZE = ("image_size", "imageSize", "resolution")
+_WIDTH, _HEIGHT = (
+    ("image_width", "image_Width", "width"),
+    ("image_height", "image_Height", "height"),
+)
 CALIBRATION_KINDS = (
     "calibration file of ROS' camera_calibration, OpenCV (YAML, JSON), Kalibr (camchain), COLMAP "
-    "(cameras.txt), PhotonVision, Gyroflow, or JSON with K, D, width and height"
+    "(cameras.txt), Gyroflow, or JSON with K, D, width and height"
 )
 # Who writes FILE#cam1 means a camera in a file; a name of a file may hold the sign, too.
 _CHOICE = re.compile(r"(.+)#([^/#]+)")
@@ -126,8 +109,8 @@ def _camera(text: str, chosen: str | None) -> Camera:
         return colmap_camera(text, chosen)
     tree = _load_tree(text)
     tree = tree if isinstance(tree, dict) else {}
-    lenses = (own for _, block in parameter_blocks(tree) for own in _at(block, (LENS,)))
-    tree = next(lenses, tree)
+    blocks = (block for _, block in parameter_blocks(tree) if isinstance(block, dict))
+    tree = next((block[LENS] for block in blocks if LENS in block), tree)
     cameras = {name: item for name, item in tree.items() if _is_camera(item)}
     if cameras:
         tree = _choose(cameras, chosen)
@@ -135,9 +118,10 @@ def _camera(text: str, chosen: str | None) -> Camera:
         raise ValueError(f"it has no camera {chosen!r} to choose")
     if _is_kalibr(tree):
         return kalibr_camera(tree)
-    for program in _PROGRAMS:
-        if (camera := _of_program(tree, program)) is not None:
-            return camera
+    if {"fisheye_params", "calib_dimension"} <= set(tree):
+        return _gyroflow_camera(tree)
+    if (camera := _named_camera(tree)) is not None:
+        return camera
     found = ", ".join(sorted(map(str, tree))[:8]) or "nothing"
     raise ValueError(f"expected a {CALIBRATION_KINDS}; found {found}")
 
@@ -172,38 +156,13 @@ def _load_tree(text: str) -> Any:
     return load_yaml(_TAG.sub("", _DIRECTIVE.sub("", text)))
 
 
-def _at(tree: dict[str, Any], paths: tuple[str, ...]) -> Iterator[Any]:
-    """Values of the tree at each dotted path."""
-    for path in paths:
-        item: Any = tree
-        for name in path.split(".") if path else ():
-            item = item.get(name) if isinstance(item, dict) else None
-        if item is not None:
-            yield item
-
-
-def _of_program(tree: dict[str, Any], program: _Program) -> Camera | None:
-    """The camera of a program's file; None: it is of another."""
-    lens = next((item for item in _at(tree, program.K) if _numbers(item)), None)
-    if lens is None:
-        return None
-    size = next((both for item in _at(tree, program.size) if (both := _size(item))), None)
-    if size is None:
-        raise ValueError("it has no image size: add image_width and image_height")
-    said = next((item for item in _at(tree, program.model) if item), program.default)
-    name = "fisheye" if tree.get("fisheye_model") else str(said).lower()  # of OpenCV's example
-    model = _MODELS.get(name, name)
-    D = next((_values(item) for item in _at(tree, program.D) if _numbers(item)), None)
-    if D is None:  # which writers have behind the matrix
-        raise ValueError(
-            "it has a camera matrix and no distortion coefficients: is it cut off? A lens "
-            "without distortion says so: distortion_coefficients: {data: []}"
-        )
-    # Without a name, OpenCV's own model: its first coefficients mean the same in all lengths.
-    if name in ("", "pinhole") or name.startswith("lensmodel_opencv"):
-        model = "rational_polynomial" if len(D) >= _RATIONAL else "plumb_bob"
-    seconds = 1e-3 * float(tree.get(program.readout_ms) or 0.0) * (size[1] - 1) / size[1]
-    return Camera(*size, _values(lens).reshape(3, 3), D, model, readout_time=max(seconds, 0.0))
+def _gyroflow_camera(tree: dict[str, Any]) -> Camera:
+    size = tree["calib_dimension"]
+    lens = {"width": size["w"], "height": size["h"], "distortion_model": "equidistant"}
+    camera = lens_camera(tree["fisheye_params"] | lens)
+    seconds = 1e-3 * float(tree.get("frame_readout_time") or 0.0)  # of all rows
+    readout_time = seconds * (camera.height - 1) / camera.height
+    return replace(camera, readout_time=max(readout_time, 0.0))
 
 
 def lens_camera(lens: dict[str, Any]) -> Camera:
@@ -212,30 +171,47 @@ def lens_camera(lens: dict[str, Any]) -> Camera:
     Raises:
         ValueError, KeyError, TypeError: when something is missing or impossible.
     """
-    if (camera := _of_program(lens, _PROGRAMS[-1])) is None:
+    if (camera := _named_camera(lens)) is None:
         raise KeyError("camera_matrix")
     return camera
 
 
-def _numbers(item: Any) -> bool:
-    """True for a list, or a matrix of ROS or OpenCV, and no mapping of names."""
-    return not isinstance(item, dict) or "data" in item
+def _named_camera(tree: dict[str, Any]) -> Camera | None:
+    """The camera of a file of ROS or OpenCV, or of its usual names; None: it has no matrix."""
+    K, D = (_first(tree, names) for names in (_K, _D))
+    if K is None:
+        return None
+    size = _first(tree, _SIZE)
+    if size is None:
+        size = [_first(tree, names) for names in (_WIDTH, _HEIGHT)]
+        if size == [None, None]:
+            raise ValueError("it has no image size: add image_width and image_height")
+        if None in size:
+            raise KeyError((_WIDTH, _HEIGHT)[size.index(None)][0])
+    if D is None:  # which writers have behind the matrix
+        raise ValueError(
+            "it has a camera matrix and no distortion coefficients: is it cut off? A lens "
+            "without distortion says so: distortion_coefficients: {data: []}"
+        )
+    width, height = (int(side) for side in _values(size))
+    coefficients = _values(D)
+    name = str(_first(tree, ("distortion_model", "camera_model")) or "").lower()
+    name = "fisheye" if tree.get("fisheye_model") else name  # of OpenCV's example
+    model = _MODELS.get(name, name)
+    # Without a name, OpenCV's own model: its first coefficients mean the same in all lengths.
+    if name in ("", "pinhole"):
+        model = "rational_polynomial" if len(coefficients) >= _RATIONAL else "plumb_bob"
+    return Camera(width, height, _values(K).reshape(3, 3), coefficients, model)
+
+
+def _first(tree: dict[str, Any], names: tuple[str, ...]) -> Any:
+    """The first of the names that the tree has; None: it has none."""
+    return next((tree[name] for name in names if tree.get(name) is not None), None)
 
 
 def _values(item: Any) -> Array:
+    """Numbers of a list, or of a matrix of ROS or OpenCV."""
     return np.array(item["data"] if isinstance(item, dict) else item, np.float64).ravel()
-
-
-def _size(item: Any) -> tuple[int, int] | None:
-    """Width and height of a pair or a mapping; None: it says neither."""
-    if _numbers(item):
-        width, height = _values(item).tolist()
-        return int(width), int(height)
-    sides: list[Any]
-    sides = [next((item[n] for n in names if n in item), None) for names in (_WIDTH, _HEIGHT)]
-    if None in sides and sides != [None, None]:
-        raise KeyError((_WIDTH, _HEIGHT)[sides.index(None)][0])
-    return None if None in sides else (int(sides[0]), int(sides[1]))
 
 
 # Parameters of COLMAP's models behind its size; f stands for both focal lengths.

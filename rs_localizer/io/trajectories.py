@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectory files: TUM poses ``t x y z qx qy qz qw`` and twists ``t wx wy wz vx vy vz``.
 
-Truths of others are read, too: EuRoC's CSV (ns, position, quaternion w x y z, more), lines in any
-order, and NaN where a tracker has lost its target.
+Lines may come in any order, with commas, and with NaN where a tracker has lost its target.
 
 Times are seconds in the files and integer nanoseconds here: a float of today's date in seconds
 is 240 ns coarse. Files that end in ``.gz`` are compressed text.
@@ -157,24 +156,17 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64]
     for number, line in _lines(path):
         words = line.replace(",", " ").split()
         try:
-            stamp_ns = _stamp(words[0])
-            values = [float(word) for word in words[1 : len(columns) + 1]]
-            of_euroc = "," in line and words[0] == str(stamp_ns) and columns[-1] == "qw"
-            more = len(words) - 1 - len(columns)
-            if more < 0 or (more and not of_euroc):
+            stamp_ns, values = parse_stamp(words[0]), [float(word) for word in words[1:]]
+            if len(values) != len(columns):
                 raise ValueError
-            if of_euroc:
-                values = [*values[:3], *values[4:7], values[3]]  # EuRoC's: w x y z
             if np.isnan(values).all():  # a tracker that has lost its target
                 continue
             if not np.isfinite(values).all():
                 raise ValueError
         except (ValueError, IndexError, InvalidOperation):
-            if not stamps and "," in line and not line[0].isdigit():
-                continue  # the heading
             raise TrajectoryError(
-                f"{path}, line {number}: expected the finite numbers t {' '.join(columns)} (or, "
-                f"with commas, EuRoC's: ns, then the quaternion as w x y z), found {line[:80]!r}"
+                f"{path}, line {number}: expected the finite numbers t {' '.join(columns)}, found "
+                f"{line[:80]!r}"
             ) from None
         stamps.append(stamp_ns)
         numbers.append(number)
@@ -192,13 +184,6 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64]
         )
     first = np.append(True, ~again)
     return times[first], rows[first]
-
-
-def _stamp(word: str) -> int:
-    """Nanoseconds of a time in s, or of a whole number that can only be ns, as EuRoC's."""
-    if word.isdecimal() and _LATEST < int(word) < 2**63:
-        return int(word)
-    return parse_stamp(word)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:

@@ -5,25 +5,22 @@
 Which it is, what a file holds tells. Poses are of the print's frame: origin in its middle, x to the
 right, y up, z toward the viewer; corners go from the top left one clockwise, from the front.
 
-* WPILib's AprilTag fields, JSON: m; z is up, x of a tag comes out of it toward the viewer, y is to
-  the viewer's right. Sizes are not in the file.
 * Bundles of apriltag_ros (ROS 1), YAML: m; axes of a tag are those of a print
   (AprilRobotics/apriltag_ros #156); what is missing of a pose is that of the origin.
-* Targets of Kalibr, YAML: of an AprilGrid in its frame, the lower left corner of tag 0.
+* AprilGrids of Kalibr, YAML: in their frame, the lower left corner of tag 0.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from rs_localizer.core.arrays import Array
 from rs_localizer.io.yaml_text import file_faults, load_yaml, read_text
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
@@ -32,30 +29,20 @@ from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
 
 USUAL_FAMILY = FAMILIES["apriltag_36h11"]
 """Family of files of other programs that do not say it."""
-OWN, _WPILIB, _BUNDLES, _KALIBR = "rs_localizer", "wpilib", "apriltag_ros", "kalibr"
-FORMATS = (OWN, _WPILIB, _BUNDLES, _KALIBR)
+OWN, _BUNDLES, _KALIBR = "rs_localizer", "apriltag_ros", "kalibr"
+FORMATS = (OWN, _BUNDLES, _KALIBR)
 """Formats that are read; our own alone is written."""
 _KEYS = {
-    OWN: ("markers", "boards", "map_frame"), _WPILIB: ("tags",),
+    OWN: ("markers", "boards", "map_frame"),
     _BUNDLES: ("tag_bundles", "standalone_tags"), _KALIBR: ("target_type",),
 }  # fmt: skip
 SUFFIXES = (".yaml", ".yml", ".json")
-# A parameter of apriltag_ros, which reads it beside the bundles; WPILib passes over it.
+# A parameter of apriltag_ros, which reads it beside the bundles.
 _TAG_FAMILY = "tag_family"
-# Tag of WPILib from print: to the right is y, up z, out of the print x.
-_TAG_FROM_PRINT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 # A pose stands for corners that it gives to within this share of a side; of a size that is given
 # beside the corners.
 _SAME, _SIZE_TOLERANCE = 1e-9, 0.05
 _CHESSBOARD, _CHARUCO = _BOARDS = "chessboard", "charuco"
-
-
-@dataclass(frozen=True, slots=True)
-class Unsaid:
-    """Properties of markers that a file does not say."""
-
-    family: Family | None = None  # None: as the file says, or the usual one
-    size: float | None = None  # m
 
 
 def is_marker_file(path: Path) -> bool:
@@ -63,17 +50,21 @@ def is_marker_file(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
-def read_marker_map(path: Path | str, unsaid: Unsaid | None = None) -> MarkerMap:
+def read_marker_map(path: Path | str) -> MarkerMap:
     """Read a map file of any format.
 
     Raises:
         MarkerMapError: for anything that cannot be used, saying where and what was found.
     """
-    return read_any(Path(path), unsaid)[0]
+    return read_any(Path(path))[0]
 
 
-def read_any(path: Path, unsaid: Unsaid | None = None) -> tuple[MarkerMap, str]:
-    """A marker map of any format, and the name of the format; raises as above."""
+def read_any(path: Path, kind: Family | None = None) -> tuple[MarkerMap, str]:
+    """A marker map of any format, and the name of the format; raises as above.
+
+    Args:
+        kind: of the markers of apriltag_ros; None: as the file says, or the usual one.
+    """
     with file_faults(path, MarkerMapError, "YAML or JSON"):
         tree = load_yaml(read_text(path))
     try:
@@ -82,11 +73,9 @@ def read_any(path: Path, unsaid: Unsaid | None = None) -> tuple[MarkerMap, str]:
         if not name:
             raise ValueError(f"its format is not known ({', '.join(FORMATS)}): it has {file.names}")
         if name in (OWN, _KALIBR):
-            return (_own if name == OWN else _kalibr_target)(file), OWN
-        unsaid = unsaid or Unsaid()
-        kind = unsaid.family or family(file.take(_TAG_FAMILY, str, USUAL_FAMILY.name))
-        markers = (_wpilib if name == _WPILIB else _bundle)(file, kind.name, unsaid)
-        return MarkerMap(tuple(markers)), name
+            return (_own if name == OWN else _aprilgrid)(file), name
+        kind = kind or family(file.take(_TAG_FAMILY, str, USUAL_FAMILY.name))
+        return MarkerMap(tuple(_bundle(file, kind.name))), name
     except ValueError as error:
         raise MarkerMapError(f"{path}: {error}") from error
 
@@ -149,43 +138,21 @@ def _pose(entry: _Entry) -> Pose:
     return Pose(position, rotation)
 
 
-def _kalibr_target(entry: _Entry) -> MarkerMap:
-    kind = entry.take("target_type", str)
-    if kind == "aprilgrid":
-        columns, rows = entry.take("tagCols", int), entry.take("tagRows", int)
-        size, gap = entry.take("tagSize", _NUMBER), entry.take("tagSpacing", _NUMBER)
-        name, pitch = FAMILIES["apriltag_36h11_border2"].name, size * (1.0 + gap)
-        return MarkerMap(tuple(
-            Marker.at(name, k, size, Pose(np.array([
-                pitch * (k % columns) + 0.5 * size, pitch * (k // columns) + 0.5 * size, 0.0
-            ])))
-            for k in range(columns * rows)
-        ))  # fmt: skip
-    if kind != "checkerboard":
-        raise ValueError(f"target_type must be aprilgrid or checkerboard, not {kind!r}")
-    counts = entry.take("targetCols", int), entry.take("targetRows", int)
-    square, other = (float(entry.take(f"{of}SpacingMeters", _NUMBER)) for of in ("row", "col"))
-    if square != other:
-        raise ValueError(f"squares must be as high as wide, found {square:g} and {other:g} m")
-    return MarkerMap(boards=(Chessboard(*counts, square),))
+def _aprilgrid(entry: _Entry) -> MarkerMap:
+    if (kind := entry.take("target_type", str)) != "aprilgrid":
+        raise ValueError(f"target_type must be aprilgrid, not {kind!r}; of a chessboard: --board")
+    columns, rows = entry.take("tagCols", int), entry.take("tagRows", int)
+    size, gap = entry.take("tagSize", _NUMBER), entry.take("tagSpacing", _NUMBER)
+    name, pitch = FAMILIES["apriltag_36h11_border2"].name, size * (1.0 + gap)
+    return MarkerMap(tuple(
+        Marker.at(name, k, size, Pose(np.array([
+            pitch * (k % columns) + 0.5 * size, pitch * (k // columns) + 0.5 * size, 0.0
+        ])))
+        for k in range(columns * rows)
+    ))  # fmt: skip
 
 
-def _wpilib(file: _Entry, name: str, unsaid: Unsaid) -> Iterator[Marker]:
-    if unsaid.size is None:
-        raise ValueError(
-            "a field of WPILib does not say how large its tags are: give --size (m; 0.1651 of FRC)"
-        )
-    for tag in file.entries("tags", "tag"):
-        number = tag.identify("ID")
-        pose = tag.below("pose")
-        place = pose.below("translation").numbers("xyz")
-        turn = pose.below("rotation").below("quaternion").numbers("XYZW")
-        with tag.named():
-            rotation = rotation_of_quaternion(turn) @ _TAG_FROM_PRINT
-            yield Marker.at(name, number, unsaid.size, Pose(np.array(place), rotation))
-
-
-def _bundle(file: _Entry, name: str, unsaid: Unsaid) -> Iterator[Marker]:
+def _bundle(file: _Entry, name: str) -> Iterator[Marker]:
     bundles = {
         str(bundle.take("name", (str, int), f"{index}")): bundle
         for index, bundle in enumerate(file.entries("tag_bundles", "bundle"))
@@ -278,10 +245,6 @@ def _rounded(values: Iterable[float]) -> list[float]:
     return [round(float(value), 12) + 0.0 for value in values]
 
 
-def _named(names: Iterable[str], values: Array) -> dict[str, float]:
-    return dict(zip(names, _rounded(values), strict=True))
-
-
 def _yaml(tree: dict[str, Any], width: int) -> str:
     return str(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=width))
 
@@ -329,9 +292,6 @@ class _Entry:
     def numbers(self, names: Iterable[str]) -> list[float]:
         """Numbers by their names; a missing one is 0."""
         return [float(self.take(name, _NUMBER, 0.0)) for name in names]
-
-    def below(self, name: str) -> _Entry:
-        return _Entry(self.take(name, dict), f"{self.where}: {name}")
 
     def entries(self, name: str, one: str) -> list[_Entry]:
         listed = self.take(name, (list, type(None)), None) or []

@@ -63,16 +63,6 @@ def test_info_and_convert(tmp_path, marker_file, capsys):
     assert main(["map", "info", str(marker_file)]) == 0
     said = capsys.readouterr().out
     assert re.search(r"ids_apriltag_36h11 +\[0, 1, 2, 3, 4, 5\]\n", said)
-    field, back = tmp_path / "field.json", tmp_path / "back.yaml"
-    turned = {"W": 0.0, "X": 0.0, "Y": 0.0, "Z": 1.0}
-    pose = {"translation": {"x": 1.0, "y": 0.0, "z": 2.0}, "rotation": {"quaternion": turned}}
-    field.write_text(json.dumps({"tags": [{"ID": 7, "pose": pose}]}))
-    assert main(["map", "align", str(field), str(back)]) == 1
-    assert "give --size" in capsys.readouterr().err
-    assert not back.exists()
-    assert main(["map", "align", str(field), str(back), "--size", "0.16"]) == 0
-    (found,) = read_marker_map(back).markers
-    assert (found.id, found.size) == (7, pytest.approx(0.16))
     corners = tmp_path / "corners.npz"
     assert main(["map", "align", str(marker_file), str(corners)]) == 0
     landmarks = read_map_file(corners, "map")

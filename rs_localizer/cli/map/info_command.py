@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from rs_localizer.cli import WORKING
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.recording import MAP_FRAME
-from rs_localizer.markers.map_files import FORMATS, USUAL_FAMILY, Unsaid, is_marker_file, read_any
+from rs_localizer.markers.map_files import FORMATS, USUAL_FAMILY, is_marker_file, read_any
 
 if WORKING:
     import numpy as np
@@ -29,14 +28,13 @@ Figures = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """markers: what files of other programs omit."""
-
     file: Path = argument(
         "landmarks: a .npz file or a folder of COLMAP; markers: a .yaml or .json file of "
         f"{', '.join(FORMATS)}", "FILE",
     )  # fmt: skip
-    family: str | None = option(f"(default: that of the file, or {USUAL_FAMILY.name})", "NAME")
-    size: float | None = option("of all markers", "M", limits=(0.0, math.inf), above=True)
+    family: str | None = option(
+        f"of tags of apriltag_ros (default: that of the file, or {USUAL_FAMILY.name})", "NAME"
+    )
 
 
 def run(options: Options) -> Figures:
@@ -56,7 +54,7 @@ def read(options: Options) -> tuple[Map | MarkerMap, str]:
         kind = None if options.family is None else family(options.family)
     except ValueError as error:
         raise UsageError(f"--family: {error}") from error
-    return read_any(options.file, Unsaid(kind, options.size))
+    return read_any(options.file, kind)
 
 
 def describe(file: Path, any_map: Map | MarkerMap, kind: str) -> Figures:

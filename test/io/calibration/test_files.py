@@ -22,10 +22,6 @@ camera_matrix: {rows: 3, cols: 3, data: [500.0, 0, 320.5, 0, 510.0, 240.5, 0, 0,
 distortion_model: rational_polynomial
 distortion_coefficients: {rows: 1, cols: 8, data: [1, 2, 3, 4, 5, 6, 7, 8]}
 """
-PHOTONVISION = """{"resolution": {"width": 640.0, "height": 480.0}, "cameraIntrinsics":
- {"rows": 3, "cols": 3, "type": 6, "data": [500.0, 0, 320.5, 0, 510.0, 240.5, 0, 0, 1]},
- "distCoeffs": {"rows": 1, "cols": 8, "type": 6, "data": [1, 2, 3, 4, 0, 0, 0, 0]},
- "calobjectSize": {"width": 7.0, "height": 7.0}, "lensmodel": "LENSMODEL_OPENCV"}"""
 GYROFLOW = """{"calib_dimension": {"w": 640, "h": 480}, "orig_dimension": {"w": 64, "h": 48},
  "fisheye_params": {"camera_matrix": [[500, 0, 320.5], [0, 510, 240.5], [0, 0, 1]],
  "distortion_coeffs": [0.1, 0.2, 0.3, 0.4]}, "frame_readout_time": 9.6}"""
@@ -53,7 +49,6 @@ FIVE = [0.1, -0.2, 1e-3, 2e-3, 0.3]
         (KALIBR, "equidistant", [0.1, 0.2, 0.3, 0.4]),
         (KALIBR.replace("equidistant", "radtan"), "plumb_bob", [0.1, 0.2, 0.3, 0.4]),
         (ROS, "rational_polynomial", [1, 2, 3, 4, 5, 6, 7, 8]),
-        (PHOTONVISION, "rational_polynomial", [1, 2, 3, 4, 0, 0, 0, 0]),
         (GYROFLOW, "equidistant", [0.1, 0.2, 0.3, 0.4]),
         (COLMAP.format("SIMPLE_RADIAL_FISHEYE", "500 321 241 .1"), "equidistant", [0.1, 0, 0, 0]),
         # COLMAP's first pixel has its corner at 0, 0; its order has the tangential ones third.
