@@ -112,7 +112,9 @@ class FleetOptions:
     """many recordings."""
 
     workers: int | None = option(
-        "processes of this machine (default: one for each core)", "N", limits=(1, math.inf)
+        "so many at a time, each in a process of its own (pip install 'rs_localizer[fleet]')",
+        "N",
+        limits=(1, math.inf),
     )
     scheduler: str | None = option(
         "instead: the workers of a Dask scheduler, such as tcp://host:8786, which see these files "

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
+import importlib
 import math
 import shlex
 import textwrap
@@ -418,10 +418,8 @@ def _replay_all(options: Options) -> None:
         raise UsageError("many recordings need --out DIR, for a folder of each")
     if options.workers is not None and options.scheduler is not None:
         raise UsageError("--workers are of this machine; give it or --scheduler")
-    if options.scheduler is not None and importlib.util.find_spec("distributed") is None:
-        raise ValueError(
-            "--scheduler needs Dask, which is not installed: pip install 'rs_localizer[fleet]'"
-        )
+    if options.scheduler or options.workers:
+        importlib.import_module("distributed")  # what is not installed is said now
     config = _settings(options)  # refuses wrong ones before there are workers
     if options.map is None and config.map_file:  # where it is from here, not from a worker
         options = replace(options, map=Path(config.map_file))
@@ -445,11 +443,11 @@ def _replay_all(options: Options) -> None:
 
         def heard(task: Task, outcome: Outcome) -> None:
             bar.update()
-            bar.write(f"{task.folder.name}: {outcome.reason or 'done'}")
+            bar.write(f"{task.folder.name}: {outcome if isinstance(outcome, str) else 'done'}")
 
         outcomes = fleet.do_all(tasks, out, options.scheduler, options.workers, heard)
     print(f"written to {out / fleet.SUMMARY}")
-    done = [task for task in tasks if outcomes[task.folder].figures is not None]
+    done = [task for task in tasks if not isinstance(outcomes[task.folder], str)]
     if options.parquet is not None:
         _write_table(
             [frame_table.read_parquet(task.folder / TABLE) for task in done], options.parquet
