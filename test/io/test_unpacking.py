@@ -3,6 +3,7 @@
 """Recordings, texts and images of which few bytes stand for gigabytes: one sentence, 250 MB."""
 
 import bz2
+import contextlib
 import gzip
 import io
 import os
@@ -124,29 +125,31 @@ def lone_file(path: Path) -> Path:
     return next(files(path).glob("*.zstd"))
 
 
-def computed(path: Path) -> Path:
+def altered(path: Path, script: str) -> Path:
+    """A database whose tables another program has made."""
     (file,) = bag(path / "bag", b"any").glob("*.db3")
-    with sqlite3.connect(file) as tables:
-        tables.executescript(
-            "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, "
-            "timestamp INTEGER, data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL);"
-            "INSERT INTO messages(topic_id, timestamp) VALUES (1, 1)"
-        )
-    tables.close()
+    with contextlib.closing(sqlite3.connect(file)) as tables:
+        tables.executescript(script)
     return file
+
+
+def computed(path: Path) -> Path:
+    return altered(
+        path,
+        "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, "
+        "timestamp INTEGER, data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL);"
+        "INSERT INTO messages(topic_id, timestamp) VALUES (1, 1)",
+    )
 
 
 def endless(path: Path) -> Path:
-    (file,) = bag(path / "bag", b"any").glob("*.db3")
-    with sqlite3.connect(file) as tables:
-        tables.executescript(
-            "DROP TABLE message_definitions; CREATE VIEW message_definitions AS WITH RECURSIVE "
-            "n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x AS id, '' AS topic_type, "
-            "'ros2msg' AS encoding, '' AS encoded_message_definition, '' AS type_description_hash "
-            "FROM n"
-        )
-    tables.close()
-    return file
+    return altered(
+        path,
+        "DROP TABLE message_definitions; CREATE VIEW message_definitions AS WITH RECURSIVE "
+        "n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x AS id, '' AS topic_type, "
+        "'ros2msg' AS encoding, '' AS encoded_message_definition, '' AS type_description_hash "
+        "FROM n",
+    )
 
 
 def record(kind: int, body: bytes) -> bytes:
