@@ -273,18 +273,6 @@ class Matching:
         "landmark's; 1: always",
         (0.01, 1.0),
     )
-    gate: float = setting(
-        20.0,
-        "While tracking, only landmarks predicted within this distance of a keypoint, in px, are "
-        "compared with it by descriptor (more where the prediction is less certain); 0: all",
-        (0.0, 10000.0),
-    )
-    max_keypoints: int = setting(
-        2000,
-        "Most keypoints of a frame to match by descriptor: those with the best scores, or the "
-        "first ones",
-        (7, 1_000_000),
-    )
 
     def __post_init__(self) -> None:
         check(self, "matching.")
@@ -549,9 +537,6 @@ class DetectorConfig:
 
     marker_map: str = setting(
         "", "File of the marker map; rs_localizer markers make writes one with the prints"
-    )
-    min_side: float = setting(
-        10.0, "Markers with a shorter side than this, in px, are left out", (0.0, 10000.0)
     )
     transport: str = setting(
         ImageTransport.AUTO,

@@ -46,6 +46,10 @@ NODES: dict[Kind, str] = {
 _FOREIGN = ("use_sim_time", "qos_overrides", "start_type_description_service", LENS)
 
 
+FIRST = (
+    "readout_time", "scan_direction", "stamp_offset", "base_frame", "publish_tf", "map_deviation",
+)  # fmt: skip
+"""The settings that everybody sets, first in the help, as in README."""
 Kind = type[NodeConfig] | type[DetectorConfig] | type[FeatureConfig]
 Config = TypeVar("Config", NodeConfig, DetectorConfig, FeatureConfig)
 _cached: dict[Kind, dict[str, Setting]] = {}
@@ -93,7 +97,8 @@ def _cameras(values: Mapping[str, Any]) -> list[str]:
 def settings(kind: Kind = NodeConfig) -> dict[str, Setting]:
     """All settings of a node, by dotted name."""
     if kind not in _cached:
-        _cached[kind] = dict(_walk(kind(), ""))
+        found = dict(_walk(kind(), ""))
+        _cached[kind] = {name: found[name] for name in (*FIRST, *found) if name in found}
     return _cached[kind]
 
 

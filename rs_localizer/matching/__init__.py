@@ -160,6 +160,12 @@ def make_index(descriptors: Descriptors, *, binary: bool) -> Index:
 
 # Standard deviations of the prediction within which the camera is looked for.
 _DEVIATIONS = 3.0
+# Pixels around its prediction in which a landmark is looked for at least: some ten times the error
+# of a tracked prediction of a hand-held camera.
+_GATE = 20.0
+MOST_KEYPOINTS = 2000
+"""Of a frame, matched by descriptor: those with the best scores, or the first ones. A frame needs
+some hundreds, and detectors give one to two thousand."""
 # Pixels along each border of the image that bound its bearings.
 _BORDER_PIXELS = 33
 
@@ -309,10 +315,10 @@ class Matcher:
         if self.choose(keypoints) == MatchBy.ID:
             return self._by_id(keypoints)
         assert keypoints.descriptors is not None
-        chosen = _best(keypoints, settings.max_keypoints)
+        chosen = _best(keypoints, MOST_KEYPOINTS)
         queries, pixels = keypoints.descriptors[chosen], keypoints.pixels[chosen]
-        if settings.gate > 0.0 and camera is not None and prior is not None:
-            matches, owners = self._predicted(queries, pixels, settings.gate, camera, prior)
+        if camera is not None and prior is not None:
+            matches, owners = self._predicted(queries, pixels, _GATE, camera, prior)
         else:
             matches, owners = self._anywhere(queries)
         return _accepted(matches, owners, chosen, settings.ratio)

@@ -397,12 +397,12 @@ class FrameLocalizer:
             refusal = self._stream.follow(keypoints.stamp_ns, self.map.frame)
             if refusal is not None:
                 return refusal
-        by = self._landmarks.how(keypoints, self.config.matching)
+        by = self._landmarks.how(keypoints)
         if isinstance(by, Refusal):
             return by
         if (cloud := self._landmarks.repeated(keypoints)) is not None:
             return self._delayed(self._localize(cloud), keypoints.stamp_ns)
-        if by == matching.MatchBy.DESCRIPTOR and self._config.matching.gate > 0.0:
+        if by == matching.MatchBy.DESCRIPTOR:
             time_ns = self._middle_row_ns(keypoints.stamp_ns)
             if self.map is not None:
                 self._expect(time_ns, self.map.frame)
@@ -465,7 +465,7 @@ class FrameLocalizer:
             return replace(found, detail=f"{name}: {found.detail}")
         if isinstance(found, Correspondences):
             return found
-        by = self._landmarks.how(found, self._config.matching)
+        by = self._landmarks.how(found)
         if isinstance(by, Refusal):
             return by
         return self._landmarks.match(found, self._config.matching, camera, None)

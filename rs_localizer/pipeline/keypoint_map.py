@@ -15,7 +15,7 @@ from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.clouds import Correspondences, Keypoints
 from rs_localizer.io.maps.landmarks import Map, MapError
-from rs_localizer.matching import MatchBy, Matcher, MatchError
+from rs_localizer.matching import MOST_KEYPOINTS, MatchBy, Matcher, MatchError
 from rs_localizer.pipeline.refusal import Notify, Refusal
 
 
@@ -51,7 +51,7 @@ class Landmarks:
         self.error_modes = None if modes is None else ErrorModes(landmarks.points, modes)
         self.lacking = False
 
-    def how(self, keypoints: Keypoints, settings: Matching) -> MatchBy | Refusal:
+    def how(self, keypoints: Keypoints) -> MatchBy | Refusal:
         """Means by which keypoints can be matched."""
         if self._matcher is None:
             self.lacking = True
@@ -62,11 +62,10 @@ class Landmarks:
             by = self._matcher.choose(keypoints)
         except MatchError as error:
             return Refusal(Reason.BAD_KEYPOINTS, str(error))
-        if by == MatchBy.DESCRIPTOR and len(keypoints) > settings.max_keypoints:
+        if by == MatchBy.DESCRIPTOR and len(keypoints) > MOST_KEYPOINTS:
             self._notice(
                 Notice.TOO_MANY_KEYPOINTS,
-                f"{len(keypoints)} keypoints have come, matching.max_keypoints of them, "
-                f"{settings.max_keypoints}, are matched",
+                f"{len(keypoints)} keypoints have come; the best {MOST_KEYPOINTS} are matched",
             )
         return by
 

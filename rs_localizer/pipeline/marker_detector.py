@@ -29,6 +29,8 @@ _LARGE_MAP = 1000.0  # m
 # Fewer corners than those of three markers may be what is left of a mirrored map: some markers,
 # mirrored, are others. Mirrored back there are twice as many, and two markers more.
 _LITTLE, _TIMES, _MORE = 12, 2, 8
+# px; in smaller markers a cell has less than two pixels, and corners are off by more than noise.
+_LEAST_SIDE = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +84,7 @@ class FrameDetector:
             marker_map = read_marker_map(Path(config.marker_map).expanduser())
         self.map = marker_map
         self._notice = notice
-        self._detector = MarkerDetector(marker_map, config.min_side)
+        self._detector = MarkerDetector(marker_map, _LEAST_SIDE)
         self._row = _row_type(marker_map.points)
 
         # What is wrong with all images, as a sentence; empty: unknown.

@@ -19,7 +19,7 @@ from rs_localizer.offline.frame_table import COLUMNS
 from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.ros.node.diagnostics import State
-from rs_localizer.settings import Kind, settings
+from rs_localizer.settings import FIRST, Kind, settings
 from rs_localizer.solvers.table import SOLVERS, find_solver
 
 OF_NODES: list[tuple[Kind, set[str]]] = [
@@ -48,6 +48,12 @@ def test_every_parameter_is_in_a_table_with_its_default(kind, where):
     assert {name for _, name, _ in rows} == set(known)
     for page, name, default in rows:
         assert read(default, known[name].default) == known[name].default, (page, name)
+
+
+def test_readme_and_the_help_begin_with_what_everybody_sets():
+    (table,) = [t for t in pages.all_tables("parameter", "default") if t.page == "README.md"]
+    assert [name for row in table.rows for name in pages.names_in(row[0])] == list(FIRST)
+    assert list(settings())[: len(FIRST)] == list(FIRST)
 
 
 def read(cell: str, like: Any) -> Any:
