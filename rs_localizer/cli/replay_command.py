@@ -8,20 +8,18 @@ import functools
 import importlib
 import math
 import shlex
-import textwrap
-import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from rs_localizer.cli import WORKING, earlier_result
 from rs_localizer.cli.image_input import ImageOptions
 from rs_localizer.cli.options import FleetOptions, UsageError, argument, option
 from rs_localizer.cli.settings_args import given_topics, given_values
 from rs_localizer.io.atomic_files import atomic_directory, check_writable
-from rs_localizer.io.bags import BagReader, BagWriter, is_bag, open_bag
+from rs_localizer.io.bags import is_bag, open_bag
+from rs_localizer.io.recording import BRIDGED, RESULT
 from rs_localizer.io.trajectories import POSES_FILE as POSES
 from rs_localizer.io.trajectories import TWISTS_FILE as TWISTS
 
@@ -30,31 +28,18 @@ if WORKING:
     from tqdm import tqdm
 
     from rs_localizer.config import FeatureKind, ImuUse, NodeConfig
-    from rs_localizer.io.image_clock import readout_fault
     from rs_localizer.io.maps.files import read_map_file
     from rs_localizer.io.maps.landmarks import Map
-    from rs_localizer.io.messages import stamp_ns
-    from rs_localizer.io.outputs import Localized
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
     from rs_localizer.io.topics import IMU
     from rs_localizer.markers.map_files import is_marker_file
     from rs_localizer.offline import fleet, frame_table
     from rs_localizer.offline.fleet import Figures, Outcome, Task
     from rs_localizer.offline.image_sources import holds_images, image_topics
-    from rs_localizer.offline.replay import (
-        NO_FRAMES,
-        Answer,
-        Topics,
-        has_frames,
-        imu_topics,
-        prepare,
-        replay,
-    )
-    from rs_localizer.offline.results import Tally, figures, write_frame
+    from rs_localizer.offline.replay import has_frames, imu_topics, prepare
+    from rs_localizer.offline.results import Smooth, Tally, figures, summary, write_results
     from rs_localizer.pipeline.frames import FrameLocalizer
-    from rs_localizer.pipeline.refusal import explained
     from rs_localizer.settings import build
-    from rs_localizer.solvers.table import find_solver
 
 if TYPE_CHECKING:
     from pyarrow import Table  # an extra
@@ -64,7 +49,6 @@ if TYPE_CHECKING:
 _ORB_BYTES = 32  # of a descriptor; AKAZE's has 61
 # Of each of many recordings.
 TABLE = "frames.parquet"
-RESULT, BRIDGED = "result", "bridged.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,10 +221,16 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
         # What a user has beside these stays.
         names = POSES, TWISTS, BRIDGED, RESULT, fleet.MARKER, fleet.LOG
         earlier = earlier_result(options, f"{RESULT}/metadata.yaml", out, names)
-        with atomic_directory(out, earlier) as built:
+        with (
+            atomic_directory(out, earlier) as built,
+            # The bar is for a person who waits: none in a log file.
+            tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
+        ):
             built.mkdir()
             _hint(path, options.params)
-            _replay(bag, topics, localizer, tally, built, options)
+            smooth = _smoothing(localizer, options.pose_rate) if options.smooth else None
+            tally.done = bar.update
+            write_results(bag, topics, localizer, tally, built, smooth)
         _tell(tally, config, out, timed)
         if tally.table is not None and options.parquet is not None:
             _write_table([tally.table.table()], options.parquet)
@@ -249,6 +239,12 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
                 f"no frame of {recording} was localized; of the last one, {tally.last_refusal}"
             )
     return tally
+
+
+def _smoothing(localizer: FrameLocalizer, rate: float | None) -> Smooth:
+    from rs_localizer.tools.smoothed import smooth_frames  # with SciPy
+
+    return lambda frames, stamps: smooth_frames(localizer, frames, stamps, rate)
 
 
 def _write_table(tables: list[Table], file: Path) -> None:
@@ -262,146 +258,8 @@ def _hint(bag: Path, params: Path | None) -> None:
         print(f"the recording has settings of its own: --params {shlex.quote(str(file))}")
 
 
-def _localized(
-    bag: BagReader,
-    topics: Topics,
-    localizer: FrameLocalizer,
-    tally: Tally,
-    refused: list[Answer],
-    bar: tqdm[NoReturn],
-) -> Iterator[tuple[int, Localized]]:
-    """The frames with a pose, and when they were recorded; the others are counted and kept."""
-    for answer in replay(bag, topics, localizer):
-        result = answer.result
-        if result:
-            tally.add(result)
-            yield answer.recorded_ns, result
-        else:
-            tally.refuse(result)
-            if result.reason in NO_FRAMES:
-                continue
-            if tally.table is not None:
-                refused.append(answer)
-        bar.update()
-
-
-def _replay(
-    bag: BagReader,
-    topics: Topics,
-    localizer: FrameLocalizer,
-    tally: Tally,
-    out: Path,
-    options: Options,
-) -> None:
-    """Replay into ``out``."""
-    refused: list[Answer] = []
-    smoothed: set[int] = set()  # stamps of images
-    start = time.perf_counter()
-    # The bar is for a person who waits: none in a log file.
-    with (
-        BagWriter(out / RESULT) as writer,
-        tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
-    ):
-        frames = _localized(bag, topics, localizer, tally, refused, bar)
-        if options.smooth:
-            from rs_localizer.tools.smoothed import smooth_frames
-
-            stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
-            parts = smooth_frames(
-                localizer, (frame for _, frame in frames), stamps, options.pose_rate
-            )
-            frames = (
-                (frame.input_stamp_ns, frame) for part in parts for frame in tally.smooth(part)
-            )
-        for recorded_ns, frame in frames:
-            tally.not_sent += not write_frame(writer, frame, localizer, recorded_ns)
-            tally.track.add(frame)
-            if tally.table is not None:
-                tally.table.add(frame.input_stamp_ns, frame)
-                if options.smooth:
-                    smoothed.add(frame.input_stamp_ns)
-    if tally.smoothed is not None:
-        text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in tally.bridged)
-        (out / BRIDGED).write_text(text, encoding="utf-8")
-    if tally.table is not None:
-        for answer in refused:
-            if answer.stamp_ns not in smoothed:
-                tally.table.add(answer.stamp_ns, answer.result)
-    tally.seconds = time.perf_counter() - start
-    if localizer.config.of_cameras:
-        # Images of several cameras are one frame.
-        lost = sum(n for reason, n in tally.refused.items() if reason not in NO_FRAMES)
-        tally.total = tally.localized + lost
-    tally.imu = localizer.imu.state
-    if (measured := localizer.readout_watch.measured) is not None:
-        tally.readout = measured.readout_time, measured.deviation
-    tally.repeated, tally.moving = tally.track.write(out, localizer.config.pose_time)
-
-
-# Notices of a frame that could not follow the one before.
-_RESTARTS = ("time_went_back", "map_changed")
-_WIDTH = 96  # columns of a terminal that is not narrow
-
-
-def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:
-    """Print it as a table, the reasons of refusals explained below.
-
-    ``timed``: whether to say how fast, which is never the same twice.
-    """
-    rows: list[tuple[str, object]] = [("frames", tally.total), ("localized", tally.localized)]
-    rows += [(f"  refused: {reason}", n) for reason, n in tally.refused.most_common()]
-    for name, (count, _) in sorted(tally.notices.items(), key=lambda item: -item[1][0]):
-        rows.append((f"{'restarted' if name in _RESTARTS else 'noticed'}: {name}", count))
-    for name, count in (
-        ("rows dropped (not finite)", int(tally.column("dropped").sum())),
-        ("stamps repeated, not in the text files", tally.repeated),
-        ("without a transform on /tf", tally.not_sent),
-    ):
-        rows += [(name, count)] if count else []
-    if tally.localized:
-        rolling = find_solver(config.solver).rolling_shutter
-        rows += [
-            (name, f"{np.median(tally.column(column)):{form}}")
-            for name, column, form in (
-                ("residual of the inliers (px rms, median)", "residual", ".3f"),
-                ("error of map and lens (px rms, median)", "model_error", ".3f"),
-                ("points of a frame (median)", "points", ".0f"),
-                ("  inliers", "inliers", ".0f"),
-            )
-        ]
-        if rolling:
-            rows.append(("tracked from the frame before", f"{tally.column('tracked').mean():.1%}"))
-    if (imu := tally.imu) is not None:
-        rows.append(("localized with the IMU", f"{imu.used / imu.frames:.1%}"))
-        rows += [(f"  without: {reason}", count) for reason, count in imu.reasons.items()]
-        if imu.used and imu.status is not None and np.isfinite(imu.time_offset):
-            bias = np.linalg.norm(np.degrees(imu.status.bias))
-            rows.append(("  bias of the gyroscope (deg/s)", f"{bias:.2f}"))
-            rows.append(("  time offset of the IMU (ms)", f"{1e3 * imu.time_offset:.2f}"))
-    if timed:
-        rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
-    if (smoothed := tally.smoothed) is not None:
-        rows += [
-            ("samples of the smoothed motion", smoothed["samples"]),
-            (f"  bridged, listed in {BRIDGED}", len(tally.bridged)),
-            ("  left out, not determined", smoothed["undetermined"]),
-            ("  vibrating, left as they were", smoothed["shaken"]),
-        ]
-    for name, text in rows:
-        print(f"{name:40} {text!s:>8}")
-    reasons = (*tally.refused, *(tally.imu.reasons if tally.imu else ()))
-    sentences = {reason: explained(reason) for reason in reasons}
-    for name, text in (
-        sentences | {name: text for name, (_, text) in tally.notices.items()}
-    ).items():
-        if text:
-            print(textwrap.fill(f"{name}: {text}", _WIDTH, subsequent_indent="    "))
-    if (fault := readout_fault(config.readout_time, tally.period)) is not None:
-        print(f"warning: {fault}")
-
-
 def _tell(tally: Tally, config: NodeConfig, out: Path, timed: bool) -> None:
-    print_summary(tally, config, timed)
+    print("\n".join(summary(tally, config, timed)))
     if tally.localized and not tally.moving:
         why = f"solver {config.solver} estimates no velocities"
         if config.readout_time == 0.0:

@@ -22,6 +22,8 @@ KEYPOINTS_TOPIC = f"/{topics.KEYPOINTS}"
 IMAGE_TOPIC = f"/{topics.COMPRESSED_IMAGE}"
 RAW_IMAGE_TOPIC = "/image_raw/compressed"
 # Settings and maps in the directory of a recording, or a camera of a map that was built.
+RESULT, BRIDGED = "result", "bridged.txt"
+"""Of a result: its bag, and its list of images without a pose of their own."""
 PARAMETERS = "parameters.yaml"
 CAMERA = "camera.yaml"
 MARKER_MAP = "marker_map.yaml"

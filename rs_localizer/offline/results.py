@@ -7,19 +7,25 @@ Frames are written as they come; of each, some numbers stay (250 bytes).
 
 from __future__ import annotations
 
+import textwrap
+import time
 from array import array
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rs_localizer.config import PoseTime
+from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.bags import BagReader, BagWriter
+from rs_localizer.io.image_clock import readout_fault
+from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized, messages
+from rs_localizer.io.recording import BRIDGED, RESULT
 from rs_localizer.io.topics import TF
 from rs_localizer.io.trajectories import (
     POSES_FILE,
@@ -33,12 +39,13 @@ from rs_localizer.io.trajectories import (
 from rs_localizer.io.transforms import TransformError, make_transform
 from rs_localizer.offline.fleet import Figures
 from rs_localizer.offline.frame_table import FrameTable
-from rs_localizer.offline.replay import TF_TYPE
+from rs_localizer.offline.replay import NO_FRAMES, TF_TYPE, Answer, Topics, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.imu_readings import ImuState
 from rs_localizer.pipeline.published import broadcast
-from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.refusal import Refusal, explained
 from rs_localizer.settings import NODE_NAME
+from rs_localizer.solvers.table import find_solver
 
 _UNKNOWN_TWIST = (np.nan,) * 6
 
@@ -127,6 +134,7 @@ class Tally:
     total: int
     notices: dict[str, tuple[int, str]]  # by name: how often, and the latest sentence
     table: FrameTable | None = None  # of the frames, where one is wanted
+    done: Callable[[], object] = lambda: None  # called after each frame
     track: Track = field(default_factory=Track)
     refused: Counter[str] = field(default_factory=Counter)
     last_refusal: str = "nothing came"
@@ -164,6 +172,16 @@ class Tally:
         self.refused[refusal.reason] += 1
         self.last_refusal = f"{refusal.reason}: {refusal.detail}"
 
+    def finish(self, localizer: FrameLocalizer) -> None:
+        """Take what the localizer knows at the end."""
+        if localizer.config.of_cameras:
+            # Images of several cameras are one frame.
+            lost = sum(n for reason, n in self.refused.items() if reason not in NO_FRAMES)
+            self.total = self.localized + lost
+        self.imu = localizer.imu.state
+        if (measured := localizer.readout_watch.measured) is not None:
+            self.readout = measured.readout_time, measured.deviation
+
     @property
     def localized(self) -> int:
         """Number of frames with a pose."""
@@ -180,6 +198,132 @@ class Tally:
         steps = np.diff(np.unique(np.array(self._stamps_ns, np.int64))) * 1e-9
         # Between those with a pose others may have been refused.
         return float(np.median(steps / np.round(steps / steps.min()))) if len(steps) else np.nan
+
+
+Smooth = Callable[[Iterator[Localized], list[int]], Iterable[Any]]
+"""One motion through frames, by windows: of frames, and the stamps (ns) of all images; as
+``tools.smoothed`` makes it."""
+
+
+def write_results(
+    bag: BagReader, topics: Topics, localizer: FrameLocalizer, tally: Tally, out: Path,
+    smooth: Smooth | None = None,
+) -> None:  # fmt: skip
+    """Replay a recording into a folder, and count what became of its frames.
+
+    Args:
+        bag: the recording, of these topics.
+        localizer: of its frames.
+        tally: with a table where one is wanted.
+        out: has the poses, the twists, and the bag of the node's messages then.
+        smooth: makes one motion of the frames.
+    """
+    refused: list[Answer] = []
+    smoothed: set[int] = set()  # stamps of images
+    start = time.perf_counter()
+
+    def localized() -> Iterator[tuple[int, Localized]]:
+        """The frames with a pose, and when they were recorded; the others are counted and kept."""
+        for answer in replay(bag, topics, localizer):
+            result = answer.result
+            if result:
+                tally.add(result)
+                yield answer.recorded_ns, result
+            else:
+                tally.refuse(result)
+                if result.reason in NO_FRAMES:
+                    continue
+                if tally.table is not None:
+                    refused.append(answer)
+            tally.done()
+
+    with BagWriter(out / RESULT) as writer:
+        frames: Iterable[tuple[int, Localized]] = localized()
+        if smooth is not None:
+            stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
+            parts = smooth((frame for _, frame in localized()), stamps)
+            frames = (
+                (frame.input_stamp_ns, frame) for part in parts for frame in tally.smooth(part)
+            )
+        for recorded_ns, frame in frames:
+            tally.not_sent += not write_frame(writer, frame, localizer, recorded_ns)
+            tally.track.add(frame)
+            if tally.table is not None:
+                tally.table.add(frame.input_stamp_ns, frame)
+                if smooth is not None:
+                    smoothed.add(frame.input_stamp_ns)
+    if tally.smoothed is not None:
+        text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in tally.bridged)
+        (out / BRIDGED).write_text(text, encoding="utf-8")
+    if tally.table is not None:
+        for answer in refused:
+            if answer.stamp_ns not in smoothed:
+                tally.table.add(answer.stamp_ns, answer.result)
+    tally.seconds = time.perf_counter() - start
+    tally.finish(localizer)
+    tally.repeated, tally.moving = tally.track.write(out, localizer.config.pose_time)
+
+
+# Notices of a frame that could not follow the one before.
+_RESTARTS = ("time_went_back", "map_changed")
+_WIDTH = 96  # columns of a terminal that is not narrow
+
+
+def summary(tally: Tally, config: NodeConfig, timed: bool = True) -> list[str]:
+    """Lines of a table, the reasons of refusals explained below.
+
+    ``timed``: whether to say how fast, which is never the same twice.
+    """
+    rows: list[tuple[str, object]] = [("frames", tally.total), ("localized", tally.localized)]
+    rows += [(f"  refused: {reason}", n) for reason, n in tally.refused.most_common()]
+    for name, (count, _) in sorted(tally.notices.items(), key=lambda item: -item[1][0]):
+        rows.append((f"{'restarted' if name in _RESTARTS else 'noticed'}: {name}", count))
+    for name, count in (
+        ("rows dropped (not finite)", int(tally.column("dropped").sum())),
+        ("stamps repeated, not in the text files", tally.repeated),
+        ("without a transform on /tf", tally.not_sent),
+    ):
+        rows += [(name, count)] if count else []
+    if tally.localized:
+        rolling = find_solver(config.solver).rolling_shutter
+        rows += [
+            (name, f"{np.median(tally.column(column)):{form}}")
+            for name, column, form in (
+                ("residual of the inliers (px rms, median)", "residual", ".3f"),
+                ("error of map and lens (px rms, median)", "model_error", ".3f"),
+                ("points of a frame (median)", "points", ".0f"),
+                ("  inliers", "inliers", ".0f"),
+            )
+        ]
+        if rolling:
+            rows.append(("tracked from the frame before", f"{tally.column('tracked').mean():.1%}"))
+    if (imu := tally.imu) is not None:
+        rows.append(("localized with the IMU", f"{imu.used / imu.frames:.1%}"))
+        rows += [(f"  without: {reason}", count) for reason, count in imu.reasons.items()]
+        if imu.used and imu.status is not None and np.isfinite(imu.time_offset):
+            bias = np.linalg.norm(np.degrees(imu.status.bias))
+            rows.append(("  bias of the gyroscope (deg/s)", f"{bias:.2f}"))
+            rows.append(("  time offset of the IMU (ms)", f"{1e3 * imu.time_offset:.2f}"))
+    if timed:
+        rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
+    if (smoothed := tally.smoothed) is not None:
+        rows += [
+            ("samples of the smoothed motion", smoothed["samples"]),
+            (f"  bridged, listed in {BRIDGED}", len(tally.bridged)),
+            ("  left out, not determined", smoothed["undetermined"]),
+            ("  vibrating, left as they were", smoothed["shaken"]),
+        ]
+    lines = [f"{name:40} {text!s:>8}" for name, text in rows]
+    reasons = (*tally.refused, *(tally.imu.reasons if tally.imu else ()))
+    sentences = {reason: explained(reason) for reason in reasons}
+    for name, text in (
+        sentences | {name: text for name, (_, text) in tally.notices.items()}
+    ).items():
+        if text:
+            lines += textwrap.wrap(f"{name}: {text}", _WIDTH, subsequent_indent="    ")
+    if (fault := readout_fault(config.readout_time, tally.period)) is not None:
+        lines.append(f"warning: {fault}")
+    return lines
 
 
 def figures(tally: Tally) -> Figures:

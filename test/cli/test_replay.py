@@ -16,12 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli import replay_command
 from rs_localizer.cli.commands import main
-from rs_localizer.cli.replay_command import print_summary
 from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized
 from rs_localizer.io.trajectories import read_motions, read_tum, read_twists
-from rs_localizer.offline import frame_table
+from rs_localizer.offline import frame_table, results
 from rs_localizer.offline.results import Tally, figures
 from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.tools.simulation.scene import room
@@ -168,7 +167,7 @@ def test_no_frame_localized_is_a_failure(recording, tmp_path, capsys):
 
 def test_frames_are_written_as_they_come_and_let_go(recording, tmp_path, monkeypatch):
     """An hour of them would take gigabytes."""
-    real = replay_command.replay
+    real = results.replay
     alive, most = weakref.WeakSet[Localized](), 0
 
     class Watched(Localized):
@@ -185,14 +184,14 @@ def test_frames_are_written_as_they_come_and_let_go(recording, tmp_path, monkeyp
             most = max(most, len(alive))
             yield answer._replace(result=frame)
 
-    monkeypatch.setattr(replay_command, "replay", many)
+    monkeypatch.setattr(results, "replay", many)
     assert main(["replay", str(recording), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
     assert len(read_tum(tmp_path / "out" / "poses.txt")) == 300
     assert most < 10
 
 
 def test_notices_stand_in_the_summary(recording, tmp_path, monkeypatch, capsys):
-    real = replay_command.replay
+    real = results.replay
     tallies: list[Tally] = []
 
     def odd(bag: Any, topics: Any, localizer: Any) -> Any:
@@ -201,8 +200,8 @@ def test_notices_stand_in_the_summary(recording, tmp_path, monkeypatch, capsys):
             yield item
         localizer.readout_watch.measured = MeasuredReadout(0.0211, 0.0002, 50, 50.0)
 
-    monkeypatch.setattr(replay_command, "replay", odd)
-    monkeypatch.setattr(replay_command, "print_summary", both(tallies, print_summary))
+    monkeypatch.setattr(results, "replay", odd)
+    monkeypatch.setattr(replay_command, "summary", both(tallies, results.summary))
     assert main(["replay", str(recording), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
     said = capsys.readouterr().out
     assert re.search(rf"noticed: readout_time +{FRAMES}\n", said)
@@ -214,4 +213,4 @@ def test_notices_stand_in_the_summary(recording, tmp_path, monkeypatch, capsys):
 
 
 def both(kept: list[Tally], function: Any) -> Any:
-    return lambda tally, *rest: (kept.append(tally), function(tally, *rest))
+    return lambda tally, *rest: (kept.append(tally), function(tally, *rest))[1]
