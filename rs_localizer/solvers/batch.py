@@ -20,11 +20,14 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, Array3, Array4, IntArray, Out
 from rs_localizer.core.rig import Mounts
-from rs_localizer.core.simd.algebra import multiply
-from rs_localizer.core.simd.tracing import LANES, Vector
+from rs_localizer.core.simd.algebra import dot, multiply
+from rs_localizer.core.simd.tracing import LANES, Vector, select
 from rs_localizer.native import entry, kernel
 
 MODEL_SIZE = 18
+
+# Of v and w together, rad: a millionth of a pixel, and above the rounding of most samples.
+_CONVERGED = 1e-9
 
 
 def inputs(size: int) -> int:
@@ -90,6 +93,15 @@ def into_rig(models: Array, camera: IntArray, mounts: Mounts) -> None:
                     models[s, first + step * i, h] = turned[i]
 
 
+@kernel
+def converged(work: Array, change: int) -> bool:
+    """True if value ``change``, as of :meth:`Sample.stepped`, is that of no more steps."""
+    moving = False
+    for lane in range(LANES):
+        moving = moving or work[change * LANES + lane] > _CONVERGED**2
+    return not moving
+
+
 @entry
 def unpack(
     models: Array3,
@@ -139,4 +151,20 @@ class Sample:
             *self.tau,
             *(x for row in rotation for x in row),
             *state,
+        ]
+
+    def stepped(
+        self, points: Sequence[Vector], rotation: Sequence[Vector], state: Vector, *steps: Vector
+    ) -> Vector:
+        """As :meth:`with_results` after an iteration by these steps (rad), their square behind.
+
+        A sample that has converged stays what it is, whatever the others in its lanes do.
+        """
+        change = sum((dot(step, step) for step in steps), 0.0)
+        before = self.with_results(self.points, self.rotation, self.state)
+        after = self.with_results(points, rotation, [*state, change])
+        moving = self.state[-1] > _CONVERGED**2
+        return [
+            new if new is old else select(moving, new, old)
+            for old, new in zip(before, after, strict=True)
         ]

@@ -68,10 +68,12 @@ def times_row(column: Column, tau: Vector) -> Column:
 
 def minus(left: Column, right: Column) -> Column:
     """The difference of two columns."""
-    return (
-        [x - y for x, y in zip(left[0], right[0], strict=True)],
-        [x - y for x, y in zip(left[1], right[1], strict=True)],
-    )
+    return difference(left[0], right[0]), difference(left[1], right[1])
+
+
+def difference(left: Vector, right: Vector) -> Vector:
+    """The difference of two vectors."""
+    return [x - y for x, y in zip(left, right, strict=True)]
 
 
 def solve(

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.solvers.batch import MODEL_SIZE, unpack
-from rs_localizer.solvers.table import find_solver
+from rs_localizer.solvers.table import SOLVERS, find_solver
 
 
 def solve_minimal(
@@ -24,6 +25,7 @@ def solve_minimal(
     iterations: int = 5,
     as_published: bool = False,
     threads: int = 1,
+    bound: float | None = None,
 ) -> tuple[Array, Array, Array, Array]:
     """Solve many minimal samples at once.
 
@@ -34,10 +36,12 @@ def solve_minimal(
         tau: (h,n) row times, see :mod:`rs_localizer.core.shutter`.
         rotation: initial rotation camera_from_map, (3,3) or (h,3,3); identity by default. The
             rolling-shutter solvers need it to tens of degrees; ``p3p`` ignores it.
-        iterations: of the iterative solvers.
+        iterations: of the iterative solvers, at most: each sample stops where it converges.
         as_published: r6p_vcwt with v^ frozen and r9p with its gauge free, as in the paper;
             otherwise relinearised, and with ``trace(R_RS) = 0``.
         threads: how many parts of a large batch run side by side; 0 = one per core.
+        bound: of ``r6p`` alone: solutions have a ``|v|``, the tangent of the angle to the initial
+            rotation, below this (1 by default, 45 degrees).
 
     Returns:
         rotations (h,k,3,3), translations (h,k,3), w (h,k,3) and t (h,k,3) of model A,
@@ -45,9 +49,10 @@ def solve_minimal(
         fewer than k solutions. For ``p3p``, w and t are zero.
 
     Raises:
-        ValueError: unknown solver, wrong shapes, fewer than one iteration, or threads below 0.
+        ValueError: unknown solver, wrong shapes, fewer than one iteration, threads below 0, or a
+            bound that is none, or of another solver than ``r6p``.
     """
-    solver = find_solver(name)
+    solver, row = find_solver(name), SOLVERS[name]
     points = np.ascontiguousarray(points, dtype=np.float64)
     rays = np.ascontiguousarray(rays, dtype=np.float64)
     tau = np.ascontiguousarray(tau, dtype=np.float64)
@@ -65,8 +70,12 @@ def solve_minimal(
         raise ValueError(f"iterations must be 1 or more, got {iterations}")
     if threads < 0:
         raise ValueError(f"threads must be 0 (all cores) or more, got {threads}")
+    if bound is not None and not (row.bounded and bound > 0.0):
+        raise ValueError(f"bound is that of r6p, above 0, got {bound} for {name}")
     samples = np.arange(h * n, dtype=np.int64).reshape(h, n)
     solve = solver.solve_as_published if as_published else solver.solve
+    if bound is not None:
+        solve = partial(solve, bound=bound)
     initial = initial.reshape(-1, 3, 3)
     k = solver.solutions
     rotations, translations = np.empty((h, k, 3, 3)), np.empty((h, k, 3))

@@ -183,11 +183,14 @@ def _solve(
 
 def solve_batch(
     points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
-    models: Array,
+    models: Array, bound: float = BOUND,
 ) -> None:  # fmt: skip
     """Arguments and result as in :mod:`rs_localizer.solvers.batch`; not iterative.
+
+    Args:
+        bound: of |v|.
 
     The solutions of a sample come first, those nearest to the initial rotation before others.
     """
     # Not a kernel itself: Numba would optimize all of the code once more.
-    _solve(points, rays, tau, samples, rotations, BOUND, models, np.empty((0, 3, 1)))
+    _solve(points, rays, tau, samples, rotations, float(bound), models, np.empty((0, 3, 1)))

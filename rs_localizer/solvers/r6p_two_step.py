@@ -22,14 +22,15 @@ from rs_localizer.core.simd.algebra import cross
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
 from rs_localizer.native import entry
 from rs_localizer.solvers import linear
-from rs_localizer.solvers.batch import Sample, gather, inputs, scatter
+from rs_localizer.solvers.batch import Sample, converged, gather, inputs, scatter
 
 SAMPLE_SIZE = 6
 SOLUTIONS = 1
 
 _INPUTS = inputs(SAMPLE_SIZE)
-_STATE = 12  # C, w, t, v
+_STATE = 13  # C, w, t, v, and the square of the last step
 _MODEL = _INPUTS - 9
+_CHANGE = _INPUTS + _STATE - 1
 _SIZE = (_INPUTS + _STATE) * LANES
 
 
@@ -99,7 +100,8 @@ def _step(values: list[Lanes], *, t_in_first: bool, t_in_second: bool) -> Vector
     w, t = sample.state[3:6], sample.state[6:9]
     v, c, t = _first_step(sample, w, None if t_in_first else t)
     w, t = _second_step(sample, v, c, None if t_in_second else t)
-    return sample.with_results(sample.points, sample.rotation, [*c, *w, *t, *v])
+    changes = [linear.difference(*of) for of in ((v, sample.state[9:12]), (w, sample.state[3:6]))]
+    return sample.stepped(sample.points, sample.rotation, [*c, *w, *t, *v], *changes)
 
 
 def _end(values: list[Lanes]) -> Vector:
@@ -110,7 +112,7 @@ def _end(values: list[Lanes]) -> Vector:
 
 def _begin(values: list[Lanes]) -> Vector:
     sample = Sample(values, SAMPLE_SIZE)
-    return sample.with_results(sample.rotated_points(), sample.rotation, [0.0] * _STATE)
+    return sample.with_results(sample.rotated_points(), sample.rotation, [0.0] * 12 + [1.0])
 
 
 _begin_lanes = traced(_begin, _INPUTS)
@@ -143,6 +145,8 @@ def solve_vc_wt(
         _begin_lanes(work, work)
         for _ in range(iterations):
             _vc_wt_lanes(work, work)
+            if converged(work, _CHANGE):
+                break
         _end_lanes(work, work)
         scatter(work, _MODEL, start, models[0])
 
@@ -164,6 +168,8 @@ def solve_vct_w(
         _begin_lanes(work, work)
         for _ in range(iterations):
             _vct_w_lanes(work, work)
+            if converged(work, _CHANGE):
+                break
         _end_lanes(work, work)
         scatter(work, _MODEL, start, models[0])
 
@@ -185,5 +191,7 @@ def solve_vct_wt(
         _begin_lanes(work, work)
         for _ in range(iterations):
             _vct_wt_lanes(work, work)
+            if converged(work, _CHANGE):
+                break
         _end_lanes(work, work)
         scatter(work, _MODEL, start, models[0])

@@ -22,14 +22,15 @@ from rs_localizer.core.simd.algebra import cross, multiply, nearest_rotation
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
 from rs_localizer.native import entry
 from rs_localizer.solvers import linear
-from rs_localizer.solvers.batch import Sample, gather, inputs, scatter
+from rs_localizer.solvers.batch import Sample, converged, gather, inputs, scatter
 
 SAMPLE_SIZE = 6
 SOLUTIONS = 1
 
 _INPUTS = inputs(SAMPLE_SIZE)
-_STATE = 12  # C, w, t, v
+_STATE = 13  # C, w, t, v, and the square of the last step
 _MODEL = _INPUTS - 9  # rotation, C, w, t lie side by side once v has been folded in
+_CHANGE = _INPUTS + _STATE - 1
 
 
 def _solve(sample: Sample, v: Vector | None) -> tuple[Vector, Vector, Vector, Vector]:
@@ -57,7 +58,7 @@ def _solve(sample: Sample, v: Vector | None) -> tuple[Vector, Vector, Vector, Ve
 
 def _begin(values: list[Lanes]) -> Vector:
     sample = Sample(values, SAMPLE_SIZE)
-    return sample.with_results(sample.rotated_points(), sample.rotation, [0.0] * _STATE)
+    return sample.with_results(sample.rotated_points(), sample.rotation, [0.0] * 12 + [1.0])
 
 
 def _relinearized_step(values: list[Lanes]) -> Vector:
@@ -65,13 +66,15 @@ def _relinearized_step(values: list[Lanes]) -> Vector:
     v, c, w, t = _solve(sample, None)
     turn = nearest_rotation(v)
     points = [multiply(turn, x) for x in sample.points]
-    return sample.with_results(points, linear.fold(sample.rotation, v), [*c, *w, *t, *v])
+    change = linear.difference(w, sample.state[3:6])
+    return sample.stepped(points, linear.fold(sample.rotation, v), [*c, *w, *t, *v], v, change)
 
 
 def _frozen_step(values: list[Lanes]) -> Vector:
     sample = Sample(values, SAMPLE_SIZE)
     v, c, w, t = _solve(sample, sample.state[9:12])
-    return sample.with_results(sample.points, sample.rotation, [*c, *w, *t, *v])
+    changes = [linear.difference(*of) for of in ((v, sample.state[9:12]), (w, sample.state[3:6]))]
+    return sample.stepped(sample.points, sample.rotation, [*c, *w, *t, *v], *changes)
 
 
 def _frozen_end(values: list[Lanes]) -> Vector:
@@ -82,7 +85,7 @@ def _frozen_end(values: list[Lanes]) -> Vector:
 
 
 _begin_lanes = traced(_begin, _INPUTS)
-_relinearized_lanes = traced(_relinearized_step, _INPUTS)
+_relinearized_lanes = traced(_relinearized_step, _INPUTS + _STATE)
 _frozen_lanes = traced(_frozen_step, _INPUTS + _STATE)
 _frozen_end_lanes = traced(_frozen_end, _INPUTS + _STATE)
 
@@ -104,6 +107,8 @@ def solve_batch(
         _begin_lanes(work, work)
         for _ in range(iterations):
             _relinearized_lanes(work, work)
+            if converged(work, _CHANGE):
+                break
         scatter(work, _MODEL, start, models[0])
 
 
@@ -124,5 +129,7 @@ def solve_batch_frozen(
         _begin_lanes(work, work)
         for _ in range(iterations):
             _frozen_lanes(work, work)
+            if converged(work, _CHANGE):
+                break
         _frozen_end_lanes(work, work)
         scatter(work, _MODEL, start, models[0])

@@ -25,11 +25,12 @@ class Row(NamedTuple):
     solve: str = "solve_batch"
     as_published: str = ""  # the paper's form where ours differs
     rolling_shutter: bool = True
+    bounded: bool = False  # takes a ``bound`` of its solutions
 
 
 SOLVERS = {
     "p3p": Row("p3p", rolling_shutter=False),
-    "r6p": Row("r6p"),
+    "r6p": Row("r6p", bounded=True),
     "r6p_vc_wt": Row("r6p_two_step", "solve_vc_wt"),
     "r6p_vct_w": Row("r6p_two_step", "solve_vct_w"),
     "r6p_vct_wt": Row("r6p_two_step", "solve_vct_wt"),

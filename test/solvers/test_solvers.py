@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import warnings
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -219,6 +220,26 @@ def test_relinearising_converges_from_far_where_freezing_does_not(minimal):
         share[as_published] = np.mean(angles(rotation, p.rotation) < 2.0)
     assert share[False] > 0.85
     assert share[True] < 0.5 * share[False]
+
+
+@pytest.mark.parametrize(
+    ("name", "as_published"), [variant for variant in VARIANTS if variant[0] != "r9p"]
+)
+def test_iterations_stop_at_convergence(minimal, name, as_published):
+    """And what has converged stays, whatever its neighbours in the lanes do."""
+    p = minimal.problem(64, 6, 0.1, 0.05, 0.05, seed=3)
+    every = solve(name, p, iterations=2000, as_published=as_published)
+    more = solve(name, p, iterations=2500, as_published=as_published)
+    still = np.array([
+        all(np.array_equal(a[i], b[i]) for a, b in zip(every, more, strict=True))
+        for i in range(64)
+    ])  # fmt: skip
+    assert still.mean() > 0.5
+    chosen = {key: values[still] for key, values in vars(p).items()}
+    # A million million would take months.
+    alone = solve(name, SimpleNamespace(**chosen), iterations=10**12, as_published=as_published)
+    for ours, before in zip(alone, every, strict=True):
+        np.testing.assert_array_equal(ours, before[still])
 
 
 def test_joint_gives_the_solutions_of_both(minimal):
