@@ -176,6 +176,14 @@ class CalibrationErrors:
         check(self, "calibration.")
 
 
+class RefinementKind(StrEnum):
+    """What is made of the best minimal sample of a frame."""
+
+    NONE = "none"
+    MOTION = "motion"
+    FULL = "full"
+
+
 @dataclass(frozen=True, slots=True)
 class LocalizerConfig:
     """Settings of one pose estimate (keyword arguments of :class:`rs_localizer.Localizer`)."""
@@ -183,7 +191,15 @@ class LocalizerConfig:
     solver: str = setting(
         "r6p_vcwt", "Minimal solver that generates the hypotheses", choices=tuple(SOLVERS)
     )
-    solver_iterations: int = setting(5, "Iterations of the iterative linear solvers", (1, 100))
+    solver_iterations: int = setting(
+        5, "Most iterations of the iterative solvers, which stop where they converge", (1, 100)
+    )
+    refinement: str = setting(
+        RefinementKind.FULL,
+        "What follows the search; none: nothing, the best sample's model is published, without a "
+        "covariance; motion: least squares of the inliers, without priors; full: the posterior. "
+        "Frames are tracked by full alone",
+    )
     inlier_threshold: float = setting(
         2.0, "Largest reprojection error of an inlier, in raw image pixels", (0.01, 1000.0)
     )

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.config import LocalizerConfig, localizer_config
+from rs_localizer.config import LocalizerConfig, RefinementKind, localizer_config
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.bearings import seen_at
 from rs_localizer.core.camera import Camera
@@ -37,7 +37,7 @@ from rs_localizer.estimation.observations import (
     relinearized,
     unfit,
 )
-from rs_localizer.estimation.posterior import Posterior
+from rs_localizer.estimation.posterior import Posterior, best_motion
 from rs_localizer.estimation.prior import (
     Prior,
     PriorTerms,
@@ -47,7 +47,7 @@ from rs_localizer.estimation.prior import (
     with_motion,
 )
 from rs_localizer.estimation.ransac import Candidate, generator
-from rs_localizer.estimation.result import estimate_of
+from rs_localizer.estimation.result import estimate_of, sample_estimate
 from rs_localizer.estimation.searching import MotionSearch
 from rs_localizer.solvers.table import find_solver, start_solver
 
@@ -108,6 +108,7 @@ class Localizer:
         self._search = MotionSearch(
             camera.focal_length, self.config, self._solver, start_solver(self._solver)
         )
+        self._full = self.config.refinement == RefinementKind.FULL
         self._exposure = camera.exposure()
         # Of as many spans as a rig of cameras that are in step has.
         self._assume = lru_cache(16)(
@@ -166,13 +167,19 @@ class Localizer:
             reason. Same seed and same input give the same result.
 
         Raises:
-            ValueError: wrong shapes, or values that are not finite.
+            ValueError: wrong shapes, values that are not finite, or a prior or turn where
+                ``refinement`` uses none.
         """
+        if not self._full and (prior is not None or turn is not None):
+            raise ValueError(
+                f"refinement {self.config.refinement} knows the points alone: neither a prior nor "
+                "a turn"
+            )
         return self.accepted(self.find(points, pixels, scores, prior, expected_share, turn, stamps))
 
     def accepted(self, found: Estimate | Failure) -> Estimate | Failure:
         """The same, or a :class:`Failure` where the orientation is too uncertain."""
-        if not found:
+        if not found or self.config.refinement == RefinementKind.NONE:
             return found
         failure = uncertain(found, self.config.max_orientation_deviation)
         return found if failure is None else failure
@@ -190,8 +197,11 @@ class Localizer:
     ) -> Estimate | Failure:
         """As :meth:`localize`, however uncertain it is: the next frames may know better.
 
-        ``error_modes``: of the map of these points, if it has them; they enter covariances.
+        ``error_modes``: of the map of these points, if it has them; they enter covariances. What
+        ``refinement`` does not use is ignored.
         """
+        if not self._full:
+            prior = turn = None
         if prior is not None:
             instance("prior", prior, Prior)
             self._check_rate(prior)
@@ -265,6 +275,11 @@ class Localizer:
         best = self._search.find(observed)
         if not best.found:
             return Failure(Reason.NO_HYPOTHESIS, "no three points gave a pose")
+        if self.config.refinement == RefinementKind.NONE:
+            return sample_estimate(
+                observed, best.state, best.samples, self.config.inlier_threshold,
+                self.config.min_inliers,
+            )  # fmt: skip
         # 4. Maximum a posteriori on the inliers; rest or motion; the leans of a plane.
         posterior = self._settle(observed, best, observed.terms)
         # 5. Nothing rather than a wrong pose.
@@ -336,6 +351,9 @@ class Localizer:
         observations = relinearized(
             sighted.exposure, observed.observations, best.state, sighted.turn
         )
+        if not self._full:
+            seen = observations.packed, observations.count
+            return Posterior(*best_motion(*seen, best.state, terms, gate))
         one_lens = sighted.exposure.alone
         return frame_posterior(observations, best.state, terms, gate, assumed, one_lens)
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.config import Acceleration
+from rs_localizer.config import Acceleration, RefinementKind
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
@@ -511,8 +511,8 @@ class Tracker:
         pixels: ArrayLike | None,
         prior: Prior | None,
     ) -> Estimate:
-        """The same with its integrity; of a rig, it has none."""
-        if isinstance(points, Mapping) or pixels is None:
+        """The same with its integrity; of a rig, and without a covariance, it has none."""
+        if isinstance(points, Mapping) or pixels is None or np.isnan(result.joint_covariance[0, 0]):
             return result
         numbers = self._integrity.numbers(result, points, pixels, prior)
         return replace(result, integrity=self._integrity.add(numbers))
@@ -603,6 +603,8 @@ def _check_motion(localizer: Localizer) -> None:
     cameras = localizer.rig.cameras.values()
     if not all(camera.readout_time > 0.0 for camera in cameras):
         raise ValueError("tracking needs the readout time of the camera, which is 0 (unknown)")
+    if localizer.config.refinement != RefinementKind.FULL:
+        raise ValueError(f"tracking needs refinement full, got {localizer.config.refinement}")
     if not find_solver(localizer.config.solver).rolling_shutter:
         raise ValueError(
             f"tracking needs velocities, which solver {localizer.config.solver} does not find"

@@ -37,7 +37,8 @@ class Estimate(Motion):
     Accelerations and shaking are averaged out of it; ``joint_covariance`` has them behind, in the
     order of ``rs_localizer.core.state`` and of ``shake``. The former has the errors of the
     calibration, which are the same in all frames, and what belongs to this frame alone, as of
-    vibration that hides in the noise; the latter is what goes on to the next frame.
+    vibration that hides in the noise; the latter is what goes on to the next frame. With
+    ``refinement`` none all of them are NaN.
     """
 
     inliers: BoolArray  # (n,)
@@ -90,7 +91,12 @@ class Estimate(Motion):
 
     @property
     def orientation_deviation(self) -> float:
-        """Standard deviation (rad) of the orientation at tau = 0, about the axis known worst."""
+        """Standard deviation (rad) of the orientation at tau = 0, about the axis known worst.
+
+        NaN where there is no covariance.
+        """
+        if np.isnan(self.joint_covariance[0, 0]):
+            return math.nan
         return math.sqrt(np.linalg.eigvalsh(self.covariance[TURN, TURN])[-1])
 
     def shake_at(self, tau: float) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.config import LocalizerConfig
+from rs_localizer.config import LocalizerConfig, RefinementKind
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3, Out
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rig import Rig
@@ -583,14 +583,15 @@ def assumptions(
     """
     span = span or _UNKNOWN_READOUT_TIME
     velocity, acceleration = config.velocity_prior, config.acceleration
-    terms = (
-        motion_terms(
+    if not solver.rolling_shutter:
+        terms = held_terms()
+    elif config.refinement == RefinementKind.MOTION:
+        terms = motion_terms((0.0, 0.0), (_LEAST_DEVIATION, _LEAST_DEVIATION))
+    else:
+        terms = motion_terms(
             (velocity.angular * span, velocity.linear * span),
             (acceleration.angular * span**2, acceleration.linear * span**2),
         )
-        if solver.rolling_shutter
-        else held_terms()
-    )
     return terms, Assumed(
         map_deviation=config.map_deviation,
         focal_length=rig.focal_length,

@@ -316,6 +316,7 @@ class Hypotheses(NamedTuple):
     final_scale: float  # px, truncation after local optimisation: the inlier threshold
     noise: float  # px, expected standard deviation
     iterations: int  # of an iterative solver
+    optimized: bool = True  # False: minimal models are judged as they are
 
 
 class Draws(NamedTuple):
@@ -338,7 +339,8 @@ def search(
     when the chance that no sample so far held inliers alone, at the inlier ratios of the best
     *optimised* motion, is below ``1 - draws.confidence``: minimal models see too few of the inliers
     to count them (a six-point model sees a tenth). Only models that beat all minimal ones before
-    are optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003).
+    are optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). Where none is, the best minimal
+    model counts, and the search ends late.
     """
     solver, pools, mounts = hypotheses.solver, draws.pools, observations.mounts
     scales = hypotheses.score_scale, hypotheses.final_scale, hypotheses.noise
@@ -359,6 +361,7 @@ def search(
         state, cost, least, missed = _judge(
             models, camera, mounts, observations.packed, observations.count, state, cost, scales,
             no_fit - best_gain, prior, pools, drawn, shares, solver.sample_size,
+            hypotheses.optimized,
         )  # fmt: skip
         best_gain = max(best_gain, no_fit - least)
         left = draws.most - int(drawn.sum())
@@ -371,7 +374,7 @@ def search(
 def _judge(
     models: Out[Array3], camera: IntArray1, mounts: Mounts, data: Array2, count: int, best: Array1,
     least: float, scales: tuple[float, float, float], bar: float, prior: PriorTerms, pools: Pools,
-    drawn: IntArray1, shares: Out[Array1], size: int,
+    drawn: IntArray1, shares: Out[Array1], size: int, optimized: bool,
 ) -> tuple[Array, float, float, float]:  # fmt: skip
     """Optimise the best of a block's models.
 
@@ -383,6 +386,7 @@ def _judge(
         drawn: (p,) samples from each pool until now, of ``size`` points.
         shares: (p,) of its points that are inliers of the best state, kept up to date; NaN: not
             counted yet.
+        optimized: whether the best are optimised.
 
     Returns:
         the best state and its cost; the least cost of a minimal model; and the chance that none of
@@ -391,7 +395,9 @@ def _judge(
     into_rig(models, camera, mounts)
     score_scale, final_scale, noise = scales
     states, costs = best_models(models, data, score_scale, _KEEP, bar)
-    state, cost = optimize(states, costs, data, 2.0 * score_scale, final_scale, prior, noise)
+    state, cost = states[0], costs[0]
+    if optimized:
+        state, cost = optimize(states, costs, data, 2.0 * score_scale, final_scale, prior, noise)
     better = cost < least
     if better:
         best, least = state, cost

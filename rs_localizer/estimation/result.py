@@ -23,6 +23,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, Array2, Array3
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rate_spline import multiplied
+from rs_localizer.core.reasons import Reason
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
     MOTION_PARAMETERS,
@@ -34,7 +35,7 @@ from rs_localizer.core.state import (
     STATE_TRANSLATION,
     rotation_of,
 )
-from rs_localizer.core.types import Estimate
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import CalibrationEffect
 from rs_localizer.estimation.modes import along_arcs
 from rs_localizer.estimation.observations import Observations, Observed
@@ -129,6 +130,41 @@ def _turned(
             for k in range(3):
                 turned[i, row] += by_turn[i, row, k] * phi[k]
     return turned
+
+
+def sample_estimate(
+    observed: Observed, state: Array, samples: int, threshold: float, fewest: int
+) -> Estimate | Failure:
+    """The estimate of a minimal sample's model as it is, without a covariance.
+
+    Args:
+        state: (24,) of the model.
+        samples: minimal samples drawn.
+        threshold: px, of inliers.
+        fewest: inliers of an accepted pose.
+    """
+    usable, rotation = observed.sighted.usable, rotation_of(state)
+    residuals = np.full(len(observed.sighted.points), np.nan)
+    residuals[usable.indices] = np.sqrt(observed.observations.squared_errors(state))
+    inliers = residuals < threshold  # NaN is none
+    found = int(np.count_nonzero(inliers))
+    if found < fewest:
+        return Failure(
+            Reason.TOO_FEW_INLIERS,
+            f"{found} inliers of {observed.observations.count} points after {samples} samples, "
+            f"{fewest} are needed",
+        )
+    return Estimate(
+        rotation=rotation,
+        translation=state[STATE_TRANSLATION] - rotation @ observed.centre,
+        angular_velocity=state[STATE_ANGULAR],
+        linear_velocity=state[STATE_LINEAR],
+        inliers=inliers,
+        residuals=residuals,
+        joint_covariance=np.full((PARAMETERS, PARAMETERS), np.nan),
+        iterations=samples,
+        span=observed.sighted.exposure.span,
+    )
 
 
 def estimate_of(

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rs_localizer.config import LocalizerConfig
+from rs_localizer.config import LocalizerConfig, RefinementKind
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.state import STATE_SIZE, rotation_of
 from rs_localizer.estimation.observations import Observed
@@ -60,12 +60,18 @@ class MotionSearch:
         self._near = _POOL_SCALE * focal_length
         threshold = config.inlier_threshold
         self._noise = EXPECTED_NOISE * threshold
+        self._optimizes = config.refinement != RefinementKind.NONE
         expected = self._noise, config.solver_iterations
         wide = max(GLOBAL_SHUTTER_SCALE * focal_length, threshold)
         self._rough = wide
-        scales = (wide, wide) if solver.rolling_shutter else (_SCORE_SCALE * threshold, threshold)
-        self._starts = Hypotheses(start, _GLOBAL_SHUTTER_BLOCK, *scales, *expected)
-        self._motions = Hypotheses(solver, _BLOCK, _SCORE_SCALE * threshold, threshold, *expected)
+        score = (_SCORE_SCALE if self._optimizes else 1.0) * threshold
+        scales = (wide, wide) if solver.rolling_shutter else (score, threshold)
+        self._starts = Hypotheses(
+            start, _GLOBAL_SHUTTER_BLOCK, *scales, *expected, optimized=self._optimizes
+        )
+        self._motions = Hypotheses(
+            solver, _BLOCK, score, threshold, *expected, optimized=self._optimizes
+        )
 
     def find(self, observed: Observed) -> Candidate:
         """The motion found from a global-shutter start, or nothing."""
@@ -104,14 +110,17 @@ class MotionSearch:
         if not start.found:
             return start
         observations, threshold = observed.observations, self._config.inlier_threshold
-        near, state, cost, agreeing = _from_start(
-            observations.packed, observations.count, start.state, self._near, threshold,
-            observed.terms, self._noise,
-        )  # fmt: skip
-        # The global-shutter pose is a hypothesis, too: at rest it is the best one.
-        first = Candidate(state, cost)
-        if agreeing < _AGREEING * np.count_nonzero(near):
-            first = self._facing(observed, start, near, first)
+        if self._optimizes:
+            near, state, cost, agreeing = _from_start(
+                observations.packed, observations.count, start.state, self._near, threshold,
+                observed.terms, self._noise,
+            )  # fmt: skip
+            # The global-shutter pose is a hypothesis, too: at rest it is the best one.
+            first = Candidate(state, cost)
+            if agreeing < _AGREEING * np.count_nonzero(near):
+                first = self._facing(observed, start, near, first)
+        else:
+            near, first = observations.within(start.state, self._near), NOTHING
         pools = pools_of(
             observations.camera, observations.tau, len(observations.mounts.axes),
             self._solver.sample_size, near, observed.ranking, True,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
 
+import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
@@ -74,6 +75,12 @@ class Localized:
         return True
 
 
+def _sent(covariance: Array) -> Array:
+    """A covariance (6,6) as messages have it (36,): -1 on the diagonal where there is none."""
+    known: Array = -np.eye(6) if np.isnan(covariance[0, 0]) else covariance
+    return known.ravel()
+
+
 def messages(frame: Localized, make: Make) -> dict[str, Any]:
     """The messages of a frame by output topic (see :data:`TYPES`), the same for node and replay.
 
@@ -102,7 +109,7 @@ def each_message(
 
     @cache
     def pose_with_covariance() -> Any:
-        covariance = frame.pose.covariance.ravel()
+        covariance = _sent(frame.pose.covariance)
         kind = "geometry_msgs/msg/PoseWithCovariance"
         return make(kind, pose=pose(), covariance=covariance)
 
@@ -116,7 +123,7 @@ def each_message(
     def velocity_with_covariance() -> Any:
         assert twist is not None
         kind = "geometry_msgs/msg/TwistWithCovariance"
-        return make(kind, twist=velocity(), covariance=twist.covariance.ravel())
+        return make(kind, twist=velocity(), covariance=_sent(twist.covariance))
 
     parts: dict[str, dict[str, Callable[[], Any]]] = {
         topics.POSE: {"pose": pose},

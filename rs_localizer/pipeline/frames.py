@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rs_localizer import matching
-from rs_localizer.config import CameraSettings, Imu, ImuUse, NodeConfig, PoseTime
+from rs_localizer.config import (
+    CameraSettings,
+    Imu,
+    ImuUse,
+    NodeConfig,
+    PoseTime,
+    PublishTf,
+    RefinementKind,
+)
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice, Reason
@@ -160,7 +168,9 @@ class FrameLocalizer:
             # The readout that was adopted stays.
             now = self.config
             self._config = replace(
-                config, readout_time=now.readout_time, scan_direction=now.scan_direction
+                _in_effect(config),
+                readout_time=now.readout_time,
+                scan_direction=now.scan_direction,
             )
             self._settings = config
             return False
@@ -175,6 +185,7 @@ class FrameLocalizer:
 
     def _use(self, config: NodeConfig) -> None:
         # Nothing changes if this raises: cameras, tracker and settings always belong together.
+        config = _in_effect(config)
         seen = {
             name: self.calibrations.get(name, ANY_CALIBRATION).camera(
                 own.readout_time, own.scan_direction
@@ -489,8 +500,8 @@ class FrameLocalizer:
         self.imu.track(self._tracker, config, time_ns, frame, self.transforms, localized)
         result = self._tracker.newest
         assert result is not None
-        adopted = config
-        if not self._tracker.repeats:  # a copy says nothing of the shutter
+        adopted, full = config, config.refinement == RefinementKind.FULL
+        if full and not self._tracker.repeats:  # a copy says nothing of the shutter
             adopted = self.readout_watch.add(Watched(time_ns, cloud, result, config, camera))
         if result and not self.readout_watch.wrong_axis:
             ahead = (cloud.points[result.inliers] - result.position) @ result.rotation[2]
@@ -688,6 +699,20 @@ class FrameLocalizer:
     def mounted(self, localized: Localized) -> Localized | Refusal:
         """The result of ``base_frame``, from that of the camera."""
         return of_body(localized, self.config, self.transforms)
+
+
+def _in_effect(config: NodeConfig) -> NodeConfig:
+    """The settings without what ``refinement`` turns off.
+
+    That is what knows more than a frame's points, and TF where no covariance says how good a pose
+    is.
+    """
+    if config.refinement == RefinementKind.FULL:
+        return config
+    config = replace(config, tracking=False, imu=replace(config.imu, use=ImuUse.NONE))
+    if config.refinement == RefinementKind.NONE:
+        config = replace(config, publish_tf=PublishTf.NONE)
+    return config
 
 
 def _shutters(config: NodeConfig) -> Mapping[str, CameraSettings]:

@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.config import NodeConfig
+from rs_localizer.config import NodeConfig, RefinementKind
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -140,7 +140,9 @@ class RigWatch:
         self._names = config.cameras
         self._rolling = find_solver(config.solver).rolling_shutter
         # Orientations that are not worth publishing still say something.
-        self._alone = replace(config, max_orientation_deviation=10.0)
+        self._alone = replace(
+            config, max_orientation_deviation=10.0, refinement=RefinementKind.FULL
+        )
         self.reset()
 
     def reset(self) -> None:

@@ -153,6 +153,34 @@ def test_settings_of_a_file_and_of_the_command_line(recording, tmp_path):
     assert (middle - first).tolist() == [15_000_000] * FRAMES
 
 
+@pytest.mark.parametrize("kind", ["none", "motion"])
+def test_frames_that_are_not_refined_stand_alone(recording, tmp_path, capsys, kind):
+    """Nothing is tracked, and of a sample's model no covariance and no transform are sent."""
+    out, table = tmp_path / "out", tmp_path / "frames.parquet"
+    words = ["-p", f"refinement:={kind}", "-p", "publish_tf:=map_to_camera", "--parquet"]
+    assert main(["replay", str(recording), "--out", str(out), *SHUTTER, *words, str(table)]) == 0
+    rows = dict(line.rsplit(None, 1) for line in capsys.readouterr().out.splitlines())
+    assert rows["localized"] == str(FRAMES)
+    assert rows.get("tracked from the frame before", "0.0%") == "0.0%"
+    truth, poses = (
+        read_motions(recording, "/truth/pose", "/truth/twist"),
+        read_tum(out / "poses.txt"),
+    )
+    np.testing.assert_allclose(poses.positions, truth.poses.positions[::2], atol=0.5)
+    sent = messages(out / "result")
+    odometry = [message for name, _, message in sent if name == "/rs_localizer/odometry"]
+    assert len(odometry) == FRAMES
+    for part in (part for message in odometry for part in (message.pose, message.twist)):
+        known = part.covariance.reshape(6, 6)
+        if kind == "none":
+            np.testing.assert_array_equal(known, -np.eye(6))
+        else:
+            assert (np.linalg.eigvalsh(known) > 0.0).all()
+    assert ("/tf" in {name for name, _, _ in sent}) == (kind == "motion")
+    known = np.array(frame_table.read_parquet(table)["pose_covariance"].to_pylist())
+    assert np.isnan(known).all() == (kind == "none")
+
+
 def test_no_frame_localized_is_a_failure(recording, tmp_path, capsys):
     with BagWriter(tmp_path / "empty") as bag:
         for topic, stamp_ns, message in messages(recording):
