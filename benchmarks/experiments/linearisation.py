@@ -67,4 +67,5 @@ def run(context: Context) -> Result:
                 straight, _METHODS, "initial orientation off by (deg)", skip_zero=False
             )
         },
+        [straight.orientations("deg", 0.0, 6.0, 15.0, 30.0).replace("motion", "start off by", 1)],
     )  # fmt: skip

@@ -98,6 +98,7 @@ def run(context: Context) -> Result:
                 curves, (*m.PAPERS, m.REFINED), _X_LABEL, skip_zero=False, decorate=draw_bounds
             )
         },
+        [curves.orientations("px", 0.0, 1.0, 4.0).replace("motion", "noise", 1)],
     )  # fmt: skip
 
 

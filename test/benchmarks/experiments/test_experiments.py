@@ -66,8 +66,12 @@ def result(name: str) -> Result:
         return EXPERIMENTS[name](context)
 
 
-FAULTS = {"first bearing": (1.01, 1.0), "row time": (1.0, 1.05)}
-"""What the rays' x and the row times are multiplied with in the equations of one solver."""
+FAULTS = {
+    "first bearing": (1.01, 1.0, 1.0),
+    "second bearing": (1.0, 1.01, 1.0),
+    "row time": (1.0, 1.0, 1.05),
+}
+"""What the rays' x and y and the row times are multiplied with in the equations of one solver."""
 
 
 @pytest.mark.parametrize(
@@ -78,11 +82,11 @@ def test_a_wrong_coefficient_in_any_solver_fails_a_claim(fault, solver, monkeypa
     context, solve = Context(40, 0, untracked), methods.solve_minimal
     if (fault, solver) == ("first bearing", "p3p"):  # once
         assert all(claim.held for claim in convergence.exactness(context))
-    by_ray, by_tau = FAULTS[fault]
+    *by_ray, by_tau = FAULTS[fault]
 
     def wrong(name, points, rays, tau, *others):
         if name == solver:
-            rays, tau = rays * [by_ray, 1.0], by_tau * tau
+            rays, tau = rays * by_ray, by_tau * tau
         return solve(name, points, rays, tau, *others)
 
     monkeypatch.setattr(methods, "solve_minimal", wrong)
