@@ -80,6 +80,8 @@ class PredictionErrors:
     def _learn(self, seconds: float, ratios: Array) -> None:
         if not np.isfinite(ratios).all():  # rounding errors are all that is left of a covariance
             return
+        # Copies of this object keep theirs.
+        self._told, self._factors = self._told.copy(), self._factors.copy()
         place = np.clip(seconds / self._longest, _KNOTS[0], _KNOTS[-1])
         for k, weight in enumerate(np.maximum(1.0 - np.abs(place - _KNOTS) / _KNOTS[0], 0.0)):
             if weight > 0.0:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -297,6 +298,15 @@ class Tracker:
         if isinstance(there, RigEstimate):
             there = replace(there, time=there.time + seconds)
         return there if self.localizer.accepted(there) else None
+
+    def snapshot(self) -> Tracker:
+        """What :meth:`at` knows now, for another thread while frames are localized here."""
+        there = copy(self)
+        there._seen = deque(map(copy, self._seen), LENGTH)
+        there._track, there._errors = copy(self._track), copy(self._errors)
+        if self._aid is not None:
+            there._aid = self._aid.snapshot()
+        return there
 
     def _turned(self, time_ns: int, samples: ImuSamples | None) -> Estimate | None:
         """The motion after the last frame, turning as a gyroscope says; None where it does not."""

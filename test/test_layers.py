@@ -246,3 +246,29 @@ def test_each_module_and_class_has_a_name_of_its_own():
     excepted = ("__init__.py", "__main__.py", "build.py")
     shared = {name: of for name, of in homes.items() if len(of) > 1 and name not in excepted}
     assert shared == {}
+
+
+def test_nodes_use_public_names_of_rclpy_only():
+    """What rclpy calls with an underscore, or keeps in ``impl``, changes without notice."""
+    own, used = set(), {}
+    for path in sorted((PACKAGE / "ros").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                own.add(node.name)
+            elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                own.add(node.target.id)
+            elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+                own.add(node.attr)
+            elif isinstance(node, ast.Attribute):
+                used[node.attr] = f"{path.name}:{node.lineno}"
+            elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rclpy.impl"):
+                used["_impl"] = f"{path.name}:{node.lineno}"
+            elif isinstance(node, ast.Constant) and str(node.value).startswith("_LifecycleNode"):
+                used[node.value] = f"{path.name}:{node.lineno}"
+    own |= {"_exit"}  # of os
+    private = {
+        name: where for name, where in used.items()
+        if name.startswith("_") and not name.endswith("__") and name not in own
+    }  # fmt: skip
+    assert private == {}
+    assert not any(name.startswith("_LifecycleNode") for name in own)

@@ -40,24 +40,25 @@ def main() -> int:
     print(f"{args.points} points, {args.outliers:.0%} outliers", flush=True)
     results = steady(frames, args.cameras, round(60.0 * args.minutes * args.rate))
     print(f"{args.cameras} camera(s) at {args.rate:g} Hz for {args.minutes:g} min")
-    met = [_report(index, result) for index, result in enumerate(results)]
+    met = [_report(index, result, args.rate) for index, result in enumerate(results)]
     return 0 if all(met) else 1
 
 
-def _report(index: int, result: Result) -> bool:
+def _report(index: int, result: Result, rate: float) -> bool:
     """Print the figures of one camera; whether they meet the limits."""
     p50, p99, most = np.percentile(1e3 * result.latencies, (50, 99, 100)).tolist()
     replaced = result.replaced / result.frames
     memory = result.memory
     after_a_minute = float(memory[min(60, len(memory) - 1)])
     growth = float(memory[-1]) - after_a_minute
+    spent = 1e3 * result.cpu * result.frames / (rate * max(result.answered, 1))
     print(
         f"camera {index}: {result.frames} frames, {result.answered} answered, "
         f"{result.replaced} replaced ({replaced:.3%}), {result.refused} refused, "
         f"{result.lost} lost{f', {result.imu} with the IMU' if result.imu else ''}\n"
         f"  latency p50 {p50:.2f} ms, p99 {p99:.2f} ms, most {most:.1f} ms\n"
         f"  memory {after_a_minute:.1f} MB after a minute, {growth:+.1f} MB at the end; "
-        f"CPU {result.cpu:.0%} of a core"
+        f"CPU {result.cpu:.0%} of a core, {spent:.2f} ms a pose"
     )
     return (
         result.lost == 0

@@ -10,6 +10,7 @@ import pickle
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,7 +22,6 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -29,7 +29,7 @@ from benchmarks.load.camera import Camera
 from benchmarks.load.frames import READOUT_TIME, Frames
 from rs_localizer.core.arrays import Array
 from rs_localizer.io import topics
-from rs_localizer.ros.node.subscriptions import Intake, NotByExecutor
+from rs_localizer.ros.node.managed import executor_of
 from rs_localizer.settings import NODE_NAME
 
 _NODE = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
@@ -70,25 +70,13 @@ class Ear:
         self._frames = frames
         self._name = f"{namespace.lstrip('/')}/{NODE_NAME}: localizer"
         prefix = f"{namespace}/{NODE_NAME}"
-        # Taken as the node does it: an executor would be part of the latency.
-        listeners = [
-            node.create_subscription(
-                kind,
-                topic,
-                callback,
-                QoSProfile(depth=50),
-                callback_group=NotByExecutor(),
-                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-                raw=raw,
-            )
-            for kind, topic, callback, raw in (
-                (PoseStamped, f"{prefix}/{topics.POSE}", self._take, True),
-                # Somebody listens to the twist, too: it is what this node is for.
-                (Odometry, f"{prefix}/{topics.ODOMETRY}", lambda _: None, True),
-                (DiagnosticArray, topics.DIAGNOSTICS, self._take_status, False),
-            )
-        ]
-        self.close = Intake(node.context, listeners, sys.exit).close
+        for kind, topic, callback, raw in (
+            (PoseStamped, f"{prefix}/{topics.POSE}", self._take, True),
+            # Somebody listens to the twist, too: it is what this node is for.
+            (Odometry, f"{prefix}/{topics.ODOMETRY}", lambda _: None, True),
+            (DiagnosticArray, topics.DIAGNOSTICS, self._take_status, False),
+        ):
+            node.create_subscription(kind, topic, callback, QoSProfile(depth=50), raw=raw)
 
     def _take(self, message: Any) -> None:
         now = time.monotonic()
@@ -161,6 +149,9 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
             )
         memory: list[list[float]] = []
         used: list[list[float]] = []
+        ended = threading.Event()
+        listening = threading.Thread(target=_listen, args=(peer, ended))
+        listening.start()
         while any(publisher.poll() is None for publisher in publishers):
             time.sleep(1.0)
             if sents[0][0] > 0.0:
@@ -168,8 +159,8 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
                 used.append([time.monotonic(), *(cpu_time(pid) for _, pid in nodes)])
         spent = np.subtract(used[-1], used[0])
         time.sleep(_REST_TIME)
-        for ear in ears:
-            ear.close()
+        ended.set()
+        listening.join()
         return [
             Result(
                 frames=count,
@@ -185,6 +176,15 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
                 ears, sents, np.array(memory).T, spent[1:], strict=True
             )
         ]
+
+
+def _listen(node: Node, ended: threading.Event) -> None:
+    """Take what comes until the end, as the localizer does."""
+    executor = executor_of(node.context)
+    executor.add_node(node)
+    while not ended.is_set():
+        executor.spin_once(timeout_sec=0.1)
+    executor.remove_node(node)
 
 
 def _memory(pid: int) -> float:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -119,6 +120,12 @@ class GyroscopeAid:
         self._watch.reset()
         self._last_ns, self._stepped = None, False
         self._search = OffsetSearch() if self._settings.estimate_time_offset else None
+
+    def snapshot(self) -> GyroscopeAid:
+        """What :meth:`ahead` knows now: frames that come later do not change it."""
+        there = copy(self)
+        there.filter = copy(self.filter)
+        return there
 
     def seek(
         self, camera: Camera, points: ArrayLike, pixels: ArrayLike, found: Estimate, middle_ns: int

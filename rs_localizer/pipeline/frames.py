@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -549,6 +550,12 @@ class FrameLocalizer:
     def predicts(self) -> bool:
         """True if frames are tracked, so that :meth:`at` knows the motion between them."""
         return self._alone and self._tracker.remembers_motion
+
+    def snapshot(self) -> FrameLocalizer:
+        """What :meth:`at` knows now, for another thread while frames are localized here."""
+        there = copy(self)
+        there._tracker = self._tracker.snapshot()
+        return there
 
     def at(self, stamp_ns: int) -> Localized | Refusal | None:
         """Pose and twist at a time of the images' clock, without inliers.

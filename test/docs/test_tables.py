@@ -6,6 +6,7 @@ import re
 import runpy
 from collections.abc import Iterator
 from typing import Any
+from unittest.mock import Mock
 
 import pages
 import pytest
@@ -17,7 +18,7 @@ from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.topics import LIVE
 from rs_localizer.offline.frame_table import COLUMNS
 from rs_localizer.pipeline.inputs import INPUTS
-from rs_localizer.ros.localizer.node import Feed
+from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.diagnostics import State
 from rs_localizer.settings import FIRST, Kind, settings
 from rs_localizer.solvers.table import SOLVERS, find_solver
@@ -89,8 +90,7 @@ def test_figures_are_of_solvers_that_exist():
 
 
 def taken_topics() -> Any:
-    unused: Any = None
-    return Feed(unused, unused, unused, unused).topics(NodeConfig())
+    return LocalizerNode.topics(Mock(), NodeConfig())
 
 
 def test_the_topics_of_the_localizer():

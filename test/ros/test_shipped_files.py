@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import rclpy
@@ -24,7 +25,7 @@ from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Chessboard
 from rs_localizer.pipeline.inputs import INPUTS
-from rs_localizer.ros.localizer.node import Feed
+from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.settings import (
     DETECTOR_NAME,
     NODE_NAME,
@@ -160,8 +161,7 @@ def test_arguments_and_files_exist(describe, file):
 
 
 def test_every_input_can_be_remapped(describe):
-    unused: Any = None
-    inputs = set(Feed(unused, unused, unused, unused).topics(NodeConfig())) | set(INPUTS)
+    inputs = set(LocalizerNode.topics(Mock(), NodeConfig())) | set(INPUTS)
     inputs -= {name for name in inputs if name.startswith("~/")}
     launched = node(describe("localizer.launch.py"), "localizer")
     assert {name for name, _ in launched.options["remappings"]} == inputs

@@ -7,14 +7,12 @@ It listens to images only while somebody listens to it.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.lifecycle import LifecycleNode
 from rclpy.timer import Timer
 from sensor_msgs.msg import CompressedImage, PointCloud2
 from sensor_msgs.msg import Image as ImageMessage
@@ -38,7 +36,6 @@ from rs_localizer.ros.node.diagnostics import (
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.statistics import WINDOW, Summary, Told
 from rs_localizer.ros.node.subscriptions import Silence, Topic
-from rs_localizer.ros.node.worker import Worker
 
 Result = TypeVar("Result")
 Picture = NDArray[np.uint8]  # (h,w,3) blue, green, red
@@ -68,14 +65,7 @@ _LOOK_PERIOD = 0.2
 Settings = TypeVar("Settings", DetectorConfig, FeatureConfig)
 
 
-@dataclass(slots=True)
-class Work:
-    """State that the worker alone touches."""
-
-    finder: Any
-
-
-class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
+class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
     """Looks at images; see :class:`rs_localizer.ros.node.managed.ManagedNode`.
 
     A node says what it looks for by overriding :meth:`make_finder`, :meth:`make_cloud`,
@@ -93,8 +83,8 @@ class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
         tell: Callable[[Result], tuple[int, Told]],
         **options: Any,
     ) -> None:
-        self._outputs: ImageOutputs[Result] | None = None
-        self._topics: dict[str, Topic] = {}  # all that may be listened to
+        self._finder: Any = None  # from configuring on the worker's
+        self._outputs: tuple[Any, ...] = ()  # publishers of clouds and of debug pictures
         self._timer: Timer | None = None
         self._listening: tuple[str, ...] = ()
         super().__init__(name, kind, tell, **options)
@@ -127,23 +117,24 @@ class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
         self.make_finder(config)
 
     def open(self, config: Settings) -> None:
-        finder = self.make_finder(config)
-        self._outputs = outputs = ImageOutputs(self, self.output, self.make_cloud, self.draw)
-        self._topics = _image_topics(self.employ(Work(finder), outputs.publish))
-        self._description = self.describe(finder)
+        self._finder = self.make_finder(config)
+        self._outputs = (
+            create_output(self, PointCloud2, self.output),
+            create_output(self, ImageMessage, f"~/{topics.DEBUG_IMAGE}"),
+        )
+        self._description = self.describe(self._finder)
+        self.employ(lambda _, image: self._finder.take(image), self._publish)
 
     def close(self) -> None:
-        self._topics = {}
-        if self._outputs is not None:
-            self._outputs.close()
-            self._outputs = None
+        for publisher in self._outputs:
+            self.destroy_lifecycle_publisher(publisher)
+        self._outputs = ()
 
     def begin(self, config: Settings) -> None:
-        assert self._outputs is not None
         self._timer = steady_timer(self, _LOOK_PERIOD, self._look)
         self.get_logger().info(
             f"active with {self._description}; subscribed to images while somebody subscribes to "
-            f"{' or '.join(self._outputs.topics)}"
+            f"{' or '.join(each.topic_name for each in self._outputs)}"
         )
 
     def end(self) -> None:
@@ -154,10 +145,20 @@ class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
 
     def change(self, config: Settings) -> None:
         if self.worker is not None:
-            self.worker.update("settings", lambda work: self._change(work, config))
+            self.worker.update("settings", lambda: self._change(config))
 
-    def _change(self, work: Work, config: Settings) -> None:
-        work.finder = self.make_finder(config)
+    def _change(self, config: Settings) -> None:
+        self._finder = self.make_finder(config)
+
+    def _publish(self, result: Result) -> None:
+        """Publish of an image what somebody listens to, in the worker's thread."""
+        clouds, pictures = self._outputs
+        if clouds.get_subscription_count():
+            clouds.publish(self.make_cloud(result, make_message))
+        if pictures.get_subscription_count():
+            image, picture = self.draw(result)
+            header = make_header(make_message, image.stamp_ns, image.frame)
+            pictures.publish(_raw(header, picture))
 
     def examine(self) -> tuple[Health, str]:
         summary = self.statistics.summary()
@@ -173,11 +174,18 @@ class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
 
     def _look(self) -> None:
         """Listen to what is needed just now."""
-        assert self._outputs is not None
-        wanted = (self._image_topic(),) if self._outputs.wanted else ()
-        if wanted != self._listening:
-            self.listen({name: self._topics[name] for name in wanted})
-            self._listening = wanted
+        assert self.worker is not None
+        heard = any(publisher.get_subscription_count() for publisher in self._outputs)
+        wanted = (self._image_topic(),) if heard else ()
+        if wanted == self._listening:
+            return
+        self.listen({
+            name: Topic(
+                _IMAGES[name], partial(self.worker.process, name), overridable=True, single=True
+            )
+            for name in wanted
+        })  # fmt: skip
+        self._listening = wanted
 
     def _image_topic(self) -> str:
         """The topic of the images; where none has a publisher, the one so far."""
@@ -188,79 +196,6 @@ class ImageNode(ManagedNode[Settings, Work, Result], Generic[Settings, Result]):
             if self.count_publishers(self.resolve_topic_name(topic)):
                 return topic
         return self._listening[-1] if self._listening else IMAGE
-
-
-def _image_topics(worker: Worker[Work, Result]) -> dict[str, Topic]:
-    """Both topics of images, whose messages go to the worker."""
-
-    def images(topic: str) -> Callable[[Any], None]:
-        def take(message: Any) -> None:
-            worker.process(topic, message, lambda work, image: work.finder.take(image))
-
-        return take
-
-    return {name: Topic(kind, images(name), single=True) for name, kind in _IMAGES.items()}
-
-
-class ImageOutputs(Generic[Result]):
-    """The clouds, and ``~/debug_image``.
-
-    Nothing is built that nobody listens to. All methods may be called from any thread.
-
-    Args:
-        node: creates the publishers, which publish while it is active.
-        topic: of the clouds.
-        make_cloud: the sensor_msgs/PointCloud2 of what was found in an image.
-        draw: the image, and its picture.
-    """
-
-    def __init__(
-        self,
-        node: LifecycleNode,
-        topic: str,
-        make_cloud: Callable[[Result, Make], Any],
-        draw: Callable[[Result], tuple[Image, Picture]],
-    ) -> None:
-        self._node = node
-        self._make_cloud, self._draw = make_cloud, draw
-        self._clouds = create_output(node, PointCloud2, topic)
-        self._pictures = create_output(node, ImageMessage, f"~/{topics.DEBUG_IMAGE}")
-        # Held while publishing: after close() nothing is published any more.
-        self._lock = threading.Lock()
-        self._closed = False
-
-    @property
-    def topics(self) -> tuple[str, str]:
-        """Full names of the topic of clouds and of the debug image."""
-        return self._clouds.topic_name, self._pictures.topic_name
-
-    @property
-    def _publishers(self) -> tuple[Any, ...]:
-        return self._clouds, self._pictures
-
-    @property
-    def wanted(self) -> bool:
-        """True while somebody listens."""
-        return not self._closed and any(p.get_subscription_count() for p in self._publishers)
-
-    def publish(self, result: Result) -> None:
-        """Publish what is wanted of an image."""
-        with self._lock:
-            if self._closed:
-                return
-            clouds, pictures = (p.get_subscription_count() for p in self._publishers)
-            if clouds:
-                self._clouds.publish(self._make_cloud(result, make_message))
-            if pictures:
-                image, picture = self._draw(result)
-                header = make_header(make_message, image.stamp_ns, image.frame)
-                self._pictures.publish(_raw(header, picture))
-
-    def close(self) -> None:
-        with self._lock:
-            self._closed = True
-            for publisher in self._publishers:
-                self._node.destroy_lifecycle_publisher(publisher)
 
 
 def _raw(header: Any, picture: Picture) -> Any:

@@ -3,12 +3,11 @@
 """TF in the node: where the camera is on the robot, and where odometry believes the robot.
 
 tf2_ros is imported when a setting needs it: it is not on PyPI, and all else works without it.
-Transforms are taken in a thread of their own. Nobody waits in here for those that are not known
+Transforms are taken in the executor's thread. Nobody waits in here for those that are not known
 yet: frames are kept until they are, while others are localized.
 """
 
 import contextlib
-import functools
 import importlib
 import threading
 import time
@@ -20,7 +19,6 @@ from typing import Any
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from rclpy.time import Time
 
 from rs_localizer.config import NodeConfig, PublishTf
@@ -40,7 +38,6 @@ from rs_localizer.pipeline.published import Broadcast, broadcast, check_time
 from rs_localizer.ros.node.conversion import make_message, steady_timer
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import WINDOW
-from rs_localizer.ros.node.subscriptions import Intake, NotByExecutor
 
 # For how long tf2's buffer remembers, in ns: its default.
 _MEMORY = 10_000_000_000
@@ -80,17 +77,12 @@ class Tf:
 
     Args:
         node: listens.
-        heard: told, in a thread of the listener's, of the transforms that have come
-            (geometry_msgs/TransformStamped).
-        failed: told in one sentence of errors while they are taken.
+        heard: told of the transforms that have come (geometry_msgs/TransformStamped).
     """
 
-    def __init__(
-        self, node: Node, heard: Callable[[list[Any]], None], failed: Callable[[str], None]
-    ) -> None:
+    def __init__(self, node: Node, heard: Callable[[list[Any]], None]) -> None:
         self._node = node
         self._heard = heard
-        self._failed = failed
         self._buffer: Any = None
         self._errors: Any = None  # tf2_ros
         self._deaf = "TF is not listened to"  # why it is not
@@ -125,10 +117,8 @@ class Tf:
             post_callback=lambda _: buffer.clear(),
         )
         self._errors, self._buffer = tf2_ros, buffer
-        node = _WithoutExecutor(self._node)
-        listener = _listen(tf2_ros.TransformListener, buffer, node, self._hear)
-        intake = Intake(self._node.context, node.subscriptions, self._failed)
-        for undo in (jumps.unregister, listener.unregister, intake.close):
+        listener = _listen(tf2_ros, buffer, self._node, self._hear)
+        for undo in (jumps.unregister, listener.unregister):
             self._undo.callback(undo)
 
     def _hear(self, transforms: list[Any]) -> None:
@@ -192,39 +182,19 @@ class Tf:
         raise TransformError(text)
 
 
-class _WithoutExecutor:
-    """A node for the TransformListener, whose messages are left to an Intake.
-
-    A robot sends some hundred messages a second on /tf, and the executor takes 0.4 ms for each.
-    """
-
-    def __init__(self, node: Node) -> None:
-        self.subscriptions: list[Subscription] = []
-        self._node = node
-        self._group = NotByExecutor()
-
-    def create_subscription(self, *args: Any, **settings: Any) -> Subscription:
-        settings["callback_group"] = self._group
-        self.subscriptions.append(self._node.create_subscription(*args, **settings))
-        return self.subscriptions[-1]
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._node, name)
-
-
-def _listen(base: Any, buffer: Any, node: Any, hear: Callable[[list[Any]], None]) -> Any:
+def _listen(tf2_ros: Any, buffer: Any, node: Node, hear: Callable[[list[Any]], None]) -> Any:
     """A tf2_ros.TransformListener that tells of what has come."""
 
-    def callback(self: Any, data: Any) -> None:
-        base.callback(self, data)
-        hear(data.transforms)
+    class Listener(tf2_ros.TransformListener):  # type: ignore[misc]
+        def callback(self, data: Any) -> None:
+            super().callback(data)
+            hear(data.transforms)
 
-    def static_callback(self: Any, data: Any) -> None:
-        base.static_callback(self, data)
-        hear(data.transforms)
+        def static_callback(self, data: Any) -> None:
+            super().static_callback(data)
+            hear(data.transforms)
 
-    methods = {"callback": callback, "static_callback": static_callback}
-    return type("Listener", (base,), methods)(buffer, node)
+    return Listener(buffer, node)
 
 
 def _text(error: Exception) -> str:
@@ -244,16 +214,15 @@ class Broadcaster:
     sent ``tf_rate`` times a second, as long as odometry comes, stamped ``transform_tolerance``
     ahead of it, so that whoever asks for a time that odometry knows has an answer.
 
-    :meth:`publish` may be called from any thread; transforms are heard in one of their own, and all
-    else belongs to the executor's.
+    :meth:`publish` may be called from any thread, all else belongs to the executor's.
 
     Args:
         node: sends, and listens for the odometry.
-        refusals: told of what was not sent, of jumps, and of errors that nobody foresaw.
+        refusals: told of what was not sent, and of jumps.
     """
 
     def __init__(self, node: Node, refusals: Refusals) -> None:
-        self.tf = Tf(node, self._hear, functools.partial(refusals.add, "internal_error"))
+        self.tf = Tf(node, self._hear)
         self._node = node
         self._refusals = refusals
         self._broadcaster: Any = None

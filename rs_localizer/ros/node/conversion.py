@@ -69,14 +69,11 @@ def xyz(vector: Any) -> Any:
     return np.array([vector.x, vector.y, vector.z])
 
 
-def create_output(node: LifecycleNode, kind: type, topic: str) -> Any:
-    """A reliable publisher that publishes while the node is active; its QoS can be overridden."""
-    return node.create_lifecycle_publisher(
-        kind,
-        topic,
-        QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE),
-        qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-    )
+def create_output(node: LifecycleNode, kind: type, topic: str, *, overridable: bool = False) -> Any:
+    """A reliable publisher that publishes while the node is active; its QoS may have parameters."""
+    options = QoSOverridingOptions.with_default_policies() if overridable else None
+    profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+    return node.create_lifecycle_publisher(kind, topic, profile, qos_overriding_options=options)
 
 
 def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:

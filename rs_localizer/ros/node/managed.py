@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A managed node with a worker: what the nodes of this package have in common.
 
-Three threads: the executor's answers services, changes parameters and the life cycle, and publishes
-diagnostics; that of the inputs takes messages; the worker's does the work and publishes.
+Two threads: the executor's takes messages, answers services, changes parameters and the life cycle,
+and publishes diagnostics; the worker's does the work and publishes its results.
 """
 
 import contextlib
@@ -19,7 +19,9 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from lifecycle_msgs.srv import ChangeState
+from rclpy.context import Context
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
@@ -29,14 +31,13 @@ from rs_localizer.ros.node.diagnostics import Diagnostics, Health
 from rs_localizer.ros.node.refusals import Refusals, describe
 from rs_localizer.ros.node.statistics import Statistics, Told
 from rs_localizer.ros.node.subscriptions import Inputs, Silence, Topic
-from rs_localizer.ros.node.worker import State, Worker, wait_for_workers
+from rs_localizer.ros.node.worker import Work, Worker, wait_for_workers
 from rs_localizer.settings import Config
 
-_ON_CHANGE_STATE = "_LifecycleNodeMixin__on_change_state"
 Result = TypeVar("Result")
 
 
-class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
+class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
     """Only while active it takes and publishes messages.
 
     A node says what it does by overriding :meth:`check`, :meth:`open`, :meth:`close`,
@@ -65,8 +66,10 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
     ) -> None:
         super().__init__(name, **options)
         self._kind: type[Config] = kind
+        self.state = "unconfigured"
+        """Label of the state in which the last transition has ended."""
         # From configuring to cleaning up.
-        self.worker: Worker[State, Result] | None = None
+        self.worker: Worker[Result] | None = None
         # From activating to deactivating.
         self._inputs: Inputs | None = None
         try:
@@ -89,6 +92,9 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
         self._diagnostics = Diagnostics(
             self, self.examine, self.refusals.notice, self.task, self.lack
         )
+        for service in self.services:
+            if service.srv_type is ChangeState:
+                service.callback = functools.partial(self._change_state, service.callback)
 
     # -- what a node does --------------------------------------------------------------------
 
@@ -137,14 +143,15 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
         """Silences of the topics that are listened to, by name."""
         return {} if self._inputs is None else self._inputs.silence()
 
-    def employ(self, state: State, publish: Callable[[Result], None]) -> Worker[State, Result]:
-        """Start the worker, which alone touches this state from now on."""
-        self.worker = Worker(
-            state,
-            publish,
-            self.statistics,
-            functools.partial(self.refusals.add, "internal_error"),
-        )
+    def employ(
+        self,
+        work: Work[Result],
+        publish: Callable[[Result], None],
+        patience: Callable[[Any], float] = lambda _: 0.0,
+    ) -> Worker[Result]:
+        """Start the worker, which alone touches what it works with from now on."""
+        failed = functools.partial(self.refusals.add, "internal_error")
+        self.worker = Worker(work, publish, self.statistics, failed, patience)
         return self.worker
 
     def listen(self, topics: Mapping[str, Topic]) -> list[str]:
@@ -161,25 +168,25 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
 
     # -- life cycle --------------------------------------------------------------------------
 
-    @property
-    def state(self) -> str:
-        """Label of the present state."""
-        label: str = self._state_machine.current_state[1]
-        return label
+    def _change_state(self, change: Callable[..., Any], request: Any, response: Any) -> Any:
+        """Answer a request for a transition that the present state does not have, too.
 
-    # rclpy (7.x, Jazzy) lets the error of a transition that the present state does not have out of
-    # the service's callback: the client waits for ever and the executor stops. This is the name,
-    # private to its class, under which it registers the callback; where there is none of this name
-    # the override does nothing, and the node's loop still survives the error.
-    def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
-        wanted = request.transition.label or request.transition.id
+        rclpy of Jazzy lets the error out of its callback: the client waits for ever and the
+        executor stops (ros2/rclpy#1209; from Kilted on nothing comes here).
+        """
         try:
-            return getattr(super(), _ON_CHANGE_STATE)(request, response)
+            return change(request, response)
         except RuntimeError:  # RCLError; what callbacks raise does not come here
-            _, present = self._state_machine.current_state
-            self.get_logger().warning(f"transition {wanted} is refused: the node is {present}")
+            wanted = request.transition.label or request.transition.id
+            self.warn(f"transition {wanted} is refused: the node is {self.state}")
             response.success = False
             return response
+
+    def _arrived(self, state: str, result: TransitionCallbackReturn) -> TransitionCallbackReturn:
+        """The result of a transition to a state, which is the node's if it succeeds."""
+        if result == TransitionCallbackReturn.SUCCESS:
+            self.state = state
+        return result
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
@@ -189,7 +196,7 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
             self.get_logger().error(f"not configured:{why}")
             self._close()
             return TransitionCallbackReturn.FAILURE
-        return super().on_configure(state)
+        return self._arrived("inactive", super().on_configure(state))
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         # Before a message can come: publishers that are not active yet drop what they are given.
@@ -201,20 +208,25 @@ class ManagedNode(LifecycleNode, Generic[Config, State, Result]):
             self._end()
             super().on_deactivate(state)
             return TransitionCallbackReturn.FAILURE
-        return result
+        return self._arrived("active", result)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._end()
-        return super().on_deactivate(state)
+        return self._arrived("inactive", super().on_deactivate(state))
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._close()
-        return super().on_cleanup(state)
+        return self._arrived("unconfigured", super().on_cleanup(state))
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._end()
         self._close()
-        return super().on_shutdown(state)
+        return self._arrived("finalized", super().on_shutdown(state))
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._end()
+        self._close()
+        return self._arrived("unconfigured", super().on_error(state))
 
     def destroy_node(self) -> None:
         self._end()
@@ -245,7 +257,7 @@ _SWITCH_INTERVAL = 0.001
 
 
 def run(
-    make: Callable[[], ManagedNode[Any, Any, Any]],
+    make: Callable[[], ManagedNode[Any, Any]],
     name: str,
     stop: StopRequest,
     args: list[str] | None = None,
@@ -271,8 +283,6 @@ def run(
     code = 1
     try:
         code = _start(node, stop) or spin(node, lambda: stop.requested)
-    except ExternalShutdownException:
-        code = 0
     finally:
         with _ends_within(_LONGEST_END, code):
             node.destroy_node()
@@ -323,15 +333,24 @@ def _start(node: Any, stop: StopRequest) -> int:
     return 0
 
 
+def executor_of(context: Context) -> Executor:
+    """An executor that costs a third of rclpy's others a message, where rclpy has it (7.1.4 on)."""
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        return SingleThreadedExecutor(context=context)
+    return EventsExecutor(context=context)
+
+
 def spin(node: Any, stopped: Callable[[], bool]) -> int:
-    """Run the callbacks of the node's executor, which no error of theirs ends; the exit code."""
-    executor = SingleThreadedExecutor(context=node.context)
+    """Run the node's callbacks, errors of which end nothing, until it is to stop; the exit code."""
+    executor = executor_of(node.context)
     executor.add_node(node)
-    while not stopped():
+    while node.context.ok() and not stopped():
         try:
             executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
         except ExternalShutdownException:
-            raise
+            break
         except Exception as error:  # one callback's: the others go on
             node.refusals.add("internal_error", describe(error))
     executor.remove_node(node)

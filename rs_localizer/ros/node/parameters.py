@@ -32,33 +32,54 @@ from rs_localizer.settings import (
 _UNCONFIGURED = "unconfigured"
 
 
-def declare(node: Node, kind: type[Config]) -> Config:
+class Started(Node):
+    """A node that knows the values that it was started with.
+
+    rclpy has them declared all at once, without descriptions and for good, and offers no other way
+    to learn their names. Here they are kept and declared as what they are.
+    """
+
+    given: Mapping[str, Any] | None = None
+    """Values by name."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, automatically_declare_parameters_from_overrides=True, **options)
+
+    def declare_parameters(
+        self, namespace: str, parameters: list[Any], ignore_override: bool = False
+    ) -> Any:
+        """Declare parameters, but for those that the node was started with."""
+        if self.given is None and ignore_override:
+            self.given = {name: value for name, value, _ in parameters}
+            return []
+        return super().declare_parameters(namespace, parameters, ignore_override)
+
+
+def declare(node: Started, kind: type[Config]) -> Config:
     """Declare every setting as a parameter and return those that the node was started with.
 
     Args:
-        node: whose parameters they become.
+        node: whose parameters they become: :class:`Started`.
         kind: the class of its settings.
 
     Raises:
         ValueError: for a value of a wrong type or out of range, saying what was found.
     """
-    own = _of_camera_file(node, kind)
+    own = _of_camera_file(node.given, kind)
     _declare(node, settings(kind), own)
     _declare(node, _of_cameras(node, kind), own)
     return read(node, kind)
 
 
-def _of_camera_file(node: Node, kind: Kind) -> dict[str, Any]:
+def _of_camera_file(given: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
     """Values of ``camera_file``; a parameters file that holds the defaults does not change them."""
-    given, known = node._parameter_overrides, settings(kind)
-    if kind is not NodeConfig or "camera_file" not in given or not given["camera_file"].value:
+    file, known = given.get("camera_file"), settings(kind)
+    if kind is not NodeConfig or not file:
         return {}
-    values = camera_values(Path(str(given["camera_file"].value)))
     return {
         name: value
-        for name, value in values.items()
-        if name not in given
-        or (name in known and as_tuple(given[name].value) == known[name].default)
+        for name, value in camera_values(Path(str(file))).items()
+        if name not in given or (name in known and as_tuple(given[name]) == known[name].default)
     }
 
 
@@ -69,14 +90,13 @@ def _of_cameras(node: Node, kind: Kind) -> dict[str, Setting]:
     return camera_settings({name: node.get_parameter(name).value for name in settings(kind)})
 
 
-def _declare(node: Node, names: Mapping[str, Setting], own: Mapping[str, Any]) -> None:
+def _declare(node: Any, names: Mapping[str, Setting], own: Mapping[str, Any]) -> None:
     for name, setting in names.items():
         try:
             default = own.get(name, setting.default)
             node.declare_parameter(name, default, _descriptor(setting), ignore_override=name in own)
         except InvalidParameterTypeException as error:
-            value = node._parameter_overrides[name].value
-            hint = ""
+            value, hint = node.given[name], ""
             if isinstance(setting.default, float) and type(value) is int:
                 hint = f" (write {float(value)!r})"
             raise ValueError(
@@ -86,13 +106,12 @@ def _declare(node: Node, names: Mapping[str, Setting], own: Mapping[str, Any]) -
             raise ValueError(str(error)) from error
 
 
-def unknown_names(node: Node, kind: Kind) -> list[str]:
+def unknown_names(node: Started, kind: Kind) -> list[str]:
     """Sentences on parameters that the node was started with and does not have.
 
     No reason to refuse the start: a params file for ``/**`` speaks to several nodes.
     """
-    names = sorted(node._parameter_overrides)
-    return [text for name in names if (text := unknown(name, kind))]
+    return [text for name in sorted(node.given) if (text := unknown(name, kind))]
 
 
 def _names(node: Node, kind: Kind) -> list[str]:

@@ -3,17 +3,13 @@
 """The subscriptions of a node."""
 
 import functools
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.callback_groups import CallbackGroup
-from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
@@ -28,100 +24,13 @@ from rclpy.subscription import Subscription
 
 from rs_localizer.core.reasons import Notice
 from rs_localizer.ros.node.conversion import steady_timer, type_name
-from rs_localizer.ros.node.refusals import Refusals, describe
-
-# A context that is shut down by others wakes nobody: it is looked at this often, in ns.
-_CONTEXT_PERIOD = 200_000_000
-
-
-class NotByExecutor(CallbackGroup):
-    """Subscriptions whose messages an :class:`Intake` takes."""
-
-    def can_execute(self, entity: Any) -> bool:
-        return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        pass
-
-
-class Intake:
-    """Calls the callbacks of subscriptions, in their order when several have messages.
-
-    Args:
-        context: that of their node.
-        subscriptions: in a callback group :class:`NotByExecutor`.
-        failed: told in one sentence of errors in callbacks; the thread goes on.
-    """
-
-    def __init__(
-        self,
-        context: Context,
-        subscriptions: Sequence[Subscription],
-        failed: Callable[[str], None],
-    ) -> None:
-        self._context = context
-        self._subscriptions = subscriptions
-        self._failed = failed
-        self._closed = False
-        handle = context.handle
-        assert handle is not None  # the context of a node has been initialized
-        with handle:
-            # Ready-made waiting as in rclpy.wait_for_message: the public ways need an executor.
-            self._wake = rclpy_implementation.GuardCondition(handle)
-            self._waiting = rclpy_implementation.WaitSet(len(subscriptions), 1, 0, 0, 0, 0, handle)
-        self._thread = threading.Thread(target=self._run, name="rs_localizer intake", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """End the thread after the callback that it is in; no other comes any more."""
-        self._closed = True
-        self._wake.trigger_guard_condition()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._closed and self._context.ok():
-            try:
-                ready = self._ready()
-            except Exception as error:  # without messages for once: the thread goes on
-                if not self._closed and self._context.ok():
-                    self._failed(describe(error))
-                    time.sleep(1e-9 * _CONTEXT_PERIOD)
-                continue
-            for subscription in ready:
-                try:
-                    # Also what cannot be deserialized raises.
-                    taken = subscription.handle.take_message(
-                        subscription.msg_type, subscription.raw
-                    )
-                    if taken is not None:
-                        subscription.callback(taken[0])
-                except Exception as error:  # of one message: the others go on
-                    self._failed(describe(error))
-
-    def _ready(self) -> list[Subscription]:
-        """Wait for messages: the subscriptions that have some."""
-        self._waiting.clear_entities()
-        for subscription in self._subscriptions:
-            self._waiting.add_subscription(subscription.handle)
-        self._waiting.add_guard_condition(self._wake)
-        self._waiting.wait(_CONTEXT_PERIOD)
-        ready = self._waiting.get_ready_entities("subscription")
-        return [item for item in self._subscriptions if item.handle.pointer in ready]
-
+from rs_localizer.ros.node.refusals import Refusals
 
 Policies = tuple[ReliabilityPolicy, DurabilityPolicy]
 
 
 def policies(profile: QoSProfile) -> Policies:
     return profile.reliability, profile.durability
-
-
-def offered(node: Node, topic: str) -> list[Policies]:
-    """Policies of the publishers of a topic (full name)."""
-    return [policies(info.qos_profile) for info in node.get_publishers_info_by_topic(topic)]
 
 
 def node_of(publisher: Any) -> str:
@@ -148,7 +57,7 @@ def best(wished: Policies, offers: Sequence[Policies]) -> Policies:
 
 
 # As qos_profile_sensor_data, but reliable where the publishers are, and with more room: what comes
-# while this process does not get the CPU shall be counted by the mailbox, which keeps the newest,
+# while this process does not get the CPU shall be counted by the worker, which keeps the newest,
 # and not be lost unseen.
 SENSOR_DATA = {"depth": 20, "reliability": ReliabilityPolicy.BEST_AVAILABLE}
 # Messages that come some hundred times a second.
@@ -185,13 +94,13 @@ _LARGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """An input of a node."""
+    """A topic that a node listens to."""
 
     type: type
-    callback: Callable[[Any], None]  # runs in a thread of the inputs
+    callback: Callable[[Any], None]  # runs in the executor's thread
     qos: Mapping[str, Any] = field(default_factory=lambda: SENSOR_DATA)
     lasting: bool = False  # one message is enough
-    raw: bool = False  # whether the callback takes serialized messages
+    overridable: bool = False  # whether its QoS has parameters
     single: bool = False  # whether two publishers would contradict each other
 
 
@@ -212,27 +121,23 @@ class Inputs:
 
     Args:
         node: creates them.
-        topics: by name. Waiting messages are taken in this order.
-        refusals: told of publishers that cannot be heard, and of failing callbacks.
+        topics: by name.
+        refusals: told of publishers that cannot be heard.
     """
 
     def __init__(self, node: Node, topics: Mapping[str, Topic], refusals: Refusals) -> None:
-        self._node = node
-        self._refusals = refusals
-        self._group = NotByExecutor()
+        self._node, self._topics, self._refusals = node, topics, refusals
         self._created = time.monotonic()
         self._heard: dict[str, float] = {}
-        self._topics = topics
         self._wished: dict[str, Policies] = {}  # with overrides
         self._subscriptions: dict[str, Subscription] = {}
-        try:
-            for name, topic in topics.items():
-                self._subscriptions[name] = self._subscribe(name, topic)
-        except Exception:
-            self._destroy()
-            raise
-        self._intake = self._take_all()
         self._timer = steady_timer(node, _LOOK_PERIOD, self._follow_publishers)
+        try:
+            for name in topics:
+                self._subscriptions[name] = self._subscribe(name)
+        except Exception:
+            self.close()
+            raise
 
     @property
     def topics(self) -> list[str]:
@@ -246,19 +151,12 @@ class Inputs:
     def close(self) -> None:
         """Take no more messages."""
         self._node.destroy_timer(self._timer)
-        self._intake.close()
-        self._destroy()
-
-    def _take_all(self) -> Intake:
-        return Intake(
-            self._node.context,
-            tuple(self._subscriptions.values()),
-            functools.partial(self._refusals.add, "internal_error"),
-        )
+        for subscription in self._subscriptions.values():
+            self._node.destroy_subscription(subscription)
+        self._subscriptions = {}
 
     def _follow_publishers(self) -> None:
         """Listen anew to topics whose publishers offer more, or less, than they are heard with."""
-        changed = []
         for name, subscription in self._subscriptions.items():
             publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)
             if self._topics[name].single and len(publishers) > 1:
@@ -266,45 +164,40 @@ class Inputs:
                 text = f"{names} publish on {subscription.topic_name}: their frames alternate"
                 self._refusals.notice(Notice.TWO_PUBLISHERS, text)
             offers = [policies(each.qos_profile) for each in publishers]
-            present = policies(subscription.qos_profile)
-            if offers and best(self._wished[name], offers) != present:
-                changed.append(name)
-        if not changed:
-            return
-        self._intake.close()
-        for name in changed:
-            self._node.destroy_subscription(self._subscriptions[name])
-            self._subscriptions[name] = self._subscribe(name, self._topics[name])
-        self._intake = self._take_all()
+            if offers and best(self._wished[name], offers) != policies(subscription.qos_profile):
+                self._node.destroy_subscription(subscription)
+                self._subscriptions[name] = self._subscribe(name)
 
-    def _destroy(self) -> None:
-        for subscription in self._subscriptions.values():
-            self._node.destroy_subscription(subscription)
-        self._subscriptions = {}
+    def _subscribe(self, name: str) -> Subscription:
+        topic = self._topics[name]
 
-    def _subscribe(self, name: str, topic: Topic) -> Subscription:
         def take(message: Any) -> None:
             self._heard[name] = time.monotonic()
             topic.callback(message)
 
+        profile, options = QoSProfile(**topic.qos), None
+        settle = functools.partial(self._settle, name)
+        if topic.overridable:  # called once the user's values are written into the profile
+            options = QoSOverridingOptions(_OVERRIDABLE, callback=settle)
+        else:
+            settle(profile)
         return self._node.create_subscription(
             topic.type,
             name,
             take,
-            QoSProfile(**topic.qos),  # a new one each: overrides are written into it
-            callback_group=self._group,
-            # Events of a subscription wake the executor with every message; the graph knows more.
+            profile,
+            # The graph knows more than events do, and an event that is pending when its
+            # subscription is destroyed ends the process (ros2/rclpy#1644).
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            qos_overriding_options=QoSOverridingOptions(
-                _OVERRIDABLE, callback=functools.partial(self._settle, name)
-            ),
-            raw=topic.raw,
+            qos_overriding_options=options,
         )
 
     def _settle(self, name: str, profile: QoSProfile) -> SetParametersResult:
         """Fill in, after the user's overrides, what the publishers offer now."""
         self._wished[name] = policies(profile)
-        offers = offered(self._node, self._node.resolve_topic_name(name))
+        topic = self._node.resolve_topic_name(name)
+        found = self._node.get_publishers_info_by_topic(topic)
+        offers = [policies(each.qos_profile) for each in found]
         profile.reliability, profile.durability = best(self._wished[name], offers)
         return SetParametersResult(successful=True)
 

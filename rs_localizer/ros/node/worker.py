@@ -18,12 +18,10 @@ from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node.refusals import describe
 from rs_localizer.ros.node.statistics import Statistics
 
-State = TypeVar("State")
 Result = TypeVar("Result")
-Update = Callable[[State], None]
-Process = Callable[[State, Any], Result | Refusal | Iterator[Result | Refusal] | None]
-"""What is done with a message, given what the worker alone touches; a message may have no result,
-or several, which are published as they come.
+Work = Callable[[str, Any], Result | Refusal | Iterator[Result | Refusal] | None]
+"""What is done with a topic's message. It may have no result, or several, which are published as
+they come.
 """
 
 _NAME = "rs_localizer worker"
@@ -32,72 +30,59 @@ _LATE_PERIOD = 0.005
 _MOST_LATE = 100
 
 
-@dataclass(frozen=True, slots=True)
-class Need(Generic[State]):
-    """Condition that a frame waits for before it is processed."""
-
-    missing: Callable[[State, Any], bool]  # whether something is, and may still come
-    patience: float  # s for which it waits
+def _nothing(message: Any) -> float:
+    """A frame that waits for nothing."""
+    return 0.0
 
 
 @dataclass(frozen=True, slots=True)
-class _Arrival(Generic[State, Result]):
+class _Arrival:
     """A frame that has come."""
 
+    topic: str
     message: Any
-    process: Process[State, Result]
     received: float  # s, time.monotonic()
-    need: Need[State] | None
     session: int  # its result is wanted as long as this is the worker's
 
 
-@dataclass(frozen=True, slots=True)
-class _Late(Generic[State, Result]):
-    """A frame whose result waits for something."""
-
-    arrival: _Arrival[State, Result]
-    result: Waiting
-    deadline: float  # s, time.monotonic()
-
-
-class Worker(Generic[State, Result]):
-    """A thread, and what it alone touches.
+class Worker(Generic[Result]):
+    """A thread that alone does the work and applies updates of what that depends on.
 
     What waits for it is bounded: one frame of each topic and one update of each kind. All methods
     may be called from any thread; none of them waits for the work.
 
     Args:
-        state: that; from now on only through updates and frames.
+        work: makes results of frames.
         publish: called in the thread with each result, never after :meth:`pause`.
         statistics: told what becomes of each frame.
         failed: told in one sentence of errors in updates that nobody foresaw; the thread goes on.
             Those in frames are refusals, ``internal_error``.
+        patience: s for which a frame waits, since it came, for what it lacks now; 0: for nothing.
     """
 
     def __init__(
         self,
-        state: State,
+        work: Work[Result],
         publish: Callable[[Result], None],
         statistics: Statistics[Result],
         failed: Callable[[str], None],
+        patience: Callable[[Any], float] = _nothing,
     ) -> None:
-        self._state = state
-        self._publish = publish
-        self._statistics = statistics
-        self._failed = failed
+        self._work, self._publish, self._patience = work, publish, patience
+        self._statistics, self._failed = statistics, failed
         self._changed = threading.Condition()  # of the next five
-        self._updates: dict[str, Update[State]] = {}
-        self._frames: dict[str, _Arrival[State, Result]] = {}
+        self._updates: dict[str, Callable[[], None]] = {}
+        self._frames: dict[str, _Arrival] = {}
         self._session = 0
         self._closed = self._woken = False
-        # The thread's: frames that wait for what they need, and results.
-        self._early: deque[_Arrival[State, Result]] = deque()
-        self._late: deque[_Late[State, Result]] = deque()
+        # The thread's: frames that wait for what they need; results that do, until a time.
+        self._early: deque[_Arrival] = deque()
+        self._late: deque[tuple[_Arrival, Waiting, float]] = deque()
         # Held while publishing: after pause() nothing comes any more.
         self._publishing = threading.Lock()
         threading.Thread(target=self._run, name=_NAME, daemon=True).start()
 
-    def update(self, kind: str, update: Update[State]) -> None:
+    def update(self, kind: str, update: Callable[[], None]) -> None:
         """Have this done before the next frame, after all updates of other kinds so far.
 
         An older one of the same kind that still waits is dropped: an update says how things are
@@ -108,22 +93,15 @@ class Worker(Generic[State, Result]):
             self._updates[kind] = update
             self._changed.notify()
 
-    def process(
-        self,
-        topic: str,
-        message: Any,
-        process: Process[State, Result],
-        need: Need[State] | None = None,
-    ) -> None:
-        """Have this frame processed and published, unless a newer one comes first.
+    def process(self, topic: str, message: Any) -> None:
+        """Have this frame processed and published, unless a newer one of its topic comes first.
 
-        That takes its place. While a frame needs something it waits, and those behind it, too.
+        That takes its place. While a frame lacks something it waits, and those behind it, too.
         """
         self._statistics.received(topic, message)
         with self._changed:
             replaced = topic in self._frames
-            arrival = _Arrival(message, process, time.monotonic(), need, self._session)
-            self._frames[topic] = arrival
+            self._frames[topic] = _Arrival(topic, message, time.monotonic(), self._session)
             self._changed.notify()
         if replaced:
             self._statistics.replaced()
@@ -152,63 +130,60 @@ class Worker(Generic[State, Result]):
     # -- in the thread ----------------------------------------------------------------------
 
     def _run(self) -> None:
-        while True:
-            timeout = 0.0 if self._is_ready() else None
-            if timeout is None and (self._late or self._early):
-                timeout = _LATE_PERIOD
-            with self._changed:
-                self._changed.wait_for(
-                    lambda: self._updates or self._frames or self._closed or self._woken, timeout
-                )
-                if self._closed:
-                    return
-                self._woken = False
-                updates, self._updates = self._updates, {}
-                oldest = next(iter(self._frames), None)
-                frame = None if oldest is None else self._frames.pop(oldest)
-            for update in updates.values():
-                try:
-                    update(self._state)
-                except Exception as error:  # of one message: the others go on
-                    self._failed(describe(error))
+        while self._take():
             self._finish_late()
-            if frame is not None:
-                self._early.append(frame)
             if self._is_ready():
                 self._begin(self._early.popleft())
+
+    def _take(self) -> bool:
+        """Wait for something to do, apply updates and take a frame; False at the end."""
+        timeout = 0.0 if self._is_ready() else None
+        if timeout is None and (self._late or self._early):
+            timeout = _LATE_PERIOD
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._updates or self._frames or self._closed or self._woken, timeout
+            )
+            self._woken = False
+            updates, self._updates = self._updates, {}
+            oldest = next(iter(self._frames), None)
+            if oldest is not None:
+                self._early.append(self._frames.pop(oldest))
+        for update in updates.values():
+            try:
+                update()
+            except Exception as error:  # of one message: the others go on
+                self._failed(describe(error))
+        return not self._closed
 
     def _is_ready(self) -> bool:
         """True if there is a frame that need not wait."""
         if not self._early:
             return False
-        arrival = self._early[0]
-        if (need := arrival.need) is None:
+        frame = self._early[0]
+        if len(self._early) > _MOST_LATE:
             return True
-        overdue = time.monotonic() >= arrival.received + need.patience
-        if overdue or len(self._early) > _MOST_LATE:
-            return True
-        return self._attempt(lambda: need.missing(self._state, arrival.message)) is not True
+        patience = self._attempt(lambda: self._patience(frame.message)) or 0.0
+        return time.monotonic() >= frame.received + patience
 
-    def _is_wanted(self, arrival: _Arrival[State, Result]) -> bool:
+    def _is_wanted(self, frame: _Arrival) -> bool:
         with self._changed:
-            return arrival.session == self._session and not self._closed
+            return frame.session == self._session and not self._closed
 
-    def _begin(self, arrival: _Arrival[State, Result]) -> None:
-        if not self._is_wanted(arrival):
+    def _begin(self, frame: _Arrival) -> None:
+        if not self._is_wanted(frame):
             self._statistics.dropped(1)
             return
         self._statistics.started()
-        for each in self._results(arrival):
+        for each in self._results(frame):
             if isinstance(each, Waiting) and len(self._late) < _MOST_LATE:
-                deadline = time.monotonic() + each.patience
-                self._late.append(_Late(arrival, each, deadline))
+                self._late.append((frame, each, time.monotonic() + each.patience))
             else:
-                self._finish(arrival, each)
+                self._finish(frame, each)
         self._statistics.ended()
 
-    def _results(self, arrival: _Arrival[State, Result]) -> Iterator[Any]:
-        """Results of a frame."""
-        result = self._attempt(lambda: arrival.process(self._state, arrival.message))
+    def _results(self, frame: _Arrival) -> Iterator[Any]:
+        result = self._attempt(lambda: self._work(frame.topic, frame.message))
         several = result if isinstance(result, Iterator) else iter([result])
         while (each := self._attempt(lambda: next(several, None))) is not None:
             yield each
@@ -216,13 +191,13 @@ class Worker(Generic[State, Result]):
     def _finish_late(self) -> None:
         """Publish what has become known, in the order in which it came; give up what is overdue."""
         while self._late:
-            item = self._late[0]
-            result = self._attempt(item.result.again)
-            patient = time.monotonic() < item.deadline and self._is_wanted(item.arrival)
+            frame, waiting, deadline = self._late[0]
+            result = self._attempt(waiting.again)
+            patient = time.monotonic() < deadline and self._is_wanted(frame)
             if isinstance(result, Waiting) and patient:
                 return
             self._late.popleft()
-            self._finish(item.arrival, result)
+            self._finish(frame, result)
 
     def _attempt(self, function: Callable[[], Any]) -> Any:
         """The function's value, or a refusal where it fails."""
@@ -231,13 +206,13 @@ class Worker(Generic[State, Result]):
         except Exception as error:  # of one message: the others go on
             return Refusal(Reason.INTERNAL_ERROR, describe(error))
 
-    def _finish(self, arrival: _Arrival[State, Result], result: Result | Refusal) -> None:
+    def _finish(self, frame: _Arrival, result: Result | Refusal) -> None:
         """Publish it, unless nobody wants it any more, and count it."""
         if isinstance(result, Refusal):
             self._statistics.refused(result)
             return
         with self._publishing:
-            wanted = self._is_wanted(arrival)
+            wanted = self._is_wanted(frame)
             if wanted:
                 failure = self._attempt(lambda: self._publish(result))
         if not wanted:
@@ -245,7 +220,7 @@ class Worker(Generic[State, Result]):
         elif failure is not None:
             self._statistics.refused(failure)
         else:
-            self._statistics.answered(result, arrival.received)
+            self._statistics.answered(result, frame.received)
 
 
 def wait_for_workers(seconds: float) -> bool:

@@ -72,7 +72,7 @@ def test_node_and_replay_say_the_same_to_the_last_byte(recording, tmp_path, star
 
 def test_life_cycle_of_a_node_with_other_names(recording, start_node, peer, tmp_path):
     """It waits to be configured, its namespace is another, and a QoS is overridden."""
-    override = "qos_overrides./cam/camera_info.subscription.reliability:=best_effort"
+    override = "qos_overrides./cam/correspondences.subscription.reliability:=best_effort"
     words = ("-p", "autostart:=false", "-r", "__ns:=/cam", "-p", override)
     node = start_node(*words, *SHUTTER)
     robot = Robot(peer, namespace="/cam")
@@ -134,8 +134,8 @@ def test_life_cycle_of_a_node_with_other_names(recording, start_node, peer, tmp_
     subscriptions = peer.node.get_subscriptions_info_by_topic
     # Where nothing is overridden, that of the publisher.
     reliable = ReliabilityPolicy.RELIABLE
-    assert peer.spin_until(lambda: reliability("/cam/correspondences", subscriptions) == reliable)
-    assert reliability("/cam/camera_info", subscriptions) == ReliabilityPolicy.BEST_EFFORT
+    assert peer.spin_until(lambda: reliability("/cam/camera_info", subscriptions) == reliable)
+    assert reliability("/cam/correspondences", subscriptions) == ReliabilityPolicy.BEST_EFFORT
     for name in TYPES:
         topic = f"/cam/rs_localizer/{name}"
         assert reliability(topic, peer.node.get_publishers_info_by_topic) == reliable

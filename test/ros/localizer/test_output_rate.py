@@ -12,6 +12,7 @@ from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.pipeline.frames import FrameLocalizer
 
+from ..conftest import RUN  # noqa: TID252 - Python has a package "test"
 from .robot import READOUT_TIME, SHUTTER, Robot, inputs, record
 
 
@@ -51,3 +52,34 @@ def test_odometry_between_and_after_images(tmp_path, start_node, peer):
     assert count >= 10
     turn_to(now_ns + 300_000_000)  # beyond max_prediction
     assert not peer.spin_until(lambda: len(said()) > count, 0.5)
+
+
+def test_odometry_while_a_frame_is_localized(tmp_path, start_node, peer):
+    """By a simulated clock; the fifth frame takes for ever."""
+    slow = (
+        "import time; from rs_localizer.pipeline.frames import FrameLocalizer as F\n"
+        "localize, count = F.localize, iter(range(1000))\n"
+        "def wait(self, message):\n"
+        "    if next(count) == 4: print('a slow frame', flush=True); time.sleep(9999)\n"
+        "    return localize(self, message)\n"
+        "F.localize = wait\n"
+    )
+    record(tmp_path / "flight")
+    words = (*SHUTTER, "-p", "output_rate:=50.0", "-p", "use_sim_time:=true")
+    node = start_node(*words, run=slow + RUN)
+    robot = Robot(peer)
+    clock = peer.node.create_publisher(Clock, "/clock", 10)
+    robot.connect()
+    flight = inputs(tmp_path / "flight")
+    for info, cloud in flight[:4]:
+        robot.localize(info, cloud)
+    while "a slow frame" not in node.log:
+        robot.send(*flight[4])
+        peer.spin_until(lambda: False, 0.2)
+    for later in (10, 20, 30):
+        before, message = len(robot.answers["odometry"]), Clock()
+        now_ns = stamp_ns(flight[3][1]) + later * 1_000_000
+        message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
+        clock.publish(message)
+        assert peer.spin_until(lambda before=before: len(robot.answers["odometry"]) > before)
+    assert len(robot.answers["inliers"]) == 4

@@ -64,7 +64,7 @@ def made(peer, robot) -> Iterator[Callable[..., Any]]:
         def keep(*words: str) -> None:
             notes.append(words)
 
-        broadcaster = Broadcaster(peer.node, SimpleNamespace(notice=keep, add=keep))
+        broadcaster = Broadcaster(peer.node, SimpleNamespace(notice=keep))
         config = NodeConfig(**settings)
         broadcaster.configure(config)
         parts.append(broadcaster)

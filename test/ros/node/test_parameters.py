@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import rclpy
 from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rs_localizer.config import NodeConfig
@@ -33,7 +32,9 @@ class Recorder:
     """A node with the parameters, that refuses one seed and keeps what is applied."""
 
     def __init__(self, context: Context, *arguments: str) -> None:
-        self.node = Node("some_node", context=context, cli_args=["--ros-args", *arguments])
+        self.node = parameters.Started(
+            "some_node", context=context, cli_args=["--ros-args", *arguments]
+        )
         self.config = parameters.declare(self.node, NodeConfig)
         self.applied: list[NodeConfig] = []
         parameters.on_change(self.node, NodeConfig, self.check, self.applied.append)

@@ -15,7 +15,7 @@ from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node import worker as worker_module
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
-from rs_localizer.ros.node.worker import Need, Worker, wait_for_workers
+from rs_localizer.ros.node.worker import Worker, wait_for_workers
 
 PATIENCE = 3500.0  # s: what has not come by then hangs
 
@@ -54,16 +54,21 @@ class Fake:
         self.while_publishing: Callable[[], Any] = lambda: None
         self.refusals = Refusals(lambda text: None)
         self.statistics = Count(self.refusals, lambda text: (0, text))
-        self.worker: Worker[Fake, str] = Worker(self, self._publish, self.statistics, pytest.fail)
+        self.patience_of_frames = PATIENCE
+        self.worker: Worker[str] = Worker(
+            lambda _, frame: self._localize(frame), self._publish, self.statistics, pytest.fail,
+            lambda frame: self.patience_of_frames if frame in self.awaited else 0.0,
+        )  # fmt: skip
 
-    def send(self, frame: str, topic: str = "frames", patience: float = PATIENCE) -> None:
-        need: Need[Fake] = Need(lambda frames, message: message in self.awaited, patience)
-        self.worker.process(topic, frame, lambda frames, message: self._localize(message), need)
+    def send(self, frame: str, topic: str = "frames") -> None:
+        self.worker.process(topic, frame)
 
     def wait(self, semaphore: threading.Semaphore) -> None:
         assert semaphore.acquire(timeout=PATIENCE)
 
-    def _localize(self, frame: str) -> Any:
+    def _localize(self, frame: Any) -> Any:
+        if isinstance(frame, Iterator):
+            return frame
         self.started.release()
         before = self.settings
         assert self.go_on.acquire(timeout=PATIENCE)
@@ -110,7 +115,7 @@ def test_updates_come_before_the_next_frame_and_never_within_one(fake):
     order: list[str] = []
 
     def settings(text: str) -> Any:
-        def change(frames: Any) -> None:
+        def change() -> None:
             order.append(text)
             fake.settings = text
 
@@ -120,7 +125,7 @@ def test_updates_come_before_the_next_frame_and_never_within_one(fake):
     fake.wait(fake.started)
     fake.send("two")
     fake.worker.update("settings", settings("newer"))
-    fake.worker.update("camera", lambda frames: order.append("camera"))
+    fake.worker.update("camera", lambda: order.append("camera"))
     fake.worker.update("settings", settings("newest"))
     fake.go_on.release(2)
     fake.wait(fake.done)
@@ -200,7 +205,7 @@ def test_a_worker_that_is_closed_publishes_nothing_more(fake):
 def test_all_results_of_a_message_are_published_as_they_come(fake):
     """As of a rig's image, which may complete two frames; one refusal ends none of them."""
     refusal = Refusal(Reason.NO_STAMP, "none")
-    fake.worker.process("frames", "one", lambda *_: iter(["a", refusal, "b", "c"]))
+    fake.worker.process("frames", iter(["a", refusal, "b", "c"]))
     for _ in "abc":
         fake.wait(fake.done)
     fake.go_on.release()
@@ -217,7 +222,7 @@ def test_what_a_frame_waited_for_wakes_the_worker(monkeypatch, fake):
     fake.awaited = {"one"}
     fake.send("one")
     changed = threading.Semaphore(0)
-    fake.worker.update("settings", lambda frames: changed.release())
+    fake.worker.update("settings", changed.release)
     fake.wait(changed)
     while not fake.worker._early:
         time.sleep(0.001)
@@ -231,7 +236,7 @@ def test_all_that_wakes_the_worker_does_so_at_once(fake):
     """An update without a frame, and a frame without an update."""
     changed = threading.Semaphore(0)
     for _ in range(3):
-        fake.worker.update("settings", lambda frames: changed.release())
+        fake.worker.update("settings", changed.release)
         fake.wait(changed)
     fake.go_on.release()
     fake.send("one")
@@ -241,13 +246,13 @@ def test_all_that_wakes_the_worker_does_so_at_once(fake):
 def test_what_an_update_of_nobody_foresaw_is_told_and_the_next_is_done():
     told: list[str] = []
     done = threading.Semaphore(0)
-    worker: Worker[None, str] = Worker(None, print, Count(Refusals(print), print), told.append)
+    worker: Worker[str] = Worker(print, print, Count(Refusals(print), print), told.append)
 
-    def fail(state: None) -> None:
+    def fail() -> None:
         raise TypeError("a bug")
 
     worker.update("one", fail)
-    worker.update("other", lambda state: done.release())
+    worker.update("other", done.release)
     assert done.acquire(timeout=PATIENCE)
     worker.close()
     assert wait_for_workers(PATIENCE)
@@ -283,7 +288,7 @@ def test_a_frame_waits_for_what_it_needs_but_not_for_long(fake):
     fake.worker.look()
     fake.wait(fake.done)
     fake.wait(fake.done)
-    fake.awaited = {"three"}
-    fake.send("three", patience=0.05)
+    fake.awaited, fake.patience_of_frames = {"three"}, 0.05
+    fake.send("three")
     fake.wait(fake.done)
     assert fake.published == ["one old", "two old", "three old"]
