@@ -38,6 +38,14 @@ SUMMARY = "summary.csv"
 
 # Scheduler that answers nothing for so long is none, s.
 _CONNECT_TIMEOUT = 5.0
+# Level of what Dask logs: what goes wrong is an outcome or an error.
+_SILENT = logging.CRITICAL + 1
+# Run by each worker. A terminal's Ctrl-C comes to all: this process ends for it, and ends the
+# others, which would log that their tasks were cancelled.
+_PRELOAD = f"""import logging, signal
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+logging.getLogger("distributed").setLevel({_SILENT})
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,15 +167,14 @@ def perform_all(
     import dask.config
     from distributed import Client, KilledWorker, LocalCluster, as_completed
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
+    logging.getLogger("distributed").setLevel(_SILENT)
     with contextlib.ExitStack() as stack:
         place: Any = scheduler
         if scheduler is None:
             stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": 0}))
             of_each: dict[str, Any] = {
                 "threads_per_worker": 1, "dashboard_address": None,
-                # A terminal's Ctrl-C comes to all; this process ends for it, and ends the others.
-                "preload": "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)",
+                "preload": _PRELOAD,
             }  # fmt: skip
             place = stack.enter_context(LocalCluster(n_workers=workers, **of_each))
         try:
