@@ -344,7 +344,8 @@ static PyObject *failed(int code, const void *error, const char *name) {
     }
     PyObject *pickle = PyImport_ImportModule("pickle"), *both = NULL;
     if (pickle)
-        both = PyObject_CallMethod(pickle, "loads", "y#", raised->data, (Py_ssize_t)raised->size);
+        both = PyObject_CallMethod(pickle, "loads", "N",
+                                   PyBytes_FromStringAndSize(raised->data, raised->size));
     Py_DecRef(pickle);
     if (both && PyType_IsSubtype(Py_TYPE(both), &PyTuple_Type) && PyTuple_Size(both) >= 2)
         PyErr_SetObject(PyTuple_GetItem(both, 0), PyTuple_GetItem(both, 1));

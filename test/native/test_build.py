@@ -98,6 +98,92 @@ def test_the_same_bytes_come_from_another_folder_and_seed(tmp_path):
     assert str(tmp_path).encode() not in (one / "kernels.o").read_bytes()
 
 
+GIVING = """
+import numpy as np
+from rs_localizer.core.arrays import Array, Array2
+from rs_localizer.native import entry
+
+
+@entry
+def parts(table: Array2) -> tuple[Array, Array, Array, float]:
+    twice, unused = 2.0 * table, np.ones(len(table))
+    if table[0, 0] < 0.0:
+        raise ValueError("less than nothing")
+    return twice[1:, ::2], twice.T, twice, unused.sum()
+"""
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
+def test_parts_of_arrays_are_given_and_all_are_freed(tmp_path):
+    """By what the C knows of how Numba lays out arrays and counts references to them."""
+    (tmp_path / "giving.py").write_text(GIVING)
+    path = os.pathsep.join(map(str, (tmp_path, sources.PACKAGE.parent)))
+    level = "v2" if platform.machine() == "x86_64" else "generic"
+    environment = os.environ | build._environment(level, True) | {"PYTHONPATH": path}
+    command = [sys.executable, "-m", "rs_localizer.native.bitcode", tmp_path, build._CPUS[level]]
+    command += [f"{platform.machine()}-unknown-linux-gnu", "giving"]
+    subprocess.run(command, env=environment | {"RS_LOCALIZER_KERNELS": "build"}, check=True)
+    module, native = tmp_path / "_kernels_test.so", sources.PACKAGE / "native"
+    command = ["gcc", "-O2", "-shared", "-fPIC", "-I", native, '-DRS_LEVEL="test"']
+    command += ["-DRS_LEVEL_NAME=test", native / "runtime.c", tmp_path / "table.c"]
+    subprocess.run([*command, tmp_path / "kernels.o", "-lm", "-o", module], check=True)
+    given = run_in_a_process(GIVEN, module)
+    assert given == "1000 kB at most\n"
+
+
+GIVEN = """
+import gc, importlib.machinery, importlib.util, resource, sys
+import numpy as np
+loader = importlib.machinery.ExtensionFileLoader("_kernels_test", sys.argv[1])
+module = importlib.util.module_from_spec(importlib.util.spec_from_loader("_kernels_test", loader))
+loader.exec_module(module)
+parts = module.bound("giving.parts").call
+table = np.arange(1.0, 20_001.0).reshape(100, 200)
+for k in range(3000):
+    if k == 500:
+        gc.collect()
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    some, turned, whole, total = parts(table)
+    try:
+        parts(-table)
+    except ValueError as error:
+        assert str(error) == "less than nothing"
+    else:
+        raise AssertionError
+grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+print("1000 kB at most" if grown < 1000 else f"{grown} kB")
+for found, wanted in ((some, 2 * table[1:, ::2]), (turned, 2 * table.T), (whole, 2 * table)):
+    np.testing.assert_array_equal(found, wanted)
+    assert found.flags.c_contiguous and found.flags.owndata
+assert total == 100.0
+"""
+
+
+def run_in_a_process(code, *arguments):
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    environment = {k: v for k, v in os.environ.items() if k != "RS_LOCALIZER_KERNELS"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_modules_with_kernels_import_numpy_and_no_other_package():
+    """The build imports them, in an environment that has nothing else."""
+    code = (
+        "import importlib, sys\n"
+        "class Refusing:\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        "        first = name.partition('.')[0]\n"
+        "        known = {'rs_localizer', 'numpy', 'numba', 'llvmlite', *sys.stdlib_module_names}\n"
+        "        if first not in known:\n"
+        "            raise ImportError(f'{name} is imported')\n"
+        "sys.meta_path.insert(0, Refusing())\n"
+        "for name in sys.argv[1].split():\n"
+        "    importlib.import_module(name)\n"
+    )
+    run_in_a_process(code, " ".join(sources.kernel_modules()))
+
+
 @pytest.mark.skipif(shutil.which("objdump") is None, reason="needs objdump")
 @pytest.mark.parametrize(("level", "unwanted"), [("v2", ("%ymm", "%zmm")), ("v3", ("%zmm",))])
 def test_a_level_has_no_instructions_of_a_higher_one(level, unwanted, tmp_path):
