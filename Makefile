@@ -5,6 +5,7 @@
 # make test   lint, types and tests
 # make kernels  compiles what has been edited of the kernels; the others do that first
 # make wheel  wheels for other machines, in dist/
+# make levels what `make wheel` has made, each level against what `make jit` kept, aarch64 by qemu
 # make jit    the kernels' own tests under Numba, and the native module against what they gave
 # make bench  the statistical tests, which take longer: coverage of regions, verdicts of experiments
 # make coverage  the tests once more, and which lines they run: without kernels, and
@@ -21,7 +22,8 @@
 VENV ?= .venv
 OUT ?= out
 # What `make jit` runs: tests that call kernels.
-JIT ?= test/core test/solvers test/estimation test/inertial test/matching test/markers test/native
+JIT ?= test/core test/solvers test/estimation test/inertial test/matching test/markers test/native \
+    test/trajectory/test_factors.py test/trajectory/test_spline.py test/simulation/test_rendering.py
 COVERAGE ?= --cov
 
 # The first interpreter that will do; without any, python3 is refused below with the reason.
@@ -50,7 +52,7 @@ progress := $(PYTHON) .ci/progress.py
 native = $$($(python) -m rs_localizer.native.build --environment)
 pip := $(python) -m pip install --disable-pip-version-check --no-input --progress-bar off
 
-.PHONY: demo test bench ros coverage docs collect kernels wheel jit lint release clean
+.PHONY: demo test bench ros coverage docs collect kernels wheel levels jit lint release clean
 .DELETE_ON_ERROR:
 
 demo: kernels
@@ -99,6 +101,10 @@ wheel: $(ready)
 release:
 	@bash .ci/release
 
+# The kernels of other processors, too, which a wheel has and nobody here runs.
+levels: jit wheel
+	@bash .ci/levels dist $(VENV)/calls.pkl
+
 # The kernels under Numba: their own tests, and whether the native module answers as they do.
 jit: kernels
 	@env RS_LOCALIZER_KERNELS=numba RS_LOCALIZER_CALLS=$(VENV)/calls.pkl PYTHONPATH=test/native \
@@ -132,6 +138,6 @@ $(ready): setup.py pyproject.toml Makefile
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(OUT) .kernels build install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .coverage
+	rm -rf $(VENV) $(OUT) .kernels build dist install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .coverage
 	rm -f rs_localizer/native/*.so rs_localizer/native/_kernels_*.json
 	find rs_localizer benchmarks test -name __pycache__ -type d -prune -exec rm -rf {} +
