@@ -84,11 +84,15 @@ def frame_posterior(
         one_lens: one camera sees them all; of two lenses a smooth error is not one polynomial.
     """
     if observations.count > MOST_POINTS:
-        thinned = observations.thinned(MOST_POINTS)
-        part = _of_points(thinned, start, terms, threshold, assumed, one_lens)
-        gate = np.sqrt(part.squared_errors[part.inliers].max(initial=0.0))
-        errors = observations.squared_errors(part.state)
-        inliers = errors <= gate**2
+        some = np.linspace(0, observations.count - 1, MOST_POINTS).astype(np.int64)
+        part = _of_points(observations.only(some), start, terms, threshold, assumed, one_lens)
+        lines = linearized(
+            observations.packed, observations.count, part.state,
+            shake_at(observations.tau, part.shake),
+        )  # fmt: skip
+        errors = np.sum(lines.errors**2, axis=1)
+        # The farthest inlier of the part is one of all points: no rounding leaves it out.
+        inliers = errors <= errors[some][part.inliers].max(initial=0.0)
         bend = part.bend
         if bend.shape[1]:
             depth = max(observations.median_depth(part.state, inliers), NEAREST)

@@ -76,14 +76,13 @@ def checked(
 
     OpenCV's (n,1,3) and (n,1,2) are taken, too.
 
-    Those that are read-only are copied: to Numba they are another type, whose kernels nothing has
-    compiled yet.
+    Those that are read-only or unaligned, as Dask sends them, are copied.
 
     Raises:
         ValueError: wrong shapes, or values that are not finite.
     """
-    points = np.require(points, np.float64, ["C", "W"])
-    pixels = np.require(pixels, np.float64, ["C", "W"])
+    points = np.require(points, np.float64, ["C", "A", "W"])
+    pixels = np.require(pixels, np.float64, ["C", "A", "W"])
     if points.size == 0 and pixels.size == 0:  # empty lists have no second dimension
         points, pixels = points.reshape(0, 3), pixels.reshape(0, 2)
     points, pixels = (
@@ -97,7 +96,7 @@ def checked(
         )
     checks = [("points", points), ("pixels", pixels)]
     if scores is not None:
-        scores = np.ascontiguousarray(scores, dtype=np.float64)
+        scores = np.require(scores, np.float64, ["C", "A"])
         if scores.shape != (n,):
             raise ValueError(f"scores must be ({n},), got {scores.shape}")
         checks.append(("scores", scores))
@@ -249,10 +248,6 @@ class Observations:
             camera = np.zeros(len(points), np.int64)
         packed = pack(points, rays, tau, by_ray, camera, mounts)
         return cls(points, rays, tau, camera, mounts, packed, len(points))
-
-    def thinned(self, count: int) -> Observations:
-        """So many of the points, evenly taken."""
-        return self.only(np.linspace(0, len(self) - 1, count).astype(np.int64))
 
     def only(self, chosen: IntArray) -> Observations:
         """These of the points."""

@@ -119,6 +119,28 @@ def test_a_vibrating_camera_stays_in_its_region(frames):
     assert (np.mean(np.array(squared) < chi2.ppf(0.95, 6), axis=0) >= 0.85).all()
 
 
+def test_of_very_many_points_of_a_vibrating_camera_the_inliers_are_kept():
+    """More than are fitted: the others are judged with what the camera turns beside its motion."""
+    observations, state = shaken(1, 1.8, count=3000)
+    found = frame_posterior(observations, state, PRIOR, 2.0, ASSUMED)
+    assert len(found.shake)
+    assert np.count_nonzero(found.inliers) > 0.98 * 3000
+    assert np.sqrt(found.squared_errors[found.inliers].mean() / 2) == pytest.approx(0.2, rel=0.1)
+
+
+def test_of_very_many_points_rounding_leaves_none_out():
+    for seed in range(6):
+        observations, state = frame(seed, 0.02, 0.5, count=2600)
+        found = frame_posterior(observations, state, PRIOR, 1.0, ASSUMED)
+        rounded = type(observations).of(
+            observations.points * (1.0 + 1e-15), observations.rays * (1.0 - 1e-15),
+            observations.tau, jacobian_of(observations.rays), observations.mounts,
+        )  # fmt: skip
+        again = frame_posterior(rounded, state, PRIOR, 1.0, ASSUMED)
+        assert 2000 < np.count_nonzero(found.inliers) < 2600
+        np.testing.assert_array_equal(found.inliers, again.inliers)
+
+
 def is_refused(posterior):
     failure = refusal(posterior, 0, min_inliers=12, threshold=2.0, rolling=True)
     return failure is not None
