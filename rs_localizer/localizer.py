@@ -115,6 +115,9 @@ class Localizer:
             partial(assumptions, rig=camera, config=self.config, solver=self._solver)
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:  # made anew in the process that unpickles it
+        return type(self), (self.camera if self._alone else self.rig, self.config)
+
     def __repr__(self) -> str:
         ordinary, values = LocalizerConfig(), self.config
         own = [

@@ -4,7 +4,12 @@
 root finder that looks for the row which sees a point."""
 
 import copy
+import gc
+import multiprocessing
+import pathlib
+import re
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -142,6 +147,83 @@ def test_same_seed_same_bits_and_no_memory_of_earlier_frames():
         for name in ("rotation", "translation", "angular_velocity", "linear_velocity",
                      "covariance", "inliers", "residuals"):  # fmt: skip
             np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+
+
+FRAMES = [frame(camera(), Path(seed), 60, 0.5, 0.3, seed)[:2] for seed in (1, 2)]
+
+
+def assert_same_bits(found):
+    expected = [rsl.Localizer(camera()).localize(*each) for each in FRAMES]
+    assert not np.array_equal(expected[0].rotation, expected[1].rotation)
+    for given, wanted in zip(found, expected, strict=True):
+        for name in ("rotation", "covariance", "residuals"):
+            np.testing.assert_array_equal(getattr(given, name), getattr(wanted, name))
+
+
+def test_arrays_that_are_read_only_or_anywhere_in_memory_are_taken():
+    anywhere = [
+        np.concatenate([[np.uint8(0)], each.ravel().view(np.uint8)])[1:].view(float)
+        for each in FRAMES[0]
+    ]
+    assert not any(each.flags.aligned for each in anywhere)
+    points, pixels = anywhere[0].reshape(-1, 3), anywhere[1].reshape(-1, 2)
+    read_only = [each.copy() for each in FRAMES[1]]
+    for each in read_only:
+        each.flags.writeable = False
+    localizer = rsl.Localizer(camera())
+    assert_same_bits([localizer.localize(points, pixels), localizer.localize(*read_only)])
+
+
+def test_two_threads_on_one_localizer_get_what_each_would_get_alone():
+    localizer = rsl.Localizer(camera())
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(20):
+            work = [pool.submit(localizer.localize, *each) for each in FRAMES]
+            assert_same_bits([each.result() for each in work])
+
+
+@pytest.mark.parametrize("how", ["fork", "spawn"])
+@pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+def test_other_processes_get_the_same_from_a_localizer_that_is_sent(how):
+    localizer = rsl.Localizer(camera())
+    localizer.localize(*FRAMES[0])  # which does not go along
+    with multiprocessing.get_context(how).Pool(1) as pool:
+        assert_same_bits(pool.starmap_async(localizer.localize, FRAMES).get(60))
+
+
+def test_workers_of_dask_get_the_same():
+    distributed = pytest.importorskip("distributed", reason="needs Dask")
+    localizer = rsl.Localizer(camera())
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=True, dashboard_address=":0"
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        work = [client.submit(localizer.localize, *each) for each in FRAMES]
+        assert_same_bits([each.result(timeout=60) for each in work])
+
+
+def resident():
+    """kB of this process that are in memory."""
+    return int(re.search(r"VmRSS:\s+(\d+)", pathlib.Path("/proc/self/status").read_text())[1])
+
+
+@pytest.mark.parametrize("count", [1000, pytest.param(10_000, marks=pytest.mark.bench)])
+def test_memory_stays_as_it_is_from_frame_to_frame(count):
+    """Of frames alone and tracked, with a pose and without one."""
+    localizer = rsl.Localizer(camera())
+    tracker, rng = rsl.Tracker(localizer), np.random.default_rng(0)
+    nonsense = FRAMES[0][0], rng.uniform([0, 0], [639, 479], (60, 2))
+    before = 0
+    for k in range(count):
+        localizer.localize(*FRAMES[k % 2])
+        tracker.localize(33_000_000 * k, *(nonsense if k % 10 == 9 else FRAMES[0]))
+        if k == 200:
+            gc.collect()
+            before = resident()
+    gc.collect()
+    assert resident() < before + 2000
 
 
 def test_a_far_origin_and_turned_map_change_nothing_but_the_map():

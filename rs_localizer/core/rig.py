@@ -94,6 +94,9 @@ class Rig:
         set_field(self, "camera_from_rig", MappingProxyType(extrinsics))
         set_field(self, "time_offset", MappingProxyType(offsets))
 
+    def __reduce__(self) -> tuple[Any, ...]:  # no pickle holds mappings that cannot be changed
+        return Rig, (dict(self.cameras), dict(self.camera_from_rig), dict(self.time_offset))
+
     @classmethod
     def of(cls, camera: Camera) -> Rig:
         """A camera alone, whose axes are those of the rig."""
