@@ -32,9 +32,6 @@ void add_product(Matrix &sum, double factor, const Left &left, const Right &righ
 }
 }  // namespace
 
-// Where malloc has no memory Eigen calls this, so that it throws: nothing of C++ is linked but for it.
-__attribute__((visibility("hidden"))) void *operator new(std::size_t) { std::abort(); }
-
 ROUTINE int numba_xxgemm(char kind, char turn_a, char turn_b, Index m, Index n, Index k, void *alpha, void *a_data,
                          Index a_step, void *b_data, Index b_step, void *beta, void *c_data, Index c_step) {
     if (kind != 'd') return WRONG_KIND;

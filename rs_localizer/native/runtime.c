@@ -89,6 +89,13 @@ HIDDEN void *NRT_MemInfo_varsize_realloc(MemInfo *info, size_t size) {
     }
     return data;
 }
+/* operator new, which Eigen calls where malloc has no memory, so that it throws: nothing else is of
+   the library of C++, which is not linked. */
+HIDDEN void *without_memory(size_t size) __asm__("_Znwm");
+void *without_memory(size_t size) {
+    (void)size;
+    abort();
+}
 HIDDEN void numba_fatal_error(void) { Py_FatalError("a kernel failed"); }
 HIDDEN void numba_gil_ensure(int *state) { *state = PyGILState_Ensure(); }
 HIDDEN void numba_gil_release(int *state) { PyGILState_Release(*state); }
