@@ -206,3 +206,25 @@ def test_the_lenses_of_a_rig_are_those_of_its_file(tmp_path, make_camera_info):
     for name, camera in cameras.items():
         frames.calibrate(read_camera_info(make_camera_info(width=640, height=480)), name)
         assert tuple(camera.K.ravel()) == frames.calibrations[name].K
+
+
+def test_refinement_turns_off_what_knows_more_than_the_points_of_a_frame(make_camera_info):
+    """However the settings come; asked for again, all of it is back."""
+    wanted = NodeConfig(readout_time=READOUT_TIME, publish_tf="map_to_camera", refinement="none")
+    frames = FrameLocalizer(replace(wanted, publish_tf="none"))
+    frames.calibrate(read_camera_info(make_camera_info()))
+
+    def told(config: NodeConfig) -> list[Localized]:
+        frames.config = config
+        frames.reset()
+        return [localized(frames.localize(message_of(seen))) for seen in simulated()[:2]]
+
+    for kind, sent in (("none", "none"), ("motion", "map_to_camera")):
+        for found in told(replace(wanted, refinement=kind)):
+            assert frames.config.publish_tf == sent
+            assert not frames.predicts
+            assert not found.estimate.tracked
+            assert np.isnan(found.pose.covariance).all() == (kind == "none")
+            assert np.isnan(found.estimate.integrity) == (kind == "none")
+    assert [it.estimate.tracked for it in told(replace(wanted, refinement="full"))] == [False, True]
+    assert frames.predicts
