@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parts of the launch files: every setting is an argument, and a wrong one ends the launch."""
 
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription  # type: ignore[attr-defined]  # not our folder of this name
-from rs_localizer.config import NO_NAMES, DetectorConfig, NodeConfig
+from rs_localizer.config import NO_NAMES, DetectorConfig, NodeConfig, meant
 from rs_localizer.io.yaml_text import YamlError, load_yaml
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
@@ -67,7 +69,9 @@ def description(
         "rviz": ("false", "start RViz with a view of the outputs, too"),
         **(others or {}),
     }
+    known: dict[str, Any] = {}  # some with dots, too
     for kind in (NodeConfig, *kinds):
+        known |= settings(kind)
         file = share("config", f"{NODES[kind]}.yaml")
         own[_file_of(kind)] = (file, f"parameters of {NODES[kind]}")
         for name, one in settings(kind).items():
@@ -78,6 +82,12 @@ def description(
         arguments=["-d", share("config", "rs_localizer.rviz")],
         condition=IfCondition(LaunchConfiguration("rviz")),
     )  # fmt: skip
+
+    def start(context: Any) -> list[Node]:
+        if _is_launched():
+            refuse_unknown(context.argv, {**own, **known})
+        return nodes(context.launch_configurations)
+
     return LaunchDescription(
         [
             *(
@@ -85,9 +95,30 @@ def description(
                 for name, (default, text) in own.items()
             ),
             rviz,
-            OpaqueFunction(function=lambda context: nodes(context.launch_configurations)),
+            OpaqueFunction(function=start),
         ]
     )
+
+
+def _is_launched() -> bool:
+    """True if a file of this package is launched, and none of others that includes it.
+
+    Arguments of such a file may be its own, and nobody tells which it has.
+    """
+    for before, word in pairwise(("", *sys.argv)):
+        if word.endswith(".launch.py"):
+            return PACKAGE in (before, Path(word).absolute().parent.parent.name)
+    return False
+
+
+def refuse_unknown(words: Iterable[str], own: Iterable[str]) -> None:
+    """Raise ``ValueError`` for ``name:=value`` of a name that is none of a launch file's own."""
+    names = list(own)
+    for word in words:
+        name, given, _ = word.partition(":=")
+        if given and name not in names:
+            text = meant(name, names) or "; --show-args lists those that there are"
+            raise ValueError(f"{name} is no argument of this launch file{text}")
 
 
 def _file_of(kind: Kind) -> str:

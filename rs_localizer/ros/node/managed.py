@@ -27,6 +27,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from rs_localizer.process.stopping import StopRequest
 from rs_localizer.ros.node import parameters
+from rs_localizer.ros.node.bond import Bond
 from rs_localizer.ros.node.diagnostics import Diagnostics, Health
 from rs_localizer.ros.node.refusals import Refusals, describe
 from rs_localizer.ros.node.statistics import Statistics, Told
@@ -72,6 +73,7 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         self.worker: Worker[Result] | None = None
         # From activating to deactivating.
         self._inputs: Inputs | None = None
+        self._bond: Bond | None = None
         try:
             config = parameters.declare(self, kind)
             if self.checked_at_start:
@@ -203,6 +205,7 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         result = super().on_activate(state)
         try:
             self.begin(self.config)
+            self._bind()
         except Exception as error:  # rclpy would hide it; QoS overrides that make no QoS
             self.get_logger().error(f"not activated: {describe(error)}")
             self._end()
@@ -233,7 +236,21 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         self._close()
         super().destroy_node()
 
+    def _bind(self) -> None:
+        """Tell nav2's lifecycle manager that the node lives, where its messages are installed."""
+        try:
+            self._bond = Bond(self)
+        except (ImportError, AttributeError):  # not there, or another package of this name
+            self.get_logger().info(
+                "nav2's lifecycle manager gets no heartbeat, and needs bond_timeout 0.0: the "
+                "package bond is not installed",
+                once=True,
+            )
+
     def _end(self) -> None:
+        if self._bond is not None:
+            self._bond.close()
+            self._bond = None
         self.listen({})
         if self.worker is not None:
             self.worker.pause()

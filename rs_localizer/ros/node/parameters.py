@@ -4,6 +4,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -39,7 +40,7 @@ class Started(Node):
     to learn their names. Here they are kept and declared as what they are.
     """
 
-    given: Mapping[str, Any] | None = None
+    given: Mapping[str, Any] = MappingProxyType({})
     """Values by name."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -49,7 +50,7 @@ class Started(Node):
         self, namespace: str, parameters: list[Any], ignore_override: bool = False
     ) -> Any:
         """Declare parameters, but for those that the node was started with."""
-        if self.given is None and ignore_override:
+        if ignore_override and "given" not in vars(self):
             self.given = {name: value for name, value, _ in parameters}
             return []
         return super().declare_parameters(namespace, parameters, ignore_override)
