@@ -95,6 +95,28 @@ def example_matcher(args: list[str] | None = None) -> int:
     return 0
 
 
+def doctor(args: list[str] | None = None) -> int:
+    """Say what a localizer finds on a running robot, and whether it works."""
+    words = sys.argv[1:] if args is None else args
+    if not {*_HELP}.isdisjoint(words):
+        sys.stdout.write(
+            "usage: ros2 run rs_localizer doctor [--ros-args -p readout_time:=0.02 ...]\n\nFinds "
+            "the topics of a running robot, localizes for some seconds, and says in one screen "
+            "what it has found and what is wrong; writes rs_localizer_doctor.yaml.\n"
+        )
+        return 0
+    ignore_working_folder()
+    limit_threads()
+    with StopRequest() as stop:
+        try:
+            with stop.at_once():
+                from rs_localizer.ros import doctor as program
+        except ImportError as error:
+            sys.stderr.write(f"doctor: {explain(error)}\n")
+            return 1
+        return program.run(stop, args)
+
+
 def _run(name: str, args: list[str] | None = None) -> int:
     ignore_working_folder()
     limit_threads()

@@ -26,6 +26,9 @@ from rs_localizer.ros.node.diagnostics import (
 from rs_localizer.ros.node.statistics import Summary, Told
 from rs_localizer.ros.node.subscriptions import Silence
 
+DEVIATION = "Position deviation (cm)"
+"""Name of a value: root of the sum over the axes, of the last pose."""
+
 
 def tell(frame: Localized) -> tuple[int, Told]:
     """The stamp of the input (ns), and what is told."""
@@ -39,6 +42,7 @@ def tell(frame: Localized) -> tuple[int, Told]:
         "Residual RMS (px)": f"{residual:.3f}",
         "Model error (px)": f"{estimate.model_error:.3f}",
         "Iterations": str(estimate.iterations),
+        DEVIATION: f"{100.0 * math.sqrt(frame.pose.covariance[:3, :3].trace()):.2f}",
     }
     for camera in frame.cameras:  # of a rig
         share = camera.inliers / max(camera.points, 1)

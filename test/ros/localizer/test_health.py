@@ -37,9 +37,11 @@ def frame(stamp: float = 0.0, tracked: bool = False, rig: bool = False) -> Any:
         lens=None,
     )
     cameras = (CameraShare("front", 3, 2, 3.5), CameraShare("rear", 1, 1, 0.0))
+    pose = SimpleNamespace(covariance=np.diag([1e-6, 4e-6, 4e-6, 1.0, 1.0, 1.0]))  # 3 mm
     return SimpleNamespace(
-        input_stamp_ns=round(stamp * 1e9), estimate=estimate, cameras=cameras if rig else ()
-    )
+        input_stamp_ns=round(stamp * 1e9), estimate=estimate, pose=pose,
+        cameras=cameras if rig else (),
+    )  # fmt: skip
 
 
 class World:
@@ -98,6 +100,7 @@ def test_numbers_of_a_working_node(world):
         "Residual RMS (px)": f"{np.sqrt(25.0 / 3.0):.3f}",
         "Model error (px)": "0.000",
         "Iterations": "64",
+        "Position deviation (cm)": "0.30",
         "Frames received": "100",
         "Frames answered": "100",
         "Frames replaced": "0",
