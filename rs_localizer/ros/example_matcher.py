@@ -94,8 +94,8 @@ def _text(*numbers: float) -> str:
     return " ".join(f"{number:+.3f}" for number in numbers)
 
 
-def run(stop: StopRequest, args: list[str] | None = None) -> None:
-    """Publish until ``stop`` is requested."""
+def run(stop: StopRequest, args: list[str] | None = None) -> int:
+    """Publish until ``stop`` is requested; the exit code."""
     # rclpy's own handlers end the context from a thread while the node still publishes.
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node = ExampleMatcher()
@@ -105,3 +105,4 @@ def run(stop: StopRequest, args: list[str] | None = None) -> None:
         executor.spin_once()  # returns after each of the timer's calls
     node.destroy_node()
     rclpy.try_shutdown()
+    return 0

@@ -101,13 +101,19 @@ def test_publishers_that_cannot_be_heard_are_named(peer, monkeypatch):
 def test_two_publishers_of_frames_are_named(peer):
     said: list[str] = []
     topics = {"frames": Topic(PointCloud2, print, single=True), "info": Topic(CameraInfo, print)}
-    inputs = Inputs(peer.node, topics, Refusals(said.append))
     context = Context()
     context.init(args=[])
     driver = Node("driver", context=context)
     for name, topic in topics.items():
         peer.node.create_publisher(topic.type, name, 1)
         driver.create_publisher(topic.type, name, 1)
+
+    def known() -> set[str]:  # names of nodes come later than their publishers
+        found = peer.node.get_publishers_info_by_topic("/frames")
+        return {info.node_name for info in found}
+
+    assert peer.spin_until(lambda: known() == {"driver", peer.node.get_name()})
+    inputs = Inputs(peer.node, topics, Refusals(said.append))
     assert peer.spin_until(lambda: said)
     names = " and ".join(sorted(("/driver", f"/{peer.node.get_name()}")))
     assert said == [f"two_publishers: {names} publish on /frames: their frames alternate"]
