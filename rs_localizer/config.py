@@ -461,6 +461,12 @@ class NodeConfig(LocalizerConfig):
         "stamped into the future, in s",
         (0.0, 10.0),
     )
+    saved_pose_file: str = setting(
+        "",
+        "File that keeps the last pose of map_to_odom and is started from, as from a click; empty: "
+        "none",
+        fixed=True,
+    )
     camera_file: str = setting(
         "",
         "What calibrate writes of a camera: its lens, in place of camera_info's, and the settings "

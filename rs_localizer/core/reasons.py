@@ -75,6 +75,7 @@ class Notice(StrEnum):
     STILL_IMAGE = "still_image"
     WOULD_FIT = "would_fit"
     PRIOR_REFUSED = "prior_refused"
+    POSE_GIVEN = "pose_given"
     DOUBTFUL = "doubtful"
     READOUT_TIME = "readout_time"
     LENS = "lens"
@@ -91,6 +92,9 @@ class Notice(StrEnum):
     # Of nodes.
     NOT_BROADCAST = "not_broadcast"
     MAP_JUMPED = "map_jumped"
+    CONTRADICTED = "contradicted"
+    SECOND_BROADCASTER = "second_broadcaster"
+    TIME_JUMPED = "time_jumped"
     TWO_PUBLISHERS = "two_publishers"
     INCOMPATIBLE_PUBLISHER = "incompatible_publisher"
     NO_POSE = "no_pose"

@@ -30,8 +30,10 @@ ODOMETRY = "odometry"
 INLIERS = "inliers"
 # Of the node alone, and their types.
 INTEGRITY, MAP_MARKERS, CAMERA_MARKER = "integrity", "map_markers", "camera_marker"
+MAP_TO_ODOM = "map_to_odom"
 LIVE = {
-    INTEGRITY: "std_msgs/msg/Float64",
+    INTEGRITY: "diagnostic_msgs/msg/DiagnosticArray",
+    MAP_TO_ODOM: "geometry_msgs/msg/PoseWithCovarianceStamped",
     MAP_MARKERS: "visualization_msgs/msg/MarkerArray",
     CAMERA_MARKER: "visualization_msgs/msg/MarkerArray",
 }

@@ -42,6 +42,7 @@ from rs_localizer.offline.frame_table import FrameTable
 from rs_localizer.offline.replay import NO_FRAMES, TF_TYPE, Answer, Topics, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.imu_readings import ImuState
+from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import broadcast
 from rs_localizer.pipeline.refusal import Refusal, explained
 from rs_localizer.settings import NODE_NAME
@@ -106,21 +107,27 @@ class Track:
 
 
 def write_frame(
-    writer: BagWriter, frame: Localized, localizer: FrameLocalizer, recorded_ns: int
-) -> bool:
-    """Write all messages of a frame; whether its transform could be told."""
+    writer: BagWriter,
+    frame: Localized,
+    localizer: FrameLocalizer,
+    recorded_ns: int,
+    tally: Tally,
+) -> None:
+    """Write all messages of a frame; count it if its transform cannot be told."""
     for name, message in messages(frame, writer.make).items():
         writer.write(f"/{NODE_NAME}/{name}", message, recorded_ns)
     try:
-        item = broadcast(frame, localizer.config, localizer.transforms)
+        item, tally.correction = broadcast(
+            frame, localizer.config, localizer.transforms, tally.correction
+        )
     except TransformError:
-        return False
+        tally.not_sent += 1
+        return
     if item is not None:
         transform = make_transform(
             writer.make, item.stamp_ns, item.parent, item.child, item.parent_from_child
         )
         writer.write(TF, writer.make(TF_TYPE, transforms=[transform]), recorded_ns)
-    return True
 
 
 # Of each frame with a pose.
@@ -136,6 +143,7 @@ class Tally:
     table: FrameTable | None = None  # of the frames, where one is wanted
     done: Callable[[], object] = lambda: None  # called after each frame
     track: Track = field(default_factory=Track)
+    correction: CorrectionState = field(default_factory=CorrectionState)  # of map -> odom
     refused: Counter[str] = field(default_factory=Counter)
     last_refusal: str = "nothing came"
     not_sent: int = 0
@@ -246,7 +254,7 @@ def write_results(
                 (frame.input_stamp_ns, frame) for part in parts for frame in tally.smooth(part)
             )
         for recorded_ns, frame in frames:
-            tally.not_sent += not write_frame(writer, frame, localizer, recorded_ns)
+            write_frame(writer, frame, localizer, recorded_ns, tally)
             tally.track.add(frame)
             if tally.table is not None:
                 tally.table.add(frame.input_stamp_ns, frame)

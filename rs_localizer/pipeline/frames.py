@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     from rs_localizer.pipeline.tags import Tags
 
 # From this chance on of a wrong pose or map, it is more probable than not.
-_DOUBTFUL = 0.5
+DOUBTFUL = 0.5
 # Smooth errors (px, root mean square; median of so many frames) that nobody has who calibrated
 # well: surveyed tags before a calibrated lens have 0.2.
 _MUCH, _FRAMES = 0.3, 30
@@ -91,8 +91,8 @@ ANY_CALIBRATION = Calibration(
 _BESIDE = frozenset({
     "readout_time_deviation", "estimate_readout_time", "pose_time", "max_points", "base_frame",
     "odom_frame", "publish_tf", "tf_rate", "hold", "two_d_mode",
-    "transform_tolerance", "map_file", "map_frame", "marker_map", "matching", "autostart",
-    "output_rate", "camera_file",
+    "transform_tolerance", "saved_pose_file", "map_file", "map_frame", "marker_map", "matching",
+    "autostart", "output_rate", "camera_file",
 })  # fmt: skip
 
 
@@ -590,7 +590,7 @@ class FrameLocalizer:
             return Refusal(Reason.SCAN_AXIS, watch.wrong_axis)
         if not result:
             return Refusal(result.reason, result.detail)
-        if result.integrity > _DOUBTFUL:
+        if result.integrity > DOUBTFUL:
             text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
             self._notice(Notice.DOUBTFUL, text)
         if result.left_out:

@@ -47,6 +47,14 @@ class GivenPose:
         """True for a filter's pose: others will follow."""
         return bool(self.body)
 
+    @property
+    def allowed(self) -> Array:
+        """Its covariance (6,6), with what nobody has said or can know better."""
+        least = np.repeat(_LEAST, 3)
+        unsaid = np.where(self.covariance.diagonal() > 0.0, least, np.repeat(_UNSAID, 3))
+        allowed: Array = self.covariance + np.diag(unsaid**2)
+        return allowed
+
 
 def read_given_pose(message: Any) -> GivenPose:
     """Read a PoseWithCovarianceStamped, or an Odometry.
@@ -148,12 +156,9 @@ def _of_camera(
 ) -> Prior:
     """The prior of a camera that may have moved for so long since then, as cameras do."""
     camera = given.pose @ body_from_camera
-    least = np.repeat(_LEAST, 3)
-    variances = given.covariance.diagonal()
-    unsaid = np.where(variances > 0.0, least, np.repeat(_UNSAID, 3)) ** 2
     pace = [config.velocity_prior.linear, config.velocity_prior.angular]
     moved = np.repeat(np.square(np.multiply(pace, seconds)), 3)
-    covariance = given.covariance + np.diag(unsaid + moved)
+    covariance = given.allowed + np.diag(moved)
     # Turn and place of the camera in its own axes, by those of the body about the map's.
     back = camera.rotation.T
     lever = camera.translation - given.pose.translation

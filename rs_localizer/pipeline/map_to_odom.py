@@ -1,188 +1,299 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The correction of odometry, ``map -> odom`` (REP-105): held between frames, and without them.
+"""The correction of odometry, ``map -> odom`` (REP-105): which pose to believe, and how sure it is.
 
-A frame says where the body is in the map, odometry where it is in its own frame; the correction
-is one by the other's inverse. While it is held, its error grows with what odometry drifts. How
-fast that is, the corrections themselves show: what one a second old predicts of the body's pose,
-against what the new frame finds, beside the noise of both. Errors of drift count as growing with
-time, not with its root: scale and heading of wheels are off the same way all along.
+:func:`decide` takes one observation after the other and knows no clock and no ROS. What is held is
+a pose that odometry carries on. A pose of a frame takes its place if it is probably right and
+passes a chi-squared gate. One that does not is kept aside as a second hypothesis, and believed when
+
+* poses agree with it for a second, and odometry between them, and
+* a body can have come there (a robot that is carried, wheels that slip, odometry that starts over),
+  or the first hypothesis never had a second of poses itself.
+
+A wrong map agrees with itself as well as a right one. But its poses jump from one image to the
+next, which no body does, and are not believed however long they last. A click is a measurement. A
+refusal changes nothing of what is held; no acceptance makes drift larger than any odometry's.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
 
 import numpy as np
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.outputs import BodyPose, Localized
 from rs_localizer.io.transforms import Transform
+from rs_localizer.pipeline.carried_pose import (
+    PLACE,
+    TURN,
+    CarriedPose,
+    Drift,
+    Odometry,
+    carried_pose,
+    far,
+)
 
-# Of odometry that nobody has seen drift yet: m/s and rad/s, of wheels on carpet.
-_DRIFT = (0.03, 0.015)
-# Drift is judged by corrections so far apart (s); by closer ones, poses' noise is all there is.
-_BASELINE = 1.0
-# Weight of the newest: some ten seconds count.
-_NEWEST = 0.2
-# Jumps above so many deviations are told: one axis alone has them once in two million frames.
-_JUMP = 5.0
+# Chi-squared, 99.99 %: of x, y and heading, and of six numbers. By chance a camera of 30 Hz has ten
+# poses an hour refused, one at a time, while odometry carries on what is held.
+_GATES = {3: 21.1, 6: 27.9}
+_DOUBTFUL = 0.5  # a pose that is more probably wrong than right is no evidence
+_CLEARLY = 9.0  # twice the logarithm of ninety to one, against the hypothesis that has more poses
+# Who carries a robot walks, m/s, and turns, rad/s; what is beyond that has to be noise, by three
+# deviations at most.
+_PACE, _SPIN, _SLACK = 1.5, 3.0, 9.0
+# s of agreement that a hypothesis needs to be believed, and to be told as a contradiction; what a
+# pose adds at most; s for which poses of which nothing followed are remembered.
+_AGREES, _PERSISTS, _STEP, _BRIEF = 1.0, 0.2, 0.2, 1.0
+_FRESH = 0.5  # s after a pose until which it is tracking; cameras of 5 Hz may miss one image
+_RESTART = 500_000_000  # ns by which time goes back only if a recording starts over
 
 
-def corrected(map_from_body: Transform, odom_from_body: Transform, *, two_d: bool) -> Transform:
-    """``map_from_odom`` by which odometry has the body where it is in the map.
+class Standing(StrEnum):
+    """How ``map -> odom`` is known."""
 
-    Args:
-        two_d: its z, roll and pitch are zero; then the body has its x and y, and the heading of
-            odometry is turned about z only.
-    """
-    whole = map_from_body @ odom_from_body.inverse()
-    if not two_d:
-        return whole
-    yaw = math.atan2(
-        whole.rotation[1, 0] - whole.rotation[0, 1], whole.rotation[0, 0] + whole.rotation[1, 1]
-    )
-    rotation = so3.exp(np.array([0.0, 0.0, yaw]))
-    translation = map_from_body.translation - rotation @ odom_from_body.translation
-    return Transform(rotation, translation * np.array([1.0, 1.0, 0.0]))
+    LOST = "lost"
+    HELD = "held"
+    TRACKING = "tracking"
+    CONTRADICTED = "contradicted"
 
 
 @dataclass(frozen=True, slots=True)
-class Holding:
-    """Age and deviations of the correction at a moment."""
+class Settings:
+    two_d: bool = False  # z, roll and pitch of map -> odom are zero
+    hold: float = 0.0  # s without a pose after which it is given up; 0: never
 
-    seconds: float  # since the frame that it is of
-    position: float  # m, standard deviation of the body's place in the map
-    angle: float  # rad, of its orientation
-    ended: bool = False  # it is older than ``hold`` and no longer sent
-
-    def __str__(self) -> str:
-        off = f"{100.0 * self.position:.2g} cm, {math.degrees(self.angle):.2g} deg"
-        if self.ended:
-            return f"not sent since hold ended, {self.seconds:.1f} s after the last frame, {off}"
-        return f"holding for {self.seconds:.1f} s, {off}"
+    @property
+    def axes(self) -> list[int]:
+        """Of the six numbers of a pose, those that it has."""
+        return [0, 1, 5] if self.two_d else [0, 1, 2, 3, 4, 5]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Correction:
-    """The correction that one frame made."""
+class FoundPose:
+    """A pose of the body that a frame found."""
 
-    stamp_ns: int
-    map_from_odom: Transform
-    odom_from_body: Transform
-    variance: tuple[float, float]  # m^2, rad^2: traces of the pose's covariance
+    at: Odometry
+    map_from_body: Transform
+    covariance: Array  # (6,6) x, y, z, then rotations about the axes of the map
+    doubt: float = 0.0  # probability that it is wrong; NaN: nobody says
 
 
-class MapToOdom:
-    """The last correction, and what is known of the drift since then."""
+class Click(FoundPose):
+    """A pose of the body that a user, or a file, gives."""
 
-    def __init__(self) -> None:
-        self._last: _Correction | None = None
-        self._way, self._at = 0.0, np.zeros(3)  # m since then by odometry, and where it was last
-        self._base: _Correction | None = None  # that the drift is judged by
-        self._drift = np.square(_DRIFT)  # per s, squared: m/s, rad/s
 
-    def forget(self) -> None:
-        """Hold nothing; the drift is the same odometry's as before."""
-        self._last = self._base = None
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """A pose that may be right."""
+
+    pose: CarriedPose
+    near_ns: int  # of the last pose there, be it as doubtful as it may
+    seen_ns: float = -math.inf  # of the last pose of a frame that counted
+    support: float = 0.0  # s for which poses agreed
+    reachable: bool = True  # whether a body can have come there
 
     @property
-    def stamp_ns(self) -> int | None:
-        """Stamp of the frame that is held; None: nothing is."""
-        return None if self._last is None else self._last.stamp_ns
+    def told(self) -> bool:
+        """Whether poses agreed for long enough to speak of it."""
+        return self.support >= _PERSISTS
 
-    def take(self, frame: Localized, odom_from_body: Transform, *, two_d: bool) -> str:
-        """Hold this frame's correction from now on.
 
-        Returns:
-            What to say of a jump that no deviation explains; empty: there is none.
-        """
-        place = Transform(frame.pose.rotation, frame.pose.position)
-        newest = _Correction(
-            frame.stamp_ns,
-            corrected(place, odom_from_body, two_d=two_d),
-            odom_from_body,
-            _variances(frame.pose, two_d=two_d),
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrectionState:
+    """What is remembered; :func:`decide` returns the next."""
+
+    held: Hypothesis | None = None
+    aside: Hypothesis | None = None
+    refused: Hypothesis | None = None  # the last click that was
+    base: CarriedPose | None = None  # that drift is judged by
+    drift: Drift = field(default_factory=Drift)
+    newest: Odometry | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decision:
+    """What follows of an observation."""
+
+    state: CorrectionState
+    standing: Standing
+    map_from_odom: Transform | None = None  # to be sent; None: nothing
+    covariance: Array | None = None  # (6,6) of the body's pose by it
+    of_transform: Array | None = None  # (6,6) of map_from_odom: of the odometry's origin
+    seconds: float = 0.0  # since the last pose or click that was believed
+    jump: Array | None = None  # (6,) from what is held to what contradicts it
+    smallest: tuple[float, float] | None = None  # jump that would be refused
+    said: str = ""  # a hypothesis is believed now; the answer to a click
+
+    def __str__(self) -> str:
+        if self.covariance is None:
+            return str(self.standing)
+        own = far(np.sqrt(self.covariance.diagonal()))
+        if self.map_from_odom is None:
+            return f"not sent since hold ended, {self.seconds:.1f} s after the last frame, {own}"
+        text = f"holding for {self.seconds:.1f} s, {own}"
+        if self.jump is None:
+            return text
+        return f"{text}; contradicted by poses {far(self.jump)} from there"
+
+
+def decide(settings: Settings, state: CorrectionState, seen: Odometry | FoundPose) -> Decision:
+    """Take an observation; pure: the same arguments give the same decision."""
+    now = seen if isinstance(seen, Odometry) else seen.at
+    last = state.held.pose.since if state.held and isinstance(seen, FoundPose) else state.newest
+    if last and now.stamp_ns < last.stamp_ns - _RESTART and not isinstance(seen, Click):
+        state = CorrectionState(drift=state.drift)
+    now, newest = now.after(state.newest)
+    state = replace(state, newest=newest)
+    said, case = "", _Case(settings, state, now)
+    if isinstance(seen, FoundPose):
+        pose = carried_pose(now, seen.map_from_body, seen.covariance, settings.axes)
+        if isinstance(seen, Click):
+            state, said = case.clicked(Hypothesis(pose, now.stamp_ns))
+        else:
+            found = Hypothesis(pose, now.stamp_ns, now.stamp_ns)
+            state, said = case.posed(found, not seen.doubt >= _DOUBTFUL)
+    return _Case(settings, state, now).decision(said)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Case:
+    """The rules, for one moment."""
+
+    settings: Settings
+    state: CorrectionState
+    now: Odometry
+
+    def posed(self, found: Hypothesis, right: bool) -> tuple[CorrectionState, str]:
+        """The state after a pose of a frame, probably right or not, and what is to be said."""
+        state, held, aside = self.state, self.held, self.aside
+        if held is not None and self.now.stamp_ns <= held.pose.since.stamp_ns:
+            return state, ""
+        if held is None:
+            return replace(state, held=found, aside=None, base=found.pose) if right else state, ""
+        ours, theirs = self._misfit(held, found), self._misfit(aside, found)
+        # What has grown for long explains much, and a sharper hypothesis better.
+        likelier = ours[1] <= theirs[1] + (-_CLEARLY if aside and aside.told else _CLEARLY)
+        if self._passes(ours) and (likelier or not self._passes(theirs)):
+            if not right:
+                return replace(state, held=replace(held, near_ns=self.now.stamp_ns)), ""
+            base, drift = state.drift.judged(state.base or found.pose, found.pose, self.now)
+            held = self._renewed(held, found, _STEP)
+            return replace(state, held=held, aside=None, base=base, drift=drift), ""
+        if aside is None or not self._passes(theirs):
+            found = replace(found, reachable=self._reachable(held, aside, found))
+            return replace(state, aside=found), ""
+        found = self._renewed(aside, found, _STEP if right else 0.0)
+        if found.support < _AGREES or not (found.reachable or held.support < _AGREES):
+            return replace(state, aside=found), ""
+        jump = far(held.pose.offset(found.pose, self.now))
+        said = f"map -> odom moves the body by {jump}: poses agreed on that for {_AGREES:g} s"
+        return replace(state, held=found, aside=None, base=found.pose), said
+
+    def clicked(self, found: Hypothesis) -> tuple[CorrectionState, str]:
+        """The state after a user's pose, and the answer."""
+        state, held = self.state, self.held
+        for known, text in ((held, "as a measurement"), (self.aside, "for what contradicts it")):
+            if known is not None and self._passes(self._misfit(known, found)):
+                measured = (found.pose, self.now, state.drift, self.settings.axes)
+                fused = replace(known, pose=known.pose.fused(*measured), reachable=True)
+                aside, base = (self.aside, state.base) if known is held else (None, None)
+                state = replace(state, held=fused, aside=aside, base=base, refused=None)
+                return state, f"taken {text}"
+        again = self._passes(self._misfit(state.refused, found))
+        if held is None or again:
+            text = "taken: it came twice" if again else "taken: map -> odom begins with it"
+            return replace(state, held=found, aside=None, base=None, refused=None), text
+        jump, known = held.pose.offset(found.pose, self.now), self._grown(held)
+        return replace(state, refused=found), (
+            f"refused: it lies {far(jump)} from where map -> odom has the body, known to "
+            f"{far(np.sqrt(known.diagonal()))}; the same again is taken"
         )
-        jump = self._jump(newest)
-        base = self._base
-        if base is None or newest.stamp_ns < base.stamp_ns:
-            self._base = newest
-        elif (seconds := 1e-9 * (newest.stamp_ns - base.stamp_ns)) >= _BASELINE:
-            off = np.square(_offsets(base, newest))
-            noise = np.add(base.variance, newest.variance)
-            drift = np.maximum(off - noise, 0.0) / seconds**2
-            self._drift += _NEWEST * (drift - self._drift)
-            self._base = newest
-        self._last, self._way, self._at = newest, 0.0, odom_from_body.translation
-        return jump
 
-    def held(self, time_ns: int, hold: float) -> Transform | None:
-        """``map_from_odom`` at a time; None where nothing is held, or no longer.
+    def decision(self, said: str) -> Decision:
+        """What is to be sent now."""
+        state, held, aside = self.state, self.state.held, self.aside
+        if held is None:
+            return Decision(state, Standing.LOST, said=said)
+        seconds, grown = held.pose.seconds(self.now), self._grown(held)
+        if self.held is None:
+            return Decision(state, Standing.LOST, None, grown, seconds=seconds, said=said)
+        fresh = 1e-9 * (self.now.stamp_ns - held.seen_ns) < _FRESH
+        standing, jump = Standing.TRACKING if fresh else Standing.HELD, None
+        smallest = _smallest(grown + held.pose.covariance, self.settings.axes)
+        if aside is not None:  # room for what may be as well
+            off = held.pose.offset(aside.pose, self.now)
+            grown = grown + np.outer(off, off)
+            if aside.told:
+                standing, jump = Standing.CONTRADICTED, off
+        of_transform = held.pose.of_transform(grown, self.now)
+        return Decision(state, standing, held.pose.map_from_odom, grown, of_transform, seconds,
+                        jump, smallest, said)  # fmt: skip
 
-        Args:
-            hold: s for which it is; 0: for ever.
-        """
-        last = self._last
-        return None if last is None or self._ended(time_ns, hold) else last.map_from_odom
+    @property
+    def held(self) -> Hypothesis | None:
+        """What is held and not given up."""
+        held, hold = self.state.held, self.settings.hold
+        ended = held is not None and 0.0 < hold < held.pose.seconds(self.now)
+        return None if ended else held
 
-    def _ended(self, time_ns: int, hold: float) -> bool:
-        return self._last is not None and 0.0 < hold < 1e-9 * (time_ns - self._last.stamp_ns)
+    @property
+    def aside(self) -> Hypothesis | None:
+        """What contradicts it; not a few poses of which nothing followed."""
+        aside = self.state.aside
+        brief = aside is None or aside.told or aside.pose.seconds(self.now) < _BRIEF
+        return aside if brief else None
 
-    def holding(self, time_ns: int, odom_from_body: Transform, hold: float) -> Holding | None:
-        """Age and deviations at a time when odometry has the body there; None: there was no frame.
+    def _grown(self, known: Hypothesis) -> Array:
+        return known.pose.grown(self.now, self.state.drift, self.settings.axes)
 
-        To be asked often: the way since the last frame counts, not the distance.
+    def _misfit(self, known: Hypothesis | None, found: Hypothesis) -> tuple[float, float]:
+        """Squared distance in deviations, and minus twice the likelihood's logarithm, less 2 pi."""
+        if known is None:
+            return math.inf, math.inf
+        spread, offset = self._spread(known, found), known.pose.offset(found.pose, self.now)
+        distance = self._distance(offset, spread)
+        return distance, distance + float(np.linalg.slogdet(spread)[1])
 
-        Args:
-            hold: as of :meth:`held`.
-        """
-        if self._last is None:
-            return None
-        seconds = max(1e-9 * (time_ns - self._last.stamp_ns), 0.0)
-        position, angle = self._grown(self._last, seconds, odom_from_body)
-        ended = self._ended(time_ns, hold)
-        return Holding(seconds, math.sqrt(position), math.sqrt(angle), ended)
+    def _spread(self, known: Hypothesis, found: Hypothesis) -> Array:
+        axes = self.settings.axes
+        spread: Array = (self._grown(known) + found.pose.covariance)[np.ix_(axes, axes)]
+        return spread
 
-    def _grown(
-        self, since: _Correction, seconds: float, odom_from_body: Transform
-    ) -> tuple[float, float]:
-        """Variances (m^2, rad^2) of the body's pose by a correction, so much later."""
-        self._way += float(np.linalg.norm(odom_from_body.translation - self._at))
-        self._at = odom_from_body.translation
-        place, turn = since.variance
-        drift, drift_of_turn = self._drift * seconds**2
-        # A heading that is off, and ever more so, sends all of the way astray.
-        astray = self._way**2 * (turn + 0.25 * drift_of_turn)
-        return place + drift + astray, turn + drift_of_turn
+    def _distance(self, offset: Array, spread: Array) -> float:
+        own = offset[self.settings.axes]
+        return float(own @ np.linalg.solve(spread, own))
 
-    def _jump(self, newest: _Correction) -> str:
-        last = self._last
-        if last is None or newest.stamp_ns < last.stamp_ns:
-            return ""
-        off = _offsets(last, newest)
-        seconds = 1e-9 * (newest.stamp_ns - last.stamp_ns)
-        grown = self._grown(last, seconds, newest.odom_from_body)
-        ratio = float(np.max(off / np.sqrt(np.add(grown, newest.variance))))
-        if ratio <= _JUMP:
-            return ""
-        return (
-            f"map -> odom jumps by {100.0 * off[0]:.2g} cm and {math.degrees(off[1]):.2g} deg "
-            f"after {seconds:.1f} s, {ratio:.0f} times the deviation of what was held: which of "
-            "the two is right?"
-        )
+    def _passes(self, misfit: tuple[float, float]) -> bool:
+        return misfit[0] <= _GATES[len(self.settings.axes)]
 
+    def _reachable(self, held: Hypothesis, aside: Hypothesis | None, found: Hypothesis) -> bool:
+        """Whether a body can have come from the last pose to a new one, whatever odometry says."""
+        gate = _GATES[len(self.settings.axes)]
+        if aside and aside.told and not (aside.reachable and self._near(aside, found, gate)):
+            return False
+        return self._near(held, found, _SLACK)
 
-def _offsets(older: _Correction, newer: _Correction) -> Array:
-    """Distances (m, rad) of the body by the older one from where the newer one has it."""
-    expected = older.map_from_odom @ newer.odom_from_body
-    found = newer.map_from_odom @ newer.odom_from_body
-    turn = so3.log(np.ascontiguousarray(expected.rotation.T @ found.rotation))
-    off: Array = found.translation - expected.translation
-    return np.array([np.linalg.norm(off), np.linalg.norm(turn)])
+    def _near(self, known: Hypothesis, found: Hypothesis, slack: float) -> bool:
+        """Whether only noise is beyond what a body goes, from where odometry had it or it was."""
+        reach = np.multiply((_PACE, _SPIN), 1e-9 * (self.now.stamp_ns - known.near_ns))
+        stayed = known.pose.body(known.pose.since) @ self.now.odom_from_body.inverse()
+        for start in (known.pose, replace(known.pose, map_from_odom=stayed)):
+            off = start.offset(found.pose, self.now)
+            for part, most in zip((PLACE, TURN), reach, strict=True):
+                off[part] *= max(1.0 - most / max(float(np.linalg.norm(off[part])), 1e-12), 0.0)
+            if self._distance(off, self._spread(known, found)) <= slack:
+                return True
+        return False
+
+    def _renewed(self, known: Hypothesis, found: Hypothesis, most: float) -> Hypothesis:
+        """A hypothesis by its newest pose, which supports it for so many s at most."""
+        support = min(known.support + min(known.pose.seconds(self.now), most), _AGREES)
+        return replace(found, support=support, reachable=known.reachable)
 
 
-def _variances(pose: BodyPose, *, two_d: bool) -> tuple[float, float]:
-    """Traces of a covariance; of a correction in the plane, of what it has."""
-    own = pose.covariance.diagonal()
-    return (own[:2].sum(), own[5]) if two_d else (own[:3].sum(), own[3:].sum())
+def _smallest(spread: Array, axes: list[int]) -> tuple[float, float]:
+    """The smallest jump that would be refused, m and rad."""
+    least, cut = np.linalg.inv(spread[np.ix_(axes, axes)]), sum(axis < 3 for axis in axes)
+    parts = least[:cut, :cut], least[cut:, cut:]
+    place, turn = (math.sqrt(_GATES[len(axes)] / np.linalg.eigvalsh(it)[-1]) for it in parts)
+    return place, turn

@@ -28,7 +28,7 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences, select_inliers
 from rs_localizer.io.outputs import BodyPose, Localized, Twist
 from rs_localizer.io.transforms import NotYetError, Transform, TransformError, Transforms
-from rs_localizer.pipeline.map_to_odom import corrected
+from rs_localizer.pipeline.map_to_odom import CorrectionState, FoundPose, Odometry, Settings, decide
 from rs_localizer.pipeline.pose_at_time import (
     backwards,
     either,
@@ -218,22 +218,37 @@ def check_time(frame: Localized) -> None:
         raise TransformError("header.stamp of the input is zero: the pose has no time for TF")
 
 
-def broadcast(frame: Localized, config: NodeConfig, transforms: Transforms) -> Broadcast | None:
-    """The transform to publish of a frame; None when ``publish_tf`` is ``none``.
+def pose_in_odometry(frame: Localized, config: NodeConfig, transforms: Transforms) -> FoundPose:
+    """A frame's pose with what odometry says of its time, for :func:`.decide`.
+
+    Raises:
+        TransformError: when the frame says nothing of its time, or odometry says nothing for it.
+    """
+    check_time(frame)
+    odom_from_body = transforms.lookup(config.odom_frame, frame.body_frame, frame.stamp_ns)
+    at = Odometry(frame.stamp_ns, odom_from_body)
+    map_from_body = Transform(frame.pose.rotation, frame.pose.position)
+    return FoundPose(at, map_from_body, frame.pose.covariance, frame.estimate.integrity)
+
+
+def broadcast(
+    frame: Localized, config: NodeConfig, transforms: Transforms, state: CorrectionState
+) -> tuple[Broadcast | None, CorrectionState]:
+    """The transform to publish of a frame, if there is one, and the next state of ``map -> odom``.
 
     Raises:
         TransformError: when the frame says nothing of its time, or odometry says nothing for it.
     """
     if config.publish_tf == PublishTf.NONE:
-        return None
+        return None, state
+    if config.publish_tf == PublishTf.MAP_TO_ODOM:
+        pose = pose_in_odometry(frame, config, transforms)
+        decision = decide(Settings(config.two_d_mode, config.hold), state, pose)
+        if (correction := decision.map_from_odom) is None:
+            return None, decision.state
+        ahead_ns = frame.stamp_ns + round(config.transform_tolerance * 1e9)
+        sent = Broadcast(ahead_ns, frame.map_frame, config.odom_frame, correction)
+        return sent, decision.state
     check_time(frame)
     map_from_body = Transform(frame.pose.rotation, frame.pose.position)
-    if config.publish_tf == PublishTf.MAP_TO_CAMERA:
-        return Broadcast(frame.stamp_ns, frame.map_frame, frame.body_frame, map_from_body)
-    odom_from_body = transforms.lookup(config.odom_frame, frame.body_frame, frame.stamp_ns)
-    return Broadcast(
-        frame.stamp_ns + round(config.transform_tolerance * 1e9),
-        frame.map_frame,
-        config.odom_frame,
-        corrected(map_from_body, odom_from_body, two_d=config.two_d_mode),
-    )
+    return Broadcast(frame.stamp_ns, frame.map_frame, frame.body_frame, map_from_body), state

@@ -29,6 +29,7 @@ from rs_localizer.io.recording import CAMERA_FRAME, write_frame
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.offline.replay import TF_TYPE, find_topics, find_transforms, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import broadcast
 from rs_localizer.settings import build, load_params_file
 
@@ -197,8 +198,9 @@ def test_nav2_finds_the_robot_by_its_odometry(flight):
     """With config/nav2.yaml: map -> odom, with odom -> base_link of that moment, is the pose."""
     config = build(load_params_file(CONFIG / "nav2.yaml") | {"readout_time": 0.03})
     found, used = replayed(flight, config)
+    state = CorrectionState()
     for index, frame in enumerate(found):
-        sent = broadcast(frame, config, used.transforms)
+        sent, state = broadcast(frame, config, used.transforms, state)
         assert sent is not None
         assert (sent.parent, sent.child) == ("map", "odom")
         assert sent.stamp_ns == frame.stamp_ns + 200_000_000  # usable until the next one comes

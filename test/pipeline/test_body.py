@@ -27,6 +27,7 @@ from rs_localizer.io.outputs import Localized, messages
 from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import Broadcast, broadcast
 from rs_localizer.pipeline.refusal import Refusal
 
@@ -266,7 +267,7 @@ def test_every_quantity(localize, robot, pose_time, direction):
     assert np.array_equal(odometry.twist.covariance.reshape(6, 6), frame.twist.covariance)
 
     # TF: the drift is what the localizer finds. Odometry between its samples is interpolated.
-    correction = broadcast(*result, robot)
+    correction, _ = broadcast(*result, robot, CorrectionState())
     assert (correction.parent, correction.child) == ("map", "odom")
     assert correction.stamp_ns == frame.stamp_ns + 200_000_000
     assert np.allclose(as_matrix(correction), drift, atol=2e-4)
@@ -274,7 +275,7 @@ def test_every_quantity(localize, robot, pose_time, direction):
     chain = as_matrix(correction) @ matrix(interpolated.translation, interpolated.rotation)
     assert np.allclose(chain, pose, atol=1e-12)
     frame, config = localize(robot, **settings, publish_tf="map_to_camera")
-    direct = broadcast(frame, config, robot)
+    direct, _ = broadcast(frame, config, robot, CorrectionState())
     assert (direct.parent, direct.child) == ("map", "base_link")
     assert direct.stamp_ns == frame.stamp_ns
     assert np.allclose(as_matrix(direct), pose, atol=1e-12)
@@ -343,4 +344,4 @@ def test_a_stamp_of_zero_in_a_recording_that_starts_there(localize, robot, pose_
         assert np.allclose(frame.pose.position, expected.pose.position, atol=1e-12)
     assert frame.stamp_ns == (0 if pose_time == PoseTime.STAMP else -10_000_000)
     with pytest.raises(TransformError, match=r"header.stamp of the input is zero"):
-        broadcast(frame, config, robot)
+        broadcast(frame, config, robot, CorrectionState())

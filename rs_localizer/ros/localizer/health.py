@@ -7,13 +7,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from rs_localizer.core.reasons import Notice
+from rs_localizer.io.messages import make_header
 from rs_localizer.io.outputs import Localized
+from rs_localizer.pipeline.frames import DOUBTFUL
 from rs_localizer.pipeline.imu_readings import ImuState, in_words
 from rs_localizer.pipeline.inputs import Role, input_named, said
-from rs_localizer.pipeline.map_to_odom import Holding
+from rs_localizer.pipeline.map_to_odom import Decision, Standing
 from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.pipeline.refusal import IMU_REASONS
+from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.diagnostics import (
     Health,
     Level,
@@ -53,6 +58,20 @@ def tell(frame: Localized) -> tuple[int, Told]:
     state = State.TRACKING if estimate.tracked else State.LOCALIZED
     text = f"{state} with {inliers} of {points} points"
     return frame.input_stamp_ns, Told(state, text, values)
+
+
+def integrity_message(frame: Localized) -> DiagnosticArray:
+    """The probability that a pose lies outside its region, with the pose's stamp."""
+    doubt = frame.estimate.integrity
+    status = DiagnosticStatus(
+        level=bytes([Level.WARN if doubt > DOUBTFUL else Level.OK]),
+        name="rs_localizer: integrity",
+        message=f"the pose lies outside its 99.9 % region with a probability of {doubt:.2%}",
+        hardware_id=frame.body_frame,
+        values=[KeyValue(key="integrity", value=f"{doubt:.6f}")],
+    )
+    header = make_header(make_message, frame.stamp_ns, frame.map_frame)
+    return DiagnosticArray(header=header, status=[status])
 
 
 # Share of the last frames below which it is worth a warning that the IMU is not used.
@@ -125,7 +144,7 @@ class Condition:
     missing: Sequence[str]  # inputs without which no frame can be localized
     silence: Mapping[str, Silence]  # by input topic
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
-    holding: Holding | None = None  # the correction of odometry; None: there has been none
+    correction: Decision | None = None  # of odometry; None: there has been none
     values: Mapping[str, str] = field(default_factory=dict)  # others, by readable names
 
 
@@ -208,10 +227,15 @@ def _judge_frames(summary: Summary, condition: Condition) -> Health:
         message = f"the last {summary.refused_since_answer} frames gave no pose"
         if reasons := summary.recent_reasons:
             message += f", mostly for {max(reasons, key=lambda reason: reasons[reason])}"
-        held = "" if condition.holding is None else str(condition.holding)
+        held = "" if condition.correction is None else str(condition.correction)
         message = "; ".join(filter(None, [message, held, one_line(oddities)]))
         return Health(Level.ERROR, State.LOST, message)
     state = State(last.state)
+    correction = condition.correction
+    if correction is not None and correction.standing is Standing.CONTRADICTED:
+        return Health(Level.ERROR, state, f"map -> odom is contradicted: {correction}")
+    if text := oddities.get(Notice.SECOND_BROADCASTER):
+        return Health(Level.ERROR, state, text)
     if message := hindrance(summary, "frames") or one_line(oddities):
         return Health(Level.WARN, state, message)
     return Health(Level.OK, state, last.text)
@@ -219,8 +243,6 @@ def _judge_frames(summary: Summary, condition: Condition) -> Health:
 
 def _values(condition: Condition, summary: Summary) -> dict[str, str]:
     values = counts(summary, "Frames", "Poses out")
-    if condition.holding is not None:
-        values["Correction of odometry"] = str(condition.holding)
     values |= condition.values
     values |= {f"Topic {item.topic}": _heard(item) for item in condition.silence.values()}
     return values | {f"Notice: {name}": text for name, text in condition.oddities.items()}

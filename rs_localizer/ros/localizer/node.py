@@ -12,7 +12,6 @@ from collections.abc import Collection
 from typing import Any
 
 from rclpy.timer import Timer
-from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray  # type: ignore[import-untyped]
 
@@ -37,16 +36,18 @@ from rs_localizer.pipeline.given_pose import read_given_pose
 from rs_localizer.pipeline.inputs import Input, Results, Role, inputs_of
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.localizer import tf
+from rs_localizer.ros.localizer.broadcaster import Broadcaster
 from rs_localizer.ros.localizer.health import (
     Condition,
     diagnose,
     imu_oddity,
     imu_values,
+    integrity_message,
     of_interest,
     readout_values,
     tell,
 )
-from rs_localizer.ros.localizer.tf import Broadcaster
+from rs_localizer.ros.node.clock import watch_clock
 from rs_localizer.ros.node.conversion import (
     create_output,
     installed,
@@ -69,7 +70,7 @@ _MOTION = tuple(name for name in TYPES if name != INLIERS)
 _ODD = (
     "map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "no_images",
     "lens", "clock", "bad_imu", "map_scale", "map_jumped", "two_publishers", "doubtful",
-    "would_fit",
+    "would_fit", "second_broadcaster",
 )  # fmt: skip
 
 
@@ -106,7 +107,7 @@ class Publisher:
             marker = MarkerArray(markers=[camera_marker(frame, corners)])
             self._publishers[CAMERA_MARKER].publish(marker)
         if math.isfinite(frame.estimate.integrity):
-            self._publishers[INTEGRITY].publish(Float64(data=frame.estimate.integrity))
+            self._publishers[INTEGRITY].publish(integrity_message(frame))
 
     def publish_motion(self) -> None:
         """Publish pose and twist of now, in the executor's thread, by the last frames' motion."""
@@ -153,6 +154,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         self._needs_tf = True  # of readings whose axes are not the camera's
         super().__init__(NODE_NAME, NodeConfig, tell, **options)
         self._broadcaster = Broadcaster(self, self.refusals)
+        self._clock_watch = watch_clock(self, self._time_jumped)
 
     def check(self, config: NodeConfig) -> None:
         tf.check(config)
@@ -211,6 +213,10 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             self._ticks = None
         if rate > 0.0 and self._publisher is not None:
             self._ticks = steady_timer(self, 1.0 / rate, self._publisher.publish_motion)
+
+    def _time_jumped(self, seconds: float) -> None:
+        self._broadcaster.jumped(seconds)
+        self.statistics.restart()
 
     def _forget(self) -> None:
         if self._publisher is not None:
@@ -285,6 +291,8 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         except MessageError as error:
             self.refusals.notice(Notice.PRIOR_REFUSED, str(error))
             return
+        if not given.lasts:
+            self._broadcaster.give(given)
         kind = "filter's pose" if given.lasts else "given pose"
         self._update(kind, FrameLocalizer.give_pose, given)
 
@@ -334,8 +342,8 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             missing=missing,
             silence=of_interest(inputs, missing),
             oddities=oddities,
-            holding=self._broadcaster.holding,
-            values=values,
+            correction=self._broadcaster.decision,
+            values=self._broadcaster.values | values,
         )
         health = diagnose(condition, self.statistics.summary())
         return health, "" if frames is None else frames.camera_frame

@@ -9,35 +9,22 @@ yet: frames are kept until they are, while others are localized.
 
 import contextlib
 import importlib
-import threading
-import time
-from collections import deque
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-from rclpy.clock import JumpThreshold
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.time import Time
 
 from rs_localizer.config import NodeConfig, PublishTf
-from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import stamp_ns as stamp_of
-from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms import (
     NotYetError,
     Transform,
     TransformError,
     UnusableTransforms,
-    make_transform,
     read_transform,
 )
-from rs_localizer.pipeline.map_to_odom import Holding, MapToOdom
-from rs_localizer.pipeline.published import Broadcast, broadcast, check_time
-from rs_localizer.ros.node.conversion import make_message, steady_timer
-from rs_localizer.ros.node.refusals import Refusals
-from rs_localizer.ros.node.statistics import WINDOW
 
 # For how long tf2's buffer remembers, in ns: its default.
 _MEMORY = 10_000_000_000
@@ -77,10 +64,11 @@ class Tf:
 
     Args:
         node: listens.
-        heard: told of the transforms that have come (geometry_msgs/TransformStamped).
+        heard: told of the transforms that have come (geometry_msgs/TransformStamped), and
+            whether they are static.
     """
 
-    def __init__(self, node: Node, heard: Callable[[list[Any]], None]) -> None:
+    def __init__(self, node: Node, heard: Callable[[list[Any], bool], None]) -> None:
         self._node = node
         self._heard = heard
         self._buffer: Any = None
@@ -109,22 +97,19 @@ class Tf:
         if self._buffer is not None:
             return
         buffer = tf2_ros.Buffer()
-        # By its own clock tf2 would not see the time of a simulation or a recording go back.
-        jumps = self._node.get_clock().create_jump_callback(
-            JumpThreshold(
-                min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
-            ),
-            post_callback=lambda _: buffer.clear(),
-        )
         self._errors, self._buffer = tf2_ros, buffer
         listener = _listen(tf2_ros, buffer, self._node, self._hear)
-        for undo in (jumps.unregister, listener.unregister):
-            self._undo.callback(undo)
+        self._undo.callback(listener.unregister)
 
-    def _hear(self, transforms: list[Any]) -> None:
+    def _hear(self, transforms: list[Any], static: bool) -> None:
         for item in transforms:
             self._unusable.read(item)
-        self._heard(transforms)
+        self._heard(transforms, static)
+
+    def clear(self) -> None:
+        """Forget all but the static transforms: time has jumped."""
+        if (buffer := self._buffer) is not None:
+            buffer.clear()
 
     def close(self) -> None:
         """Stop listening; whoever asks for a transform gets none."""
@@ -182,211 +167,20 @@ class Tf:
         raise TransformError(text)
 
 
-def _listen(tf2_ros: Any, buffer: Any, node: Node, hear: Callable[[list[Any]], None]) -> Any:
+def _listen(tf2_ros: Any, buffer: Any, node: Node, hear: Callable[[list[Any], bool], None]) -> Any:
     """A tf2_ros.TransformListener that tells of what has come."""
 
     class Listener(tf2_ros.TransformListener):  # type: ignore[misc]
         def callback(self, data: Any) -> None:
             super().callback(data)
-            hear(data.transforms)
+            hear(data.transforms, False)
 
         def static_callback(self, data: Any) -> None:
             super().static_callback(data)
-            hear(data.transforms)
+            hear(data.transforms, True)
 
     return Listener(buffer, node)
 
 
 def _text(error: Exception) -> str:
     return " ".join(str(error).split())
-
-
-# Frames that wait for odometry, which mostly comes later than they do.
-_MOST_PENDING = 100
-# Odometry that goes back by more (ns) has started over.
-_RESTART = 500_000_000
-
-
-class Broadcaster:
-    """TF's side of the outputs.
-
-    ``map_to_odom`` never stops: with each frame there is a new correction of odometry, and that is
-    sent ``tf_rate`` times a second, as long as odometry comes, stamped ``transform_tolerance``
-    ahead of it, so that whoever asks for a time that odometry knows has an answer.
-
-    :meth:`publish` may be called from any thread, all else belongs to the executor's.
-
-    Args:
-        node: sends, and listens for the odometry.
-        refusals: told of what was not sent, and of jumps.
-    """
-
-    def __init__(self, node: Node, refusals: Refusals) -> None:
-        self.tf = Tf(node, self._hear)
-        self._node = node
-        self._refusals = refusals
-        self._broadcaster: Any = None
-        self._timer: Any = None
-        self._config: NodeConfig | None = None
-        self._sending = threading.Lock()  # of the next three
-        # With when they are given up, time.monotonic().
-        self._pending: deque[tuple[Localized, NodeConfig, float]] = deque(maxlen=_MOST_PENDING)
-        self._correction, self._map_frame = MapToOdom(), ""
-        self._sent_ns = 0  # the newest stamp of map -> odom
-        self._holding: Holding | None = None
-        self._body = ""  # frame of the body whose correction is held
-        self._own: set[tuple[str, str]] = set()  # parents and children that we have sent
-        self._parents: dict[str, str] = {}  # that others have sent, by child
-        self._sent = 0.0  # when, time.monotonic()
-        self._failed: tuple[float, str] | None = None
-
-    def configure(self, config: NodeConfig) -> None:
-        """Have what these settings need.
-
-        Raises:
-            ValueError: without tf2_ros.
-        """
-        self.tf.configure(config)
-        if config.publish_tf != PublishTf.NONE and self._broadcaster is None:
-            self._broadcaster = import_tf2_ros(needed(config)).TransformBroadcaster(self._node)
-        self._stop_timer()
-        self._config = config
-        if config.publish_tf == PublishTf.MAP_TO_ODOM and config.tf_rate > 0.0:
-            self._timer = steady_timer(self._node, 1.0 / config.tf_rate, self._tick)
-
-    def _stop_timer(self) -> None:
-        if self._timer is not None:
-            self._node.destroy_timer(self._timer)
-            self._timer = None
-
-    def forget(self) -> None:
-        """Send nothing of the frames so far."""
-        with self._sending:
-            self._pending.clear()
-            self._correction.forget()
-            self._failed = self._holding = None
-
-    def fault(self) -> dict[str, str]:
-        """For the diagnostics: why nothing has been sent lately, if something should have been."""
-        failed = self._failed
-        since = time.monotonic() - WINDOW
-        if failed is None or failed[0] < since or self._sent >= since:
-            return {}
-        return {Notice.NOT_BROADCAST: failed[1]}
-
-    @property
-    def holding(self) -> Holding | None:
-        """Age and deviations of the correction of odometry; None: there has been none."""
-        return self._holding
-
-    def close(self) -> None:
-        self.forget()
-        self._stop_timer()
-        self.tf.close()
-        if self._broadcaster is not None:
-            self._node.destroy_publisher(self._broadcaster.pub_tf)
-            self._broadcaster = None
-
-    def publish(self, frame: Localized, config: NodeConfig) -> None:
-        """Send the frame's transform: now, or when odometry has come so far.
-
-        After ``transform_tolerance`` it is given up.
-        """
-        if config.publish_tf == PublishTf.NONE:
-            return
-        deadline = time.monotonic() + config.transform_tolerance
-        with self._sending:
-            self._pending.append((frame, config, deadline))
-        self._flush()
-
-    def _hear(self, transforms: list[Any]) -> None:
-        for item in transforms:
-            parent = item.header.frame_id.removeprefix("/")
-            child = item.child_frame_id.removeprefix("/")
-            if (parent, child) not in self._own:
-                self._parents[child] = parent
-        self._flush()
-
-    def _flush(self) -> None:
-        with self._sending:
-            waiting = list(self._pending)
-            self._pending.clear()
-            for frame, config, deadline in waiting:
-                try:
-                    self._take(frame, config)
-                except TransformError as error:
-                    if isinstance(error, NotYetError) and time.monotonic() < deadline:
-                        self._pending.append((frame, config, deadline))
-                    else:
-                        self._say(config, error)
-
-    def _take(self, frame: Localized, config: NodeConfig) -> None:
-        if config.publish_tf != PublishTf.MAP_TO_ODOM:
-            if (item := broadcast(frame, config, self.tf)) is not None:
-                self._send(item)
-            return
-        check_time(frame)
-        body_in_odom = self.tf.lookup(config.odom_frame, frame.body_frame, frame.stamp_ns)
-        last = self._correction.stamp_ns
-        if frame.map_frame != self._map_frame or (last is not None and frame.stamp_ns < last):
-            self._correction.forget()
-            self._map_frame = frame.map_frame
-        first = self._correction.stamp_ns is None
-        if jump := self._correction.take(frame, body_in_odom, two_d=config.two_d_mode):
-            self._refusals.notice(Notice.MAP_JUMPED, jump)
-        if first:  # nobody shall have to wait for the time that it is stamped ahead
-            self._sent_ns = 0
-            self._send_correction(frame.stamp_ns, config)
-        self._hold(frame.body_frame, config)
-
-    def _tick(self) -> None:
-        config = self._config
-        if config is None or config.publish_tf != PublishTf.MAP_TO_ODOM:
-            return
-        with self._sending:
-            try:
-                self._hold(self._body, config)
-            except TransformError as error:
-                self._say(config, error)
-
-    def _hold(self, body_frame: str, config: NodeConfig) -> None:
-        """Send what is held ahead of the newest odometry, if that is new."""
-        self._body = body_frame
-        if self._correction.stamp_ns is None:
-            return
-        newest_ns, body_in_odom = self.tf.latest(config.odom_frame, body_frame)
-        newest_ns = newest_ns or self._node.get_clock().now().nanoseconds
-        self._holding = self._correction.holding(newest_ns, body_in_odom, config.hold)
-        ahead_ns = newest_ns + round(config.transform_tolerance * 1e9)
-        if ahead_ns < self._sent_ns - _RESTART:
-            self._sent_ns = 0
-        if ahead_ns > self._sent_ns:
-            self._send_correction(ahead_ns, config, newest_ns)
-
-    def _send_correction(self, stamp_ns: int, config: NodeConfig, now_ns: int = 0) -> None:
-        held = self._correction.held(now_ns or stamp_ns, config.hold)
-        if held is not None:
-            self._send(Broadcast(stamp_ns, self._map_frame, config.odom_frame, held))
-            self._sent_ns = stamp_ns
-
-    def _say(self, config: NodeConfig, error: TransformError) -> None:
-        text = f"publish_tf {config.publish_tf}: {error}"
-        self._failed = time.monotonic(), text
-        self._refusals.notice(Notice.NOT_BROADCAST, text)
-
-    def _send(self, item: Broadcast) -> None:
-        if self._broadcaster is None:
-            return
-        other = self._parents.get(item.child, item.parent)
-        if other != item.parent:
-            raise TransformError(
-                f"TF frame {item.child!r} already has parent {other!r}; "
-                "choose publish_tf map_to_odom, or the root of the camera's frames as base_frame"
-            )
-        self._own.add((item.parent, item.child))
-        self._broadcaster.sendTransform(
-            make_transform(
-                make_message, item.stamp_ns, item.parent, item.child, item.parent_from_child
-            )
-        )
-        self._sent = time.monotonic()

@@ -132,6 +132,11 @@ class Statistics(Generic[Result]):
         with self._lock:
             self._add(Event.RECEIVED, (topic, stamp_ns(message)))
 
+    def restart(self) -> None:
+        """Time has jumped: frames before and after are not compared."""
+        with self._lock:
+            self._events.clear()
+
     def replaced(self) -> None:
         with self._lock:
             self._add(Event.REPLACED)

@@ -4,7 +4,7 @@
 
 import re
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
 from rclpy.time import Time
+from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.simulation import __main__ as simulated
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
@@ -54,16 +55,30 @@ def stamped(make: Callable[..., Any], sample: Sample) -> Any:
     )
 
 
+def true_odometry(truth: list[Any]) -> Iterator[Sample]:
+    """Odometry at 50 Hz, which rests before the flight and after it."""
+    first_ns = stamp_ns(truth[0])
+    times = np.array([1e-9 * (stamp_ns(message) - first_ns) for message in truth])
+    places = [message.pose.position for message in truth]
+    places = np.array([(place.x, place.y, place.z) for place in places])
+    turns = [message.pose.orientation for message in truth]
+    turns = Slerp(times, Rotation.from_quat([(q.x, q.y, q.z, q.w) for q in turns]))
+    lever, mounted = np.array(MOUNTING[2]), Rotation.from_quat(MOUNTING[3])
+    for tick in range(-3, round(50.0 * times[-1]) + 5):
+        time = min(max(0.02 * tick, 0.0), times[-1])
+        body = turns(time) * mounted.inv()
+        place = np.array([np.interp(time, times, row) for row in places.T]) - body.apply(lever)
+        stamp = first_ns + tick * 20_000_000
+        yield ("odom", "base_link", tuple(place.tolist()), tuple(body.as_quat().tolist()), stamp)
+
+
 def record(folder: Path) -> Path:
     """A flight with an IMU, of a robot that knows where its camera is, and has odometry."""
     simulated.record(folder / "flight", *FLIGHT)
     with open_bag(folder / "flight") as bag:
         items = list(bag.messages((*KINDS, "/tf_static")))
-    stamps = [stamp_ns(message) for topic, _, message in items if topic == "/correspondences"]
-    odometry = [
-        ("odom", "base_link", (0.1 * i, 0.3, 0.0), (0.0, 0.0, 0.6, 0.8), ns)
-        for i, ns in enumerate(range(stamps[0] - 50_000_000, stamps[-1] + 100_000_000, 20_000_000))
-    ]
+        truth = [message for _, _, message in bag.messages(("/truth/pose",))]
+    odometry = list(true_odometry(truth))
     with BagWriter(folder / "robot") as bag:
         for sample in (MOUNTING, *odometry):
             topic = "/tf" if sample[-1] else "/tf_static"

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from rs_localizer.io.outputs import CameraShare
+from rs_localizer.pipeline.map_to_odom import CorrectionState, Decision, Standing
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.localizer.health import (
     Condition,
     diagnose,
+    integrity_message,
     tell,
 )
 from rs_localizer.ros.node.diagnostics import Level
@@ -183,3 +185,35 @@ def test_what_is_missing_comes_first(world, change, level, state, message):
     health = world.diagnose(replace(GOOD, **change))
     assert (health.level, health.values["State"]) == (level, state)
     assert health.message.startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("standing", "level"),
+    [(Standing.CONTRADICTED, Level.ERROR), (Standing.HELD, Level.OK), (None, Level.OK)],
+)
+def test_a_contradicted_correction_is_an_error(world, standing, level):
+    world.pass_frames(10, rate=10.0)
+    correction = None if standing is None else Decision(CorrectionState(), standing)
+    health = world.diagnose(replace(GOOD, correction=correction))
+    assert health.level == level
+    assert health.message.startswith("map -> odom is contradicted") == (level == Level.ERROR)
+
+
+def test_a_second_broadcaster_is_an_error(world):
+    world.pass_frames(10, rate=10.0)
+    health = world.diagnose(replace(GOOD, oddities={"second_broadcaster": "it is 4.7 m off"}))
+    assert (health.level, health.message) == (Level.ERROR, "it is 4.7 m off")
+
+
+def test_integrity_joins_its_pose():
+    localized = SimpleNamespace(
+        stamp_ns=5 * 10**9 + 7, map_frame="map", body_frame="base_link",
+        estimate=SimpleNamespace(integrity=0.00312),
+    )  # fmt: skip
+    message = integrity_message(localized)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (5, 7)
+    (status,) = message.status
+    assert {item.key: item.value for item in status.values} == {"integrity": "0.003120"}
+    assert status.level == b"\x00"
+    localized.estimate.integrity = 0.6
+    assert integrity_message(localized).status[0].level == b"\x01"

@@ -3,6 +3,7 @@
 """TF in the node. Where tf2_ros is installed the same tests run with it."""
 
 import contextlib
+import json
 import sys
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
@@ -10,13 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from rclpy.time import Time
 
 from rs_localizer.config import NodeConfig
+from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import BodyPose, Localized
-from rs_localizer.io.transforms import TransformError
-from rs_localizer.ros.localizer.tf import Broadcaster, check
+from rs_localizer.io.transforms import Transform, TransformError
+from rs_localizer.pipeline.given_pose import GivenPose
+from rs_localizer.ros.localizer.broadcaster import Broadcaster
+from rs_localizer.ros.localizer.tf import check
 
 from ..node.test_worker import waits  # noqa: TID252 - Python has a package "test"
 from .robot import tf2_ros
@@ -66,8 +70,8 @@ def made(peer, robot) -> Iterator[Callable[..., Any]]:
 
         broadcaster = Broadcaster(peer.node, SimpleNamespace(notice=keep))
         config = NodeConfig(**settings)
-        broadcaster.configure(config)
         parts.append(broadcaster)
+        broadcaster.configure(config)
         return SimpleNamespace(
             tf=broadcaster.tf, publish=broadcaster.publish, notes=notes, config=config,
             broadcaster=broadcaster,
@@ -82,7 +86,8 @@ def frame(stamp_ns: int, x: float = 0.0) -> Localized:
     pose = BodyPose(np.array([x, 0.0, 0.0]), np.eye(3), np.eye(6))
     return Localized(
         input_stamp_ns=stamp_ns, stamp_ns=stamp_ns, map_frame="map", body_frame="base_link",
-        pose=pose, twist=None, inliers=np.zeros(0), dropped=0, estimate=None,
+        pose=pose, twist=None, inliers=np.zeros(0), dropped=0,
+        estimate=SimpleNamespace(integrity=0.0),
     )  # fmt: skip
 
 
@@ -141,12 +146,14 @@ def test_the_correction_never_stops(made, robot, peer):
         base = heard(robot, peer, "map", "base_link", tenth * 10**8 - 5 * 10**7)
         assert base.transform.translation.x == pytest.approx(0.1 * tenth - 0.05)
     known(node, peer, "odom", "base_link", 7_900_000_000)
-    peer.spin_until(lambda: node.broadcaster.holding.seconds > 2.35)
-    assert str(node.broadcaster.holding).startswith("holding for 2.4 s, ")
-    # A frame that contradicts it beyond all drift is told; it counts all the same.
+    peer.spin_until(lambda: node.broadcaster.decision.seconds > 2.35)
+    assert str(node.broadcaster.decision).startswith("holding for 2.4 s, ")
+    assert node.broadcaster.values["map -> odom"] == "held"
+    # A frame that contradicts it beyond all drift is kept aside, and room is made for it.
     node.publish(frame(7_800_000_000, x=97.8), node.config)
-    ((_, text),) = [note for note in node.notes if note[0] == "map_jumped"]
-    assert "jumps by 9e+03 cm" in text
+    decision = node.broadcaster.decision
+    assert decision.map_from_odom.translation[0] == pytest.approx(0.0)
+    assert decision.covariance[0, 0] > 80.0**2
     # After hold it ends.
     for tenth in range(80, 115):
         robot.send("odom", "base_link", 0.1 * tenth, tenth * 10**8, NO_TURN)
@@ -154,7 +161,7 @@ def test_the_correction_never_stops(made, robot, peer):
     peer.spin_until(lambda: False, 0.3)
     with pytest.raises(Exception, match="future"):
         robot.buffer.lookup_transform("map", "base_link", Time(nanoseconds=11_300_000_000))
-    assert str(node.broadcaster.holding).startswith("not sent since hold ended, 3.6 s after the ")
+    assert str(node.broadcaster.decision).startswith("not sent since hold ended, 5.9 s after the ")
 
 
 def test_without_tf2_ros_only_what_needs_it_is_refused(monkeypatch):
@@ -185,3 +192,142 @@ def test_others_wait_until_what_is_being_sent_is_out(made, peer, robot, monkeypa
     monkeypatch.setattr(broadcaster, "sendTransform", sending)
     node.publish(frame(5_500_000_000, x=5.5), node.config)
     assert waited[:1] == [True]
+
+
+def odometry(node: Any, robot: Any, peer: Any, *tenths: int) -> None:
+    """A robot that goes one metre a second."""
+    for tenth in tenths:
+        robot.send("odom", "base_link", 0.1 * tenth, tenth * 10**8, NO_TURN)
+    known(node, peer, "odom", "base_link", tenths[-1] * 10**8)
+
+
+def click(x: float, stamp: float, frame: str = "map") -> GivenPose:
+    """A pose as RViz gives it; the stamp in s."""
+    covariance = np.diag([0.25, 0.25, 0.0, 0.0, 0.0, 0.0685])
+    place = Transform(np.eye(3), np.array([x, 0.0, 0.0]))
+    return GivenPose(round(stamp * 1e9), frame, "", place, covariance)
+
+
+def test_a_click_begins_it_and_is_carried_by_odometry(made, robot, peer):
+    sure: list[Any] = []
+    peer.node.create_subscription(PoseWithCovarianceStamped, "~/map_to_odom", sure.append, 100)
+    node = made(publish_tf="map_to_odom", base_frame="base_link")
+    odometry(node, robot, peer, *range(50, 61))
+    node.broadcaster.give(click(12.0, 5.5))
+    assert node.notes == [("pose_given", "taken: map -> odom begins with it")]
+    base = heard(robot, peer, "map", "base_link", 6 * 10**9)
+    assert base.transform.translation.x == pytest.approx(12.5)
+    assert node.broadcaster.values["Last given pose"].startswith("taken: map -> odom begins")
+    assert peer.spin_until(lambda: len(sure) > 0)
+    assert (sure[-1].header.frame_id, stamp_ns(sure[-1])) == ("map", 6 * 10**9)
+    assert sure[-1].pose.pose.position.x == pytest.approx(6.5)
+    # The body's half a metre across, and its heading over the way back to odometry's origin.
+    across = np.sqrt(sure[-1].pose.covariance[7])
+    assert across == pytest.approx(np.hypot(0.5, 5.5 * np.sqrt(0.0685)), rel=0.02)
+    node.notes.clear()
+    node.broadcaster.give(click(99.0, 6.0))
+    assert node.notes[0][1].startswith("refused: it lies 86 m, ")
+    node.broadcaster.give(click(0.0, 6.0, frame="odom"))
+    assert node.notes[1][1] == "refused: it is in 'odom', the map is 'map'"
+    # RViz without use_sim_time stamps by the wall clock; after transform_tolerance it is taken.
+    node.broadcaster.give(click(12.5, 1.7e9))
+    odometry(node, robot, peer, 61)
+    assert len(node.notes) == 2
+    peer.spin_until(lambda: False, 0.25)
+    odometry(node, robot, peer, 62)
+    assert node.notes[2][1].startswith("taken as a measurement; odometry does not know its time: ")
+
+
+def test_a_click_without_a_body_is_refused(made):
+    node = made(publish_tf="map_to_odom")
+    node.broadcaster.give(click(0.0, 5.0))
+    assert node.notes == [("pose_given", "refused: set base_frame, of which it is the pose")]
+    made(publish_tf="map_to_camera").broadcaster.give(click(0.0, 5.0))
+
+
+def test_the_last_pose_is_kept_and_started_from(made, robot, peer, tmp_path):
+    file = tmp_path / "pose.json"
+    settings = {
+        "publish_tf": "map_to_odom", "base_frame": "base_link", "saved_pose_file": str(file),
+    }  # fmt: skip
+    node = made(**settings)
+    odometry(node, robot, peer, *range(50, 61))
+    node.publish(frame(5_500_000_000, x=12.0), node.config)
+    node.broadcaster.close()
+    saved = json.loads(file.read_text())
+    assert saved["position"] == pytest.approx([12.5, 0.0, 0.0])
+    again = made(**settings)
+    odometry(again, robot, peer, *range(60, 71))
+    assert peer.spin_until(lambda: again.broadcaster.decision is not None)
+    assert again.notes[-1] == ("pose_given", "taken: map -> odom begins with it")
+    body = again.broadcaster.decision.map_from_odom @ Transform(np.eye(3), np.array([7.0, 0, 0]))
+    assert body.translation[0] == pytest.approx(12.5)
+    file.write_text("{}")
+    with pytest.raises(ValueError, match=r"saved_pose_file .*pose.json holds no pose"):
+        made(**settings)
+
+
+@pytest.fixture
+def sending(made, robot, peer) -> Any:
+    """A node that sends map -> odom, whose body is known to a centimetre."""
+    node = made(publish_tf="map_to_odom", base_frame="base_link")
+    odometry(node, robot, peer, *range(50, 61))
+    sure = frame(5_500_000_000, x=5.5)
+    sure.pose.covariance[...] *= 1e-4
+    node.publish(sure, node.config)
+    heard(robot, peer, "map", "odom")
+    return node
+
+
+def rivals(node: Any) -> list[str]:
+    return [text for notice, text in node.notes if notice == "second_broadcaster"]
+
+
+def test_another_broadcaster_of_the_same_transform_is_seen(sending, robot, peer):
+    assert rivals(sending) == []
+    robot.send("map", "odom", 4.7, 6_300_000_000, NO_TURN)
+    assert peer.spin_until(lambda: rivals(sending))
+    assert rivals(sending)[0].startswith(
+        "another node broadcasts map -> odom, too: (4.70, 0.00, 0.00) m, 0 deg instead of "
+        "(0.00, 0.00, 0.00) m, 0 deg, which moves the body 4.7 m, "
+    )
+
+
+def test_a_static_one_is_seen_for_ever(sending, robot, peer):
+    robot.send("map", "odom", 0.0, turn=NO_TURN)
+    assert peer.spin_until(lambda: sending.broadcaster.fault())
+    assert "map -> odom" in sending.broadcaster.fault()["second_broadcaster"]
+
+
+def test_the_node_before_its_restart_and_a_recording_are_no_rivals(sending, robot, peer):
+    robot.send("map", "odom", 4.7, 5_400_000_000, NO_TURN)  # sent before this one began
+    robot.send("map", "odom", 0.005, 6_300_000_000, NO_TURN)  # recorded of the same drive
+    peer.spin_until(lambda: False, 0.5)
+    assert rivals(sending) == []
+
+
+def test_a_frame_that_has_two_parents_is_seen(sending, robot, peer):
+    for _ in range(3):
+        robot.send("base_link", "head", 0.0, 6 * 10**9, NO_TURN)
+    robot.send("mast", "head", 0.0, 6 * 10**9, NO_TURN)  # it may have been put elsewhere
+    peer.spin_until(lambda: False, 0.3)
+    assert rivals(sending) == []
+    robot.send("base_link", "head", 0.0, 6 * 10**9, NO_TURN)
+    assert peer.spin_until(lambda: rivals(sending))
+    assert rivals(sending) == ["TF frame 'head' has two parents, 'mast' and 'base_link'"]
+    robot.send("base_link", "camera", 0.0)
+    robot.send("mast", "camera", 0.0)
+    assert peer.spin_until(lambda: sending.broadcaster.fault())
+
+
+def test_after_a_jump_of_time_nothing_is_sent_of_before(sending, robot, peer):
+    sending.broadcaster.jumped(47.0)
+    assert sending.broadcaster.decision is None
+    assert sending.notes[-1][0] == "time_jumped"
+    with pytest.raises(TransformError):
+        sending.tf.lookup("odom", "base_link", 6 * 10**9)
+    robot.send("odom", "base_link", 6.0, 53 * 10**9, NO_TURN)
+    known(sending, peer, "odom", "base_link", 53 * 10**9)
+    peer.spin_until(lambda: False, 0.3)
+    with pytest.raises(Exception, match="extrapolation"):
+        robot.buffer.lookup_transform("map", "odom", Time(nanoseconds=53 * 10**9))

@@ -1,0 +1,171 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A pose of the body in the map that odometry carries on, and what that adds to its error.
+
+Errors of drift count as growing with time, not with its root: scale and heading of wheels are off
+the same way all along. Offsets and covariances are of six numbers: x, y, z (m), then rotations
+about the axes of the map (rad).
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.transforms import Transform
+
+PLACE, TURN = slice(0, 3), slice(3, 6)
+# Drift along and about each axis of the body, m/s and rad/s: of wheels on carpet until it has been
+# seen, the least that is believed, and the most that counts as odometry.
+_CARPET, _LEAST, _MOST = (np.repeat(np.square(pair), 3) for pair in (
+    (0.03, 0.015), (0.005, 0.002), (0.2, 0.1)
+))  # fmt: skip
+# It is judged by poses so far apart (s): between closer ones, there is only their noise. The newest
+# counts by a fifth, so that some twenty seconds do.
+_BASELINE, _NEWEST = 2.0, 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """A moment of odometry."""
+
+    stamp_ns: int
+    odom_from_body: Transform
+    travelled: float = 0.0  # m since the start, as of :meth:`after`
+
+    def after(self, newest: "Odometry | None") -> tuple["Odometry", "Odometry"]:
+        """The same with its way, by the newest so far, which may be later; and the newest now."""
+        if newest is None:
+            return self, self
+        step = self.odom_from_body.translation - newest.odom_from_body.translation
+        way = float(np.linalg.norm(step))
+        if self.stamp_ns <= newest.stamp_ns:
+            return replace(self, travelled=newest.travelled - way), newest
+        now = replace(self, travelled=newest.travelled + way)
+        return now, now
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drift:
+    """What odometry drifts."""
+
+    squared: Array = field(default_factory=_CARPET.copy)  # (6,) per s, in the body's axes
+    count: int = 1  # how often it was seen
+
+    def judged(
+        self, base: "CarriedPose", found: "CarriedPose", now: Odometry
+    ) -> tuple["CarriedPose", "Drift"]:
+        """What it is to be judged by from now on, and it, by what a pose now finds."""
+        if (seconds := base.seconds(now)) < _BASELINE:
+            return base, self
+        off, body = base.offset(found, now), found.body(now).rotation
+        noise = base.covariance + found.covariance
+        newest = np.empty(6)  # below zero by chance
+        for part in (PLACE, TURN):
+            newest[part] = (body.T @ off[part]) ** 2 - np.diag(body.T @ noise[part, part] @ body)
+        weight = max(_NEWEST, 1.0 / (1.0 + self.count))
+        squared = self.squared + weight * (newest / seconds**2 - self.squared)
+        return found, Drift(np.minimum(squared, _MOST), self.count + 1)
+
+    def after(self, seconds: float) -> Array:
+        """Variances (6,) that it adds in so many s."""
+        variances: Array = seconds**2 * np.maximum(self.squared, _LEAST)
+        return variances
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CarriedPose:
+    """Where the body was at a moment of odometry, and from which odometry carries it on."""
+
+    since: Odometry
+    map_from_odom: Transform
+    covariance: Array  # (6,6) of the body's pose then; zero for what is zero in the plane
+
+    def body(self, now: Odometry) -> Transform:
+        """``map_from_body`` at another moment."""
+        return self.map_from_odom @ now.odom_from_body
+
+    def seconds(self, now: Odometry) -> float:
+        return max(1e-9 * (now.stamp_ns - self.since.stamp_ns), 0.0)
+
+    def offset(self, other: "CarriedPose", now: Odometry) -> Array:
+        """From where it has the body to where another one has it (6,)."""
+        here, there = self.body(now), other.body(now)
+        turn = so3.log(np.ascontiguousarray(there.rotation @ here.rotation.T))
+        return np.concatenate([there.translation - here.translation, turn])
+
+    def grown(self, now: Odometry, drift: Drift, axes: list[int]) -> Array:
+        """Covariance (6,6) at another moment, of these of the six numbers."""
+        body = self.body(now)
+        went = self.map_from_odom.rotation @ (
+            now.odom_from_body.translation - self.since.odom_from_body.translation
+        )
+        added, more = np.zeros((6, 6)), drift.after(self.seconds(now))
+        added[TURN, TURN] = turned = (body.rotation * more[TURN]) @ body.rotation.T
+        added[PLACE, PLACE] = (body.rotation * more[PLACE]) @ body.rotation.T
+        # A heading that is ever more off sends all of the way astray, to one side or the other.
+        way = 0.5 * (now.travelled - self.since.travelled)
+        added[PLACE, PLACE] += 0.5 * way**2 * (np.eye(3) * turned.trace() - turned)
+        grown, own = _moved(self.covariance, went), np.ix_(axes, axes)
+        grown[own] += added[own]
+        return grown
+
+    def fused(
+        self, other: "CarriedPose", now: Odometry, drift: Drift, axes: list[int]
+    ) -> "CarriedPose":
+        """The same with another one, which knows nothing of it, as a measurement."""
+        grown, own, gain = self.grown(now, drift, axes), np.ix_(axes, axes), np.zeros((6, 6))
+        gain[own] = grown[own] @ np.linalg.inv(grown[own] + other.covariance[own])
+        step, body = gain @ self.offset(other, now), self.body(now)
+        turned = so3.exp(np.ascontiguousarray(step[TURN])) @ body.rotation
+        place, spread = Transform(turned, body.translation + step[PLACE]), grown - gain @ grown
+        return carried_pose(now, place, 0.5 * (spread + spread.T), axes)
+
+    def of_transform(self, grown: Array, now: Odometry) -> Array:
+        """Covariance (6,6) of the odometry's origin in the map, from that of the body."""
+        return _moved(grown, self.map_from_odom.translation - self.body(now).translation)
+
+
+def carried_pose(
+    now: Odometry, map_from_body: Transform, covariance: Array, axes: list[int]
+) -> CarriedPose:
+    """The pose of a body, of which odometry says where it has it now."""
+    two_d, own = len(axes) == 3, np.ix_(axes, axes)
+    kept = np.zeros((6, 6))
+    kept[own] = covariance[own]
+    return CarriedPose(now, corrected(map_from_body, now.odom_from_body, two_d=two_d), kept)
+
+
+def corrected(map_from_body: Transform, odom_from_body: Transform, *, two_d: bool) -> Transform:
+    """``map_from_odom`` by which odometry has the body where it is in the map.
+
+    Args:
+        two_d: its z, roll and pitch are zero; then the body has its x and y, and the heading of
+            odometry is turned about z only.
+    """
+    whole = map_from_body @ odom_from_body.inverse()
+    if not two_d:
+        return whole
+    yaw = math.atan2(
+        whole.rotation[1, 0] - whole.rotation[0, 1], whole.rotation[0, 0] + whole.rotation[1, 1]
+    )
+    rotation = so3.exp(np.array([0.0, 0.0, yaw]))
+    translation = map_from_body.translation - rotation @ odom_from_body.translation
+    return Transform(rotation, translation * np.array([1.0, 1.0, 0.0]))
+
+
+def _moved(covariance: Array, way: Array) -> Array:
+    """Covariance (6,6) of a pose whose origin lies this way (3,) from the other's, map axes."""
+    jacobian = np.eye(6)
+    jacobian[PLACE, TURN] = -so3.hat(way)
+    moved: Array = jacobian @ covariance @ jacobian.T
+    return moved
+
+
+def far(offset: Array) -> str:
+    """An offset, or deviations (6,), in words."""
+    place, turn = np.linalg.norm(offset[PLACE]), np.linalg.norm(offset[TURN])
+    metres = f"{100.0 * place:.2g} cm" if place < 0.995 else f"{place:.2g} m"
+    return f"{metres}, {math.degrees(float(turn)):.2g} deg"

@@ -1,0 +1,132 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Who else broadcasts a transform that the node sends, and frames that have two parents."""
+
+import threading
+from collections import OrderedDict
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.reasons import Notice
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.transforms import Transform, TransformError, read_transform
+from rs_localizer.pipeline.carried_pose import far
+from rs_localizer.pipeline.map_to_odom import Decision
+from rs_localizer.pipeline.published import Broadcast
+
+# Our own come back from TF within this many.
+_REMEMBERED = 1000
+# So many deviations away nobody says the same as we: not we before a restart, nor a recording.
+_DEVIATIONS = 5.0
+Link = tuple[str, str]  # parent and child
+
+
+class Rivals:
+    """Hears the transforms on TF; all methods may be called from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sent: OrderedDict[tuple[int, tuple[float, ...]], None] = OrderedDict()
+        self._first_ns: int | None = None
+        self._own: set[Link] = set()
+        self._parents: dict[str, tuple[str, str]] = {}  # by child: the last one, the one before
+        self._static: dict[str, str] = {}  # parents of those that are, by child
+        self.static: dict[str, str] = {}
+        """What contradicts for ever, by notice."""
+
+    def parent(self, item: Broadcast) -> str:
+        """The parent that others give this child; its own where nobody does."""
+        with self._lock:
+            return self._parents.get(item.child, (item.parent, ""))[0]
+
+    def send(self, message: Any) -> None:
+        """Remember a TransformStamped that is sent."""
+        with self._lock:
+            self._own.add(_link(message))
+            self._sent[stamp_ns(message), _numbers(message)] = None
+            if self._first_ns is None:
+                self._first_ns = stamp_ns(message)
+            while len(self._sent) > _REMEMBERED:
+                self._sent.popitem(last=False)
+
+    def hear(self, message: Any, decision: Decision | None, *, static: bool) -> dict[str, str]:
+        """What is wrong with a TransformStamped that has come, by notice.
+
+        Args:
+            message: it.
+            decision: on ``map -> odom``, if that is what is sent.
+            static: whether it is on ``/tf_static``.
+        """
+        with self._lock:
+            link = _link(message)
+            if link in self._own:
+                text = self._rival(message, link, decision, static)
+            else:
+                text = self._two_parents(*link, static)
+        if not text:
+            return {}
+        found = {Notice.SECOND_BROADCASTER: text}
+        self.static |= found if static else {}
+        return found
+
+    def _rival(self, message: Any, link: Link, decision: Decision | None, static: bool) -> str:
+        if (stamp_ns(message), _numbers(message)) in self._sent:
+            return ""
+        try:
+            theirs = read_transform(message.transform)
+        except TransformError:
+            return ""
+        other = f"another node broadcasts {link[0]} -> {link[1]}, too"
+        if decision is None or (ours := decision.map_from_odom) is None:
+            return other if static else ""
+        if not static and stamp_ns(message) <= (self._first_ns or 0):
+            return ""  # of the node before its restart
+        off, spread = _offset(ours, theirs, decision), decision.covariance
+        assert spread is not None
+        allowed = [np.sqrt(spread[part, part].trace()) for part in _PARTS]
+        lengths = [np.linalg.norm(off[part]) for part in _PARTS]
+        if not static and all(np.array(lengths) <= np.multiply(_DEVIATIONS, allowed)):
+            return ""
+        return f"{other}: {_said(theirs)} instead of {_said(ours)}, which moves the body {far(off)}"
+
+    def _two_parents(self, parent: str, child: str, static: bool) -> str:
+        """A child that goes to and fro, or that is static below two."""
+        last, before = self._parents.setdefault(child, (parent, ""))
+        fixed = self._static.get(child, parent)
+        if static:
+            self._static[child] = parent
+        if parent == last:
+            return ""
+        self._parents[child] = parent, last
+        if parent != before and not (static and fixed != parent):
+            return ""
+        return f"TF frame {child!r} has two parents, {last!r} and {parent!r}"
+
+
+_PARTS = (slice(0, 3), slice(3, 6))
+
+
+def _offset(ours: Transform, theirs: Transform, decision: Decision) -> Any:
+    """From where our transform has the body to where theirs has it: (6,) m, rad."""
+    newest = decision.state.newest
+    odom = Transform(np.eye(3), np.zeros(3)) if newest is None else newest.odom_from_body
+    here, there = ours @ odom, theirs @ odom
+    turn = so3.log(np.ascontiguousarray(there.rotation @ here.rotation.T))
+    return np.concatenate([there.translation - here.translation, turn])
+
+
+def _said(transform: Transform) -> str:
+    x, y, z = transform.translation
+    yaw = np.degrees(np.arctan2(transform.rotation[1, 0], transform.rotation[0, 0]))
+    return f"({x:.2f}, {y:.2f}, {z:.2f}) m, {yaw:.0f} deg"
+
+
+def _link(message: Any) -> Link:
+    return (message.header.frame_id.removeprefix("/"), message.child_frame_id.removeprefix("/"))
+
+
+def _numbers(message: Any) -> tuple[float, ...]:
+    t, q = message.transform.translation, message.transform.rotation
+    return (t.x, t.y, t.z, q.x, q.y, q.z, q.w)
