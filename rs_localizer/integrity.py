@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Am I lost? The probability that a pose lies outside its region, or the map is another one.
+"""Am I lost? The probability that a pose lies outside its 99.9 % region.
 
 A frame shows it by what a right pose in the right map does not leave: outliers that lie together
 instead of everywhere, and are the same landmarks in the next frame, inliers in a part of what is
@@ -10,8 +10,9 @@ odds is a logistic regression's over sequences in right maps and in wrong ones
 a hidden Markov chain of two states, and calibrated (Platt, "Probabilistic outputs for support
 vector machines", 1999) where two frames in a hundred are wrong.
 
-What no image shows it does not know: a room that has been moved as a whole, or a wall that is
-another one's copy while nothing else is seen.
+What no image shows it does not know: a room that had been moved as a whole before the first frame,
+or a wall that is another one's copy while nothing else is seen. Landmarks that are gone make no
+pose wrong: :attr:`Integrity.stale` tells which they are.
 """
 
 import math
@@ -28,10 +29,11 @@ from rs_localizer.estimation.residuals import likeness
 
 NAMES = (
     "share", "together", "apart", "persists", "spread", "filled", "count", "innovation", "searched",
+    "lasting",
 )  # fmt: skip
 """Of the numbers of a frame."""
 # Of the regression: constant, then those of NAMES.
-WEIGHTS = np.array([1.363, -0.855, 0.011, 0.365, 0.845, -4.351, -0.551, -0.653, 0.781, 1.253])
+WEIGHTS = np.array([1.363, -0.855, 0.011, 0.365, 0.845, -4.351, -0.551, -0.653, 0.781, 1.253, 0.0])
 # How much of a frame's odds count beside those of the frames before; chances per frame that a right
 # track goes wrong, and that a wrong one is right again; of a first pose. By likelihood, as WEIGHTS.
 TEMPER, GOES_WRONG, RECOVERS, FIRST = 0.4, 0.001, 0.3, 0.02
@@ -41,6 +43,8 @@ CALIBRATION = (-0.128, 0.788)
 _NEIGHBOURS, _MOST = 4, 200
 # Makes one number of a landmark's place, which no other place shares to the last bit.
 _KEY = np.sqrt([2.0, 3.0, 5.0])
+# A landmark that is there is never matched with this probability, of all that a map shows in a day.
+_BY_CHANCE, _MOST_LANDMARKS = 1e-8, 20_000
 # What the least certain number may say, in odds.
 _MOST_ODDS = 8.0
 
@@ -89,22 +93,65 @@ def _innovation(estimate: Estimate, prior: Prior) -> float:
     return min(math.log1p(float(off @ np.linalg.solve(spread, off)) / 6.0), 6.0)
 
 
+def _keys(points: Array) -> Array:
+    """One number (n,) of each landmark's place (n,3)."""
+    keys: Array = (points * _KEY).sum(axis=1)
+    return keys
+
+
+class SeenLandmarks:
+    """How often landmarks were seen, and how often they were matched."""
+
+    def __init__(self) -> None:
+        self._keys = np.zeros(0)  # sorted
+        self._counts = np.zeros((0, 2))  # seen, kept
+
+    def add(self, keys: Array, kept: BoolArray) -> None:
+        """Count the landmarks of a frame."""
+        new, first = np.unique(keys, return_index=True)
+        known = np.union1d(self._keys, new)
+        counts = np.zeros((len(known), 2))
+        counts[np.searchsorted(known, self._keys)] = self._counts
+        place = np.searchsorted(known, new)
+        counts[place] += np.stack([np.ones(len(new)), kept[first]], axis=1)
+        if len(known) > _MOST_LANDMARKS:  # those that are not in view
+            keep = np.isin(known, new)
+            known, counts = known[keep], counts[keep]
+        self._keys, self._counts = known, counts
+
+    def stale(self, keys: Array) -> BoolArray:
+        """Which of these were never matched, though others are far too often for a chance."""
+        if not len(self._keys):
+            return np.zeros(len(keys), np.bool_)
+        seen, kept = self._counts.T
+        missed = 1.0 - kept.sum() / seen.sum()
+        never = (kept == 0) & (missed**seen < _BY_CHANCE)
+        place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        found: BoolArray = never[place] & (self._keys[place] == keys)
+        return found
+
+
 class Integrity:
     """The chance that a track is wrong, frame by frame."""
 
     def __init__(self) -> None:
+        self._seen = SeenLandmarks()
         self.reset()
 
     def reset(self) -> None:
-        """The next frame is the first."""
+        """The next frame is the first; landmarks stay what they are."""
         self._wrong = FIRST
         # Keys of the last frame's landmarks, in their order, and whether they were inliers
         self._kept = np.zeros(0), np.zeros(0, np.bool_)
 
+    def stale(self, points: ArrayLike) -> BoolArray:
+        """Which of these landmarks (n,3) were often seen and never matched, as no chance leaves."""
+        return self._seen.stale(_keys(np.asarray(points, float)))
+
     def numbers(
         self, estimate: Estimate, points: ArrayLike, pixels: ArrayLike, prior: Prior | None
     ) -> Array:
-        """The numbers (9,) of the next frame, in the order of ``NAMES``.
+        """The numbers (10,) of the next frame, in the order of ``NAMES``.
 
         Args:
             estimate: of the frame.
@@ -119,18 +166,20 @@ class Integrity:
         share = math.log((inliers + 1.0) / (len(kept) - inliers + 1.0))
         own = residuals[kept]
         filled = float(np.mean(own > 0.5 * max(own.max(), 1e-9))) if inliers else 1.0
-        together = _together(every, kept)
+        together, persists = _together(every, kept), self._persists(every, kept)
+        outliers = 1.0 / (1.0 + math.exp(share))
         return np.array(
             [
                 share,
                 together,
-                together / (1.0 + math.exp(share)),  # of few outliers, as of a person, less
-                self._persists(every, kept),
+                together * outliers,  # of few outliers, as of a person, less
+                persists,
                 _spread(seen[kept], seen),
                 filled,
                 math.log(max(inliers - 6.0, 1.0)),
                 0.0 if prior is None else _innovation(estimate, prior),
                 0.0 if estimate.tracked else 1.0,
+                persists * outliers,  # of few, as of landmarks that are gone, less
             ]
         )
 
@@ -139,7 +188,8 @@ class Integrity:
 
         Chance matches are others in each frame; landmarks that have been moved are always off.
         """
-        keys = (points * _KEY).sum(axis=1)
+        keys = _keys(points)
+        self._seen.add(keys, kept)
         order = np.argsort(keys)
         (before, was_kept), self._kept = self._kept, (keys[order], kept[order])
         counts = np.ones((2, 2))  # before, now

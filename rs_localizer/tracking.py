@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration, RefinementKind
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, instance
+from rs_localizer.core.arrays import Array, BoolArray, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
@@ -197,6 +197,10 @@ class Tracker:
     def inertial(self) -> InertialStatus | None:
         """What became of the gyroscope; None without one."""
         return None if self._aid is None else self._aid.status
+
+    def stale(self, points: ArrayLike) -> BoolArray:
+        """Which landmarks (n,3) of a camera alone have often been seen, and never matched."""
+        return self._integrity.stale(points)
 
     def mount(self, rig: Rig) -> None:
         """Localize with the same cameras where they are now; the rig's axes stay the same."""

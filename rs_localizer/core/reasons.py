@@ -77,6 +77,7 @@ class Notice(StrEnum):
     PRIOR_REFUSED = "prior_refused"
     POSE_GIVEN = "pose_given"
     DOUBTFUL = "doubtful"
+    STALE_LANDMARKS = "stale_landmarks"
     READOUT_TIME = "readout_time"
     LENS = "lens"
     EXTRINSICS = "extrinsics"

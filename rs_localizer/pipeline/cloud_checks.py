@@ -4,6 +4,7 @@
 
 import numpy as np
 
+from rs_localizer.core.arrays import BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.clouds import Correspondences
@@ -46,3 +47,22 @@ def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[
             f"camera_info, as ({u:.0f}, {v:.0f}): are both of the same camera and resolution?"
         )
     return notices
+
+
+# So many landmarks are named.
+_NAMED = 12
+
+
+def stale_landmarks(cloud: Correspondences, gone: BoolArray) -> str:
+    """A sentence that names the points that are gone from a map; empty where none is."""
+    if not gone.any():
+        return ""
+    rows = np.flatnonzero(gone)
+    if "id" in (cloud.table.dtype.names or ()):
+        names = [str(name) for name in np.unique(cloud.table["id"][rows])]
+    else:
+        names = [
+            f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in np.unique(cloud.points[rows], axis=0)
+        ]
+    listed = ", ".join(names[:_NAMED]) + (" ..." if len(names) > _NAMED else "")
+    return f"{len(names)} landmarks in view are often seen and never matched: {listed}"

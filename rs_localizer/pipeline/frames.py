@@ -48,7 +48,7 @@ from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, MAP_POINTS
 from rs_localizer.io.transforms import Transform, TransformError, Transforms, TransformTree
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline import what_fits
-from rs_localizer.pipeline.cloud_checks import oddities
+from rs_localizer.pipeline.cloud_checks import oddities, stale_landmarks
 from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
 from rs_localizer.pipeline.imu_readings import ImuInput, inertial_settings
 from rs_localizer.pipeline.inputs import INPUTS
@@ -593,6 +593,8 @@ class FrameLocalizer:
         if result.integrity > DOUBTFUL:
             text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
             self._notice(Notice.DOUBTFUL, text)
+        elif said := stale_landmarks(cloud, self._tracker.stale(cloud.points)):
+            self._notice(Notice.STALE_LANDMARKS, said)
         if result.left_out:
             self._notice(Notice.DOUBTFUL, result.left_out)
         if not len(result.shake):  # vibration moves points smoothly, too

@@ -273,7 +273,7 @@ def test_rviz_shows_what_the_node_publishes():
         if "Topic" in item
     }
     assert shown.items() <= SENT.items()
-    assert len(shown) == 7
+    assert len(shown) == 8
     assert "rviz_default_plugins/TF" in [item["Class"] for item in displays]
 
 

@@ -70,7 +70,7 @@ _MOTION = tuple(name for name in TYPES if name != INLIERS)
 _ODD = (
     "map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "no_images",
     "lens", "clock", "bad_imu", "map_scale", "map_jumped", "two_publishers", "doubtful",
-    "would_fit", "second_broadcaster",
+    "would_fit", "second_broadcaster", "stale_landmarks",
 )  # fmt: skip
 
 
