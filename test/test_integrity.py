@@ -8,7 +8,7 @@ import numpy as np
 
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.integrity import Integrity
+from rs_localizer.integrity import Integrity, SeenLandmarks
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform([-3.0, -3.0, 3.0], [3.0, 3.0, 9.0], (120, 3))
@@ -58,3 +58,25 @@ def test_doubt_falls_again():
     assert doubts[-1] < 0.05
     judge.reset()
     assert judge.add(judge.numbers(estimate(anywhere()), POINTS, PIXELS, None)) < 0.1
+
+
+def test_landmarks_that_are_never_matched_are_named_and_no_others():
+    """Half of the matches are wrong by chance; five landmarks are gone."""
+    judge, gone = Integrity(), np.arange(120) < 5
+    for i in range(60):
+        kept = (RNG.random(120) < 0.5) & ~gone
+        judge.numbers(estimate(kept, i > 0), POINTS, PIXELS, None)
+        if i == 5:
+            assert not judge.stale(POINTS).any()  # six misses of half say nothing
+    assert np.array_equal(judge.stale(POINTS), gone)
+    judge.reset()
+    assert np.array_equal(judge.stale(POINTS[::-1]), gone[::-1])
+    assert not judge.stale(POINTS + 1.0).any()
+
+
+def test_a_landmark_that_has_been_matched_once_is_there():
+    seen, keys = SeenLandmarks(), np.arange(10.0)
+    assert not seen.stale(keys).any()
+    for i in range(100):
+        seen.add(keys, (keys > 1) | ((keys == 0) & (i == 50)))
+    assert np.flatnonzero(seen.stale(keys)).tolist() == [1]

@@ -1,27 +1,28 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A live node on a robot: TF while nobody sees the map, and odometry at a rate of its own.
+"""A live node on a robot: TF while nobody sees the map, in wrong maps, carried, and clicked at.
 
     python -m benchmarks.load.robot occlusions     # four minutes
+    python -m benchmarks.load.robot trouble        # five: wrong maps, kidnapping, clicks, a rival
     python -m benchmarks.load.robot rate --rate 200
 
 A robot drives in circles at 0.5 m/s through a simulated room, in real time: 30 images a second
 (100 points, 0.7 px, 20 % wrong; they arrive 45 ms after their stamps), odometry at 50 Hz that
 drifts. In occlusions images have five points. Fifty times a second somebody looks up ``map ->
-base_link`` of 50 ms before.
+base_link`` of 50 ms before, and compares its error with what ``~/map_to_odom`` claims.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import heapq
 import importlib
 import importlib.util
 import math
 import os
 import random
-import re
 import sys
 import tempfile
 import time
@@ -32,7 +33,7 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.time import Time
 
@@ -40,9 +41,9 @@ from benchmarks.load.measuring import cpu_time
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.messages import make_quaternion, make_vector, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_correspondences
-from rs_localizer.io.transforms import Transform, make_transform, read_transform
+from rs_localizer.io.transforms import Transform, from_numbers, make_transform, read_transform
 from rs_localizer.ros.graph.live import LiveNode
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.tools.simulation.scene import room
@@ -61,7 +62,20 @@ _START, _CLEAR = 12.0, 5.0  # s with a view: at first, and after each occlusion
 OCCLUSIONS = (0.3, 0.3, 0.3, 2.0, 2.0, 30.0)
 # Of odometry: error of the way, as a part of it, and of the heading, rad/s.
 DRIFTS = ((0.03, 0.005), (0.0, 0.02), (-0.1, 0.0))
-_HOLDING = re.compile(r"holding for (\S+) s, (\S+) cm, (\S+) deg")
+WRONG = tuple((share, metres) for share in (0.2, 0.4, 0.6, 0.8) for metres in (0.1, 0.5, 3.0))
+_WRONG, _RIGHT = 6.0, 3.0  # s in a wrong map, and in the right one again
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """What goes on around a robot, by the time since its start."""
+
+    seconds: float
+    occluded: Callable[[float], bool] = lambda _: False
+    moved: Callable[[float], tuple[float, float]] = lambda _: (0.0, 0.0)  # share of landmarks, m
+    carried: Callable[[float], float] = lambda _: 0.0  # m to the side
+    clicks: tuple[tuple[float, float], ...] = ()  # when, and how far (m) from the truth
+    rival: tuple[float, float] = (math.inf, math.inf)  # from when until when AMCL runs beside it
 
 
 class Drive:
@@ -69,8 +83,8 @@ class Drive:
 
     radius, speed, height = 2.0, 0.5, 0.5
 
-    def __init__(self, seconds: float) -> None:
-        self.start_ns, self.seconds = 0, seconds
+    def __init__(self, seconds: float, carried: Callable[[float], float] = lambda _: 0.0) -> None:
+        self.start_ns, self.seconds, self.carried = 0, seconds, carried
 
     @property
     def intervals_ns(self) -> list[tuple[int, int]]:
@@ -80,6 +94,7 @@ class Drive:
         """map_from_body, so many s after the start."""
         angle = time * self.speed / self.radius
         place = self.radius * np.array([math.sin(angle), 1.0 - math.cos(angle), 0.0])
+        place[1] -= self.carried(time)
         return Transform(so3.exp(np.array([0.0, 0.0, angle])), place)
 
     def state(self, stamp_ns: int, offsets: Array) -> TrueState:
@@ -112,6 +127,11 @@ class Looked:
     found: Transform | None
     off: float = math.nan  # m
     turned: float = math.nan  # rad
+    claimed: float = math.nan  # m, standard deviation of ``off``
+
+    @property
+    def ratio(self) -> float:
+        return self.off / self.claimed
 
 
 @dataclass(slots=True)
@@ -119,7 +139,7 @@ class Heard:
     """What the node said."""
 
     looks: list[Looked] = field(default_factory=list)
-    claims: list[tuple[float, float, float, float]] = field(default_factory=list)
+    values: list[tuple[float, int, dict[str, str]]] = field(default_factory=list)  # level
     odometry: list[tuple[int, float, Array]] = field(default_factory=list)  # stamp, heard, place
     cpu: float = math.nan
 
@@ -133,11 +153,9 @@ def _tf2_ros() -> Iterator[Any]:
     yield importlib.import_module("tf2_ros")
 
 
-def driven(
-    seconds: float, drift: tuple[float, float], occluded: Callable[[float], bool], **settings: Any
-) -> Heard:
+def driven(trouble: Trouble, drift: tuple[float, float], **settings: Any) -> Heard:
     """What is heard of a node on such a drive."""
-    drive, heard = Drive(seconds), Heard()
+    drive = Drive(trouble.seconds, trouble.carried)
     world = room(sampled_states(drive, 0.5).positions, np.random.default_rng(0), count=20_000)
     frames = list(simulate_frames(CAMERA, drive, world, FrameSettings(100, 0.7, 0.2), seed=1))
     with _tf2_ros() as tf2, tempfile.TemporaryDirectory() as place:
@@ -148,93 +166,134 @@ def driven(
         }  # fmt: skip
         with LiveNode({**own, **settings}, log, 0) as live:
             live.wait(lambda _: None)
-            _drive(live, tf2, _Run(drive, drift, occluded, frames, heard))
-    return heard
+            around = _Around(live, tf2, drive, drift, trouble)
+            around.play(frames)
+    return around.heard
 
 
-@dataclass(frozen=True, slots=True)
-class _Run:
-    drive: Drive
-    drift: tuple[float, float]
-    occluded: Callable[[float], bool]
-    frames: Sequence[SimulatedFrame]
-    heard: Heard
+class _Around:
+    """What is around a live node: it sends, looks, and keeps what it hears."""
 
+    def __init__(
+        self, live: LiveNode, tf2: Any, drive: Drive, drift: tuple[float, float], trouble: Trouble
+    ) -> None:
+        self._live, self._drive, self._drift, self._trouble = live, drive, drift, trouble
+        self._missing = tf2.TransformException
+        self.heard = Heard()
+        self._sure: tuple[Array, Array] | None = None  # the last ~/map_to_odom: turn, covariance
+        self._base_ns = 0
+        node, own = live._node, f"{live.namespace}/rs_localizer"
+        self._moving = tf2.TransformBroadcaster(node)
+        self._fixed = tf2.StaticTransformBroadcaster(node)
+        self._buffer = tf2.Buffer()
+        self.listener = tf2.TransformListener(self._buffer, node)
+        kind = PoseWithCovarianceStamped
+        node.create_subscription(Odometry, f"{own}/odometry", self._take_odometry, 100)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._take_status, 10)
+        node.create_subscription(kind, f"{own}/map_to_odom", self._take_sure, 100)
+        self._clicked = node.create_publisher(kind, f"{live.namespace}/initialpose", 10)
 
-def _drive(live: LiveNode, tf2: Any, run: _Run) -> None:
-    node, heard, drive = live._node, run.heard, run.drive
-    moving, fixed = tf2.TransformBroadcaster(node), tf2.StaticTransformBroadcaster(node)
-    buffer = tf2.Buffer()
-    listener = tf2.TransformListener(buffer, node)
-    camera = Transform(BODY_FROM_CAMERA["forward_left_up"], np.array([0.0, 0.0, drive.height]))
-    fixed.sendTransform(_stamped(0, "base_link", CAMERA_FRAME, camera))
-    base_ns = time.time_ns() + 1_000_000_000
+    def play(self, frames: Sequence[SimulatedFrame]) -> None:
+        """Drive."""
+        camera = BODY_FROM_CAMERA["forward_left_up"], np.array([0.0, 0.0, self._drive.height])
+        self._fixed.sendTransform(_stamped(0, "base_link", CAMERA_FRAME, Transform(*camera)))
+        self._base_ns = time.time_ns() + 1_000_000_000
+        image = functools.partial(self._send_image, frames)
+        rates = (
+            (_ODOMETRY, self._send_odometry, 0.0), (_IMAGES, image, _ARRIVAL),
+            (_LOOKUPS, self._look, 0.011), (20.0, self._send_rival, 0.003),
+        )  # fmt: skip
+        events: list[tuple[float, int, Callable[[float], None]]] = []
+        for order, (hertz, act, delay) in enumerate(rates):
+            count = int((self._drive.seconds - 0.2) * hertz)
+            events += [(k / hertz + delay, order, act) for k in range(count)]
+        for when, metres in self._trouble.clicks:
+            events.append((when, len(rates), functools.partial(self._click, metres)))
+        heapq.heapify(events)
+        used, begun = cpu_time(self._live.pid), time.monotonic()
+        while events:
+            at, _, due = heapq.heappop(events)
+            while (left := at - self._since()) > 0.0:
+                self._live._executor.spin_once(timeout_sec=left)
+            due(at)
+        self.heard.cpu = (cpu_time(self._live.pid) - used) / (time.monotonic() - begun)
+        self.listener.unregister()
 
-    def take_odometry(message: Odometry) -> None:
-        p = message.pose.pose.position
-        heard.odometry.append((stamp_ns(message) - base_ns, _since(), np.array([p.x, p.y, p.z])))
+    def _since(self) -> float:
+        return 1e-9 * (time.time_ns() - self._base_ns)
 
-    def take_status(message: DiagnosticArray) -> None:
+    def _stamp(self, at: float) -> int:
+        return self._base_ns + round(1e9 * at)
+
+    def _take_odometry(self, message: Odometry) -> None:
+        p, stamp = message.pose.pose.position, stamp_ns(message) - self._base_ns
+        self.heard.odometry.append((stamp, self._since(), np.array([p.x, p.y, p.z])))
+
+    def _take_status(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            values = {item.key: item.value for item in status.values}
-            said = _HOLDING.search(values.get("Correction of odometry", ""))
-            last = next((look for look in reversed(heard.looks) if look.found), None)
-            if said and last:
-                seconds, claimed = float(said[1]), 0.01 * float(said[2])
-                heard.claims.append((_since(), seconds, claimed, last.off))
+            values = {item.key: item.value for item in status.values} | {"": status.message}
+            self.heard.values.append((self._since(), status.level[0], values))
 
-    def _since() -> float:
-        return 1e-9 * (time.time_ns() - base_ns)
+    def _take_sure(self, message: PoseWithCovarianceStamped) -> None:
+        q = message.pose.pose.orientation
+        turn = from_numbers((0.0, 0.0, 0.0), (q.x, q.y, q.z, q.w)).rotation
+        self._sure = turn, np.array(message.pose.covariance).reshape(6, 6)
 
-    def send_odometry(at: float) -> None:
-        stamp = base_ns + round(1e9 * at)
-        odom = drive.odometry(at, run.drift)
-        moving.sendTransform(_stamped(stamp, "odom", "base_link", odom))
+    def _claimed(self, when: float) -> float:
+        """Standard deviation (m) of the body's place, as ``~/map_to_odom`` has it."""
+        if self._sure is None:
+            return math.nan
+        (turn, covariance), jacobian = self._sure, np.eye(6)
+        jacobian[:3, 3:] = -so3.hat(turn @ self._drive.odometry(when, self._drift).translation)
+        return math.sqrt((jacobian @ covariance @ jacobian.T)[:3, :3].trace())
 
-    def send_image(at: float) -> None:
-        frame = run.frames[round((at - _ARRIVAL) * _IMAGES)]
-        stamp = base_ns + frame.stamp_ns
-        kept = slice(_FEW if run.occluded(1e-9 * frame.stamp_ns) else None)
-        live.send(make_camera_info(CAMERA, stamp), make_correspondences(
-            stamp, frame.points[kept], frame.pixels[kept], frame.ids[kept]
+    def _send_odometry(self, at: float) -> None:
+        odom = self._drive.odometry(at, self._drift)
+        self._moving.sendTransform(_stamped(self._stamp(at), "odom", "base_link", odom))
+
+    def _send_image(self, frames: Sequence[SimulatedFrame], at: float) -> None:
+        frame = frames[round((at - _ARRIVAL) * _IMAGES)]
+        stamp, when = self._base_ns + frame.stamp_ns, 1e-9 * frame.stamp_ns
+        kept = slice(_FEW if self._trouble.occluded(when) else None)
+        share, metres = self._trouble.moved(when)
+        hit = frame.ids * 0.618034 % 1.0 < share  # always the same ones, all over the room
+        points = frame.points + np.outer(hit, [metres, 0.0, 0.0])
+        self._live.send(make_camera_info(CAMERA, stamp), make_correspondences(
+            stamp, points[kept], frame.pixels[kept], frame.ids[kept]
         ))  # fmt: skip
 
-    def look(at: float) -> None:
+    def _look(self, at: float) -> None:
         when = at - _BEFORE
-        stamp = Time(nanoseconds=base_ns + round(1e9 * when))
+        stamp = Time(nanoseconds=self._stamp(when))
         try:
-            buffer.lookup_transform("odom", "base_link", stamp)
-        except tf2.TransformException:
+            self._buffer.lookup_transform("odom", "base_link", stamp)
+        except self._missing:
             return  # odometry itself has not come yet
         try:
-            item = buffer.lookup_transform("map", "base_link", stamp)
-        except tf2.TransformException:
-            heard.looks.append(Looked(when, None))
+            item = self._buffer.lookup_transform("map", "base_link", stamp)
+        except self._missing:
+            self.heard.looks.append(Looked(when, None))
             return
-        found, truth = read_transform(item.transform), drive.body(when)
+        found, truth = read_transform(item.transform), self._drive.body(when)
         turn = so3.log(np.ascontiguousarray(found.rotation.T @ truth.rotation))
         off = float(np.linalg.norm(found.translation - truth.translation))
-        heard.looks.append(Looked(when, found, off, float(np.linalg.norm(turn))))
+        turned = float(np.linalg.norm(turn))
+        self.heard.looks.append(Looked(when, found, off, turned, self._claimed(when)))
 
-    node.create_subscription(
-        Odometry, f"{live.namespace}/rs_localizer/odometry", take_odometry, 100
-    )
-    node.create_subscription(DiagnosticArray, "/diagnostics", take_status, 10)
-    events: list[tuple[float, int, Callable[[float], None]]] = []
-    for kind, (hertz, act, delay) in enumerate((
-        (_ODOMETRY, send_odometry, 0.0), (_IMAGES, send_image, _ARRIVAL), (_LOOKUPS, look, 0.011),
-    )):  # fmt: skip
-        count = int((drive.seconds - 0.2) * hertz)
-        events += [(k / hertz + delay, kind, act) for k in range(count)]
-    heapq.heapify(events)
-    used, begun = cpu_time(live.pid), time.monotonic()
-    while events:
-        at, _, due = heapq.heappop(events)
-        while (left := at - _since()) > 0.0:
-            live._executor.spin_once(timeout_sec=left)
-        due(at)
-    heard.cpu = (cpu_time(live.pid) - used) / (time.monotonic() - begun)
-    listener.unregister()
+    def _click(self, metres: float, at: float) -> None:
+        here = self._drive.body(at)
+        place = Transform(here.rotation, here.translation + np.array([metres, 0.0, 0.0]))
+        message = PoseWithCovarianceStamped()
+        message.header = _stamped(self._stamp(at), "map", "", place).header
+        message.pose.pose.position = make_vector(make_message, place.translation, "Point")
+        message.pose.pose.orientation = make_quaternion(make_message, place.rotation)
+        message.pose.covariance[[0, 7, 35]] = 0.25, 0.25, 0.0685  # as RViz gives it
+        self._clicked.publish(message)
+
+    def _send_rival(self, at: float) -> None:
+        if self._trouble.rival[0] <= at < self._trouble.rival[1]:
+            wrong = Transform(np.eye(3), np.array([4.7, 0.0, 0.0]))
+            self._moving.sendTransform(_stamped(self._stamp(at), "map", "odom", wrong))
 
 
 def _stamped(stamp: int, parent: str, child: str, transform: Transform) -> TransformStamped:
@@ -250,35 +309,35 @@ def occlusions() -> list[str]:
     rows: dict[float, list[list[float]]] = {length: [] for length in OCCLUSIONS}
     clear: list[Looked] = []
     for drift in DRIFTS:
-        heard = driven(now, drift, lambda t: any(a <= t < b for a, b in ends))
+        hidden = lambda t: any(a <= t < b for a, b in ends)  # noqa: E731
+        heard = driven(Trouble(now, occluded=hidden), drift)
         first = next(look.time for look in heard.looks if look.found)
         looks = [look for look in heard.looks if look.time > first]
         covered = [any(a <= look.time < b + _AFTER for a, b in ends) for look in looks]
         clear += [look for look, hidden in zip(looks, covered, strict=True) if not hidden]
         for (begin, end), length in zip(ends, OCCLUSIONS, strict=True):
             inside = [look for look in looks if begin <= look.time < end + _AFTER]
-            claims = [c for c in heard.claims if begin + 0.2 < c[0] < end and c[1] > 0.2]
             rows[length].append([
                 len(inside), sum(look.found is not None for look in inside),
                 100.0 * max(look.off for look in inside if look.found),
                 math.degrees(max(look.turned for look in inside if look.found)),
                 100.0 * _jump(inside, end, drift),
-                100.0 * claims[-1][2] if claims else math.nan,
-                max((c[3] / c[2] for c in claims), default=math.nan),
+                max(look.ratio for look in inside if look.found),
             ])  # fmt: skip
     answered = sum(look.found is not None for look in clear)
     farthest = max(look.off for look in clear if look.found)
+    ratio = max(look.ratio for look in clear if look.found)
     lines = [
         "| s without a view | lookups answered | largest error | jump | error over claimed |",
         "|---|---|---|---|---|",
-        f"| 0 | {answered} of {len(clear)} | {100.0 * farthest:.1f} cm | | |",
+        f"| 0 | {answered} of {len(clear)} | {100.0 * farthest:.1f} cm | | {ratio:.2f} |",
     ]
     for length, of in rows.items():
-        asked, found, off, turned, jump, _, ratio = np.array(of).T
-        over = f"{np.nanmax(ratio):.2f} at most" if np.isfinite(ratio).any() else ""
+        asked, found, off, turned, jump, ratio = np.array(of).T
         lines.append(
             f"| {length:g} ({len(of)} times) | {found.sum():.0f} of {asked.sum():.0f} "
-            f"| {off.max():.1f} cm, {turned.max():.1f} deg | {jump.max():.1f} cm | {over} |"
+            f"| {off.max():.1f} cm, {turned.max():.1f} deg | {jump.max():.1f} cm "
+            f"| {ratio.max():.2f} |"
         )
     return lines
 
@@ -294,9 +353,64 @@ def _jump(looks: Sequence[Looked], end: float, drift: tuple[float, float]) -> fl
     return float(np.linalg.norm(expected.translation - after.found.translation))
 
 
+def trouble() -> list[str]:
+    """Lines of a table: wrong maps, kidnapping, a rival, clicks, a blind start."""
+    lines = [
+        "| trouble | lookups answered | largest error | error over claimed | then |",
+        "|---|---|---|---|---|",
+    ]
+
+    def moved(time: float) -> tuple[float, float]:
+        k, since = divmod(time - _START, _WRONG + _RIGHT)
+        return WRONG[int(k)] if 0 <= k < len(WRONG) and since < _WRONG else (0.0, 0.0)
+
+    heard = driven(Trouble(_START + len(WRONG) * (_WRONG + _RIGHT), moved=moved), DRIFTS[0])
+    for k, (share, metres) in enumerate(WRONG):
+        begin = _START + k * (_WRONG + _RIGHT)
+        name = f"{share:.0%} of the landmarks off by {metres:g} m"
+        lines.append(_line(name, heard, begin, begin + _WRONG, begin + _WRONG + _RIGHT))
+    for metres, seconds, hidden in ((1.0, 1.0, False), (5.0, 4.0, False), (5.0, 4.0, True)):
+        heard = driven(Trouble(
+            _START + seconds + 5.0,
+            carried=lambda t: metres * min(max((t - _START) / seconds, 0.0), 1.0),  # noqa: B023
+            occluded=lambda t: hidden and _START <= t < _START + seconds,  # noqa: B023
+        ), DRIFTS[0])  # fmt: skip
+        name = f"carried {metres:g} m in {seconds:g} s, {'blind' if hidden else 'in view'}"
+        seen = _START + seconds + 0.2 if hidden else _START
+        lines.append(_line(name, heard, seen, _START + seconds + 2.0, _START + seconds + 4.5))
+    heard = driven(Trouble(_START + 6.0, rival=(_START, _START + 3.0)), DRIFTS[0])
+    lines.append(_line("AMCL beside it, 4.7 m off", heard, _START, _START + 3.0, _START + 5.5))
+    blind = Trouble(
+        24.0, occluded=lambda t: t < 18.0, clicks=((3.0, 0.3), (9.0, 4.0), (13.0, -0.3))
+    )
+    heard = driven(blind, DRIFTS[0])
+    lines.append(_line("blind start, a click 0.3 m off", heard, 3.3, 9.0, 9.0))
+    lines.append(_line("a click 4 m off", heard, 9.0, 13.0, 13.0))
+    lines.append(_line("a click -0.3 m off", heard, 13.3, 18.0, 23.5))
+    return lines
+
+
+def _line(name: str, heard: Heard, begin: float, end: float, after: float) -> str:
+    """One trouble: errors while it lasts, and how things are afterwards."""
+    inside = [look for look in heard.looks if begin <= look.time < end]
+    found = [look for look in inside if look.found]
+    last = [look for look in heard.looks if look.found and look.time < after]
+    levels = [(level, values) for time, level, values in heard.values if begin <= time < end + 1.0]
+    worst, values = max(levels, key=lambda it: it[0], default=(0, {}))
+    said = f"ERROR: {values[''][:70]}" if worst == 2 else ""
+    given = values.get("Last given pose", "")
+    then = f"{100.0 * last[-1].off:.1f} cm" if last else "nothing"
+    off = max((look.off for look in found), default=math.nan)
+    ratio = max((look.ratio for look in found), default=math.nan)
+    told = "; ".join(filter(None, [then, said, given]))
+    return (
+        f"| {name} | {len(found)} of {len(inside)} | {100.0 * off:.1f} cm | {ratio:.1f} | {told} |"
+    )
+
+
 def rate(hertz: float, seconds: float) -> list[str]:
     """Lines on odometry between images."""
-    heard = driven(seconds, DRIFTS[0], lambda _: False, output_rate=hertz)
+    heard = driven(Trouble(seconds), DRIFTS[0], output_rate=hertz)
     settled = heard.odometry[round(2.0 * hertz) :]
     stamps, times = (np.array([each[k] for each in settled]) for k in (0, 1))
     stamps, places = 1e-9 * stamps, np.array([each[2] for each in settled])
@@ -325,13 +439,14 @@ def main() -> None:
         prog="python -m benchmarks.load.robot", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("what", choices=("occlusions", "rate"))
+    parser.add_argument("what", choices=("occlusions", "trouble", "rate"))
     parser.add_argument("--rate", type=float, default=200.0, help="Hz")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the rate")
     args = parser.parse_args()
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(random.SystemRandom().randrange(1, 101))
-    lines = occlusions() if args.what == "occlusions" else rate(args.rate, args.seconds)
+    made = {"occlusions": occlusions, "trouble": trouble}
+    lines = rate(args.rate, args.seconds) if args.what == "rate" else made[args.what]()
     print("\n".join(lines))
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.io.clouds import Correspondences
-from rs_localizer.pipeline.cloud_checks import oddities
+from rs_localizer.pipeline.cloud_checks import oddities, stale_landmarks
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, K)
@@ -53,3 +53,18 @@ def test_pixels_of_another_resolution():
     part = Camera(640, 480, K, binning=(2, 2), roi=Roi(100, 60, 400, 300))
     found = oddities(cloud(pixel=(300.0, 100.0)), part, "camera")
     assert "2 of 2 pixels lie outside the 200 x 150" in found["pixels_outside"]
+
+
+def test_landmarks_that_are_gone_are_named():
+    both, none = np.ones(2, np.bool_), np.zeros(2, np.bool_)
+    assert stale_landmarks(cloud(), none) == ""
+    assert stale_landmarks(cloud(), both) == (
+        "2 landmarks in view are often seen and never matched: (0.00, 1.00, 2.00), "
+        "(1.00, -5.00, 3.00)"
+    )
+    table = np.zeros(40, [("id", "<u4")])
+    table["id"] = np.arange(40) // 4  # corners of markers
+    seen = Correspondences(0, "map", np.zeros((40, 3)), np.zeros((40, 2)), None, 0, table)
+    assert stale_landmarks(seen, table["id"] > 7).endswith("matched: 8, 9")
+    seen.table["id"] = np.arange(40)
+    assert stale_landmarks(seen, np.ones(40, np.bool_)).endswith(" 10, 11 ...")
