@@ -203,10 +203,10 @@ class _Case:
         if held is None or again:
             text = "taken: it came twice" if again else "taken: map -> odom begins with it"
             return replace(state, held=found, aside=None, base=None, refused=None), text
-        jump, known = held.pose.offset(found.pose, self.now), self._grown(held)
+        jump, spread = held.pose.offset(found.pose, self.now), self._grown(held)
         return replace(state, refused=found), (
             f"refused: it lies {far(jump)} from where map -> odom has the body, known to "
-            f"{far(np.sqrt(known.diagonal()))}; the same again is taken"
+            f"{far(np.sqrt(spread.diagonal()))}; the same again is taken"
         )
 
     def decision(self, said: str) -> Decision:
