@@ -190,9 +190,9 @@ def totals(judged: Mapping[str, Judged]) -> dict[str, dict[str, float]]:
             name: 100.0 * float(np.mean(hits[some])) if some.any() else np.nan
             for name, (hits, some) in _hits(joined).items()
         }
-        row[">5s"] = 100.0 * float(np.mean(far_off(joined)[joined.localized]))
-        del row["not>5s"]
         some = joined.localized
+        del row["not>5s"]
+        row[">5s"] = 100.0 * float(np.mean(far_off(joined)[some])) if some.any() else np.nan
         for name, figure in _ERRORS.items():
             row[name] = quantile(joined.of(figure)[some], 0.5)
         for name in _SHARP:

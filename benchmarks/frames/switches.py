@@ -81,7 +81,11 @@ SWITCHES: dict[str, tuple[Switch, ...]] = {
     "uncertain": (Switch("rs_localizer.localizer:uncertain", _always(None)),),
     "smooth-too-large": (Switch(_REFUSAL, _with_posterior(model_error=0.0)),),
     "near-outliers": (Switch(_REFUSAL, _with_posterior(near_outliers=0)),),
-    "own-motion": (Switch("rs_localizer.estimation.left_out:_moved", _always(LeftOut())),),
+    "own-motion": (Switch("rs_localizer.estimation.left_out:_own_motion", _always(None)),),
+    "another-matrix": (
+        Switch("rs_localizer.estimation.left_out:_of_another_lens", _always(None)),
+    ),
+    "by-chance": (Switch("rs_localizer.estimation.left_out:_by_chance", _always(None)),),
     "left-out": (Switch("rs_localizer.localizer:left_out", _always(LeftOut())),),
     # Tracking.
     "window": (Switch("rs_localizer.estimation.motion_window:LENGTH", lambda old: 2),),

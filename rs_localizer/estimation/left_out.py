@@ -2,51 +2,65 @@
 # SPDX-License-Identifier: Apache-2.0
 """Points that a motion leaves out: mismatches, or witnesses against it.
 
-Mismatches lie anywhere. Before a lens or a map that is grossly wrong a motion fits a part of the
-points, by velocities that it needs for that, and the rest is no chance: it lies near where it ought
-to, or it has a motion of its own.
+Mismatches lie anywhere. Where the points that are left out hang together, three explanations are
+weighed: another body before a camera whose world the motion shows; the same two groups the other
+way round; and one motion of all of them before a camera with another matrix than K.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, Array2, BoolArray
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.state import MOVE, TURN, step_between
+from rs_localizer.core.state import MOVE, PARAMETERS, TURN, step_between
 from rs_localizer.core.types import Failure
-from rs_localizer.estimation.observations import Observed
-from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior
+from rs_localizer.estimation.acceptance import speeding
+from rs_localizer.estimation.observations import Observations, Observed
+from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior, best_motion
+from rs_localizer.estimation.prior import add_prior
+from rs_localizer.estimation.refine import EXPECTED_NOISE, LEAST_NOISE, apply_step, solve_positive
 from rs_localizer.estimation.residuals import linearized
 from rs_localizer.estimation.searching import GLOBAL_SHUTTER_SCALE, MotionSearch
 from rs_localizer.native import entry
 
-# Three quarters of the inliers say as much as they do. Two fifths of the matches that are
-# shifted alike leave two thirds; with 0.5 they were lost, and 3 of 1,080 wrong cameras less passed.
-_SHARE = 0.75
-# Of points that lie just beyond the gate, where inliers go on: no match is shifted so.
-_NEAR_SHARE = 0.5
-# Six points have a motion whatever they are.
-_SAMPLE = 6
-# Groups that chance makes of mismatches in one frame of 1,000 (Desolneux, Moisan and Morel, IJCV
-# 2000: the number of false alarms).
+# Six points have a motion whatever they are; the corners of one marker may be misplaced in the map.
+_SAMPLE, _MARKER = 6, 4
+# Explanations that chance makes in one frame of 1,000 (Desolneux, Moisan and Morel, IJCV 2000: the
+# number of false alarms).
 _LEAST_CHANCE = -math.log(1e-3)
-# Errors of inliers from this part of the gate on are spread over it: they may go on beyond.
-_SPREAD = 0.35
+# Odds for a motion to be the world's, of two motions, from which it is published. Second bodies of
+# 40 to 45 % of 100 points leave 4.8 to 60, halves of a map that were moved mostly 1 (paired set).
+_LEAST_ODDS = 4.0
 # Beyond so many gates a point is another's.
 _ELSEWHERE = 2.0
-# Mismatches are strewn over the image: this part of them lies about its places in circles of this
-# part of the image.
-_CIRCLE = 0.1
 # How much the errors of two neighbours may differ, as a part of their distance: scales are off by
 # twice at most.
 _STRETCH = 0.5
 _MANY = 60
+# This part of mismatches at most is off as its neighbours are: by chance two in a hundred are.
+_STREWN = 0.1
 # A side of the image that has all but this part of a group.
 _ELSE = 0.1
+# Focal lengths, in parts of K's, from which another matrix is looked for: between two of them a
+# rough pose finds its points by another distance.
+_LENGTHS = (1.0, 0.7, 0.5, 1.4, 2.0)
+# Focal length and principal point, in focal lengths: K's, and what those of another image (binned,
+# a region of it) deviate by.
+_OF_K, _DEVIATIONS = np.array([1.0, 0.0, 0.0]), np.array([1.0, 0.3, 0.3])
+_LENS = len(_OF_K)
+# Deviation of a K of this very image, which errors that are smooth over it stand for. Both are as
+# probable where K is off by 0.048: the principal point of a phone is by 0.012, and of a lens of
+# which a third is missing by 0.03 (paired set).
+_USUAL = 0.01
+# Gates fall by this part from step to step, to the last one, with its steps. With 0.7 two of 72
+# wrong matrices were lost on the way.
+_NARROWER, _LAST_STEPS = 0.8, 6
 
 
 class LeftOut(NamedTuple):
@@ -54,6 +68,21 @@ class LeftOut(NamedTuple):
 
     failure: Failure | None = None
     notice: str = ""
+
+
+class _Group(NamedTuple):
+    """Points that one motion explains."""
+
+    chosen: BoolArray  # (n,)
+    state: Array  # (24,)
+    squared_errors: Array  # (n,) px^2
+
+
+class _Lens(NamedTuple):
+    """Points that one motion explains before a camera with another matrix."""
+
+    group: _Group
+    numbers: Array  # (3,) see _through
 
 
 def left_out(
@@ -64,98 +93,192 @@ def left_out(
     Args:
         posterior: of an accepted motion.
         threshold: px, of inliers.
-        known: the motion was predicted, so that a group as large is another thing.
+        known: the motion was predicted, so that the camera's matrix is right, and a group as large
+            is another thing.
     """
-    count, inliers = observed.observations.count, int(np.count_nonzero(posterior.inliers))
-    if count - inliers < _SAMPLE:
-        return LeftOut()
-    counts = math.exp(-0.5 * posterior.speeding) * inliers
-    most, least = ((1.0 if known else share) * counts for share in (_SHARE, _NEAR_SHARE))
-    near = _near(observed, posterior, threshold)
-    found = LeftOut()
-    if near < max(least, 1.0):
-        found = _moved(search, observed, posterior, threshold, most)
-        if found.failure is not None or known:  # what is matched near predictions is near them
-            return found
-        near = _not_strewn(observed, posterior)
-        if near < _SHARE * inliers:  # however fast: a few that lie near are seen from a car, too
-            return found
-    return LeftOut(Failure(
-        Reason.MODEL_ERROR,
-        f"{inliers} points fit to {posterior.noise:.2g} px (one sigma), and of the "
-        f"{count - inliers} others {near:.0f} lie so near to their places that they are no "
-        "mismatches: the calibration or the map is too far off for any pose",
-    ))  # fmt: skip
-
-
-def _moved(
-    search: MotionSearch, observed: Observed, posterior: Posterior, threshold: float, most: float
-) -> LeftOut:
-    """Oddity of points that are left out and have a motion of their own.
-
-    Args:
-        most: points that are no reason to refuse the frame.
-    """
-    inliers = int(np.count_nonzero(posterior.inliers))
+    least = 1.0 if known else _LEAST_ODDS
+    inliers = posterior.inliers
     rest = ~(posterior.squared_errors < (_ELSEWHERE * WIDEST_GATE * threshold) ** 2)
-    left = int(np.count_nonzero(rest))
-    few = left < most
-    if left <= _SAMPLE or (few and _moved_alike(observed, posterior, rest) <= _SAMPLE):
+    found, left = int(np.count_nonzero(inliers)), int(np.count_nonzero(rest))
+    failure = None if known else _by_chance(observed, posterior)
+    if failure is not None or np.count_nonzero(~inliers) < _SAMPLE:
+        return LeftOut(failure)
+    strewn = _moved_alike(observed, posterior, ~inliers) < _STREWN
+    second = None
+    if left > _SAMPLE and (not strewn or _odds(found, left, posterior.speeding) < least):
+        second = _own_motion(search, observed, rest, threshold)
+    if strewn and second is None:
         return LeftOut()
-    own = search.among(observed, rest, _SAMPLE)
-    if not own.found:
+    if not known and observed.sighted.exposure.alone:
+        failure = _of_another_lens(search, observed, posterior, second, threshold)
+        if failure is not None:
+            return LeftOut(failure)
+    if second is None:
         return LeftOut()
-    group = rest & observed.observations.within(own.state, WIDEST_GATE * threshold)
-    size = int(np.count_nonzero(group))
-    if _surprise(left, size, _chance(observed, WIDEST_GATE * threshold)) < _LEAST_CHANCE:
-        return LeftOut()
-    text = _described(observed, posterior, own.state, group)
-    text = f"{inliers} points fit one motion, and {size} of the {left} left out {text}"
-    if size < most:
+    size = int(np.count_nonzero(second.chosen))
+    where = _side(observed, inliers, second.chosen)
+    step = step_between(posterior.state, second.state)
+    turn, move = float(np.linalg.norm(step[TURN])), float(np.linalg.norm(step[MOVE]))
+    text = (
+        f"{found} points fit one motion, and {size} of the {left} left out {where}have a pose of "
+        f"their own, {math.degrees(turn):.1f} deg and {move:.2g} m away"
+    )
+    faster = max(posterior.speeding - speeding(observed, second.state), 0.0)
+    if _odds(found, size, faster) > least:
         return LeftOut(notice=f"{text}: have these points been moved, or do they move?")
     return LeftOut(Failure(
         Reason.MODEL_ERROR,
-        f"{text}: a part of the map was moved, or the calibration is grossly wrong (is K, its "
-        "binning or its region of interest that of another image?)",
+        f"{text}: which of both is the camera's? A part of the map was moved, or the calibration "
+        "is grossly wrong",
     ))  # fmt: skip
 
 
-def _chance(observed: Observed, distance: float) -> float:
-    """Chance of a mismatch to lie within a distance (px) of its place."""
-    area = min(math.prod(camera.size) for camera in observed.sighted.exposure.cameras)
-    return min(math.pi * distance**2 / area, 1.0)
+def _odds(size: int, other: int, faster: float) -> float:
+    """Odds that a group of points is the world's and another one a body's, not the other way round.
 
-
-def _near(observed: Observed, posterior: Posterior, threshold: float) -> float:
-    """How many points lie near where they ought to, though not within the gate, and not by chance;
-    0 where the inliers are apart from the others.
+    Of a body points are with an unknown chance below one half; the world has the motion that is
+    expected of the camera, by squared velocities that differ by ``faster``.
     """
-    if posterior.noise < _SPREAD * threshold:
-        return 0.0
-    distance = GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
-    others = posterior.squared_errors[~posterior.inliers]
-    near = np.count_nonzero(others < distance**2)
-    return float(near) - len(others) * _chance(observed, distance)
+    # Of the chance's posterior, a beta distribution, near a normal one from some ten points on.
+    below = 0.5 * math.erfc((other - size) / math.sqrt(2.0 * (size + other + 1.0)))
+    return below / max(1.0 - below, 1e-300) * math.exp(-0.5 * faster)
 
 
-def _not_strewn(observed: Observed, posterior: Posterior) -> float:
-    """How many of the points that are left out lie nearer to their places than mismatches, which
-    are strewn over the image; 0 where chance may do it.
+def _own_motion(
+    search: MotionSearch, observed: Observed, rest: BoolArray, threshold: float
+) -> _Group | None:
+    """The motion that more of the points left out have than chance makes, or None."""
+    own = search.among(observed, rest, _SAMPLE)
+    if not own.found:
+        return None
+    observations, gate = observed.observations, WIDEST_GATE * threshold
+    group = rest & observations.within(own.state, gate)
+    size, left = int(np.count_nonzero(group)), int(np.count_nonzero(rest))
+    chance = math.pi * gate**2 / _area(observed)
+    if _surprise(left, size, _SAMPLE, chance) < _LEAST_CHANCE:
+        return None
+    part = observations.only(np.flatnonzero(group))
+    best = best_motion(part.packed, part.count, own.state, observed.terms, threshold)
+    return _Group(group, best.state, observations.squared_errors(best.state))
+
+
+def _area(observed: Observed) -> float:
+    """Pixels of the smallest image."""
+    return float(min(math.prod(camera.size) for camera in observed.sighted.exposure.cameras))
+
+
+def _of_another_lens(
+    search: MotionSearch, observed: Observed, posterior: Posterior, second: _Group | None,
+    threshold: float,
+) -> Failure | None:  # fmt: skip
+    """Failure of a frame that another camera matrix explains better than two motions do."""
+    lens = _another_lens(search, observed, threshold)
+    if lens is None:
+        return None
+    off = lens.numbers - _OF_K
+    usual, other = off / _USUAL, off / _DEVIATIONS
+    if 0.5 * (usual @ usual - other @ other) < np.log(_DEVIATIONS / _USUAL).sum():
+        return None
+    area, count = _area(observed), observed.observations.count
+    first = _Group(posterior.inliers, posterior.state, posterior.squared_errors)
+    parts = [(first,)] if second is None else [(first,), (first, second)]
+    evidence = max(_evidence(groups, PARAMETERS * len(groups), count, area) for groups in parts)
+    if _evidence((lens.group,), PARAMETERS + _LENS, count, area) < evidence + _LEAST_CHANCE:
+        return None
+    more = np.count_nonzero(lens.group.chosen) - np.count_nonzero(first.chosen)
+    length, *shift = lens.numbers * (1.0, *[observed.assumed.focal_length] * 2)
+    return Failure(
+        Reason.MODEL_ERROR,
+        f"{np.count_nonzero(first.chosen)} points fit, and {more} more with a focal length of "
+        f"{length:.2f} times K's and a principal point {shift[0]:+.0f}, {shift[1]:+.0f} px "
+        "from K's: is K, its binning or its region of interest that of another image?",
+    )
+
+
+def _evidence(groups: tuple[_Group, ...], parameters: int, count: int, area: float) -> float:
+    """Logarithm of the evidence of groups of points, the others of so many being anywhere in an
+    image; by Schwarz's criterion.
     """
-    area = min(math.prod(camera.size) for camera in observed.sighted.exposure.cameras)
-    others = math.pi * posterior.squared_errors[~posterior.inliers] / area
-    count, inside = len(others), int(np.count_nonzero(others < _CIRCLE))
-    beyond = count - inside
-    if inside <= _CIRCLE * count:
-        return 0.0
-    surprise = inside * math.log(inside / (_CIRCLE * count))
-    if beyond:
-        surprise += beyond * math.log(beyond / ((1.0 - _CIRCLE) * count))
-    return inside - beyond * _CIRCLE / (1.0 - _CIRCLE) if surprise > _LEAST_CHANCE else 0.0
+    inside = sum(int(np.count_nonzero(group.chosen)) for group in groups)
+    freedom = max(2 * inside - parameters, 1)
+    variance = max(
+        sum(float(group.squared_errors[group.chosen].sum()) for group in groups) / freedom,
+        LEAST_NOISE**2,
+    )
+    density = inside * (math.log(2.0 * math.pi * variance) + 1.0)
+    return -density - (count - inside) * math.log(area) - 0.5 * parameters * math.log(2 * inside)
 
 
-def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> int:
-    """How many of the points that are left out are off as their nearest neighbours are.
+def _another_lens(search: MotionSearch, observed: Observed, threshold: float) -> _Lens | None:
+    """The motion of most points before a camera with another focal length and principal point."""
+    focal, last = observed.assumed.focal_length, WIDEST_GATE * threshold
+    middle = 0.5 * np.array(observed.sighted.exposure.cameras[0].size) / focal
+    most, gate, state, lens = _SAMPLE + _LENS, 0.0, np.zeros(0), np.zeros(_LENS)
+    for length, scaled in product(_LENGTHS, (False, True)):
+        tried = np.append(length, scaled * (length - 1.0) * middle)
+        start = search.rough(_through(observed, tried))
+        if start.found:
+            near = _through(observed, tried).observations.within(
+                start.state, length * GLOBAL_SHUTTER_SCALE * focal
+            )
+            if np.count_nonzero(near) > most:
+                most, state, lens = int(np.count_nonzero(near)), start.state, tried
+                gate = 2.0 * length * GLOBAL_SHUTTER_SCALE * focal
+        if most >= observed.observations.count - _SAMPLE:
+            break
+    if not len(state):
+        return None
+    left = _LAST_STEPS
+    while left:
+        gate = max(_NARROWER * gate, last)
+        left -= gate == last
+        step = _step(_through(observed, lens), state, lens, gate)
+        state, lens = apply_step(state, step[:PARAMETERS]), lens + step[PARAMETERS:]
+        if not 0.5 * min(_LENGTHS) < lens[0] < 2.0 * max(_LENGTHS):  # NaN is not, either
+            return None
+    errors = _through(observed, lens).observations.squared_errors(state)
+    chosen = errors < last**2
+    return _Lens(_Group(chosen, state, errors), lens) if np.count_nonzero(chosen) else None
+
+
+def _through(observed: Observed, lens: Array) -> Observed:
+    """The frame as a camera with another matrix saw it: its focal length in parts of K's, and how
+    far its principal point is from K's, in focal lengths (3,).
+    """
+    seen, usable = observed.observations, observed.sighted.usable
+    by_ray = lens[0] * usable.by_ray[usable.indices]
+    rays = (seen.rays - lens[1:]) / lens[0]
+    return replace(observed, observations=Observations.of(
+        seen.points, rays, seen.tau, by_ray, seen.mounts, seen.camera
+    ))  # fmt: skip
+
+
+def _step(observed: Observed, state: Array, lens: Array, gate: float) -> Array:
+    """Gauss and Newton's step (21,) of a motion and a lens, by the points within a gate."""
+    seen, usable = observed.observations, observed.sighted.usable
+    lines = linearized(seen.packed, seen.count, state, np.zeros((seen.count, 6)))
+    near = np.square(lines.errors).sum(axis=1) < gate**2  # NaN is not
+    if np.count_nonzero(near) < _SAMPLE + _LENS:
+        return np.full(PARAMETERS + _LENS, np.nan)
+    by_ray = usable.by_ray[usable.indices][near]
+    by_length = np.einsum("nij,nj->ni", by_ray, lines.image[near])[:, :, None]
+    columns = np.concatenate([lines.by_motion[near], by_length, by_ray], axis=2)
+    columns, errors = columns.reshape(-1, PARAMETERS + _LENS), lines.errors[near].ravel()
+    information, slope = columns.T @ columns, columns.T @ errors
+    known, pull = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    add_prior(observed.terms, state, (EXPECTED_NOISE * gate) ** 2, known, pull)
+    information[:PARAMETERS, :PARAMETERS] += known
+    slope[:PARAMETERS] += pull
+    for place, deviation in enumerate(_DEVIATIONS, PARAMETERS):
+        weight = (EXPECTED_NOISE * gate / deviation) ** 2
+        information[place, place] += weight
+        slope[place] += weight * (lens - _OF_K)[place - PARAMETERS]
+    step, positive = solve_positive(information, -slope)
+    return step if positive else np.full(PARAMETERS + _LENS, np.nan)
+
+
+def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> float:
+    """Part of the points that are left out that is off as its nearest neighbours are.
 
     It costs a tenth of a search, and mismatches seldom are.
     """
@@ -165,12 +288,9 @@ def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> i
     )  # fmt: skip
     some = np.flatnonzero(rest & np.isfinite(lines.errors[:, 0]))
     some = some[:: len(some) // _MANY + 1]
-    if len(some) <= _SAMPLE:
-        return len(some)
     focal = observed.assumed.focal_length
     places, rough = focal * observed.observations.rays[some], GLOBAL_SHUTTER_SCALE * focal
-    alike = as_nearest(places, lines.errors[some], rough)
-    return alike * (int(np.count_nonzero(rest)) // len(some))
+    return as_nearest(places, lines.errors[some], rough) / max(len(some), 1)
 
 
 @entry
@@ -189,24 +309,35 @@ def as_nearest(places: Array2, errors: Array2, rough: float) -> int:
     return alike
 
 
-def _surprise(total: int, size: int, chance: float) -> float:
-    """Negative logarithm of how many groups of a size chance makes of so many mismatches."""
-    if size <= _SAMPLE:
+def _surprise(total: int, size: int, sample: int, chance: float) -> float:
+    """Negative logarithm of how many groups of a size, of which a sample has a motion whatever it
+    is, chance makes of so many mismatches.
+    """
+    if size <= sample:
         return 0.0
 
     def choices(n: int, k: int) -> float:
         return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
 
-    free = size - _SAMPLE
-    return -(choices(total, size) + choices(size, _SAMPLE) + free * math.log(chance))
+    return -(choices(total, size) + choices(size, sample) + (size - sample) * math.log(chance))
 
 
-def _described(observed: Observed, posterior: Posterior, state: Array, group: BoolArray) -> str:
-    """Place of a group of points, and how far away its own pose is."""
-    step = step_between(posterior.state, state)
-    turn, move = float(np.linalg.norm(step[TURN])), float(np.linalg.norm(step[MOVE]))
-    where = _side(observed, posterior.inliers, group)
-    return f"{where}have a pose of their own, {math.degrees(turn):.1f} deg and {move:.2g} m away"
+def _by_chance(observed: Observed, posterior: Posterior) -> Failure | None:
+    """Failure of a motion that fits no more points than chance makes fit, where all are near.
+
+    Other mismatches lie anywhere; these may be a camera's that vibrates, or those of a rough map.
+    """
+    errors, inliers = posterior.squared_errors, posterior.inliers
+    circle = (GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2
+    near, found = int(np.count_nonzero(errors < circle)), int(np.count_nonzero(inliers))
+    chance = min(float(errors[inliers].max()) / circle, 1.0)
+    if near <= found + _MARKER or _surprise(near, found, PARAMETERS // 2, chance) > _LEAST_CHANCE:
+        return None
+    return Failure(
+        Reason.MODEL_ERROR,
+        f"{found} points fit, and {near - found} others lie within {math.sqrt(circle):.0f} px of "
+        "their places: so many fit by chance",
+    )
 
 
 def _side(observed: Observed, inliers: BoolArray, group: BoolArray) -> str:

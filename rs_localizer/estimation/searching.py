@@ -87,13 +87,17 @@ class MotionSearch:
             observed, observations=observed.observations.only(np.flatnonzero(chosen)),
             ranking=observed.ranking[:0],
         )  # fmt: skip
-        start = self._global_shutter(part, _START_SAMPLES)
+        start = self.rough(part)
         if (
             not start.found
             or np.count_nonzero(part.observations.within(start.state, self._rough)) <= least
         ):
             return NOTHING
         return self._motion(part, start, _FEW_SAMPLES)
+
+    def rough(self, observed: Observed) -> Candidate:
+        """A pose that fits all rows of enough points roughly; or nothing."""
+        return self._global_shutter(observed, _START_SAMPLES)
 
     def _global_shutter(self, observed: Observed, most: int) -> Candidate:
         """A pose that fits all rows roughly, with a wide threshold."""

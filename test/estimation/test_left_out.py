@@ -2,10 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Points that are left out: mismatches, or witnesses against the motion."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import rs_localizer as rsl
+from benchmarks.frames import paired_set
+from benchmarks.frames.judged import far_off, judge
 from benchmarks.gross import frame
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.estimation.left_out import as_nearest
@@ -34,6 +39,57 @@ def test_right_calibrations_lose_no_frame(scene):
 def test_what_has_two_poses_has_none(scene, fault):
     found = [result for result in results(scene, fault) if result]
     assert found == []
+
+
+@pytest.mark.parametrize(("fault", "length"), [("binned twice", 2.0), ("ROI twice", 1.0)])
+def test_another_matrix_is_named(fault, length):
+    """The true one, which nothing of the package has made."""
+    random, named = np.random.default_rng(5), 0
+    for _ in range(12):
+        camera, points, pixels, _ = frame("markers", fault, random)
+        result = rsl.Localizer(camera).localize(points, pixels)
+        assert not result
+        words = re.search(
+            r"length of (\S+) times K's and a principal point (\S+), (\S+) px", str(result)
+        )
+        if words is None:
+            continue
+        named += 1
+        found, *centre = (float(word) for word in words.groups())
+        assert found == pytest.approx(length, rel=0.02)
+        assert np.abs(camera.K[:2, 2] + centre - (319.5, 239.5)).max() < 10.0
+    assert named >= 2
+
+
+def test_a_principal_point_that_is_a_little_off_is_no_other_image():
+    random = np.random.default_rng(5)
+    for _ in range(6):
+        camera, points, pixels, rotation = frame("volume", "a tenth wrong", random)
+        pixels[::3] += random.uniform(-20.0, 20.0, (len(pixels[::3]), 2))
+        K = np.array(camera.K)
+        K[0, 2] += 6.0
+        result = rsl.Localizer(replace(camera, K=K)).localize(points, pixels)
+        assert result
+        assert np.abs(result.rotation - rotation).max() < 0.02
+
+
+@pytest.mark.parametrize("bench", ["bodies", "near"])
+def test_what_moves_or_is_matched_nearby_is_left_out(bench):
+    """Of frames that none of the package has made; P3P finds all of them."""
+    for _, one in paired_set.spoilt():
+        if one.bench == bench and one.name != "map":
+            found = judge(one, 4, 7, {})
+            assert np.count_nonzero(found.localized) >= 3
+            assert found.of("deg")[found.localized].max() < 1.5
+            assert not far_off(found).any()
+
+
+def test_points_that_fit_by_chance_are_no_motion():
+    random = np.random.default_rng(8)
+    for _ in range(6):
+        camera, points, pixels, _ = frame("volume", "right", random)
+        points, pixels = points[:18], pixels[:18] + random.uniform(-15.0, 15.0, (18, 2))
+        assert not rsl.Localizer(camera).localize(points, pixels)
 
 
 def test_a_moved_corner_is_a_notice():

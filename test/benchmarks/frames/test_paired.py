@@ -15,6 +15,7 @@ from benchmarks.frames import paired_set
 from benchmarks.frames.conditions import (
     FILMING,
     HAND,
+    Calibration,
     Condition,
     Points,
     Sequence,
@@ -110,7 +111,9 @@ SHAKEN = Condition(
     sequence=Sequence(8, (3, 8)),
 )  # fmt: skip
 PLANE = Condition("x", "plane", FILMING, SmallPlane(0.3, 2.0, 20.0), 1.0)
-BODY = next(one for _, one in paired_set.spoilt() if one.bench == "bodies")
+HALVES = Condition("x", "two bodies", HAND, Rich(100), 0.5, points=Points(body=0.5))
+ROUGH = Condition("x", "few near", HAND, Rich(18), 0.5, points=Points(near=(0.6, 15.0)))
+FOCAL = Condition("x", "focal", HAND, Rich(100), 0.5, calibration=Calibration(focal=0.3))
 GARBAGE = next(one for _, one in paired_set.spoilt() if one.name == "90% wrong")
 LENS, NOISE = named("camera/lens 30%/wall/1px"), named("noise/0.3deg/40points/1px")
 
@@ -120,7 +123,8 @@ SEEN_IN = {
     "smooth-error": LENS, "in-frame-turn": SHAKEN, "calibration-effect": SHAKEN,
     "typical-speeds": PLANE, "grid-over-leans": PLANE, "mixture-of-steady-and-vibrating": SHAKEN,
     "too-few": GARBAGE, "undetermined": None, "uncertain": PLANE, "smooth-too-large": LENS,
-    "near-outliers": NOISE, "own-motion": BODY, "left-out": BODY, "window": SHAKEN,
+    "near-outliers": NOISE, "own-motion": HALVES, "left-out": HALVES,
+    "another-matrix": FOCAL, "by-chance": ROUGH, "window": SHAKEN,
     "learnt-accelerations": SHAKEN,
 }  # fmt: skip
 
@@ -152,7 +156,7 @@ def test_the_command(tmp_path, capsys):
     assert [row.split()[0] for row in out.splitlines() if row[:4] in ("all ", "neit", "lens")] == [
         "all", "neither", "lens",
     ]  # fmt: skip
-    words = ["paired", "without", "own-motion", "--only", "few", "lens", "--against", file]
+    words = ["paired", "without", "left-out", "--only", "few", "lens", "--against", file]
     assert command.main(words) == 0
     out = capsys.readouterr().out
     head, row = (line.split(" | ") for line in out.splitlines()[-2:])
