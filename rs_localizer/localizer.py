@@ -415,5 +415,6 @@ class Localizer:
             odd = left_out(self._search, observed, posterior, gate, known=known)
         if odd.failure is not None:
             return odd.failure
-        estimate = estimate_of(observed, posterior, best.samples, effect)
+        predicted = own_terms is not observed.terms
+        estimate = estimate_of(observed, posterior, best.samples, effect, predicted)
         return replace(estimate, left_out=odd.notice) if odd.notice else estimate

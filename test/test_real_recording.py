@@ -2,12 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bundled webcam recording: does a real shutter do what the model says, sign and all?"""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import rs_localizer as rsl
+from benchmarks.frames.conditions import REST, TRACKED, Condition
+from benchmarks.frames.judged import judge
+from benchmarks.independent.scenes import Rich
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Mounts
@@ -165,3 +169,40 @@ def test_corners_lie_where_those_of_other_rows_say(recording):
     squared = np.concatenate(squared)
     assert np.mean(squared < chi2.ppf(0.95, 2)) > 0.93
     assert 1.0 < np.mean(squared) < 2.4  # 2 are expected
+
+
+def test_a_twist_that_is_a_mean_of_rest_and_motion_is_unknown(recording):
+    """OpenCV's poses of the neighbours say how the camera turns; a track begins every 15 images."""
+    calibration, clouds = recording
+    camera = calibration.camera(READOUT, "top_to_bottom")
+    tracker, ratios, alone = Tracker(rsl.Localizer(camera)), [], []
+    turned = []
+    for cloud in clouds:
+        _, turn, _ = cv2.solvePnP(cloud.points, cloud.pixels, camera.K, camera.D)
+        turned.append(cv2.Rodrigues(turn)[0])
+    stamps = np.array([cloud.stamp_ns for cloud in clouds])
+    for k in range(1, len(clouds) - 1):
+        if k % 15 == 1:
+            tracker.reset()
+        found = tracker.localize(stamps[k], clouds[k].points, clouds[k].pixels)
+        seconds = 1e-9 * (stamps[k + 1] - stamps[k - 1])
+        true = Rotation.from_matrix(turned[k - 1] @ turned[k + 1].T).as_rotvec() / seconds
+        if not found or seconds > NEIGHBOURS or np.linalg.norm(true) < np.radians(10.0):
+            continue
+        if found.twist_known:
+            ratios.append(found.angular_velocity / READOUT @ true / (true @ true))
+        else:
+            alone.append(not found.tracked)
+    assert len(alone) > 2
+    assert all(alone)
+    assert len(ratios) > 20
+    assert min(ratios) > 0.3
+    assert np.quantile(ratios, 0.05) > 0.5
+    assert np.quantile(ratios, 0.95) < 1.5
+
+
+def test_at_rest_a_tracked_twist_is_none():
+    rest = judge(Condition("x", "rest", REST, Rich(100), 0.3, sequence=TRACKED), 2, 1, {})
+    assert rest.localized.all()
+    assert np.median(rest.of("deg/s")) < 0.6
+    assert rest.of("deg/s").max() < 1.0

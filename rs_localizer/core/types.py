@@ -67,6 +67,8 @@ class Estimate(Motion):
     span: float = 0.0  # s of a readout, as which row times count; 0: unknown
     # Probability that the pose lies outside its region or the map is another one; NaN: not judged
     integrity: float = math.nan
+    # The velocities are the camera's, and not a mean of what may rest and what may move
+    twist_known: bool = True
     left_out: str = ""  # what is odd about the points that are no inliers, one sentence
 
     @property

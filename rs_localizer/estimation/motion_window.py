@@ -439,6 +439,7 @@ def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
         angular_acceleration=state[STATE_ANGULAR_ACCELERATION],
         linear_acceleration=state[STATE_LINEAR_ACCELERATION],
         shake=estimate.shake + step[PARAMETERS:].reshape(-1, 3),
+        twist_known=True,
     )
 
 

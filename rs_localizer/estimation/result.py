@@ -26,8 +26,12 @@ from rs_localizer.core.rate_spline import multiplied
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
+    ANGULAR,
+    LINEAR,
     MOTION_PARAMETERS,
     PARAMETERS,
+    POSE,
+    POSE_SIZE,
     STATE_ANGULAR,
     STATE_ANGULAR_ACCELERATION,
     STATE_LINEAR,
@@ -52,6 +56,10 @@ _FARTHEST, _NEAREST, _STEP = 3.0, 2.0, 1.0 / 60.0
 # What another delay has to cost beyond the best one (noise variances), at this distance from it
 # (steps), for that to be believed.
 _CLEARLY, _OTHER = 12.0, 3
+# Of a velocity so large a part may be its deviation: it is 0.5 to 1.5 of the true one then.
+_TOLD = 0.5
+# Probability of rest (in a covariance), beyond which the velocities are none.
+_CERTAIN = 0.95
 
 
 def delay_of(
@@ -168,13 +176,15 @@ def sample_estimate(
 
 
 def estimate_of(
-    observed: Observed, posterior: Posterior, samples: int, effect: CalibrationEffect
-) -> Estimate:
+    observed: Observed, posterior: Posterior, samples: int, effect: CalibrationEffect,
+    predicted: bool,
+) -> Estimate:  # fmt: skip
     """The estimate of an accepted posterior, in the map frame and for all given points.
 
     Args:
         samples: minimal samples drawn.
         effect: of what map and calibration are off.
+        predicted: frames before tell how the camera moves.
     """
     state, turn = posterior.state, observed.sighted.turn
     rotation = rotation_of(state)
@@ -213,4 +223,21 @@ def estimate_of(
         span=observed.sighted.exposure.span,
         calibration_covariance=effect.covariance,
         still_deviation=effect.still_deviation,
+        twist_known=predicted or _knows_velocities(posterior),
+    )
+
+
+def _knows_velocities(posterior: Posterior) -> bool:
+    """Whether the points tell the velocities, or certainly rest.
+
+    What they do not tell is a mean about zero, of rest and of all typical speeds: its deviation is
+    that of the speeds that are left out of the mean.
+    """
+    if len(posterior.speeds) and posterior.speeds[0] > _CERTAIN:
+        return True
+    velocities = posterior.state[POSE_SIZE:]
+    return all(
+        np.linalg.eigvalsh(posterior.covariance[part, part])[-1]
+        < (_TOLD * np.linalg.norm(velocities[part.start - POSE.stop :][:3])) ** 2
+        for part in (ANGULAR, LINEAR)
     )

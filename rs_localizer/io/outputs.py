@@ -45,6 +45,10 @@ class Twist:
     covariance: Array  # (6,6) linear, then angular
 
 
+# Variances of what nobody knows: 1,000 m/s and rad/s, as filters take them for none.
+_UNKNOWN = Twist(np.zeros(3), np.zeros(3), 1e6 * np.eye(6))
+
+
 @dataclass(frozen=True, slots=True)
 class CameraShare:
     """Contribution of one camera of a rig to a frame."""
@@ -74,6 +78,11 @@ class Localized:
     def __bool__(self) -> Literal[True]:
         return True
 
+    @property
+    def known_twist(self) -> Twist | None:
+        """The twist, or None where it is unknown, too: it would be a mean of rest and motion."""
+        return self.twist if self.estimate.twist_known else None
+
 
 def _sent(covariance: Array) -> Array:
     """A covariance (6,6) as messages have it (36,): -1 on the diagonal where there is none."""
@@ -84,7 +93,8 @@ def _sent(covariance: Array) -> Array:
 def messages(frame: Localized, make: Make) -> dict[str, Any]:
     """The messages of a frame by output topic (see :data:`TYPES`), the same for node and replay.
 
-    Without a twist there is no odometry either: zeros would be a claim.
+    Without a readout time there is neither twist nor odometry: zeros would be a claim. Where the
+    twist is unknown, those with covariance say so.
     """
     return dict(each_message(frame, make, TYPES))
 
@@ -93,7 +103,9 @@ def each_message(
     frame: Localized, make: Make, wanted: Collection[str]
 ) -> Iterator[tuple[str, Any]]:
     """Those of these topics, one after the other; each is built when it is asked for."""
-    twist = frame.twist
+    twist, known = frame.twist, frame.known_twist is not None
+    if twist is not None and not known:
+        twist = _UNKNOWN
 
     @cache
     def header(name: str) -> Any:
@@ -131,7 +143,7 @@ def each_message(
     }
     if twist is not None:
         parts |= {
-            topics.TWIST: {"twist": velocity},
+            **({topics.TWIST: {"twist": velocity}} if known else {}),
             topics.TWIST_WITH_COVARIANCE: {"twist": velocity_with_covariance},
             topics.ODOMETRY: {"pose": pose_with_covariance, "twist": velocity_with_covariance},
         }

@@ -161,7 +161,7 @@ def _quaternion(rotation: Array) -> list[float]:
 
 
 def _localized(frame: Localized) -> dict[str, Any]:
-    pose, twist, estimate = frame.pose, frame.twist, frame.estimate
+    pose, twist, estimate = frame.pose, frame.known_twist, frame.estimate
     inliers = int(np.count_nonzero(estimate.inliers))
     row = {
         "state": LOCALIZED,

@@ -60,7 +60,7 @@ class Track:
         self._maps: set[str] = set()
 
     def add(self, frame: Localized) -> None:
-        twist = frame.twist
+        twist = frame.known_twist
         rotation = np.ascontiguousarray(frame.pose.rotation)
         self._stamps_ns.append(frame.stamp_ns)
         self._rows.extend(frame.pose.position)
@@ -163,7 +163,7 @@ class Tally:
         self._stamps_ns.append(frame.input_stamp_ns)
         self._numbers.extend((
             estimate.residual_rms, estimate.model_error, int(np.count_nonzero(estimate.inliers)),
-            len(estimate.inliers), estimate.tracked, frame.dropped, frame.twist is not None,
+            len(estimate.inliers), estimate.tracked, frame.dropped, frame.known_twist is not None,
         ))  # fmt: skip
 
     def smooth(self, part: Any) -> list[Localized]:

@@ -3,6 +3,7 @@
 """The six messages of a frame: values, frames and stamps, and what is left out without a twist."""
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,8 @@ def frame() -> Localized:
     pose = BodyPose(rng.normal(size=3), so3.exp(rng.normal(size=3)), rng.normal(size=(6, 6)))
     twist = Twist(rng.normal(size=3), rng.normal(size=3), rng.normal(size=(6, 6)))
     # The stamp is half a readout before one of 0.
-    return Localized(1_999_999_999, -1, "hall", "left_eye", pose, twist, rows, 0, None)
+    estimate = SimpleNamespace(twist_known=True)
+    return Localized(1_999_999_999, -1, "hall", "left_eye", pose, twist, rows, 0, estimate)
 
 
 def vector(message: Any) -> list[float]:
@@ -61,3 +63,15 @@ def test_values(frame):
 def test_without_a_twist_nothing_claims_one(frame):
     made = messages(dataclasses.replace(frame, twist=None), make_message)
     assert set(made) == {"pose", "pose_with_covariance", "inliers"}
+
+
+def test_an_unknown_twist_is_not_sent_or_says_so(frame):
+    """A mean of rest and motion would be taken for a camera that hardly moves."""
+    unknown = dataclasses.replace(frame, estimate=SimpleNamespace(twist_known=False))
+    assert unknown.known_twist is None
+    made = messages(unknown, make_message)
+    assert set(made) == set(TYPES) - {"twist"}
+    for message in (made["twist_with_covariance"].twist, made["odometry"].twist):
+        assert vector(message.twist.linear) == vector(message.twist.angular) == [0.0, 0.0, 0.0]
+        assert np.array_equal(message.covariance.reshape(6, 6), 1e6 * np.eye(6))
+    assert np.array_equal(made["odometry"].pose.covariance.reshape(6, 6), frame.pose.covariance)

@@ -57,6 +57,8 @@ def tell(frame: Localized) -> tuple[int, Told]:
         }
     state = State.TRACKING if estimate.tracked else State.LOCALIZED
     text = f"{state} with {inliers} of {points} points"
+    if frame.twist is not None and frame.known_twist is None:
+        text += ", twist unknown"
     return frame.input_stamp_ns, Told(state, text, values)
 
 
