@@ -382,11 +382,6 @@ class NodeConfig(LocalizerConfig):
         "Standard deviation of readout_time, in s, as rs_localizer calibrate finds it",
         (0.0, LONGEST_READOUT_TIME),
     )
-    estimate_readout_time: bool = setting(
-        False,
-        "Where readout_time is 0, find it and the scan direction from the camera's motion: after "
-        "some seconds of it frames have twists and are tracked",
-    )
     scan_direction: str = setting(
         ScanDirection.TOP_TO_BOTTOM,
         "Direction in which the shutter moves over the raw image",
@@ -540,9 +535,8 @@ class NodeConfig(LocalizerConfig):
                     f"{name}.scan_direction must be one of {', '.join(ScanDirection)}; "
                     f"got {camera.scan_direction!r}"
                 )
-        for name in ("estimate_readout_time", "marker_map"):
-            if getattr(self, name) not in (False, ""):
-                raise ValueError(f"{name} is for one camera: leave it out with cameras")
+        if self.marker_map:
+            raise ValueError("marker_map is for one camera: leave it out with cameras")
 
 
 class ImageTransport(StrEnum):

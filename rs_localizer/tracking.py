@@ -54,6 +54,7 @@ from rs_localizer.integrity import Integrity
 from rs_localizer.localizer import Localizer
 from rs_localizer.prediction_errors import PredictionErrors
 from rs_localizer.repeated_images import RepeatedImages, coasting
+from rs_localizer.shutter_watch import FAR_OFF, ShutterWatch
 from rs_localizer.solvers.table import find_solver
 
 if TYPE_CHECKING:  # without a gyroscope nobody needs them
@@ -77,10 +78,6 @@ _NEWEST = 0.3
 _LEARNING, _LEAST_SCALE, _MOST_SCALE = 0.5, 0.3, 1e4
 # Squared distance of what was found by a search from the track: once in a million by chance.
 _MOST_INNOVATION = 62.0
-# Of the readout time: off by more, frames that stand alone are better than tracked ones. Errors of
-# a hand's turn rates, tracked over alone, where it is off by a factor of 1.3, 1.5, 1.7: 0.95, 1.3,
-# 1.5 (150 points, 0.3 px); known to a half, it is off by a third in the median.
-FAR_OFF = 0.5
 # Of a motion that is but a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least acceleration that a configuration may have, rad/s^2 and m/s^2.
@@ -91,12 +88,8 @@ _LEAST_ACCELERATION = 0.001
 class FrameContext:
     """Knowledge of a frame beside its points."""
 
-    # A readout time that is far off makes wrong velocities per readout of those from frame to
-    # frame: then each image speaks for itself, and the frames before give a first guess.
-    trusts_readout_time: bool = True
     # s; velocities per readout say that much less of how far the camera goes.
     readout_time_deviation: float = 0.0
-    of_rest: float = 0.0  # logarithm of the odds for a global shutter, beside those of any
     error_modes: ErrorModes | None = None  # of the map of these points, if it has them
 
 
@@ -169,6 +162,7 @@ class Tracker:
         self.output_lag, self.max_prediction = int(output_lag), max_prediction
         self._seen: deque[_Seen] = deque(maxlen=LENGTH)  # the newest last
         self._images = RepeatedImages()
+        self.shutter = self._watch()
         self.repeats = False  # whether the last frame shows an image that had come before
         self._track: _Track | None = None
         self._given: tuple[int, Prior] | None = None
@@ -190,8 +184,16 @@ class Tracker:
         self._errors.reset()
         self._seen.clear()
         self._images, self.repeats = RepeatedImages(), False
+        self.shutter.reset()
         if self._aid is not None:
             self._aid.reset()
+
+    def _watch(self) -> ShutterWatch:
+        """Who says that scan direction or readout time of a camera alone are contradicted."""
+        config, cameras = self.localizer.config, list(self.localizer.rig.cameras.values())
+        timed = len(cameras) == 1 and cameras[0].readout_time > 0.0
+        watched = timed and find_solver(config.solver).rolling_shutter
+        return ShutterWatch(cameras[0] if watched else None, config.inlier_threshold)
 
     @property
     def inertial(self) -> InertialStatus | None:
@@ -209,8 +211,12 @@ class Tracker:
     def _trusts_motion(self, context: FrameContext) -> bool:
         """Whether how far the camera goes from frame to frame tells how it moves within one."""
         least = min(camera.readout_time for camera in self.localizer.rig.cameras.values())
-        known = context.readout_time_deviation < FAR_OFF * least
-        return self.remembers_motion and context.trusts_readout_time and known
+        known = self.readout_time_deviation(context) < FAR_OFF * least
+        return self.remembers_motion and self.shutter.trusted and known
+
+    def readout_time_deviation(self, context: FrameContext) -> float:
+        """How far (s) the readout time may be off, by who gives it or by the frames."""
+        return max(context.readout_time_deviation, self.shutter.error)
 
     def _follows(self, time_ns: int) -> bool:
         """Whether the motion of the last frame with a pose predicts that at a time."""
@@ -254,7 +260,8 @@ class Tracker:
             given = self._given
             return given[1] if given is not None and given[0] == time_ns else None
         own = track.estimate.span
-        window = replace(track.window, readout_share=context.readout_time_deviation / own)
+        share = self.readout_time_deviation(context) / own
+        window = replace(track.window, readout_share=share)
         motion, covariance = motion_of(window.after(time_ns), own if span is None else span)
         try:
             return Prior(motion=motion, covariance=covariance + unshaken(track.estimate)[2])
@@ -301,7 +308,7 @@ class Tracker:
         there = replace(there, time_ns=time_ns)
         if isinstance(there, RigEstimate):
             there = replace(there, time=there.time + seconds)
-        return there if self.localizer.accepted(there) else None
+        return there if self._accepted(there) else None
 
     def snapshot(self) -> Tracker:
         """What :meth:`at` knows now, for another thread while frames are localized here."""
@@ -347,7 +354,13 @@ class Tracker:
         """The results that ``output_lag`` still holds back, at the end of a recording."""
         held = list(self._seen)[max(len(self._seen) - self.output_lag, 0) :]
         self._seen.clear()
-        return [self.localizer.accepted(seen.found) for seen in held]
+        return [self._accepted(seen.found) for seen in held]
+
+    def _accepted(self, found: Estimate | Failure) -> Estimate | Failure:
+        """The same, or why none is told."""
+        if found and self.shutter.refusal:
+            return Failure(Reason.SCAN_AXIS, self.shutter.refusal)
+        return self.localizer.accepted(found)
 
     def localize(
         self,
@@ -407,8 +420,10 @@ class Tracker:
             result, prior = self._aid.localize(
                 imu, time_ns, lambda: self._before(time_ns), localized
             )
+        if pixels is not None:  # of a camera alone
+            self.shutter.add(time_ns, result, np.asarray(points, float), np.asarray(pixels, float))
         if result:
-            result = self._judged(result, points, pixels, prior)
+            result = self.shutter.widened(self._judged(result, points, pixels, prior))
             if self.remembers_motion:
                 result = self._covering(replace(result, time_ns=time_ns), context)
                 self._remember(time_ns, prior, result, context)
@@ -471,7 +486,7 @@ class Tracker:
     @property
     def newest(self) -> Estimate | Failure | None:
         """The result of the last frame, whatever ``output_lag`` is; None before any."""
-        return self.localizer.accepted(self._seen[-1].found) if self._seen else None
+        return self._accepted(self._seen[-1].found) if self._seen else None
 
     @property
     def newest_ns(self) -> int | None:
@@ -482,7 +497,7 @@ class Tracker:
     def delayed(self) -> Estimate | Failure:
         """The result of the frame ``output_lag`` before the last one."""
         if len(self._seen) > self.output_lag:
-            return self.localizer.accepted(self._seen[-1 - self.output_lag].found)
+            return self._accepted(self._seen[-1 - self.output_lag].found)
         return Failure(
             Reason.AWAITS_FRAMES,
             f"output_lag is {self.output_lag} frames, of which {len(self._seen) - 1} have come",
@@ -503,7 +518,7 @@ class Tracker:
         Rows of a readout time that nobody knows may all have been exposed at once: then they show
         no motion, however fast the camera is.
         """
-        track = self._track
+        track, config = self._track, self.localizer.config
         if track is None or self._trusts_motion(context):
             return result
         seconds = 1e-9 * (result.time_ns - track.time_ns)
@@ -516,6 +531,9 @@ class Tracker:
         off -= np.concatenate([result.angular_velocity, result.linear_velocity])
         joint = result.joint_covariance.copy()
         joint[VELOCITIES, VELOCITIES] += np.outer(off, off)
+        if self.shutter.is_global:  # rows say nothing of how that has changed since
+            changed = acceleration_covariance(config.acceleration, seconds, result.span)
+            joint[VELOCITIES, VELOCITIES] += changed[VELOCITIES, VELOCITIES]
         return replace(result, joint_covariance=joint)
 
     def _judged(
@@ -536,10 +554,10 @@ class Tracker:
     ) -> Prior | None:
         """What is known of a frame of whose motion a gyroscope predicts no more than the turn."""
         if not self.remembers_motion:
-            return Prior(of_rest=context.of_rest) if turn is None else None
+            return Prior(of_rest=self.shutter.of_rest) if turn is None else None
         prior = self.prediction(time_ns, span, context)
         if prior is not None and not self._trusts_motion(context):
-            rest = context.of_rest if turn is None else 0.0
+            rest = self.shutter.of_rest if turn is None else 0.0
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
         if turn is None:
             return prior
@@ -575,7 +593,7 @@ class Tracker:
         context: FrameContext,
     ) -> MotionWindow:  # fmt: skip
         """The last frames and this one; where it denies them, it alone."""
-        share = context.readout_time_deviation / result.span
+        share = self.readout_time_deviation(context) / result.span
         alone = MotionWindow.begin(
             gaussian_of(result, time_ns), self.localizer.config.acceleration, share
         )

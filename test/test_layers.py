@@ -20,7 +20,7 @@ TRACED = ("core/simd/tracing.py", "core/simd/vector_type.py")
 # What each part may import besides itself; every part has a row.
 METHOD = {
     *("core", "config", "solvers", "estimation", "inertial", "integrity", "localizer"),
-    *("prediction_errors", "repeated_images", "tracking"),
+    *("prediction_errors", "repeated_images", "shutter_watch", "tracking"),
 }
 MAY_IMPORT: dict[str, set[str]] = {
     "process": set(),
@@ -31,11 +31,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     "solvers": {"core", "native"},
     "estimation": {"core", "config", "native", "solvers"},
     "inertial": {"core", "estimation", "native"},
-    "localizer": METHOD
-    - {"inertial", "integrity", "localizer", "prediction_errors", "repeated_images", "tracking"},
+    "localizer": {"core", "config", "solvers", "estimation"},
     "integrity": {"core", "estimation"},
     "prediction_errors": {"core", "estimation"},
     "repeated_images": {"core", "estimation"},
+    "shutter_watch": {"core", "estimation"},
     "tracking": METHOD - {"tracking"},
     "io": {"core"},
     "settings": {"config", "io"},

@@ -10,6 +10,7 @@ from rs_localizer import data
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.pose_at_time import twist_at
+from rs_localizer.shutter_watch import ShutterWatch
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import simulate_frames
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
@@ -298,7 +299,10 @@ def test_with_a_readout_time_far_off_each_image_speaks_for_itself():
     hand, localizer = Hand(), rsl.Localizer(CAMERA)
     trackers = [Tracker(localizer) for _ in range(3)]
     unsure = FrameContext(readout_time_deviation=0.6 * CAMERA.readout_time)
-    contexts = (FrameContext(trusts_readout_time=False), FrameContext(), unsure)
+    contexts = (FrameContext(), FrameContext(), unsure)
+    for tracker in trackers:
+        tracker.shutter = ShutterWatch(None, 2.0)  # nobody says what is wrong
+    trackers[0].shutter.trusted = False
     errors = []
     for t in times(8):
         # Frames follow each other twice as fast as they say: so do turns, but not those within.

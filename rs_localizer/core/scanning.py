@@ -23,3 +23,11 @@ REVERSED = {
     ScanDirection.RIGHT_TO_LEFT: ScanDirection.LEFT_TO_RIGHT,
 }
 """The opposite of each direction."""
+
+ACROSS = {
+    ScanDirection.TOP_TO_BOTTOM: ScanDirection.LEFT_TO_RIGHT,
+    ScanDirection.BOTTOM_TO_TOP: ScanDirection.RIGHT_TO_LEFT,
+    ScanDirection.LEFT_TO_RIGHT: ScanDirection.TOP_TO_BOTTOM,
+    ScanDirection.RIGHT_TO_LEFT: ScanDirection.BOTTOM_TO_TOP,
+}
+"""One along the other axis, as drivers that turn images make of each direction."""

@@ -55,7 +55,6 @@ from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.pipeline.keypoint_map import Landmarks, read_landmarks
 from rs_localizer.pipeline.pose_at_time import middle_row_ns, published_moment
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
-from rs_localizer.pipeline.readout_watch import ReadoutWatch, Watched
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
 from rs_localizer.pipeline.rig_frames import (
     CameraImage,
@@ -66,6 +65,7 @@ from rs_localizer.pipeline.rig_frames import (
 )
 from rs_localizer.pipeline.rig_watch import RigWatch
 from rs_localizer.pipeline.stream import Stream
+from rs_localizer.shutter_watch import ShutterWatch
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import FrameContext, Tracker
 
@@ -89,7 +89,7 @@ ANY_CALIBRATION = Calibration(
 # Settings that change what is made of an estimate, or which points come to it, and not how it is
 # made. All others start the track afresh.
 _BESIDE = frozenset({
-    "readout_time_deviation", "estimate_readout_time", "pose_time", "max_points", "base_frame",
+    "readout_time_deviation", "pose_time", "max_points", "base_frame",
     "odom_frame", "publish_tf", "tf_rate", "hold", "two_d_mode",
     "transform_tolerance", "saved_pose_file", "map_file", "map_frame", "marker_map", "matching",
     "autostart", "output_rate", "camera_file",
@@ -131,7 +131,7 @@ class FrameLocalizer:
         self._notice = notice
         self.transforms: Transforms = TransformTree() if transforms is None else transforms
         self.imu: ImuInput = ImuInput(notice)
-        self.readout_watch = ReadoutWatch(notice)
+        self._faults: set[str] = set()  # of the shutter, which have been noticed
         self.rig_watch = RigWatch(config, notice)
         self.calibrations: dict[str, Calibration] = {}
         """What the last usable camera_info of each camera said; of one without a name: ``""``."""
@@ -143,12 +143,12 @@ class FrameLocalizer:
         self._stream = Stream(notice, self._forget_motion)
         self._pose_prior = PosePrior(notice)
         # Of the last frames, by time of the middle row: with what their results are published.
-        self._waiting: dict[int, tuple[Correspondences, float]] = {}
+        self._waiting: dict[int, Correspondences] = {}
         # The newest of them that has a pose, without its rows.
-        self._newest: tuple[Correspondences, float] | None = None
+        self._newest: Correspondences | None = None
         self._smooth_errors: deque[float] = deque(maxlen=_FRAMES)
         self._too_many = False  # whether clouds above max_points have been noticed
-        self._settings = self._config = config  # an estimated readout time takes the place of one
+        self._config = config
         self._use(config)
 
     @property
@@ -165,18 +165,10 @@ class FrameLocalizer:
         What no frame's estimate depends on, as of outputs and transforms, leaves track, IMU and
         readout watch as they are.
         """
-        if _of_estimates(config) == _of_estimates(self._settings):
-            # The readout that was adopted stays.
-            now = self.config
-            self._config = replace(
-                _in_effect(config),
-                readout_time=now.readout_time,
-                scan_direction=now.scan_direction,
-            )
-            self._settings = config
+        if _of_estimates(config) == _of_estimates(self._config):
+            self._config = config
             return False
         self._use(config)
-        self._settings = config
         return True
 
     @property
@@ -210,7 +202,7 @@ class FrameLocalizer:
             self._assembler = FrameAssembler(config.cameras, config.rig.window, self._notice)
         self._cameras, self._config = seen, config
         self._mistakes = what_fits.Mistakes()
-        self.readout_watch.reset()
+        self._faults.clear()
         self.rig_watch = RigWatch(config, self._notice)
 
     def _rig(self, cameras: Mapping[str, Camera]) -> Rig:
@@ -290,7 +282,7 @@ class FrameLocalizer:
         self._newest = None
         self._waiting.clear()
         self._smooth_errors.clear()
-        self.readout_watch.reset()
+        self._faults.clear()
         self._tracker.reset()
 
     def calibrate(self, calibration: Calibration, name: str = "") -> None:
@@ -304,14 +296,14 @@ class FrameLocalizer:
             calibration = calibration.with_lens(self._lenses[name])
         if calibration == before:  # drivers repeat it with every image
             return
-        own, frame = _shutters(self._settings)[name], self.camera_frame
+        own, frame = _shutters(self._config)[name], self.camera_frame
         self._cameras[name] = calibration.camera(own.readout_time, own.scan_direction)
         self.calibrations[name] = calibration
         self._mounts.pop(name, None)
         if before is None and self.camera_frame == frame:
             return  # one more of a rig
         self._mounts = {}  # relative to other axes
-        self._use(self._settings)
+        self._use(self._config)
         if before is not None:
             of = f" of {name}" if name else ""
             self._notice(
@@ -394,7 +386,7 @@ class FrameLocalizer:
         """The result of a frame that has waited."""
         if not found:
             return Refusal(found.reason, found.detail)
-        return self._published(*self._waiting[found.time_ns], found)
+        return self._published(self._waiting[found.time_ns], found)
 
     def localize_keypoints(self, message: Any) -> Localized | Refusal:
         """Localize one sensor_msgs/PointCloud2 of keypoints; never raises for bad ones.
@@ -489,7 +481,7 @@ class FrameLocalizer:
     def _localize(self, cloud: Correspondences) -> Localized | Refusal:
         if not self.calibrations:
             return Refusal(Reason.NO_CAMERA_INFO, "no usable camera_info has come yet")
-        config, camera, frame = self._config, self._camera, self.camera_frame
+        config, frame = self._config, self.camera_frame
         cloud = self._checked(cloud)
         time_ns, context = self._middle_row_ns(cloud.stamp_ns), self._context
         self._expect(time_ns, cloud.frame)
@@ -501,21 +493,22 @@ class FrameLocalizer:
         self.imu.track(self._tracker, config, time_ns, frame, self.transforms, localized)
         result = self._tracker.newest
         assert result is not None
-        adopted, full = config, config.refinement == RefinementKind.FULL
-        if full and not self._tracker.repeats:  # a copy says nothing of the shutter
-            adopted = self.readout_watch.add(Watched(time_ns, cloud, result, config, camera))
-        if result and not self.readout_watch.wrong_axis:
+        shutter = self._tracker.shutter
+        if shutter.fault and shutter.kind not in self._faults:
+            self._faults.add(shutter.kind)
+            self._notice(Notice.READOUT_TIME, shutter.fault)
+        if result:
             ahead = (cloud.points[result.inliers] - result.position) @ result.rotation[2]
             self._stream.pace(time_ns, result, float(np.median(ahead)), config)
             self._pose_prior.judge(result)
             if self.predicts:
                 without = replace(cloud, table=cloud.table[:0], dropped=0)
-                self._newest = without, context.readout_time_deviation
+                self._newest = without
         if self._tracker.output_lag > 0:
-            self._waiting[time_ns] = cloud, context.readout_time_deviation
+            self._waiting[time_ns] = cloud
             while len(self._waiting) > self._tracker.output_lag + 1:
                 del self._waiting[next(iter(self._waiting))]
-        published = self._published(cloud, context.readout_time_deviation, result)
+        published = self._published(cloud, result)
         if self._tracker.repeats and result:
             self._notice(
                 Notice.STILL_IMAGE,
@@ -524,8 +517,6 @@ class FrameLocalizer:
             )
         if not published:
             published = self._explained(published, cloud)
-        if adopted is not config:  # from the next frame on
-            self._use(adopted)
         return published
 
     def _explained(self, refusal: Refusal, cloud: Correspondences) -> Refusal:
@@ -542,9 +533,12 @@ class FrameLocalizer:
     @property
     def _context(self) -> FrameContext:
         """Knowledge of the next frame."""
-        watch = self.readout_watch
-        deviation = max(self._config.readout_time_deviation, watch.error)
-        return FrameContext(watch.trusted, deviation, watch.of_rest, self._landmarks.error_modes)
+        return FrameContext(self._config.readout_time_deviation, self._landmarks.error_modes)
+
+    @property
+    def shutter(self) -> ShutterWatch:
+        """Who says that scan direction or readout time are contradicted."""
+        return self._tracker.shutter
 
     @property
     def predicts(self) -> bool:
@@ -572,22 +566,11 @@ class FrameLocalizer:
         found = self._tracker.at(stamp_ns, samples)
         if found is None:
             return None
-        cloud, deviation = self._newest
-        cloud = replace(cloud, stamp_ns=stamp_ns)
-        if self.readout_watch.wrong_axis:
-            return None
-        return self.mounted(self._made(cloud, found, (stamp_ns, 0.0), deviation))
+        cloud = replace(self._newest, stamp_ns=stamp_ns)
+        return self.mounted(self._made(cloud, found, (stamp_ns, 0.0)))
 
-    def _published(
-        self, cloud: Correspondences, deviation: float, result: Estimate | Failure
-    ) -> Localized | Refusal:
-        """A result of the body at the published moment; a refusal where the shutter is another.
-
-        ``deviation``: s, of the readout time.
-        """
-        watch = self.readout_watch
-        if watch.wrong_axis:
-            return Refusal(Reason.SCAN_AXIS, watch.wrong_axis)
+    def _published(self, cloud: Correspondences, result: Estimate | Failure) -> Localized | Refusal:
+        """A result of the body at the published moment."""
         if not result:
             return Refusal(result.reason, result.detail)
         if result.integrity > DOUBTFUL:
@@ -601,31 +584,26 @@ class FrameLocalizer:
             self._smooth_errors.append(result.model_error)
         off = float(np.median(self._smooth_errors)) if self._smooth_errors else 0.0
         known = len(self._smooth_errors) == _FRAMES
-        if known and off > _MUCH and not watch.axis.wrong:
+        if known and off > _MUCH:
             self._notice(
                 Notice.LENS,
                 f"residuals vary smoothly over the image ({off:.1f} px rms): recalibrate the lens, "
                 "or survey the map again; until then poses allow for it",
             )
         moment = published_moment(self._config, self._camera, cloud.stamp_ns)
-        return self.mounted(self._made(cloud, result, moment, deviation))
+        return self.mounted(self._made(cloud, result, moment))
 
     def _made(
         self,
         cloud: Correspondences,
         estimate: Estimate,
         moment: tuple[int, float],
-        deviation: float = 0.0,
     ) -> Localized:
         """Pose and twist of an estimate at a moment, as of :func:`.of_camera`."""
-        watch, first = self.readout_watch, next(iter(self._cameras.values()))
-        readout = ReadoutKnown(
-            deviation,
-            first.first_row_time,
-            watch.may_be_reversed,
-            watch.surely_global,
-            watch.axis.other,
-        )
+        deviation, first = 0.0, next(iter(self._cameras.values())).first_row_time
+        if self._alone:
+            deviation = self._tracker.readout_time_deviation(self._context)
+        readout = ReadoutKnown(deviation, first, self.shutter.is_global)
         return of_camera(cloud, estimate, self._config, self.camera_frame, moment, readout)
 
     def _checked(self, cloud: Correspondences, name: str = "") -> Correspondences:

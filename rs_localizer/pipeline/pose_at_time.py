@@ -33,7 +33,6 @@ from dataclasses import replace
 import numpy as np
 
 from rs_localizer.config import Acceleration, NodeConfig, PoseTime
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.gyro_rotation import NO_TURN, Turning
@@ -90,25 +89,6 @@ def with_timing(
         replace(pose, covariance=pose.covariance + moved),
         replace(twist, covariance=twist.covariance + changed),
     )
-
-
-def either(pose: BodyPose, other: BodyPose) -> BodyPose:
-    """A pose with room for another that it may be as well."""
-    displacement = other.position - pose.position
-    turn = so3.log(np.ascontiguousarray(other.rotation @ pose.rotation.T))
-    step = np.concatenate([displacement, turn])
-    return replace(pose, covariance=pose.covariance + np.outer(step, step))
-
-
-def either_twist(twist: Twist, other: Twist) -> Twist:
-    """A twist with room for another that it may be as well."""
-    step = np.concatenate([other.linear - twist.linear, other.angular - twist.angular])
-    return replace(twist, covariance=twist.covariance + np.outer(step, step))
-
-
-def backwards(twist: Twist) -> Twist:
-    """The opposite."""
-    return replace(twist, linear=-twist.linear, angular=-twist.angular)
 
 
 def middle_row_ns(config: NodeConfig, camera: Camera, stamp_ns: int) -> int:

@@ -29,14 +29,7 @@ from rs_localizer.io.clouds import Correspondences, select_inliers
 from rs_localizer.io.outputs import BodyPose, Localized, Twist
 from rs_localizer.io.transforms import NotYetError, Transform, TransformError, Transforms
 from rs_localizer.pipeline.map_to_odom import CorrectionState, FoundPose, Odometry, Settings, decide
-from rs_localizer.pipeline.pose_at_time import (
-    backwards,
-    either,
-    either_twist,
-    pose_at,
-    twist_at,
-    with_timing,
-)
+from rs_localizer.pipeline.pose_at_time import pose_at, twist_at, with_timing
 from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.solvers.table import find_solver
 
@@ -119,9 +112,7 @@ class ReadoutKnown:
 
     deviation: float = 0.0  # s
     first_row_time: float = 0.0  # from the middle row, in readout times
-    may_be_reversed: bool = False  # rows may run the other way
     global_shutter: bool = False  # all rows are exposed at once, whatever is set
-    other_axis: Estimate | None = None  # the same frame, if its rows may be its columns
 
 
 def of_camera(
@@ -146,14 +137,6 @@ def of_camera(
     pose = pose_at(estimate, tau)
     twist = twist_at(estimate, tau, readout_time) if moving else None
     deviation = readout.deviation
-    if twist is not None and readout.may_be_reversed:
-        other = pose_at(estimate, -tau)
-        pose, twist = either(pose, other), either_twist(twist, backwards(twist))
-    if twist is not None and readout.other_axis is not None:
-        for row in (tau, -tau):  # in either direction
-            pose = either(pose, pose_at(readout.other_axis, row))
-        columns = twist_at(readout.other_axis, tau, readout_time)
-        twist = either_twist(either_twist(twist, columns), backwards(columns))
     if twist is not None and deviation > 0.0:
         # The middle row comes later where the readout takes longer; the first one does not.
         delay = deviation * readout.first_row_time if tau == 0.0 else 0.0

@@ -22,7 +22,7 @@ from rs_localizer.io.outputs import TYPES, Localized
 from rs_localizer.io.trajectories import read_motions, read_tum, read_twists
 from rs_localizer.offline import frame_table, results
 from rs_localizer.offline.results import Tally, figures
-from rs_localizer.pipeline.readout_estimate import MeasuredReadout
+from rs_localizer.shutter_watch import MeasuredReadout
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_recording import write_simulated
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
@@ -226,7 +226,7 @@ def test_notices_stand_in_the_summary(recording, tmp_path, monkeypatch, capsys):
         for k, item in enumerate(real(bag, topics, localizer)):
             localizer._notice("readout_time", f"estimated readout time {k} ms differs")
             yield item
-        localizer.readout_watch.measured = MeasuredReadout(0.0211, 0.0002, 50, 50.0)
+        localizer.shutter.measured = MeasuredReadout(0.0211, 0.0002)
 
     monkeypatch.setattr(results, "replay", odd)
     monkeypatch.setattr(replay_command, "summary", both(tallies, results.summary))

@@ -16,7 +16,6 @@ from rs_localizer.pipeline.frames import DOUBTFUL
 from rs_localizer.pipeline.imu_readings import ImuState, in_words
 from rs_localizer.pipeline.inputs import Role, input_named, said
 from rs_localizer.pipeline.map_to_odom import Decision, Standing
-from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.pipeline.refusal import IMU_REASONS
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.diagnostics import (
@@ -30,6 +29,7 @@ from rs_localizer.ros.node.diagnostics import (
 )
 from rs_localizer.ros.node.statistics import Summary, Told
 from rs_localizer.ros.node.subscriptions import Silence
+from rs_localizer.shutter_watch import MeasuredReadout
 
 DEVIATION = "Position deviation (cm)"
 """Name of a value: root of the sum over the axes, of the last pose."""

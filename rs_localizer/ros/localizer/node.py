@@ -185,10 +185,8 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
     def begin(self, config: NodeConfig) -> None:
         topics = self.listen(self.topics(config))
         if config.readout_time == 0.0 and not config.of_cameras:
-            until = " until it is estimated" if config.estimate_readout_time else ""
             self.warn(
                 "readout_time is 0 (unknown): no twist is published and frames are not tracked"
-                f"{until}"
             )
         self.get_logger().info(
             f"active with solver {config.solver}, listening to {' and '.join(topics)}"
@@ -330,7 +328,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         oddities = self.refusals.recent(_ODD, WINDOW) | self._broadcaster.fault()
         values: dict[str, str] = {}
         if frames is not None:
-            watch, rig, imu = frames.readout_watch, frames.rig_watch, frames.imu.state
+            watch, rig, imu = frames.shutter, frames.rig_watch, frames.imu.state
             oddities |= imu_oddity(imu) | rig.faults
             oddities |= {"readout_time": watch.fault} if watch.fault else {}
             values = readout_values(watch.measured) | rig.values | imu_values(imu)

@@ -1,14 +1,16 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Alarms of a wrong readout time, and finding it, while frames are localized; hand motion."""
+"""Alarms of a wrong shutter while frames are localized: node, replay and library; hand motion."""
 
 import re
+from dataclasses import dataclass
 from dataclasses import replace as changed
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.data import GLOBAL_SHUTTER_TAGS
 from benchmarks.independent.rotations import logarithm
@@ -18,12 +20,14 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_tum
+from rs_localizer.localizer import Localizer
 from rs_localizer.offline.replay import find_topics, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.readout_estimate import MeasuredReadout
 from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.shutter_watch import MeasuredReadout, ShutterWatch
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import simulate_frames
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
@@ -33,6 +37,7 @@ from rs_localizer.tools.simulation.true_motion import (
     TrueState,
     sampled_states,
 )
+from rs_localizer.tracking import Tracker
 
 from .clouds import cloud_of
 
@@ -72,8 +77,11 @@ class Watched:
         self.said: list[tuple[str, str]] = []
         self.frames = FrameLocalizer(NodeConfig(**settings), lambda *said: self.said.append(said))
         self.frames.calibrate(CALIBRATION)
-        self.watch = self.frames.readout_watch
         self.results = [self.frames.localize(message) for message in self.clouds[:count]]
+
+    @property
+    def watch(self) -> ShutterWatch:
+        return self.frames.shutter
 
     @property
     def notices(self) -> list[str]:
@@ -97,8 +105,8 @@ def test_a_wrong_readout_time_is_said_once(factor, tracking):
     found = seen.watch.measured
     assert found is not None
     assert abs(found.readout_time - READOUT) < 4.0 * found.deviation < 0.1 * READOUT
-    assert seen.watch.fault
-    assert not seen.watch.far_off
+    assert seen.watch.kind == "duration"
+    assert seen.watch.trusted
     # As long as it is wrong, what is published is as uncertain as that.
     error = seen.watch.error
     assert error == pytest.approx(0.2 * READOUT * max(factor, 1.0), rel=0.1)
@@ -118,9 +126,8 @@ def test_a_robot_that_drives_slowly_is_hardly_ever_doubted():
         for frame in simulate_frames(CAMERA, motion, world, seen, seed=seed):
             cloud = cloud_of(frame.stamp_ns + 10**18, frame.points, frame.pixels)
             assert frames.localize(cloud)
-        doubted.append(not frames.readout_watch.trusted)
-    # Single frames are of either opinion: of twelve drives three are doubted (seeds 0, 3 and 7).
-    assert sum(doubted) <= 1
+        doubted.append(not frames.shutter.trusted)
+    assert not any(doubted)
 
 
 def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm():
@@ -129,7 +136,7 @@ def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm():
     frames = FrameLocalizer(NodeConfig(readout_time=0.0129), lambda name, _: notices.append(name))
     with open_bag(data.path(data.WEBCAM)) as bag:
         assert sum(bool(answer.result) for answer in replay(bag, find_topics(bag), frames)) > 100
-    assert frames.readout_watch.measured is not None
+    assert frames.shutter.measured is not None
     assert "readout_time" not in notices
 
 
@@ -140,8 +147,8 @@ def test_a_reversed_scan_is_said_and_covariances_hold(tracking):
     (text,) = seen.notices
     assert "against scan_direction bottom_to_top" in text
     assert text.endswith("is it top_to_bottom?")
-    assert seen.watch.far_off
-    assert seen.watch.may_be_reversed
+    assert seen.watch.kind == "reversed"
+    assert not seen.watch.trusted
     last, known = seen.last(), Watched(FRAMES - 1, **given).last()
     way = known.pose.position - last.pose.position
     turn = logarithm(known.pose.rotation @ last.pose.rotation.T)
@@ -162,9 +169,9 @@ def test_a_global_shutter_is_known_within_a_second_and_has_no_twist(tracking):
         answers = replay(bag, find_topics(bag), frames)
         found = [found for (*_, found), _ in zip(answers, range(40), strict=False)]
     assert all(found)
-    assert frames.readout_watch.far_off
-    assert frames.readout_watch.global_shutter
-    assert "(a global shutter)" in frames.readout_watch.fault
+    assert frames.shutter.is_global
+    assert not frames.shutter.trusted
+    assert "(a global shutter)" in frames.shutter.fault
     assert found[-1].twist is None
     assert np.linalg.norm(found[29].estimate.angular_velocity) < 1e-4  # 0.3 deg/s
 
@@ -173,7 +180,7 @@ def test_a_global_shutter_is_known_within_a_second_and_has_no_twist(tracking):
 def test_what_changes_starts_afresh(change):
     seen = Watched(2, readout_time=0.8 * READOUT)
     frames = seen.frames
-    seen.watch.measured = MeasuredReadout(READOUT, 1e-4, 50, 50.0)
+    seen.watch.measured = MeasuredReadout(READOUT, 1e-4)
     seen.watch.fault = "it differs"
     if change == "reset":
         frames.reset()
@@ -189,24 +196,6 @@ def test_what_changes_starts_afresh(change):
 
 
 @pytest.mark.parametrize(
-    "direction", ["bottom_to_top", pytest.param("top_to_bottom", marks=pytest.mark.bench)]
-)
-def test_the_readout_time_from_nothing(direction):
-    given = {"estimate_readout_time": True, "scan_direction": direction}
-    seen = Watched(FRAMES - 1, **given)
-    (text,) = seen.notices
-    assert text.startswith("estimated: ")
-    config = seen.frames.config
-    assert config.scan_direction == "top_to_bottom"
-    assert config.readout_time == pytest.approx(READOUT, rel=0.06)
-    assert config.readout_time_deviation < 0.02 * READOUT * 1.06
-    assert seen.last().estimate.tracked
-    # Of another camera nothing is known yet.
-    seen.frames.calibrate(changed(CALIBRATION, width=641))
-    assert seen.frames.config == NodeConfig(**given)
-
-
-@pytest.mark.parametrize(
     ("tracking", "start"),
     [(True, START)]
     + [pytest.param(*case, marks=pytest.mark.bench)
@@ -217,7 +206,7 @@ def test_the_wrong_axis_is_named_and_no_pose_comes_of_it(tracking, start):
     # region, and the advice was to calibrate again, or that the shutter is a global one.
     sideways = frames_with_truth("left_to_right", FRAMES, start)
     seen = Watched(FRAMES - 1, sideways, readout_time=READOUT, tracking=tracking)
-    assert not any(seen.results[20:])
+    assert not any(seen.results[15:])
     for result, (_, truth) in zip(seen.results, sideways[:-1], strict=True):
         if result:
             turn = logarithm(result.pose.rotation @ truth.rotations[0].T)
@@ -227,14 +216,78 @@ def test_the_wrong_axis_is_named_and_no_pose_comes_of_it(tracking, start):
     assert isinstance(refusal, Refusal)
     assert refusal.reason == Reason.SCAN_AXIS
     assert "not top_to_bottom" in refusal.detail
-    named = r"the image shows .* moves left_to_right in (19\.9|2)"
+    named = r"the image shows .* moves left_to_right in (19|2)"
     assert any(re.match(named, text) for text in seen.notices)
     assert not any("global" in text for _, text in seen.said)
 
 
-def test_the_axis_is_found_with_the_readout_time():
-    sideways = frames_with_truth("left_to_right", 110)
-    seen = Watched(110, sideways, estimate_readout_time=True)
-    assert seen.frames.config.scan_direction == "left_to_right"
-    assert seen.frames.config.readout_time == pytest.approx(READOUT, rel=0.06)
-    assert seen.results[-1]
+@pytest.mark.parametrize("start", [300, 600, 900, 1200, 1500, 2400])
+@pytest.mark.parametrize("direction", ["left_to_right", "bottom_to_top", "top_to_bottom"])
+def test_who_calls_the_library_learns_within_fifteen_frames(direction, start):
+    tracker = Tracker(Localizer(CAMERA))  # which believes in top to bottom
+    for message, _ in frames_with_truth(direction, 15, start):
+        cloud = read_correspondences(message)
+        found = tracker.localize(cloud.stamp_ns, cloud.points, cloud.pixels)
+    watch = tracker.shutter
+    if direction == "left_to_right":
+        assert not found
+        assert found.reason == Reason.SCAN_AXIS
+        assert found.detail == watch.fault
+        assert re.match("the image shows a shutter that moves left_to_right in (1|2)", watch.fault)
+    elif direction == "bottom_to_top":
+        assert watch.fault.endswith("is it bottom_to_top?")
+        assert found.covariance[6, 6] >= 4.0 * found.angular_velocity[0] ** 2
+    else:
+        assert watch.fault == ""
+        assert watch.trusted
+        assert watch.measured.odds(READOUT, 0.0) > 4.0
+
+
+@dataclass(frozen=True)
+class Shaken:
+    """A car that turns slowly, and whose camera shakes about three axes."""
+
+    amplitude: float  # deg
+    rate: float  # Hz
+
+    steady = ConstantVelocity(np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 0.02]), 2.0)
+    intervals_ns = steady.intervals_ns
+
+    def state(self, stamp_ns, offsets):
+        at, times = self.steady.state(stamp_ns, offsets), 1e-9 * stamp_ns + np.asarray(offsets)
+        turn, rate = np.zeros((2, len(times), 3))
+        for k, share in enumerate((1.0, 1.17, 0.83)):
+            pulse = 2.0 * np.pi * share * self.rate
+            axis = 0.01 * self.amplitude * np.eye(3)[k]
+            turn += np.sin(pulse * times + k)[:, None] * axis
+            rate += pulse * np.cos(pulse * times + k)[:, None] * axis
+        turned = Rotation.from_rotvec(turn).as_matrix()
+        return TrueState(
+            at.rotations @ turned, at.positions, at.angular + rate,
+            np.einsum("nji,nj->ni", turned, at.linear),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "rate"), [(0.1, 11.0), (0.3, 11.0), (0.3, 23.0), (0.1, 47.0)]
+)
+def test_a_camera_that_shakes_between_its_frames_is_not_contradicted(amplitude, rate):
+    """It goes elsewhere between its frames than within them, whatever its shutter.
+
+    Not always: 0.1 deg at 23 Hz look like a reversed shutter (-28 +- 4 ms after 45 frames).
+    """
+    motion, seen = Shaken(amplitude, rate), FrameSettings(100, 0.5, 0.1)
+    world = room(motion.state(0, np.linspace(0, 2, 6)).positions, np.random.default_rng(0), 5000)
+    tracker = Tracker(Localizer(CAMERA))
+    for frame in simulate_frames(CAMERA, motion, world, seen):
+        tracker.localize(frame.stamp_ns + 10**18, frame.points, frame.pixels)
+        assert tracker.shutter.fault == ""
+
+
+def test_a_real_camera_told_the_other_axis_is_refused():
+    frames = FrameLocalizer(NodeConfig(readout_time=0.0129, scan_direction="left_to_right"))
+    with open_bag(data.path(data.WEBCAM)) as bag:
+        results = [answer.result for answer in replay(bag, find_topics(bag), frames)]
+    # It moves slowly. Before, 13 of 121 images were refused, and not for this.
+    assert not any(results[40:])
+    assert "moves top_to_bottom in 1" in frames.shutter.fault

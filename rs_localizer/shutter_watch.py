@@ -1,0 +1,319 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the camera's motion contradicts its readout time, scan direction or axis.
+
+The poses before and after a frame say how fast the camera goes, ``v``; its image shows how far it
+goes while rows, or columns, are read. If that takes ``T_r`` over the rows, negative where they run
+against the direction that is set, and ``T_c`` over the columns (drivers that rotate images turn the
+scan sideways), the points of a frame are off by
+
+    e = J d + (tau_r T_r + tau_c T_c) J v + J (tau_r m_r + tau_c m_c) + noise
+
+with the derivatives ``J`` by the pose, the pose's own error ``d``, and what errors of map and lens
+look like, ``m``, which is alike in neighbouring frames. A Kalman filter knows ``T_r, T_c``, whose
+evidence fades, and both ``m``, which wander. The right shutter is ``(T, 0)``, a global one ``(0,
+0)``, a reversed one ``(-T, 0)``; beside the first axis lies a shutter along the other one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Rig
+from rs_localizer.core.scanning import ACROSS, REVERSED, ScanDirection
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.state import MOTION_PARAMETERS, POSE, VELOCITIES
+from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.observations import find_usable, packed
+from rs_localizer.estimation.prior import state_in
+from rs_localizer.estimation.residuals import linearized
+
+# Of the readout time: off by more, frames that stand alone are better than tracked ones. Errors of
+# a hand's turn rates, tracked over alone, where it is off by a factor of 1.3, 1.5, 1.7: 0.95, 1.3,
+# 1.5 (150 points, 0.3 px); known to a half, it is off by a third in the median.
+FAR_OFF = 0.5
+_MOST_POINTS = 200  # of a frame: more take longer than they are worth
+# Inlier thresholds within which points count: the axis may be the wrong one.
+_GATE = 3.0
+_LEAST_NOISE, _ROUNDS = 0.1, 3  # px, as little as cameras, lenses and maps have; of robust weights
+# Neighbours farther away (s), or of intervals less alike than this, say little.
+_LONGEST_INTERVAL, _MOST_UNLIKE = 0.15, 2.5
+# Of a velocity, squared and by its variance: slower, its noise makes T seem shorter by a tenth.
+_LEAST_MOTION = 60.0
+# Before anything is known, in readout times; and what is left of it one frame later: of five
+# seconds at 30 Hz, a third.
+_ANY, _MEMORY = 3.0, math.exp(-1.0 / 150.0)
+# What map and lens are off by looks like so many rad, and parts of the depth, per readout, and
+# stays alike for a second: of tags before a real global shutter 0.1 to 0.3 ms are left of 20 so.
+_LIKE_MOTION, _ALIKE = 0.002, math.exp(-1.0 / 30.0)
+# What wanders more is learnt from a tenth of each, of no more than four times as much. A camera
+# that shakes between its frames goes elsewhere within them, or shows a readout that takes longer
+# than the frames are apart: 0.1 deg at 11 to 47 Hz make 2 to 600 of it, or 60 ms; hands 1.3.
+_LEARNING, _MOST_UNLIKELY, _SHAKEN = 0.1, 4.0, 1.5
+# Deviations at which a shutter is contradicted, if it is off by more than this share, too.
+_SURELY, _LEAST_DIFFERENCE = 4.0, 0.06
+# Where the setting is known to be right to this share, so many of so many frames are enough.
+_WELL_KNOWN, _ON, _CYCLE = 0.05, 3, 9
+# Of the setting: below, nothing tells the shutter from a global one.
+_GLOBAL = 0.2
+# Logarithms of the odds of another shutter: to doubt, to doubt no more (a robot that drives slowly
+# shows neither), to be certain, and what is said of rest where that is a global one.
+_SUSPICIOUS, _SHOWN, _CERTAIN, _AT_REST = 4.0, -2.0, 8.0, 20.7
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredReadout:
+    """A readout time that the frames of the last seconds show."""
+
+    readout_time: float  # s; negative: against the scan direction that was assumed
+    deviation: float  # s
+
+    def contradicts(self, readout_time: float) -> bool:
+        """True if this readout time (s, of the assumed direction) must be wrong."""
+        least = _LEAST_DIFFERENCE * max(abs(self.readout_time), readout_time)
+        return abs(self.readout_time - readout_time) > max(_SURELY * self.deviation, least)
+
+    def odds(self, one: float, other: float) -> float:
+        """Logarithm of the odds for one readout time (s) against another."""
+        far = [((value - self.readout_time) / self.deviation) ** 2 for value in (one, other)]
+        return 0.5 * (far[1] - far[0])
+
+    def __str__(self) -> str:
+        return f"{1e3 * abs(self.readout_time):.1f} +- {1e3 * self.deviation:.1f} ms"
+
+
+class _Look(NamedTuple):
+    """A frame as its image shows it."""
+
+    time_ns: int
+    found: Estimate
+    units: Array  # (6,) rad and m, of a velocity
+    rows: Array  # (2 n,18) px, derivatives by pose, and by the way over the rows, and over columns
+    off: Array  # (2 n,) px, of the points if the camera did not move
+
+    def over_columns(self) -> tuple[bool, Array]:
+        """Whether points fit a motion (12,) over the columns better than one over rows, and it."""
+        left = []
+        for others in (slice(12, 18), slice(6, 12)):
+            rows = np.delete(self.rows, others, axis=1)
+            motion = np.linalg.lstsq(rows, self.off, rcond=None)[0]
+            left.append(float(np.sum((self.off - rows @ motion) ** 2)))
+        return left[1] < left[0], motion * np.tile(self.units, 2)
+
+
+class ShutterWatch:
+    """Compares the shutter that is set with what the frames show; see the module.
+
+    Args:
+        camera: as it is set; None: there is nothing to compare.
+        threshold: px, of inliers.
+    """
+
+    def __init__(self, camera: Camera | None, threshold: float) -> None:
+        self._gate = _GATE * threshold
+        self._camera = camera
+        if camera is not None:
+            self._exposure = Rig.of(camera).exposure().ahead()
+            self._direction = ScanDirection(camera.scan_direction)
+            self._sideways = replace(camera, scan_direction=ACROSS[self._direction])
+            spread = np.repeat([_ANY * camera.readout_time, _LIKE_MOTION], [2, 12])
+            self._any = np.diag(spread**2)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self.measured: MeasuredReadout | None = None
+        """What the last seconds of motion showed along the axis that is set; None: nothing yet."""
+        self.fault = self.kind = ""
+        """How that contradicts the setting, in one sentence, and in one word."""
+        self.refusal = ""
+        """Why no pose can be told: the shutter moves along the other axis."""
+        self.error = 0.0
+        """How far (s) the setting is off, where it is contradicted."""
+        self.trusted = True
+        """Whether the way from frame to frame tells that within them: not in doubt, nor after one
+        before frames show it. To and fro between both, poses jump."""
+        self.is_global = False
+        """Whether all rows are exposed at once."""
+        self._reversed = False  # they may run the other way
+        self._across = False  # or along the other axis
+        self._looks: deque[_Look] = deque(maxlen=3)
+        self._frames = 0
+        if self._camera is not None:
+            self._mean, self._covariance = np.zeros(14), self._any
+            self._unlike = 1.0  # by how much the square of what wanders is more than usual
+
+    @property
+    def of_rest(self) -> float:
+        """Logarithm of the odds that what looks like motion within an image is none."""
+        return _AT_REST if self.is_global else 0.0
+
+    def widened(self, found: Estimate) -> Estimate:
+        """The last frame with room for what it is as well, if the shutter may be another."""
+        if not (self._reversed or self._across):
+            return found
+        own = np.r_[found.angular_velocity, found.linear_velocity]
+        steps = [np.r_[np.zeros(6), -2.0 * own]]
+        if self._across:
+            sideways = self._looks[-1].over_columns()[1]
+            steps = [sideways * np.repeat([1.0, sign], 6) for sign in (1.0, -1.0)]
+            for step in steps:
+                step[VELOCITIES] -= own
+        joint = found.joint_covariance.copy()
+        for step in steps:
+            joint[:MOTION_PARAMETERS, :MOTION_PARAMETERS] += np.outer(step, step)
+        return replace(found, joint_covariance=joint)
+
+    def add(self, time_ns: int, found: Estimate | Failure, points: Array, pixels: Array) -> None:
+        """Take a frame whose middle row was exposed at ``time_ns``, as it was localized."""
+        if not found or self._camera is None or self._may_rest(self._camera.readout_time):
+            self._looks.clear()
+            return
+        if self._looks and time_ns <= self._looks[-1].time_ns:
+            self._looks.clear()
+        some = slice(None, None, 1 + len(points) // _MOST_POINTS)
+        points, pixels = map(np.ascontiguousarray, (points[some], pixels[some]))
+        self._looks.append(self._look(time_ns, found, points, pixels))
+        if self._covariance is self._any:  # what one image tells
+            self._across = self._looks[-1].over_columns()[0]
+        if len(self._looks) == 3:
+            before, now, after = self._looks
+            first, second = (now.time_ns - before.time_ns) * 1e-9, (time_ns - now.time_ns) * 1e-9
+            alike = 1.0 / _MOST_UNLIKE < first / second < _MOST_UNLIKE
+            if alike and max(first, second) <= _LONGEST_INTERVAL:
+                self._measure(before, now, after, first + second)
+
+    def _may_rest(self, usual: float) -> bool:
+        self._frames += 1
+        known = self.measured is not None and self.measured.deviation < _WELL_KNOWN * usual
+        return known and self.trusted and not self.kind and self._frames % _CYCLE >= _ON
+
+    def _look(self, time_ns: int, found: Estimate, points: Array, pixels: Array) -> _Look:
+        usable = find_usable(self._exposure, points, pixels, [len(pixels)], None)
+        seen, own = packed(self._exposure, points, usable), usable.indices
+        steady = Motion(
+            found.rotation, found.translation, found.angular_velocity, found.linear_velocity
+        )
+        state = state_in(steady, usable.centre)
+        lines = linearized(seen.packed, len(seen), state, np.zeros((len(seen), 6)))
+        near = np.linalg.norm(lines.errors, axis=1) < self._gate  # NaN is not
+        ahead = points[own][near] @ found.rotation[2] + found.translation[2]
+        units = np.repeat([1.0, float(np.median(ahead)) if near.any() else 1.0], 3)
+        by_pose = lines.by_motion[near, :, POSE] * units
+        over_rows = lines.by_motion[near, :, VELOCITIES] * units
+        over_columns = self._sideways.row_time(pixels[own][near])[:, None, None] * by_pose
+        rows = np.concatenate([by_pose, over_rows, over_columns], axis=2).reshape(-1, 18)
+        speed = np.r_[found.angular_velocity, found.linear_velocity] / units
+        off = rows[:, 6:12] @ speed - lines.errors[near].ravel()
+        return _Look(time_ns, found, units, rows, off)
+
+    def _measure(self, before: _Look, now: _Look, after: _Look, seconds: float) -> None:
+        """Take what a frame shows whose neighbours are so many s apart."""
+        assert self._camera is not None
+        back = now.found.rotation
+        turn = so3.log(np.ascontiguousarray(before.found.rotation @ back.T))
+        turn += so3.log(np.ascontiguousarray(back @ after.found.rotation.T))
+        way = np.r_[turn, back @ (after.found.position - before.found.position)]
+        noise = sum(look.found.joint_covariance[POSE, POSE] for look in (before, after))
+        if not way @ np.linalg.solve(noise, way) > _LEAST_MOTION or len(now.off) < 36:
+            return
+        speed, rows = way / (seconds * now.units), now.rows
+        design = np.c_[rows[:, :6], rows[:, 6:12] @ speed, rows[:, 12:] @ speed, rows[:, 6:]]
+        spread, most = self._covariance[:2, :2].diagonal().max(), self._any[0, 0]
+        lasting = np.repeat([math.sqrt(min(1.0 / _MEMORY, most / spread)), _ALIKE], [2, 12])
+        known = self._covariance * np.outer(lasting, lasting)
+        wanders = (1.0 - _ALIKE**2) * self._any[2:, 2:]
+        known[2:, 2:] += self._unlike * wanders
+        prior = np.r_[np.zeros(6), self._mean[:2], _ALIKE * self._mean[2:]]
+        information = np.zeros((20, 20))
+        information[6:, 6:] = np.linalg.inv(known)
+        expected, step = now.off - design @ prior, np.zeros(20)
+        variance = float(np.median(expected**2)) / 0.455  # of a normal distribution
+        for _ in range(_ROUNDS):
+            left, variance = expected - design @ step, max(variance, _LEAST_NOISE**2)
+            weights = 1.0 / (1.0 + left**2 / (9.0 * variance))
+            weighed = (design * (weights / variance)[:, None]).T
+            covariance = np.linalg.inv(weighed @ design + information)
+            step = covariance @ (weighed @ expected)
+            variance = float(weights @ (expected - design @ step) ** 2 / np.sum(weights))
+        self._mean, self._covariance = (prior + step)[6:], covariance[6:, 6:]
+        changed = float(np.mean(step[8:] ** 2 / wanders.diagonal()))
+        changed = min(changed, _MOST_UNLIKELY * self._unlike)
+        self._unlike = max(self._unlike + _LEARNING * (changed - self._unlike), 1.0)
+        if self._unlike < _SHAKEN and np.all(np.abs(self._mean[:2]) < 0.55 * seconds):
+            self._judge(self._camera.readout_time)
+        elif not self.kind:
+            self.trusted, self._reversed, self._across = True, False, False
+
+    def _along(self, axis: int) -> MeasuredReadout:
+        """The readout time along an axis, if the shutter moves along it."""
+        other, spread = 1 - axis, self._covariance[:2, :2]
+        gain = spread[axis, other] / spread[other, other]
+        value = float(self._mean[axis] - gain * self._mean[other])
+        return MeasuredReadout(value, math.sqrt(spread[axis, axis] - gain * spread[axis, other]))
+
+    def _far(self, over_rows: float, over_columns: float) -> float:
+        """Half the squared distance of a shutter from what is known."""
+        off = self._mean[:2] - (over_rows, over_columns)
+        return 0.5 * float(off @ np.linalg.solve(self._covariance[:2, :2], off))
+
+    def _judge(self, usual: float) -> None:
+        """Judge whether readout time, direction or axis are contradicted."""
+        measured, across = self._along(0), self._along(1)
+        far = self._mean[:2] ** 2 / np.diag(self._covariance)[:2]
+        odds = 0.5 * float(far[1] - far[0])  # of the other axis; a global shutter has both
+        sideways = self._far(0.0, math.copysign(usual, across.readout_time))
+        doubtful = self._far(usual, 0.0) - sideways > _SUSPICIOUS
+        doubtful &= self._far(0.0, 0.0) - sideways > -_SUSPICIOUS
+        self.refusal, self._across = "", doubtful or odds > _SUSPICIOUS
+        if odds > _CERTAIN or (self.kind == "axis" and odds > 0.0):
+            direction = ACROSS[self._direction]
+            direction = direction if across.readout_time > 0.0 else REVERSED[direction]
+            self.kind = "axis"
+            self.fault = self.refusal = (
+                f"the image shows a shutter that moves {direction} in {across}, not "
+                f"{self._direction}; no poses are published until scan_direction is {direction}"
+            )
+        if self.refusal or self._across:
+            self.trusted = False
+            return
+        self.measured = measured if measured.deviation < usual else None
+        self.kind = self._name(measured, usual)
+        wrong, found = bool(self.kind), measured.readout_time
+        of_global, of_reversed = (measured.odds(value, usual) for value in (0.0, -usual))
+        shorter = usual / max(abs(found), _GLOBAL * usual, measured.deviation)
+        off = math.hypot(found - usual, measured.deviation)
+        self.error = off * max(shorter, 1.0) if wrong else 0.0
+        self.is_global = self.kind == "global"
+        self._reversed = self.kind == "reversed" or of_reversed > _SUSPICIOUS
+        doubt = max(of_global, of_reversed)
+        if (wrong and found < FAR_OFF * usual) or doubt > _SUSPICIOUS:
+            self.trusted = False
+        elif doubt < _SHOWN:
+            self.trusted = True
+
+    def _name(self, measured: MeasuredReadout, usual: float) -> str:
+        """The kind of the fault of the readout time that is set, if it has one; it is described."""
+        self.fault, found, direction = "", measured.readout_time, self._direction
+        if not measured.contradicts(usual):
+            return ""
+        if found < -_SURELY * measured.deviation:
+            self.fault = f"the shutter moves against scan_direction {direction}, in {measured}: is "
+            self.fault += f"it {REVERSED[direction]}?"
+            return "reversed"
+        if found < -_GLOBAL * usual:  # one of both
+            return ""
+        kind, named = (
+            ("global", " (a global shutter)") if found < _GLOBAL * usual else ("duration", "")
+        )
+        self.fault = f"estimated readout time {measured}{named} differs from readout_time = "
+        self.fault += f"{1e3 * usual:g} ms"
+        return kind
