@@ -106,7 +106,7 @@ class _Look(NamedTuple):
             rows = np.delete(self.rows, others, axis=1)
             motion = np.linalg.lstsq(rows, self.off, rcond=None)[0]
             left.append(float(np.sum((self.off - rows @ motion) ** 2)))
-        return left[1] < left[0], motion * np.tile(self.units, 2)
+        return left[1] < left[0], np.asarray(motion * np.tile(self.units, 2), np.float64)
 
 
 class ShutterWatch:

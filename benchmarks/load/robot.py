@@ -199,7 +199,7 @@ class _Around:
         self._fixed.sendTransform(_stamped(0, "base_link", CAMERA_FRAME, Transform(*camera)))
         self._base_ns = time.time_ns() + 1_000_000_000
         image = functools.partial(self._send_image, frames)
-        rates = (
+        rates: tuple[tuple[float, Callable[[float], None], float], ...] = (
             (_ODOMETRY, self._send_odometry, 0.0), (_IMAGES, image, _ARRIVAL),
             (_LOOKUPS, self._look, 0.011), (20.0, self._send_rival, 0.003),
         )  # fmt: skip

@@ -148,8 +148,8 @@ class FrameLocalizer:
         self._newest: Correspondences | None = None
         self._smooth_errors: deque[float] = deque(maxlen=_FRAMES)
         self._too_many = False  # whether clouds above max_points have been noticed
-        self._config = config
-        self._use(config)
+        self._config = _in_effect(config)
+        self._use(self._config)
 
     @property
     def config(self) -> NodeConfig:
@@ -165,6 +165,7 @@ class FrameLocalizer:
         What no frame's estimate depends on, as of outputs and transforms, leaves track, IMU and
         readout watch as they are.
         """
+        config = _in_effect(config)
         if _of_estimates(config) == _of_estimates(self._config):
             self._config = config
             return False
@@ -178,7 +179,6 @@ class FrameLocalizer:
 
     def _use(self, config: NodeConfig) -> None:
         # Nothing changes if this raises: cameras, tracker and settings always belong together.
-        config = _in_effect(config)
         seen = {
             name: self.calibrations.get(name, ANY_CALIBRATION).camera(
                 own.readout_time, own.scan_direction

@@ -20,13 +20,13 @@ from rs_localizer.io.messages import make_header, make_quaternion, make_vector
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import LIVE, MAP_TO_ODOM
 from rs_localizer.io.transforms import NotYetError, TransformError, make_transform
+from rs_localizer.pipeline.carried_pose import Odometry
 from rs_localizer.pipeline.given_pose import GivenPose
 from rs_localizer.pipeline.map_to_odom import (
     Click,
     CorrectionState,
     Decision,
     FoundPose,
-    Odometry,
     Settings,
     Standing,
     decide,

@@ -67,7 +67,7 @@ class Rivals:
                 text = self._two_parents(*link, static)
         if not text:
             return {}
-        found = {Notice.SECOND_BROADCASTER: text}
+        found: dict[str, str] = {Notice.SECOND_BROADCASTER: text}
         self.static |= found if static else {}
         return found
 
