@@ -54,7 +54,7 @@ def input_of(fields: Collection[str]) -> str | None:
     return None
 
 
-class Look:
+class Surroundings:
     """What is published: topics by the input that they are for, and the sizes of images.
 
     Args:
@@ -72,7 +72,7 @@ class Look:
         return {wanted: sorted(names) for wanted, names in self._found.items()}
 
     def until(self, stopped: Callable[[], bool]) -> None:
-        """Look until it is to stop."""
+        """Surroundings until it is to stop."""
         listening: Inputs | None = None
         executor = executor_of(self._node.context)
         executor.add_node(self._node)
@@ -115,12 +115,12 @@ class DoctorNode(LocalizerNode):
     """A localizer that disturbs nobody, and says what it finds.
 
     Args:
-        look: at what is published; the first topic of each input is listened to.
+        around: what is published; the first topic of each input is listened to.
         options: of rclpy's node.
     """
 
-    def __init__(self, look: Look, **options: Any) -> None:
-        self._look, inputs = look, look.inputs
+    def __init__(self, around: Surroundings, **options: Any) -> None:
+        self._around, inputs = around, around.inputs
         words = ["-p", "publish_tf:=none", "-r", f"__ns:={_NAMESPACE}"]
         words += ["-r", f"{topics.DIAGNOSTICS}:={_NAMESPACE}{topics.DIAGNOSTICS}"]
         for name, (topic, *_) in inputs.items():
@@ -132,11 +132,11 @@ class DoctorNode(LocalizerNode):
         """Lines on what it finds; the last one is the answer."""
         health, frame = self.examine()
         values = health.values
-        if topics.CAMERA_INFO not in self._look.inputs:
+        if topics.CAMERA_INFO not in self._around.inputs:
             yield _line("camera_info", f"no topic has the type {CAMERA_INFO_TYPE}")
-        if not {topics.CORRESPONDENCES, topics.KEYPOINTS} & self._look.inputs.keys():
+        if not {topics.CORRESPONDENCES, topics.KEYPOINTS} & self._around.inputs.keys():
             yield _line("correspondences", "no PointCloud2 has fields u v, with x y z, or with id")
-        for name, others in self._look.inputs.items():
+        for name, others in self._around.inputs.items():
             heard = values.get(f"Topic {others[0]}", "not needed")
             more = f"; also {', '.join(others[1:])}" if others[1:] else ""
             yield _line(name, f"{others[0]}: {heard}{more}")
@@ -162,7 +162,7 @@ class DoctorNode(LocalizerNode):
         if calibration is None:
             return "no usable camera_info"
         size = f"{calibration.width} x {calibration.height}"
-        others = [f"{name}: {own}" for name, own in self._look.images.items() if own != size]
+        others = [f"{name}: {own}" for name, own in self._around.images.items() if own != size]
         text = f"; not that of the images on {', '.join(others)}" if others else ""
         return f"{size}, {calibration.distortion_model}, frame {frame!r}{text}"
 
@@ -193,14 +193,14 @@ def launch_words(inputs: Mapping[str, list[str]]) -> str:
 
 
 def run(stop: StopRequest, args: list[str] | None = None) -> int:
-    """Look, print and write; 0: a localizer works with what was found."""
+    """Surroundings, print and write; 0: a localizer works with what was found."""
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     looking = Node("doctor")
-    look, end = Look(looking), time.monotonic() + _LOOKING
-    look.until(lambda: stop.requested or time.monotonic() > end)
+    around, end = Surroundings(looking), time.monotonic() + _LOOKING
+    around.until(lambda: stop.requested or time.monotonic() > end)
     looking.destroy_node()
     try:
-        node = DoctorNode(look)
+        node = DoctorNode(around)
     except ValueError as error:
         sys.stderr.write(f"doctor: {error}\n")
         rclpy.try_shutdown()
@@ -222,5 +222,5 @@ def run(stop: StopRequest, args: list[str] | None = None) -> int:
     node.write(FILE)
     node.destroy_node()
     rclpy.try_shutdown()
-    sys.stdout.write("\n".join([*lines[:-1], launch_words(look.inputs), lines[-1]]) + "\n")
+    sys.stdout.write("\n".join([*lines[:-1], launch_words(around.inputs), lines[-1]]) + "\n")
     return 0 if well else 1
