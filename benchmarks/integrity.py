@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -29,7 +30,7 @@ from rs_localizer import integrity
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.integrity import Integrity
+from rs_localizer.integrity import INNOVATION, Integrity
 from rs_localizer.localizer import Localizer
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import simulate_frames
@@ -173,40 +174,64 @@ def weights_of(wrong: Array) -> Array:
     return weights
 
 
-def fit(rows: list[Row]) -> None:
-    """Print new weights and a new calibration."""
-    numbers, wrong = np.array([row.numbers for row in rows]), np.array([row.wrong for row in rows])
+def _jumps(rows: list[Row]) -> tuple[Array, Array]:
+    """Innovations of frames after right ones, and whether the whole map has jumped with them."""
+    pairs = [
+        (row.numbers[INNOVATION], row.kind == "jumped" and row.wrong)
+        for before, row in itertools.pairwise(rows)
+        if before.sequence == row.sequence and not before.wrong
+        if not row.wrong or row.kind == "jumped"
+    ]
+    innovations, jumped = map(np.array, zip(*pairs, strict=True))
+    return innovations, jumped
+
+
+def _regression(numbers: Array, wrong: Array, share: float, missed: float) -> Array:
+    """Constant and factors of the logarithmic odds that a frame is wrong.
+
+    Args:
+        numbers, wrong: (n,k), (n,) of the frames.
+        share: of wrong ones, for which they are weighted.
+        missed: share of the wrong ones that look as right ones do.
+    """
     mean, spread = numbers.mean(axis=0), numbers.std(axis=0) + 1e-9
     scaled = (numbers - mean) / spread
-    half = np.where(wrong, 0.5 / wrong.mean(), 0.5 / (1.0 - wrong.mean()))
+    weights = np.where(wrong, share / wrong.mean(), (1.0 - share) / (1.0 - wrong.mean()))
 
     def loss(w: Array) -> float:
-        odds = w[0] + scaled @ w[1:]
-        ridge = 1e-3 * float(w[1:] @ w[1:])
-        return float(np.mean(half * (np.logaddexp(0.0, odds) - wrong * odds))) + ridge
+        said = 1.0 / (1.0 + np.exp(-w[0] - scaled @ w[1:]))
+        told = np.where(wrong, said + (1.0 - said) * missed, 1.0 - said)
+        return float(np.mean(weights * -np.log(told + 1e-12))) + 1e-3 * share * float(w[1:] @ w[1:])
 
-    w = minimize(loss, np.zeros(1 + scaled.shape[1])).x
-    integrity.WEIGHTS = np.r_[w[0] - np.sum(w[1:] * mean / spread), w[1:] / spread]
-    integrity.CALIBRATION = (0.0, 1.0)
+    w = minimize(loss, np.r_[math.log(share), np.zeros(numbers.shape[1])]).x
+    fitted: Array = np.r_[w[0] - np.sum(w[1:] * mean / spread), w[1:] / spread]
+    return fitted
+
+
+def fit(rows: list[Row]) -> None:
+    """Print new constants."""
+    shown = [row for row in rows if row.kind != "jumped"]  # in which frames show what is wrong
+    numbers, wrong = (
+        np.array([row.numbers for row in shown]),
+        np.array([row.wrong for row in shown]),
+    )
+    own = [k for k in range(numbers.shape[1]) if k != INNOVATION]
+    found = _regression(numbers[:, own], wrong, 0.5, 0.05)
+    integrity.WEIGHTS = np.insert(found, 1 + INNOVATION, 0.0)
+    innovations, jumped = _jumps(rows)
+    jump = _regression(innovations[:, None], jumped, 0.002, 0.0)
+    integrity.JUMP = (float(jump[0]), float(jump[1]))
     best: tuple[float, ...] = (np.inf,)
+    wrong = np.array([row.wrong for row in rows])
     share = weights_of(wrong)
-    for temper in (0.1, 0.2, 0.3, 0.4, 0.6, 0.8):
-        for goes in (1e-4, 1e-3):
-            for recovers in (0.005, 0.02, 0.1, 0.3):
-                integrity.TEMPER, integrity.GOES_WRONG = temper, goes
-                integrity.RECOVERS = recovers
-                said = np.clip(recursive(rows), 1e-9, 1.0 - 1e-9)
-                cost = float(np.mean(share * -np.log(np.where(wrong, said, 1.0 - said))))
-                best = min(best, (cost, temper, goes, recovers))
+    for temper, goes, recovers in itertools.product((0.1, 0.2, 0.4), (1e-4, 1e-3), (0.02, 0.1)):
+        integrity.TEMPER, integrity.GOES_WRONG, integrity.RECOVERS = temper, goes, recovers
+        said = np.clip(recursive(rows), 1e-6, 1.0 - 1e-6)
+        cost = float(np.mean(share * -np.log(np.where(wrong, said, 1.0 - said))))
+        best = min(best, (cost, temper, goes, recovers))
     _, integrity.TEMPER, integrity.GOES_WRONG, integrity.RECOVERS = best
-    said = np.clip(recursive(rows), 1e-9, 1.0 - 1e-9)
-    odds = np.log(said / (1.0 - said))
-    platt = minimize(
-        lambda v: np.mean(share * (np.logaddexp(0, v[0] + v[1] * odds)
-                                   - wrong * (v[0] + v[1] * odds))), [0.0, 1.0],
-    ).x  # fmt: skip
-    print("WEIGHTS", np.round(integrity.WEIGHTS, 3).tolist())
-    print("TEMPER, GOES_WRONG, RECOVERS", best[1:], "CALIBRATION", np.round(platt, 3).tolist())
+    print("WEIGHTS", np.round(integrity.WEIGHTS, 3).tolist(), "JUMP", np.round(jump, 2).tolist())
+    print("TEMPER, GOES_WRONG, RECOVERS", best[1:])
 
 
 def report(rows: list[Row]) -> None:

@@ -4,11 +4,11 @@
 
 A frame shows it by what a right pose in the right map does not leave: outliers that lie together
 instead of everywhere, and are the same landmarks in the next frame, inliers in a part of what is
-seen only, a place that the frames before did not predict. Each is a number; the logarithm of their
-odds is a logistic regression's over sequences in right maps and in wrong ones
-(``python -m benchmarks.integrity --fit``), tempered, as successive frames err together, added up by
-a hidden Markov chain of two states, and calibrated (Platt, "Probabilistic outputs for support
-vector machines", 1999) where two frames in a hundred are wrong.
+seen only. Each is a number; the logarithm of their odds is a logistic regression's over sequences
+in right maps and in wrong ones (``python -m benchmarks.integrity --fit``), tempered, as successive
+frames err together. Where all of a map is wrong in the same way, nothing of that shows, but for the
+moment at which it begins: the pose lies where the frames before did not predict it. A hidden Markov
+chain adds both up. It has three states: right; wrong, and frames show it; wrong since a jump.
 
 What no image shows it does not know: a room that had been moved as a whole before the first frame,
 or a wall that is another one's copy while nothing else is seen. Landmarks that are gone make no
@@ -28,17 +28,18 @@ from rs_localizer.estimation.prior import Prior
 from rs_localizer.estimation.residuals import likeness
 
 NAMES = (
-    "share", "together", "apart", "persists", "spread", "filled", "count", "innovation", "searched",
-    "lasting",
+    "share", "together", "apart", "persists", "spread", "filled", "count", "innovation", "lasting",
 )  # fmt: skip
 """Of the numbers of a frame."""
-# Of the regression: constant, then those of NAMES.
-WEIGHTS = np.array([1.363, -0.855, 0.011, 0.365, 0.845, -4.351, -0.551, -0.653, 0.781, 1.253, 0.0])
+# Of the regression: constant, then those of NAMES; of the innovation only the jump tells.
+WEIGHTS = np.array([-0.216, -0.018, 0.044, 0.299, 0.174, -4.677, 0.279, -0.291, 0.0, -1.102])
 # How much of a frame's odds count beside those of the frames before; chances per frame that a right
-# track goes wrong, and that a wrong one is right again; of a first pose. By likelihood, as WEIGHTS.
-TEMPER, GOES_WRONG, RECOVERS, FIRST = 0.4, 0.001, 0.3, 0.02
-# Of the logarithmic odds that come of it: constant and factor.
-CALIBRATION = (-0.128, 0.788)
+# track goes wrong, and that a wrong one is right again; of a first pose, to be wrong in either way.
+TEMPER, GOES_WRONG, RECOVERS, FIRST = 0.2, 0.001, 0.1, (0.015, 0.005)
+# Logarithmic odds that an innovation is a jump, to where the pose is wrong or right again (constant
+# and factor), and the most that a jump may say.
+JUMP, MOST_JUMP = (-15.57, 5.34), 0.65
+INNOVATION = NAMES.index("innovation")
 # Neighbours of a point in the map, and how many points are looked at.
 _NEIGHBOURS, _MOST = 4, 200
 # Makes one number of a landmark's place, which no other place shares to the last bit.
@@ -140,7 +141,9 @@ class Integrity:
 
     def reset(self) -> None:
         """The next frame is the first; landmarks stay what they are."""
-        self._wrong = FIRST
+        # Of the three states, after the last frame.
+        self._chances = np.array([1.0 - sum(FIRST), *FIRST])
+        self._is_first = True
         # Keys of the last frame's landmarks, in their order, and whether they were inliers
         self._kept = np.zeros(0), np.zeros(0, np.bool_)
 
@@ -151,7 +154,7 @@ class Integrity:
     def numbers(
         self, estimate: Estimate, points: ArrayLike, pixels: ArrayLike, prior: Prior | None
     ) -> Array:
-        """The numbers (10,) of the next frame, in the order of ``NAMES``.
+        """The numbers (9,) of the next frame, in the order of ``NAMES``.
 
         Args:
             estimate: of the frame.
@@ -178,7 +181,6 @@ class Integrity:
                 filled,
                 math.log(max(inliers - 6.0, 1.0)),
                 0.0 if prior is None else _innovation(estimate, prior),
-                0.0 if estimate.tracked else 1.0,
                 persists * outliers,  # of few, as of landmarks that are gone, less
             ]
         )
@@ -202,7 +204,21 @@ class Integrity:
     def add(self, numbers: Array) -> float:
         """The probability after a frame of these numbers."""
         said = min(max(float(WEIGHTS[0] + WEIGHTS[1:] @ numbers), -_MOST_ODDS), _MOST_ODDS)
-        wrong = self._wrong * (1.0 - RECOVERS) + (1.0 - self._wrong) * GOES_WRONG
-        odds = TEMPER * said + math.log(wrong / (1.0 - wrong))
-        self._wrong = 1.0 / (1.0 + math.exp(-odds))
-        return 1.0 / (1.0 + math.exp(-CALIBRATION[0] - CALIBRATION[1] * odds))
+        if not self._is_first:
+            self._chances = _transitions(float(numbers[INNOVATION])) @ self._chances
+        self._is_first = False
+        self._chances *= [1.0, math.exp(TEMPER * said), 1.0]
+        self._chances /= self._chances.sum()
+        return float(1.0 - self._chances[0])
+
+
+def _transitions(innovation: float) -> Array:
+    """Chances (3,3) from each state of the frame before (columns) to those of the next."""
+    odds = JUMP[0] + JUMP[1] * innovation
+    jump = min(1.0 / (1.0 + math.exp(-odds)), MOST_JUMP)
+    stays, goes = 1.0 - GOES_WRONG, GOES_WRONG
+    return np.array([
+        [stays * (1.0 - jump), RECOVERS, stays * jump],
+        [goes, 1.0 - RECOVERS, goes],
+        [stays * jump, 0.0, stays * (1.0 - jump)],
+    ])  # fmt: skip

@@ -177,12 +177,12 @@ class _Case:
             if not right:
                 return replace(state, held=replace(held, near_ns=self.now.stamp_ns)), ""
             base, drift = state.drift.judged(state.base or found.pose, found.pose, self.now)
-            held = self._renewed(held, found, _STEP)
+            held = self._renewed(held, found, _AGREES)
             return replace(state, held=held, aside=None, base=base, drift=drift), ""
         if aside is None or not self._passes(theirs):
             found = replace(found, reachable=self._reachable(held, aside, found))
             return replace(state, aside=found), ""
-        found = self._renewed(aside, found, _STEP if right else 0.0)
+        found = self._renewed(aside, found, _AGREES if right else max(aside.support, _PERSISTS))
         if found.support < _AGREES or not (found.reachable or held.support < _AGREES):
             return replace(state, aside=found), ""
         jump = far(held.pose.offset(found.pose, self.now))
@@ -286,8 +286,8 @@ class _Case:
         return False
 
     def _renewed(self, known: Hypothesis, found: Hypothesis, most: float) -> Hypothesis:
-        """A hypothesis by its newest pose, which supports it for so many s at most."""
-        support = min(known.support + min(known.pose.seconds(self.now), most), _AGREES)
+        """A hypothesis by its newest pose, with a support of so many s at most."""
+        support = min(known.support + min(known.pose.seconds(self.now), _STEP), most)
         return replace(found, support=support, reachable=known.reachable)
 
 
