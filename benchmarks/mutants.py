@@ -60,7 +60,7 @@ MUTANTS = [Mutant(*row) for row in (
     ("shutter_watch.py", "-2.0 * own", "0.0 * own", "test/pipeline/test_shutter_watch.py"),
     ("pipeline/map_to_odom.py", "[0, 1, 5] if", "[0, 1, 3] if",
      "test/pipeline/test_map_to_odom.py"),
-    ("pipeline/map_to_odom.py", "aside.reachable and", "True and",
+    ("pipeline/map_to_odom.py", "not seen.doubt >= _DOUBTFUL", "True",
      "test/pipeline/test_map_to_odom.py"),
     ("pipeline/carried_pose.py", "there.rotation @ here.rotation.T",
      "there.rotation.T @ here.rotation", "test/pipeline/test_map_to_odom.py"),
