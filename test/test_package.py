@@ -112,6 +112,7 @@ def test_declared_commands_can_be_imported(wheel):
     declared.read_string(wheel.read(path).decode())
     assert declared.sections() == ["console_scripts"]
     assert set(declared["console_scripts"]) == {
+        "doctor",
         "localizer",
         "marker_detector",
         "feature_detector",
