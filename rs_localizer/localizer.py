@@ -22,7 +22,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.acceptance import refusal, speeding, uncertain
+from rs_localizer.estimation.acceptance import noise_fills, refusal, speeding, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
 from rs_localizer.estimation.left_out import LeftOut, left_out
@@ -37,7 +37,7 @@ from rs_localizer.estimation.observations import (
     relinearized,
     unfit,
 )
-from rs_localizer.estimation.posterior import Posterior, best_motion
+from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, best_motion
 from rs_localizer.estimation.prior import (
     Prior,
     PriorTerms,
@@ -64,6 +64,8 @@ _UNRANKED = np.zeros(0, np.int64)
 _LOOKS = 2
 # Points that agree with a prediction's optimum, as a share of those that agreed before.
 _STILL_TRACKED = 0.7
+# A gate is widened for noise that fills it up to so many times, by so much at least.
+_WIDEST, _LEAST_WIDER = 4.0, 1.25
 
 
 class _Inputs(NamedTuple):
@@ -357,8 +359,15 @@ class Localizer:
         if not self._full:
             seen = observations.packed, observations.count
             return Posterior(*best_motion(*seen, best.state, terms, gate))
-        one_lens = sighted.exposure.alone
-        return frame_posterior(observations, best.state, terms, gate, assumed, one_lens)
+        one_lens, most = sighted.exposure.alone, _WIDEST * gate
+        while True:
+            posterior = frame_posterior(observations, best.state, terms, gate, assumed, one_lens)
+            posterior = posterior._replace(gate=gate)
+            # A map whose points are off by more than anybody said has more noise than a gate lets
+            # through: as long as the noise fills it, nobody knows how much.
+            if gate >= most or not noise_fills(posterior, self._solver.rolling_shutter):
+                return posterior
+            gate = min(max(GATE / WIDEST_GATE * posterior.noise, _LEAST_WIDER * gate), most)
 
     def _gate(self, observed: Observed, state: Array) -> float:
         """Inlier threshold (px) with room for what the map is known to be off."""

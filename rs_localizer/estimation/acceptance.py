@@ -72,13 +72,12 @@ def refusal(
             Reason.DEGENERATE,
             f"{found} inliers leave the motion so open that it cannot be computed",
         )
-    most = _MOST_NOISE if rolling else _MOST_NOISE_GLOBAL_SHUTTER
-    if posterior.noise > most * threshold:
+    if noise_fills(posterior, rolling):
         return Failure(
             Reason.RESIDUAL,
             f"{found} inliers with errors of {posterior.noise:.2g} px (one sigma) around an "
             f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
-            "too small for the noise",
+            "too small for the noise; set map_deviation, if points of the map are that far off",
         )
     if posterior.near_outliers:
         return Failure(
@@ -96,6 +95,12 @@ def refusal(
             "or the map is too far off for any pose",
         )
     return None
+
+
+def noise_fills(posterior: Posterior, rolling: bool) -> bool:
+    """Whether errors are as large as the gate lets them be, so that nobody knows their noise."""
+    most = _MOST_NOISE if rolling else _MOST_NOISE_GLOBAL_SHUTTER
+    return posterior.noise > most * posterior.gate
 
 
 def speeding(observed: Observed, state: Array) -> float:

@@ -43,6 +43,8 @@ _ELSEWHERE = 2.0
 # twice at most.
 _STRETCH = 0.5
 _MANY = 60
+# Gates before a declared map, of two motions, differ by less, and a widened one from both by more.
+_WIDE = 1.2
 # This part of mismatches at most is off as its neighbours are: by chance two in a hundred are.
 _STREWN = 0.1
 # A side of the image that has all but this part of a group.
@@ -54,6 +56,10 @@ _LENGTHS = (1.0, 0.7, 0.5, 1.4, 2.0)
 # a region of it) deviate by.
 _OF_K, _DEVIATIONS = np.array([1.0, 0.0, 0.0]), np.array([1.0, 0.3, 0.3])
 _LENS = len(_OF_K)
+# Gain in the logarithm of the evidence for each point, from which another matrix is believed: all
+# points are seen through it. Wrong ones gain 1.5 and more (72 frames); before a curled sheet, whose
+# errors many points share, another matrix gains 0.6.
+_EACH = 1.0
 # Deviation of a K of this very image, which errors that are smooth over it stand for. Both are as
 # probable where K is off by 0.048: the principal point of a phone is by 0.012, and of a lens of
 # which a third is missing by 0.03 (paired set).
@@ -98,12 +104,13 @@ def left_out(
     """
     least = 1.0 if known else _LEAST_ODDS
     inliers = posterior.inliers
-    rest = ~(posterior.squared_errors < (_ELSEWHERE * WIDEST_GATE * threshold) ** 2)
+    rest = ~(posterior.squared_errors < (_ELSEWHERE * WIDEST_GATE * posterior.gate) ** 2)
     found, left = int(np.count_nonzero(inliers)), int(np.count_nonzero(rest))
-    failure = None if known else _by_chance(observed, posterior)
-    if failure is not None or np.count_nonzero(~inliers) < _SAMPLE:
-        return LeftOut(failure)
-    strewn = _moved_alike(observed, posterior, ~inliers) < _STREWN
+    wide = posterior.gate > _WIDE * threshold  # for noise, or for what another matrix explains
+    failure = None if known else _by_chance(observed, posterior, wide)
+    if failure is not None or not (wide or np.count_nonzero(~inliers) >= _SAMPLE):
+        return LeftOut(failure, _rough(observed, posterior) if wide else "")
+    strewn = not wide and _moved_alike(observed, posterior, ~inliers) < _STREWN
     second = None
     if left > _SAMPLE and (not strewn or _odds(found, left, posterior.speeding) < least):
         second = _own_motion(search, observed, rest, threshold)
@@ -114,7 +121,7 @@ def left_out(
         if failure is not None:
             return LeftOut(failure)
     if second is None:
-        return LeftOut()
+        return LeftOut(notice=_rough(observed, posterior) if wide else "")
     size = int(np.count_nonzero(second.chosen))
     where = _side(observed, inliers, second.chosen)
     step = step_between(posterior.state, second.state)
@@ -131,6 +138,16 @@ def left_out(
         f"{text}: which of both is the camera's? A part of the map was moved, or the calibration "
         "is grossly wrong",
     ))  # fmt: skip
+
+
+def _rough(observed: Observed, posterior: Posterior) -> str:
+    """Sentence on noise for which the gate was widened."""
+    depth = observed.observations.median_depth(posterior.state, posterior.inliers)
+    deviation = posterior.noise * depth / observed.assumed.focal_length
+    return (
+        f"errors of {posterior.noise:.2g} px (one sigma) are more than inlier_threshold allows: "
+        f"set map_deviation to {deviation:.2g} m, if points of the map are that far off"
+    )
 
 
 def _odds(size: int, other: int, faster: float) -> float:
@@ -183,7 +200,8 @@ def _of_another_lens(
     first = _Group(posterior.inliers, posterior.state, posterior.squared_errors)
     parts = [(first,)] if second is None else [(first,), (first, second)]
     evidence = max(_evidence(groups, PARAMETERS * len(groups), count, area) for groups in parts)
-    if _evidence((lens.group,), PARAMETERS + _LENS, count, area) < evidence + _LEAST_CHANCE:
+    least = evidence + max(_EACH * count, _LEAST_CHANCE)
+    if _evidence((lens.group,), PARAMETERS + _LENS, count, area) < least:
         return None
     more = np.count_nonzero(lens.group.chosen) - np.count_nonzero(first.chosen)
     length, *shift = lens.numbers * (1.0, *[observed.assumed.focal_length] * 2)
@@ -322,7 +340,7 @@ def _surprise(total: int, size: int, sample: int, chance: float) -> float:
     return -(choices(total, size) + choices(size, sample) + (size - sample) * math.log(chance))
 
 
-def _by_chance(observed: Observed, posterior: Posterior) -> Failure | None:
+def _by_chance(observed: Observed, posterior: Posterior, wide: bool) -> Failure | None:
     """Failure of a motion that fits no more points than chance makes fit, where all are near.
 
     Other mismatches lie anywhere; these may be a camera's that vibrates, or those of a rough map.
@@ -331,7 +349,9 @@ def _by_chance(observed: Observed, posterior: Posterior) -> Failure | None:
     circle = (GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2
     near, found = int(np.count_nonzero(errors < circle)), int(np.count_nonzero(inliers))
     chance = min(float(errors[inliers].max()) / circle, 1.0)
-    if near <= found + _MARKER or _surprise(near, found, PARAMETERS // 2, chance) > _LEAST_CHANCE:
+    if not wide and near <= found + _MARKER:
+        return None
+    if _surprise(near, found, PARAMETERS // 2, chance) > _LEAST_CHANCE:
         return None
     return Failure(
         Reason.MODEL_ERROR,

@@ -76,6 +76,7 @@ class Posterior(NamedTuple):
     # (n,b): of what the smooth error is a combination (see frame_fit), which other frames share, so
     # that the covariance does not have it, either
     bend: Array = np.zeros((0, 0))
+    gate: float = 0.0  # px, of inliers, which goes on to twice as many for their noise
 
     @property
     def determined(self) -> bool:

@@ -22,7 +22,8 @@ ELEVEN = np.arange(40) < 11
 def good(scene):
     camera, motion, points, _, measured = scene.frame(noise=0.3, count=40)
     observations = scene.observe(camera, points, measured)
-    return fitted(observations, scene.state_of(motion), PRIOR, THRESHOLD)
+    posterior = fitted(observations, scene.state_of(motion), PRIOR, THRESHOLD)
+    return posterior._replace(gate=THRESHOLD)
 
 
 def reason(posterior):

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from benchmarks.frames import paired_set
@@ -77,11 +78,28 @@ def test_a_principal_point_that_is_a_little_off_is_no_other_image():
 def test_what_moves_or_is_matched_nearby_is_left_out(bench):
     """Of frames that none of the package has made; P3P finds all of them."""
     for _, one in paired_set.spoilt():
-        if one.bench == bench and one.name != "map":
+        if one.bench == bench:
             found = judge(one, 4, 7, {})
             assert np.count_nonzero(found.localized) >= 3
             assert found.of("deg")[found.localized].max() < 1.5
             assert not far_off(found).any()
+
+
+def test_noise_beyond_the_gate_is_learnt_and_named():
+    random = np.random.default_rng(4)
+    for _ in range(4):
+        camera, points, pixels, rotation = frame("volume", "right", random)
+        points = points + 0.013 * random.normal(size=points.shape)  # 3 px at 2.2 m
+        result = rsl.Localizer(camera).localize(points, pixels)
+        if len(points) < 60:
+            continue
+        assert result
+        assert result.inliers.mean() > 0.9
+        words = re.search(r"set map_deviation to (\S+) m", result.left_out)
+        assert words is not None
+        assert float(words[1]) == pytest.approx(0.013, rel=0.3)
+        off = Rotation.from_matrix(result.rotation @ rotation.T).as_rotvec()
+        assert off @ np.linalg.solve(result.covariance[:3, :3], off) < 16.0
 
 
 def test_points_that_fit_by_chance_are_no_motion():
