@@ -351,7 +351,9 @@ def _by_chance(observed: Observed, posterior: Posterior, wide: bool) -> Failure 
     chance = min(float(errors[inliers].max()) / circle, 1.0)
     if not wide and near <= found + _MARKER:
         return None
-    if _surprise(near, found, PARAMETERS // 2, chance) > _LEAST_CHANCE:
+    # What fills a gate may be vibration, of which one readout tells as many numbers again.
+    sample = PARAMETERS if wide else PARAMETERS // 2
+    if _surprise(near, found, sample, chance) > _LEAST_CHANCE:
         return None
     return Failure(
         Reason.MODEL_ERROR,
