@@ -57,7 +57,7 @@ class BuildPython(build_py):
 # Where the commands say them, too, to whom lacks one.
 bounds = runpy.run_path("rs_localizer/process/missing.py")["BOUNDS"]
 requirements = [
-    "numpy>=1.26",
+    "numpy>=1.26.4",
     "opencv-python-headless>=4.6",
     "PyYAML",
     f"rosbags{bounds['rosbags']}",

@@ -56,7 +56,7 @@ def release(folder: Path) -> tuple[int, str]:
 def test_says_what_is_left_to_a_person(project):
     code, said = release(project)
     assert code == 0, said
-    for line in (f"git tag --annotate {VERSION}", f"git push origin HEAD {VERSION}", "make wheel"):
+    for line in (f"git tag --annotate {VERSION}", f"git push origin HEAD {VERSION}", "make levels"):
         assert f"\n  {line}" in said
 
 
