@@ -55,9 +55,8 @@ class _Compiler:
 
     def __init__(self, machine: str, is_portable: bool) -> None:
         self.machine = machine
-        self._is_zig = (
-            is_portable or machine != platform.machine() or not shutil.which(_system()[0])
-        )
+        has_system = all(map(shutil.which, _system()))
+        self._is_zig = is_portable or machine != platform.machine() or not has_system
         if self._is_zig and importlib.util.find_spec("ziglang") is None:
             raise CannotBuild(
                 "no C compiler was found: apt install g++, or pip install ziglang"
