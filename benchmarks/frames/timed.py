@@ -95,30 +95,37 @@ def times(options: argparse.Namespace) -> int:
     peers = {name: make for name, make in _PEERS.items() if find_spec(name.lower()) is not None}
     for name in _PEERS.keys() - peers:
         sys.stdout.write(f"{name} is not installed (pip install {name.lower()}): no ratio\n")
-    heads = ["median, ms", "mean", "95 %", *(head for name in peers for head in (name, "ratio"))]
-    sys.stdout.write(f"{'':42}" + "".join(f"{head:>11}" for head in heads) + "\n")
+    heads = ["median", "mean", "95 %", *(head for name in peers for head in (name, "ratio"))]
+    sys.stdout.write(f"{'CPU time, ms':42}" + _cells(heads, heads) + "\n")
     for condition in CONDITIONS:
         localizer = localizer_of(condition)
         theirs = [make(localizer.camera) for make in peers.values()]
-        _timed(condition, [_ours(localizer), *theirs], options)
+        _timed(condition, [_ours(localizer), *theirs], heads, options)
     for condition in IMPERFECT:
         localizer = rsl.Localizer(camera_of(condition, 0))
         tracks = condition.sequence.length > 1
         _timed(condition, [_tracked(localizer, options.rounds) if tracks else _ours(localizer)],
-               options)  # fmt: skip
+               heads, options)  # fmt: skip
     return 0
 
 
+def _cells(texts: list[str], heads: list[str]) -> str:
+    """Texts of a row below their headings."""
+    pairs = zip(texts, heads, strict=False)
+    return "".join(f"{text:>{max(len(head), 5) + 2}}" for text, head in pairs)
+
+
 def _timed(
-    condition: Condition, methods: list[Callable[[Frame], object]], options: argparse.Namespace
-) -> None:
+    condition: Condition, methods: list[Callable[[Frame], object]], heads: list[str],
+    options: argparse.Namespace,
+) -> None:  # fmt: skip
     """Print a row: the first method, and its median over those of the others."""
     frames = list(generate(condition, options.frames, _SEED))
     ours, *theirs = (1e3 * np.array(one) for one in in_turns(methods, frames, options.rounds))
     figures = [np.median(ours), np.mean(ours), np.quantile(ours, 0.95)]
     for other in theirs:
         figures += [np.median(other), figures[0] / np.median(other)]
-    cells = "".join(f"{figure:11.3f}" for figure in figures)
+    cells = _cells([f"{figure:.3f}" for figure in figures], heads)
     sys.stdout.write(f"{condition.name:42}{cells}\n")
     sys.stdout.flush()
 
