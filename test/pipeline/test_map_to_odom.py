@@ -12,12 +12,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.io.transforms import Transform
+from rs_localizer.pipeline.carried_pose import Odometry
 from rs_localizer.pipeline.map_to_odom import (
     Click,
     CorrectionState,
     Decision,
     FoundPose,
-    Odometry,
     Settings,
     Standing,
     decide,
