@@ -193,14 +193,14 @@ class _Case:
         """The state after a user's pose, and the answer."""
         state, held = self.state, self.held
         for known, text in ((held, "as a measurement"), (self.aside, "for what contradicts it")):
-            if known is not None and self._passes(self._misfit(known, found)):
+            if known and known.seen_ns > 0 and self._passes(self._misfit(known, found)):
                 measured = (found.pose, self.now, state.drift, self.settings.axes)
                 fused = replace(known, pose=known.pose.fused(*measured), reachable=True)
                 aside, base = (self.aside, state.base) if known is held else (None, None)
                 state = replace(state, held=fused, aside=aside, base=base, refused=None)
                 return state, f"taken {text}"
         again = self._passes(self._misfit(state.refused, found))
-        if held is None or again:
+        if held is None or held.seen_ns < 0 or again:  # who clicks again means that one
             text = "taken: it came twice" if again else "taken: map -> odom begins with it"
             return replace(state, held=found, aside=None, base=None, refused=None), text
         jump, spread = held.pose.offset(found.pose, self.now), self._grown(held)

@@ -266,6 +266,13 @@ def test_a_click_begins_where_nothing_is_known():
     assert drive.decision.standing is Standing.TRACKING
 
 
+def test_a_click_that_no_pose_has_confirmed_is_replaced_by_the_next():
+    drive = Drive()
+    for x in (4.0, -0.3):
+        assert drive.click(x=x) == "taken: map -> odom begins with it"
+        assert drive.errors()[0] == pytest.approx(abs(x))
+
+
 def test_a_click_counts_by_its_covariance():
     drive = tracking(turn=0.05)
     drive.go(20.0, poses=False)
