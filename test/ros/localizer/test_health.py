@@ -42,7 +42,7 @@ def frame(stamp: float = 0.0, tracked: bool = False, rig: bool = False) -> Any:
     pose = SimpleNamespace(covariance=np.diag([1e-6, 4e-6, 4e-6, 1.0, 1.0, 1.0]))  # 3 mm
     return SimpleNamespace(
         input_stamp_ns=round(stamp * 1e9), estimate=estimate, pose=pose,
-        cameras=cameras if rig else (),
+        cameras=cameras if rig else (), twist=None,
     )  # fmt: skip
 
 
