@@ -24,7 +24,7 @@ from rs_localizer.config import (
     NodeConfig,
     meant,
 )
-from rs_localizer.io.yaml_text import (
+from rs_localizer.io.reading import (
     LENS,
     YamlError,
     file_faults,

@@ -30,10 +30,18 @@ from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from rs_localizer.io import detections, video_packets
-from rs_localizer.io.containers import METADATA, ZSTD, data_files, magic, storage
+from rs_localizer.io.containers import (
+    METADATA,
+    ZSTD,
+    data_files,
+    limit_rosbags,
+    magic,
+    storage,
+    unpack_file,
+    unpack_zstd,
+)
+from rs_localizer.io.reading import load_yaml, read_text
 from rs_localizer.io.topics import TF_STATIC
-from rs_localizer.io.unpacking import limit_rosbags, unpack_file, unpack_zstd
-from rs_localizer.io.yaml_text import load_yaml, read_text
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 # Whoever plays a recording offers its topics as it says; on /tf_static everybody listens for what

@@ -19,7 +19,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
-from rs_localizer.io.yaml_text import (
+from rs_localizer.io.reading import (
     LENS,
     YamlError,
     file_faults,

@@ -36,8 +36,8 @@ from rs_localizer.io.camera_files import (
     lens_camera,
     lens_parameters,
 )
+from rs_localizer.io.reading import LENS, flat, load_yaml, parameter_blocks, read_text
 from rs_localizer.io.transforms import Transform
-from rs_localizer.io.yaml_text import LENS, flat, load_yaml, parameter_blocks, read_text
 
 _CHAIN, _IMU, _SHIFT = "T_cn_cnm1", "T_cam_imu", "timeshift_cam_imu"
 _MOUNT = "camera_from_rig"

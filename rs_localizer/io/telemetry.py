@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.limited import LimitedError, run_limited
+from rs_localizer.io.reading import LimitedError, run_limited
 
 # Optical axes (x right, y down, z forward) from telemetry-parser's.
 CAMERA_FROM_SENSOR = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagError, BagReader, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.unpacking import most_unpacked
+from rs_localizer.io.reading import most_unpacked
 
 # Files round quaternions to four digits or more; what is further from 1 is no rotation.
 _QUATERNION_TOLERANCE = 0.01

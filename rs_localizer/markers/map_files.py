@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from rs_localizer.io.yaml_text import file_faults, load_yaml, read_text
+from rs_localizer.io.reading import file_faults, load_yaml, read_text
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation, rotation_of_quaternion

@@ -18,7 +18,7 @@ from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription  # type: ignore[attr-defined]  # not our folder of this name
 from rs_localizer.config import NO_NAMES, DetectorConfig, NodeConfig, meant
-from rs_localizer.io.yaml_text import YamlError, load_yaml
+from rs_localizer.io.reading import YamlError, load_yaml
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
 from rs_localizer.settings import (

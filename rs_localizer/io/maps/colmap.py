@@ -20,8 +20,8 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import colmap_camera, colmap_parameters
-from rs_localizer.io.limited import LimitedError, run_limited
 from rs_localizer.io.maps.landmarks import Map, MapError, make_map
+from rs_localizer.io.reading import LimitedError, run_limited
 
 _SCRIPT = Path(__file__).with_name("colmap_process.py")
 _FILES = ("cameras", "images", "points3D")

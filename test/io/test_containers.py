@@ -28,7 +28,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.io import unpacking
+from rs_localizer.io import containers
 from rs_localizer.io.bags import open_bag, typestore
 from rs_localizer.io.images import decode
 from rs_localizer.io.maps.files import read_map_file
@@ -262,7 +262,7 @@ def test_what_is_packed_as_recordings_are_comes_out(unpack):
         "_unpack_lz4": lz4.frame.compress,
     }[unpack]
     for content in (data, bytes(15_000_000), b""):
-        assert getattr(unpacking, unpack)(pack(content)) == content
+        assert getattr(containers, unpack)(pack(content)) == content
 
 
 # -- text --------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from rs_localizer.io.yaml_text import YamlError, load_yaml
+from rs_localizer.io.reading import YamlError, load_yaml
 
 # Nine lines for 9^9 values.
 LAUGHS = "\n".join(f"k{n}: &a{n} [{', '.join([f'*a{n - 1}' if n else 'x'] * 9)}]" for n in range(9))
