@@ -101,10 +101,10 @@ class _Look(NamedTuple):
 
     def over_columns(self) -> tuple[bool, Array]:
         """Whether points fit a motion (12,) over the columns better than one over rows, and it."""
-        left = []
+        left, motion = [], np.zeros(12)
         for others in (slice(12, 18), slice(6, 12)):
             rows = np.delete(self.rows, others, axis=1)
-            motion = np.linalg.lstsq(rows, self.off, rcond=None)[0]
+            motion = np.asarray(np.linalg.lstsq(rows, self.off, rcond=None)[0], np.float64)
             left.append(float(np.sum((self.off - rows @ motion) ** 2)))
         return left[1] < left[0], np.asarray(motion * np.tile(self.units, 2), np.float64)
 
@@ -223,7 +223,11 @@ class ShutterWatch:
         turn += so3.log(np.ascontiguousarray(back @ after.found.rotation.T))
         way = np.r_[turn, back @ (after.found.position - before.found.position)]
         noise = sum(look.found.joint_covariance[POSE, POSE] for look in (before, after))
-        if not way @ np.linalg.solve(noise, way) > _LEAST_MOTION or len(now.off) < 36:
+        try:
+            moves = way @ np.linalg.solve(noise, way) > _LEAST_MOTION
+        except np.linalg.LinAlgError:  # rounding errors are all that is left of a covariance
+            return
+        if not moves or len(now.off) < 2 * now.rows.shape[1]:
             return
         speed, rows = way / (seconds * now.units), now.rows
         design = np.c_[rows[:, :6], rows[:, 6:12] @ speed, rows[:, 12:] @ speed, rows[:, 6:]]
