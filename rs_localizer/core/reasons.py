@@ -81,7 +81,6 @@ class Notice(StrEnum):
     READOUT_TIME = "readout_time"
     LENS = "lens"
     EXTRINSICS = "extrinsics"
-    CLOCK = "clock"
     # Of maps and keypoints.
     MAP_REPLACED = "map_replaced"
     MAP_INCOMPLETE = "map_incomplete"

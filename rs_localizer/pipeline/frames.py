@@ -63,7 +63,6 @@ from rs_localizer.pipeline.rig_frames import (
     matches_of,
     share_of,
 )
-from rs_localizer.pipeline.rig_watch import RigWatch
 from rs_localizer.pipeline.stream import Stream
 from rs_localizer.shutter_watch import ShutterWatch
 from rs_localizer.solvers.table import find_solver
@@ -132,7 +131,6 @@ class FrameLocalizer:
         self.transforms: Transforms = TransformTree() if transforms is None else transforms
         self.imu: ImuInput = ImuInput(notice)
         self._faults: set[str] = set()  # of the shutter, which have been noticed
-        self.rig_watch = RigWatch(config, notice)
         self.calibrations: dict[str, Calibration] = {}
         """What the last usable camera_info of each camera said; of one without a name: ``""``."""
         self._mounts: dict[str, Transform] = {}  # of several cameras, on the first one
@@ -203,7 +201,6 @@ class FrameLocalizer:
         self._cameras, self._config = seen, config
         self._mistakes = what_fits.Mistakes()
         self._faults.clear()
-        self.rig_watch = RigWatch(config, self._notice)
 
     def _rig(self, cameras: Mapping[str, Camera]) -> Rig:
         """The rig of the cameras whose mounting is known; before there is one, of any."""
@@ -275,7 +272,6 @@ class FrameLocalizer:
         """Forget the previous frames."""
         self._stream.reset()
         self._assembler.reset()
-        self.rig_watch.reset()
         self._forget_motion()
 
     def _forget_motion(self) -> None:
@@ -439,18 +435,11 @@ class FrameLocalizer:
             yield cloud
             return
         cloud = self._checked(cloud, name)
-        watch, frame = self.rig_watch, self.camera_frame
         start_ns = cloud.stamp_ns + round(own.stamp_offset * 1e9)
         middle_ns = start_ns - round(camera.first_row_time * own.readout_time * 1e9)
         image = CameraImage(name, start_ns, middle_ns, cloud)
         for images in self._assembler.add(image):
             yield self._localize_frame(images)
-        fixed = {
-            each: mount
-            for each, mount in self._mounts.items()
-            if not self.transforms.moves(self.calibrations[each].frame, frame)
-        }
-        watch.add(image, camera, fixed)
 
     def flush(self) -> list[Localized | Refusal]:
         """The results of what still waits for other images: none will come."""
@@ -516,18 +505,20 @@ class FrameLocalizer:
                 "camera moves: it counts once",
             )
         if not published:
-            published = self._explained(published, cloud)
+            frame = self._tracker.localizer, cloud.points, cloud.pixels, what_fits.ids_of(cloud)
+            published = self._explained(published, lambda: what_fits.what_fits(*frame))
         return published
 
-    def _explained(self, refusal: Refusal, cloud: Correspondences) -> Refusal:
+    def _explained(
+        self, refusal: Refusal, tried: Callable[[], str], notice: Notice = Notice.WOULD_FIT
+    ) -> Refusal:
         """The refusal of a frame, with what would fit where somebody found that."""
         if refusal.reason not in what_fits.REASONS:
             return refusal
-        frame = self._tracker.localizer, cloud.points, cloud.pixels, what_fits.ids_of(cloud)
-        said = self._mistakes.look(lambda: what_fits.what_fits(*frame))
+        said = self._mistakes.look(tried)
         if not said:
             return refusal
-        self._notice(Notice.WOULD_FIT, said)
+        self._notice(notice, said)
         return replace(refusal, detail=f"{refusal.detail}; {said}")
 
     @property
@@ -643,9 +634,14 @@ class FrameLocalizer:
         matches = {image.camera: matches_of(image.cloud, images) for image in images}
         context = FrameContext(error_modes=self._landmarks.error_modes)
         result = self._tracker.localize(origin_ns, matches, stamps=starts, context=context)
-        self.rig_watch.judge(bool(result))
         if not result:
-            return Refusal(result.reason, result.detail)
+            refusal = Refusal(result.reason, result.detail)
+            localizer = self._tracker.localizer
+            return self._explained(
+                refusal,
+                lambda: what_fits.cameras_apart(localizer, matches, starts),
+                Notice.EXTRINSICS,
+            )
         assert isinstance(result, RigEstimate)
         self._landmarks.lacking = False  # who sends correspondences needs none
         return self.mounted(self._localized(images, result, origin_ns))

@@ -8,7 +8,7 @@ and no figure of residuals says it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -127,6 +127,28 @@ def of_refused(
     found = localizer.localize(points, pixels)
     refused = not found and found.reason in REASONS
     return what_fits(localizer, points, pixels, ids) if refused else ""
+
+
+def cameras_apart(
+    localizer: Localizer, matches: Mapping[str, Sequence[Array]], stamps: Mapping[str, float]
+) -> str:
+    """Say that cameras of a refused rig have poses of their own; an empty text if they have none.
+
+    Args:
+        localizer: of the rig.
+        matches, stamps: of each camera, as of :meth:`.Localizer.localize`.
+    """
+    alone = {
+        name: localizer.localize({name: of}, stamps={name: stamps[name]})
+        for name, of in matches.items()
+    }
+    own = [name for name, found in alone.items() if found]
+    if len(own) < 2:
+        return ""
+    return (
+        f"{' and '.join(own)} have poses of their own, which do not agree: extrinsics or clocks "
+        "are others (rs_localizer calibrate --rig)"
+    )
 
 
 def ids_of(cloud: Correspondences) -> IntArray | None:

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of a rig from a recording to poses, against the true motion."""
 
-import re
-
 import numpy as np
 import pytest
 
@@ -13,11 +11,11 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import prepare, replay
 from rs_localizer.settings import build, load_params_file
 
-from .opposed_pair import PARTS, hand, record, rich, wall
+from .opposed_pair import PARTS, hand, record, rich
 
 
-def localize(path, seen=None, **settings):
-    """Frames, refusals and notices of a recording; ``seen``: takes what is known of the cameras."""
+def localize(path, **settings):
+    """Frames, refusals and notices of a recording."""
     values = load_params_file(path / "parameters.yaml") | {"min_inliers": 20} | settings
     notices: list[tuple[str, str]] = []
     with open_bag(path) as bag:
@@ -25,8 +23,6 @@ def localize(path, seen=None, **settings):
             bag, build(values), notice=lambda name, text: notices.append((name, text))
         )
         answers = [answer.result for answer in replay(bag, topics, localizer)]
-    if seen is not None:
-        seen.update(localizer.rig_watch.values)
     frames = [answer for answer in answers if answer]
     return frames, [answer for answer in answers if not answer], notices
 
@@ -89,52 +85,13 @@ def test_the_last_frame_that_waits_for_a_camera_comes_at_the_end(tmp_path, lag):
 SIDEWAYS = np.array([0.3, 0.8, -0.5]) / np.linalg.norm([0.3, 0.8, -0.5])
 
 
-@pytest.mark.parametrize(
-    ("degrees", "centimetres", "scene", "seconds"),
-    # Before a wall, lenses of ordinary calibrations explain it for longer.
-    [
-        (1.0, 1.0, rich, 3.0),
-        pytest.param(0.0, 1.0, lambda motion: wall(), 6.0, marks=pytest.mark.bench),
-    ],
-)
-def test_a_wrong_extrinsic_is_named(tmp_path, degrees, centimetres, scene, seconds):
-    motion, (rotation, translation) = hand(5.0, seconds), PARTS.camera_from_rig["right"]
-    mounted = (
-        so3.exp(np.radians(degrees) * SIDEWAYS) @ rotation,
-        translation + 0.01 * centimetres * SIDEWAYS,
-    )
+def test_a_wrong_extrinsic_is_named(tmp_path):
+    motion, (rotation, translation) = hand(5.0, 1.0), PARTS.camera_from_rig["right"]
+    mounted = so3.exp(np.radians(1.0) * SIDEWAYS) @ rotation, translation
     true = PARTS._replace(camera_from_rig=PARTS.camera_from_rig | {"right": mounted})
-    record(tmp_path / "bag", motion=motion, points=scene(motion), true=true)
-    notices = localize(tmp_path / "bag")[2]
-    texts = [text for name, text in notices if name == "extrinsics"]
-    assert len(texts) == 1
-    assert texts[0].startswith("extrinsics of right relative to left differ by ")
-    turn, turn_deviation, moved, moved_deviation = numbers(texts[0])
-    assert turn == pytest.approx(degrees, abs=3.0 * turn_deviation)
-    assert moved == pytest.approx(10.0 * centimetres, abs=3.0 * moved_deviation)
-
-
-def numbers(text):
-    return [float(number) for number in re.findall(r"-?\d+\.\d+", text)]
-
-
-def test_a_clock_that_is_off_is_named(tmp_path):
-    """4 ms that nobody has told, and a jump by 8 ms half-way."""
-    motion = hand(5.0, 4.0)
-    half_ns = motion.intervals_ns[0][0] + 2_000_000_000
-
-    def stamp(image):
-        jumped = 8_000_000 if image.frame.stamp_ns > half_ns else 0
-        return image.stamp_ns + (4_000_000 + jumped if image.name == "right" else 0)
-
-    record(tmp_path / "bag", motion=motion, points=rich(motion), stamp=stamp)
-    known: dict[str, str] = {}
-    frames, refused, notices = localize(tmp_path / "bag", known)
-    assert len(frames) + len(refused) >= 118
-    assert len(refused) <= 30
-    offset, deviation = numbers(known["Clock offset of right (ms)"])
-    assert deviation < 0.6
-    assert offset == pytest.approx(-12.0, abs=3.0 * deviation)
-    first, *others = [text for name, text in notices if name == "clock"]
-    assert re.match(r"the clock of right is -[34]\.\d+ \+- ", first)
-    assert others[0].endswith("both are estimated again")
+    record(tmp_path / "bag", motion=motion, points=rich(motion), true=true)
+    frames, refused, notices = localize(tmp_path / "bag")
+    assert len(frames) < 0.2 * len(refused)
+    (said,) = {text for name, text in notices if name == "extrinsics"}
+    assert said.startswith("left and right have poses of their own, which do not agree")
+    assert said in refused[-1].detail

@@ -69,7 +69,7 @@ _MOTION = tuple(name for name in TYPES if name != INLIERS)
 # Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
 _ODD = (
     "map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "no_images",
-    "lens", "clock", "bad_imu", "map_scale", "map_jumped", "two_publishers", "doubtful",
+    "lens", "extrinsics", "bad_imu", "map_scale", "map_jumped", "two_publishers", "doubtful",
     "would_fit", "second_broadcaster", "stale_landmarks",
 )  # fmt: skip
 
@@ -328,10 +328,10 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         oddities = self.refusals.recent(_ODD, WINDOW) | self._broadcaster.fault()
         values: dict[str, str] = {}
         if frames is not None:
-            watch, rig, imu = frames.shutter, frames.rig_watch, frames.imu.state
-            oddities |= imu_oddity(imu) | rig.faults
+            watch, imu = frames.shutter, frames.imu.state
+            oddities |= imu_oddity(imu)
             oddities |= {"readout_time": watch.fault} if watch.fault else {}
-            values = readout_values(watch.measured) | rig.values | imu_values(imu)
+            values = readout_values(watch.measured) | imu_values(imu)
         inputs = {
             name: item for name, item in self.silence.items() if name in inputs_of(self.config)
         }
