@@ -87,7 +87,7 @@ SIDEWAYS = np.array([0.3, 0.8, -0.5]) / np.linalg.norm([0.3, 0.8, -0.5])
 
 def test_a_wrong_extrinsic_is_named(tmp_path):
     motion, (rotation, translation) = hand(5.0, 1.0), PARTS.camera_from_rig["right"]
-    mounted = so3.exp(np.radians(1.0) * SIDEWAYS) @ rotation, translation
+    mounted = so3.exp(np.radians(3.0) * SIDEWAYS) @ rotation, translation
     true = PARTS._replace(camera_from_rig=PARTS.camera_from_rig | {"right": mounted})
     record(tmp_path / "bag", motion=motion, points=rich(motion), true=true)
     frames, refused, notices = localize(tmp_path / "bag")
