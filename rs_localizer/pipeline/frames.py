@@ -505,8 +505,9 @@ class FrameLocalizer:
                 "camera moves: it counts once",
             )
         if not published:
-            frame = self._tracker.localizer, cloud.points, cloud.pixels, what_fits.ids_of(cloud)
-            published = self._explained(published, lambda: what_fits.what_fits(*frame))
+            matches = cloud.points, cloud.pixels, what_fits.ids_of(cloud)
+            localizer = self._tracker.localizer
+            published = self._explained(published, lambda: what_fits.what_fits(localizer, *matches))
         return published
 
     def _explained(
