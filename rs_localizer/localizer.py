@@ -358,7 +358,7 @@ class Localizer:
         )
         if not self._full:
             seen = observations.packed, observations.count
-            return Posterior(*best_motion(*seen, best.state, terms, gate))
+            return Posterior(*best_motion(*seen, best.state, terms, gate))._replace(gate=gate)
         one_lens, most = sighted.exposure.alone, _WIDEST * gate
         while True:
             posterior = frame_posterior(observations, best.state, terms, gate, assumed, one_lens)
