@@ -43,6 +43,9 @@ FAR_OFF = 0.5
 _MOST_POINTS = 200  # of a frame: more take longer than they are worth
 # Inlier thresholds within which points count: the axis may be the wrong one.
 _GATE = 3.0
+# Of one image, whose points tell velocities badly: those of usual cameras are some 0.1 rad, and
+# parts of the depth, per readout, beside a noise of 0.3 px.
+_OF_USUAL_SPEEDS = 0.3 / 0.1
 _LEAST_NOISE, _ROUNDS = 0.1, 3  # px, as little as cameras, lenses and maps have; of robust weights
 # Neighbours farther away (s), or of intervals less alike than this, say little.
 _LONGEST_INTERVAL, _MOST_UNLIKE = 0.15, 2.5
@@ -100,13 +103,16 @@ class _Look(NamedTuple):
     off: Array  # (2 n,) px, of the points if the camera did not move
 
     def over_columns(self) -> tuple[bool, Array]:
-        """Whether points fit a motion (12,) over the columns better than one over rows, and it."""
+        """Whether points surely fit a motion (12,) over the columns and not over rows, and it."""
         left, motion = [], np.zeros(12)
+        usual, off = _OF_USUAL_SPEEDS * np.eye(12)[6:], np.r_[self.off, np.zeros(6)]
         for others in (slice(12, 18), slice(6, 12)):
-            rows = np.delete(self.rows, others, axis=1)
-            motion = np.asarray(np.linalg.lstsq(rows, self.off, rcond=None)[0], np.float64)
-            left.append(float(np.sum((self.off - rows @ motion) ** 2)))
-        return left[1] < left[0], np.asarray(motion * np.tile(self.units, 2), np.float64)
+            rows = np.r_[np.delete(self.rows, others, axis=1), usual]
+            motion = np.asarray(np.linalg.lstsq(rows, off, rcond=None)[0], np.float64)
+            left.append(float(np.sum((off - rows @ motion) ** 2)))
+        noise = max(left[1] / max(len(self.off) - 12, 1), _LEAST_NOISE**2)
+        sure = left[0] - left[1] > 2.0 * _SUSPICIOUS * noise
+        return sure, np.asarray(motion * np.tile(self.units, 2), np.float64)
 
 
 class ShutterWatch:

@@ -193,7 +193,7 @@ def test_a_twist_that_is_a_mean_of_rest_and_motion_is_unknown(recording):
             ratios.append(found.angular_velocity / READOUT @ true / (true @ true))
         else:
             alone.append(not found.tracked)
-    assert len(alone) > 2
+    assert len(alone) > 1
     assert all(alone)
     assert len(ratios) > 20
     assert min(ratios) > 0.3

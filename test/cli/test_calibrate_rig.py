@@ -133,8 +133,8 @@ def test_smoothed_frames_are_nearer_to_the_truth(pair, tmp_path, capsys):
         errors.append(json.loads(capsys.readouterr().out)["result"])
     plain, smooth = errors
     assert plain["poses"] == smooth["poses"]
-    limits = {"position_median_m": 0.9, "orientation_median_deg": 0.9,
-              "linear_velocity_median_m_per_s": 0.6,
-              "angular_velocity_median_deg_per_s": 0.6}  # fmt: skip
-    for quantity, limit in limits.items():
-        assert smooth[quantity] < limit * plain[quantity]
+    for quantity in ("position_median_m", "orientation_median_deg"):
+        assert smooth[quantity] < 0.9 * plain[quantity]
+    # Of one of the two plain frames the twist is unknown: it would be 0.5 m/s off.
+    assert smooth["linear_velocity_p95_m_per_s"] < 0.05
+    assert smooth["angular_velocity_p95_deg_per_s"] < 4.0

@@ -225,8 +225,11 @@ def test_a_click_begins_it_and_is_carried_by_odometry(made, robot, peer):
     across = np.sqrt(sure[-1].pose.covariance[7])
     assert across == pytest.approx(np.hypot(0.5, 5.5 * np.sqrt(0.0685)), rel=0.02)
     node.notes.clear()
+    # No pose has confirmed the first one: a later click replaces it.
     node.broadcaster.give(click(99.0, 6.0))
-    assert node.notes[0][1].startswith("refused: it lies 86 m, ")
+    node.broadcaster.give(click(12.5, 6.0))
+    assert [text for _, text in node.notes] == ["taken: map -> odom begins with it"] * 2
+    del node.notes[1:]
     node.broadcaster.give(click(0.0, 6.0, frame="odom"))
     assert node.notes[1][1] == "refused: it is in 'odom', the map is 'map'"
     # RViz without use_sim_time stamps by the wall clock; after transform_tolerance it is taken.
@@ -235,7 +238,7 @@ def test_a_click_begins_it_and_is_carried_by_odometry(made, robot, peer):
     assert len(node.notes) == 2
     peer.spin_until(lambda: False, 0.25)
     odometry(node, robot, peer, 62)
-    assert node.notes[2][1].startswith("taken as a measurement; odometry does not know its time: ")
+    assert node.notes[2][1].startswith("taken: map -> odom begins with it; odometry does not know")
 
 
 def test_a_click_without_a_body_is_refused(made):
