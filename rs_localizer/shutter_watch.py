@@ -102,17 +102,11 @@ class _Look(NamedTuple):
     rows: Array  # (2 n,18) px, derivatives by pose, and by the way over the rows, and over columns
     off: Array  # (2 n,) px, of the points if the camera did not move
 
-    def over_columns(self) -> tuple[bool, Array]:
-        """Whether points surely fit a motion (12,) over the columns and not over rows, and it."""
-        left, motion = [], np.zeros(12)
-        usual, off = _OF_USUAL_SPEEDS * np.eye(12)[6:], np.r_[self.off, np.zeros(6)]
-        for others in (slice(12, 18), slice(6, 12)):
-            rows = np.r_[np.delete(self.rows, others, axis=1), usual]
-            motion = np.asarray(np.linalg.lstsq(rows, off, rcond=None)[0], np.float64)
-            left.append(float(np.sum((off - rows @ motion) ** 2)))
-        noise = max(left[1] / max(len(self.off) - 12, 1), _LEAST_NOISE**2)
-        sure = left[0] - left[1] > 2.0 * _SUSPICIOUS * noise
-        return sure, np.asarray(motion * np.tile(self.units, 2), np.float64)
+    def over_columns(self) -> Array:
+        """The pose's step and velocity (12,) that fit the points, if they move over columns."""
+        rows = np.r_[np.delete(self.rows, slice(6, 12), axis=1), _OF_USUAL_SPEEDS * np.eye(12)[6:]]
+        motion = np.linalg.lstsq(rows, np.r_[self.off, np.zeros(6)], rcond=None)[0]
+        return np.asarray(motion * np.tile(self.units, 2), np.float64)
 
 
 class ShutterWatch:
@@ -169,7 +163,7 @@ class ShutterWatch:
         own = np.r_[found.angular_velocity, found.linear_velocity]
         steps = [np.r_[np.zeros(6), -2.0 * own]]
         if self._across:
-            sideways = self._looks[-1].over_columns()[1]
+            sideways = self._looks[-1].over_columns()
             steps = [sideways * np.repeat([1.0, sign], 6) for sign in (1.0, -1.0)]
             for step in steps:
                 step[VELOCITIES] -= own
@@ -188,8 +182,6 @@ class ShutterWatch:
         some = slice(None, None, 1 + len(points) // _MOST_POINTS)
         points, pixels = map(np.ascontiguousarray, (points[some], pixels[some]))
         self._looks.append(self._look(time_ns, found, points, pixels))
-        if self._covariance is self._any:  # what one image tells
-            self._across = self._looks[-1].over_columns()[0]
         if len(self._looks) == 3:
             before, now, after = self._looks
             first, second = (now.time_ns - before.time_ns) * 1e-9, (time_ns - now.time_ns) * 1e-9

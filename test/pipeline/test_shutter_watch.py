@@ -195,6 +195,9 @@ def test_what_changes_starts_afresh(change):
     assert seen.watch.fault == ""
 
 
+_UNTOLD = 3
+
+
 @pytest.mark.parametrize(
     ("tracking", "start"),
     [(True, START)]
@@ -207,7 +210,8 @@ def test_the_wrong_axis_is_named_and_no_pose_comes_of_it(tracking, start):
     sideways = frames_with_truth("left_to_right", FRAMES, start)
     seen = Watched(FRAMES - 1, sideways, readout_time=READOUT, tracking=tracking)
     assert not any(seen.results[15:])
-    for result, (_, truth) in zip(seen.results, sideways[:-1], strict=True):
+    # The first frames have no neighbours that tell how fast the camera goes (docs/limits.md).
+    for result, (_, truth) in list(zip(seen.results, sideways[:-1], strict=True))[_UNTOLD:]:
         if result:
             turn = logarithm(result.pose.rotation @ truth.rotations[0].T)
             off = np.r_[result.pose.position - truth.positions[0], turn]
