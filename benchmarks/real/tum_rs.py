@@ -83,7 +83,8 @@ class Mounted:
 
 def smoothed(path: Path) -> Motion:
     """The longest part without gaps of motion capture."""
-    part: Trajectory = max(split_at_gaps(read_tum(path)), key=len)
+    read = _read_euroc if path.suffix == ".csv" else read_tum
+    part: Trajectory = max(split_at_gaps(read(path)), key=len)
     if len(part) <= _SMOOTHED:
         raise ValueError(f"{path} has no part of more than {_SMOOTHED} poses without a gap")
     quaternions = part.quaternions.copy()
@@ -92,6 +93,15 @@ def smoothed(path: Path) -> Motion:
     values = np.column_stack([quaternions, part.positions])
     smooth = savgol_filter(values, _SMOOTHED, _CUBIC, axis=0)
     return Motion.of(_seconds(part.stamps_ns), Rotation.from_quat(smooth[:, :4]), smooth[:, 4:])
+
+
+def _read_euroc(path: Path) -> Trajectory:
+    """Poses in EuRoC's order: ns, position, quaternion w x y z."""
+    rows = [line.split(",")[:8] for line in path.read_text().splitlines() if line[:1].isdigit()]
+    values = np.array([row[1:] for row in rows], np.float64)
+    stamps_ns, known = np.array([int(row[0]) for row in rows]), np.isfinite(values).all(axis=1)
+    found = Trajectory(stamps_ns, values[:, :3], np.roll(values[:, 3:], -1, axis=1))
+    return found.part(known)
 
 
 def _seconds(stamps_ns: IntArray) -> Array:

@@ -173,7 +173,8 @@ def test_node_and_replay_say_the_same_of_the_base(tmp_path, start_node, peer):
         robot.listener.unregister()
     offline = replayed(recording, tmp_path / "out", *settings)
     for name in TYPES:
-        assert len(offline[name]) == frames
+        # The first twist may be unknown.
+        assert len(offline[name]) in ({frames - 1, frames} if name == "twist" else {frames})
         assert robot.answered(name) == offline[name]
     with open_bag(tmp_path / "out" / "result") as bag:
         corrections = [message.transforms[0] for _, _, message in bag.messages(["/tf"])]
