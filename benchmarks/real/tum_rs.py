@@ -101,7 +101,7 @@ def _read_euroc(path: Path) -> Trajectory:
     values = np.array([row[1:] for row in rows], np.float64)
     stamps_ns, known = np.array([int(row[0]) for row in rows]), np.isfinite(values).all(axis=1)
     found = Trajectory(stamps_ns, values[:, :3], np.roll(values[:, 3:], -1, axis=1))
-    return found.part(known)
+    return found.part(np.asarray(known, np.bool_))
 
 
 def _seconds(stamps_ns: IntArray) -> Array:
