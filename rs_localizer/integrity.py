@@ -123,7 +123,7 @@ class SeenLandmarks:
         self._keys, self._counts = known, counts
 
     def stale(self, keys: Array) -> BoolArray:
-        """Which of these were never matched, though others are far too often for a chance."""
+        """Return which landmarks, by key, were seen too often to be unmatched by chance."""
         if not len(self._keys):
             return np.zeros(len(keys), np.bool_)
         seen, kept = self._counts.T
@@ -150,7 +150,7 @@ class Integrity:
         self._kept = np.zeros(0), np.zeros(0, np.bool_)
 
     def stale(self, points: ArrayLike) -> BoolArray:
-        """Which of these landmarks (n,3) were often seen and never matched, as no chance leaves."""
+        """Return which landmarks (n,3) were seen too often to be unmatched by chance."""
         return self._seen.stale(_keys(np.asarray(points, float)))
 
     def numbers(

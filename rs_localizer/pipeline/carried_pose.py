@@ -36,7 +36,7 @@ class Odometry:
     travelled: float = 0.0  # m since the start, as of :meth:`after`
 
     def after(self, newest: "Odometry | None") -> tuple["Odometry", "Odometry"]:
-        """The same with its way, by the newest so far, which may be later; and the newest now."""
+        """Return this moment with the distance travelled so far, and the newest moment of both."""
         if newest is None:
             return self, self
         step = self.odom_from_body.translation - newest.odom_from_body.translation
@@ -49,7 +49,7 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift:
-    """What odometry drifts."""
+    """How fast the error of odometry grows, learnt from the poses of the camera."""
 
     squared: Array = field(default_factory=_CARPET.copy)  # (6,) per s, in the body's axes
     count: int = 1  # how often it was seen
@@ -57,7 +57,7 @@ class Drift:
     def judged(
         self, base: "CarriedPose", found: "CarriedPose", now: Odometry
     ) -> tuple["CarriedPose", "Drift"]:
-        """What it is to be judged by from now on, and it, by what a pose now finds."""
+        """Return the pose from which the drift is judged next, and the drift as judged now."""
         if (seconds := base.seconds(now)) < _BASELINE:
             return base, self
         off, body = base.offset(found, now), found.body(now).rotation
@@ -91,7 +91,7 @@ class CarriedPose:
         return max(1e-9 * (now.stamp_ns - self.since.stamp_ns), 0.0)
 
     def offset(self, other: "CarriedPose", now: Odometry) -> Array:
-        """From where it has the body to where another one has it (6,)."""
+        """Return the offset (6,) from this pose to ``other``, both carried to now."""
         here, there = self.body(now), other.body(now)
         turn = so3.log(np.ascontiguousarray(there.rotation @ here.rotation.T))
         return np.concatenate([there.translation - here.translation, turn])
@@ -115,7 +115,7 @@ class CarriedPose:
     def fused(
         self, other: "CarriedPose", now: Odometry, drift: Drift, axes: list[int]
     ) -> "CarriedPose":
-        """The same with another one, which knows nothing of it, as a measurement."""
+        """Return this pose corrected by an independent measurement ``other``."""
         grown, own, gain = self.grown(now, drift, axes), np.ix_(axes, axes), np.zeros((6, 6))
         gain[own] = grown[own] @ np.linalg.inv(grown[own] + other.covariance[own])
         step, body = gain @ self.offset(other, now), self.body(now)
