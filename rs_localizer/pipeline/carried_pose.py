@@ -48,6 +48,20 @@ class Odometry:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FoundPose:
+    """A pose of the body that a frame found."""
+
+    at: Odometry
+    map_from_body: Transform
+    covariance: Array  # (6,6) x, y, z, then rotations about the axes of the map
+    doubt: float = 0.0  # probability that it is wrong; NaN: nobody says
+
+
+class Click(FoundPose):
+    """A pose of the body that a user, or a file, gives."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Drift:
     """How fast the error of odometry grows, learnt from the poses of the camera."""
 
@@ -123,6 +137,14 @@ class CarriedPose:
         place, spread = Transform(turned, body.translation + step[PLACE]), grown - gain @ grown
         return carried_pose(now, place, 0.5 * (spread + spread.T), axes)
 
+    def sharper(
+        self, other: "CarriedPose", now: Odometry, drift: Drift, axes: list[int]
+    ) -> "CarriedPose":
+        """Return the more certain one of this pose and another."""
+        own, ours = np.ix_(axes, axes), self.grown(now, drift, axes)
+        volumes = (np.linalg.slogdet(spread[own])[1] for spread in (other.covariance, ours))
+        return other if next(volumes) <= next(volumes) else self
+
     def of_transform(self, grown: Array, now: Odometry) -> Array:
         """Covariance (6,6) of the odometry's origin in the map, from that of the body."""
         return _moved(grown, self.map_from_odom.translation - self.body(now).translation)
@@ -169,3 +191,11 @@ def far(offset: Array) -> str:
     place, turn = np.linalg.norm(offset[PLACE]), np.linalg.norm(offset[TURN])
     metres = f"{100.0 * place:.2g} cm" if place < 0.995 else f"{place:.2g} m"
     return f"{metres}, {math.degrees(float(turn)):.2g} deg"
+
+
+def least_jump(spread: Array, axes: list[int], gate: float) -> tuple[float, float]:
+    """Return the smallest jump, m and rad, whose squared distance in deviations is ``gate``."""
+    least, cut = np.linalg.inv(spread[np.ix_(axes, axes)]), sum(axis < 3 for axis in axes)
+    parts = least[:cut, :cut], least[cut:, cut:]
+    place, turn = (math.sqrt(gate / np.linalg.eigvalsh(it)[-1]) for it in parts)
+    return place, turn

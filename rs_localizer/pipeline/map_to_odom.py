@@ -3,8 +3,8 @@
 """The correction of odometry, ``map -> odom`` (REP-105): which pose to believe, and how sure it is.
 
 :func:`decide` takes one observation after the other and knows no clock and no ROS. What is held is
-a pose that odometry carries on. A pose of a frame takes its place if it is probably right and
-passes a chi-squared gate. One that does not is kept aside as a second hypothesis, and believed when
+a pose that odometry carries on. A pose of a frame agrees with it if it is probably right and passes
+a chi-squared gate. One that does not is kept aside as a second hypothesis, and believed when
 
 * poses agree with it for a second, and odometry between them, and
 * a body can have come there (a robot that is carried, wheels that slip, odometry that starts over),
@@ -12,7 +12,8 @@ passes a chi-squared gate. One that does not is kept aside as a second hypothesi
 
 A wrong map agrees with itself as well as a right one. But its poses jump from one image to the
 next, which no body does, and are not believed however long they last. A click is a measurement. A
-refusal changes nothing of what is held; no acceptance makes drift larger than any odometry's.
+refusal changes nothing of what is held; no acceptance makes drift larger than any odometry's, or
+opens the gate to less certain poses.
 """
 
 import math
@@ -22,15 +23,19 @@ from enum import StrEnum
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.integrity import MOST_JUMP
 from rs_localizer.io.transforms import Transform
 from rs_localizer.pipeline.carried_pose import (
     PLACE,
     TURN,
     CarriedPose,
+    Click,
     Drift,
+    FoundPose,
     Odometry,
     carried_pose,
     far,
+    least_jump,
 )
 
 # Chi-squared, 99.99 %: of x, y and heading, and of six numbers. By chance a camera of 30 Hz has ten
@@ -38,9 +43,9 @@ from rs_localizer.pipeline.carried_pose import (
 _GATES = {3: 21.1, 6: 27.9}
 _DOUBTFUL = 0.5  # a pose that is more probably wrong than right is no evidence
 _CLEARLY = 9.0  # twice the logarithm of ninety to one, against the hypothesis that has more poses
-# Who carries a robot walks, m/s, and turns, rad/s; what is beyond that has to be noise, by three
+# Who carries a robot walks, m/s, and turns, rad/s; what is beyond that has to be noise, by two
 # deviations at most.
-_PACE, _SPIN, _SLACK = 1.5, 3.0, 9.0
+_PACE, _SPIN, _SLACK = 1.5, 3.0, 4.0
 # s of agreement that a hypothesis needs to be believed, and to be told as a contradiction; what a
 # pose adds at most; s for which poses of which nothing followed are remembered.
 _AGREES, _PERSISTS, _STEP, _BRIEF = 1.0, 0.2, 0.2, 1.0
@@ -69,24 +74,15 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FoundPose:
-    """A pose of the body that a frame found."""
-
-    at: Odometry
-    map_from_body: Transform
-    covariance: Array  # (6,6) x, y, z, then rotations about the axes of the map
-    doubt: float = 0.0  # probability that it is wrong; NaN: nobody says
-
-
-class Click(FoundPose):
-    """A pose of the body that a user, or a file, gives."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
-    """A pose that may be right."""
+    """A pose that may be right.
+
+    Poses of a track err together: many are no better than the sharpest of them. That one stays
+    until drift makes it less certain than the newest, which tells how certain it is.
+    """
 
     pose: CarriedPose
+    newest: CarriedPose
     near_ns: int  # of the last pose there, be it as doubtful as it may
     seen_ns: float = -math.inf  # of the last pose of a frame that counted
     support: float = 0.0  # s for which poses agreed
@@ -139,7 +135,7 @@ class Decision:
 def decide(settings: Settings, state: CorrectionState, seen: Odometry | FoundPose) -> Decision:
     """Take an observation; pure: the same arguments give the same decision."""
     now = seen if isinstance(seen, Odometry) else seen.at
-    last = state.held.pose.since if state.held and isinstance(seen, FoundPose) else state.newest
+    last = state.held.newest.since if state.held and isinstance(seen, FoundPose) else state.newest
     if last and now.stamp_ns < last.stamp_ns - _RESTART and not isinstance(seen, Click):
         state = CorrectionState(drift=state.drift)
     now, newest = now.after(state.newest)
@@ -148,10 +144,10 @@ def decide(settings: Settings, state: CorrectionState, seen: Odometry | FoundPos
     if isinstance(seen, FoundPose):
         pose = carried_pose(now, seen.map_from_body, seen.covariance, settings.axes)
         if isinstance(seen, Click):
-            state, said = case.clicked(Hypothesis(pose, now.stamp_ns))
+            state, said = case.clicked(Hypothesis(pose, pose, now.stamp_ns))
         else:
-            found = Hypothesis(pose, now.stamp_ns, now.stamp_ns)
-            state, said = case.posed(found, not seen.doubt >= _DOUBTFUL)
+            found = Hypothesis(pose, pose, now.stamp_ns, now.stamp_ns)
+            state, said = case.posed(found, seen.doubt)
     return _Case(settings, state, now).decision(said)
 
 
@@ -163,10 +159,10 @@ class _Case:
     state: CorrectionState
     now: Odometry
 
-    def posed(self, found: Hypothesis, right: bool) -> tuple[CorrectionState, str]:
-        """The state after a pose of a frame, probably right or not, and what is to be said."""
-        state, held, aside = self.state, self.held, self.aside
-        if held is not None and self.now.stamp_ns <= held.pose.since.stamp_ns:
+    def posed(self, found: Hypothesis, doubt: float) -> tuple[CorrectionState, str]:
+        """Return the state after a pose that is wrong with probability ``doubt``, and a text."""
+        state, held, aside, right = self.state, self.held, self.aside, not doubt >= _DOUBTFUL
+        if held is not None and self.now.stamp_ns <= held.newest.since.stamp_ns:
             return state, ""
         if held is None:
             return replace(state, held=found, aside=None, base=found.pose) if right else state, ""
@@ -178,10 +174,16 @@ class _Case:
                 return replace(state, held=replace(held, near_ns=self.now.stamp_ns)), ""
             base, drift = state.drift.judged(state.base or found.pose, found.pose, self.now)
             held = self._renewed(held, found, _AGREES)
-            return replace(state, held=held, aside=None, base=base, drift=drift), ""
+            if aside and (not aside.told or aside.newest.seconds(self.now) > _BRIEF):
+                aside = None
+            return replace(state, held=held, aside=aside, base=base, drift=drift), ""
         if aside is None or not self._passes(theirs):
+            if aside and aside.told and aside.newest.seconds(self.now) <= _BRIEF:
+                return state, ""  # one pose elsewhere ends no contradiction
             found = replace(found, reachable=self._reachable(held, aside, found))
             return replace(state, aside=found), ""
+        if aside.reachable:  # a jump is no ground for doubt where the body can have made it
+            right = not doubt > MOST_JUMP
         found = self._renewed(aside, found, _AGREES if right else max(aside.support, _PERSISTS))
         if found.support < _AGREES or not (found.reachable or held.support < _AGREES):
             return replace(state, aside=found), ""
@@ -195,7 +197,8 @@ class _Case:
         for known, text in ((held, "as a measurement"), (self.aside, "for what contradicts it")):
             if known and known.seen_ns > 0 and self._passes(self._misfit(known, found)):
                 measured = (found.pose, self.now, state.drift, self.settings.axes)
-                fused = replace(known, pose=known.pose.fused(*measured), reachable=True)
+                pose = known.pose.fused(*measured)
+                fused = replace(known, pose=pose, newest=pose, reachable=True)
                 aside, base = (self.aside, state.base) if known is held else (None, None)
                 state = replace(state, held=fused, aside=aside, base=base, refused=None)
                 return state, f"taken {text}"
@@ -203,7 +206,7 @@ class _Case:
         if held is None or held.seen_ns < 0 or again:  # who clicks again means that one
             text = "taken: it came twice" if again else "taken: map -> odom begins with it"
             return replace(state, held=found, aside=None, base=None, refused=None), text
-        jump, spread = held.pose.offset(found.pose, self.now), self._grown(held)
+        jump, spread = held.pose.offset(found.pose, self.now), self._grown(held.newest)
         return replace(state, refused=found), (
             f"refused: it lies {far(jump)} from where map -> odom has the body, known to "
             f"{far(np.sqrt(spread.diagonal()))}; the same again is taken"
@@ -214,12 +217,13 @@ class _Case:
         state, held, aside = self.state, self.state.held, self.aside
         if held is None:
             return Decision(state, Standing.LOST, said=said)
-        seconds, grown = held.pose.seconds(self.now), self._grown(held)
+        seconds, grown = held.newest.seconds(self.now), self._grown(held.newest)
         if self.held is None:
             return Decision(state, Standing.LOST, None, grown, seconds=seconds, said=said)
         fresh = 1e-9 * (self.now.stamp_ns - held.seen_ns) < _FRESH
         standing, jump = Standing.TRACKING if fresh else Standing.HELD, None
-        smallest = _smallest(grown + held.pose.covariance, self.settings.axes)
+        axes, spread = self.settings.axes, self._grown(held.pose) + held.pose.covariance
+        smallest = least_jump(spread, axes, _GATES[len(axes)])
         if aside is not None:  # room for what may be as well
             off = held.pose.offset(aside.pose, self.now)
             grown = grown + np.outer(off, off)
@@ -233,18 +237,18 @@ class _Case:
     def held(self) -> Hypothesis | None:
         """What is held and not given up."""
         held, hold = self.state.held, self.settings.hold
-        ended = held is not None and 0.0 < hold < held.pose.seconds(self.now)
+        ended = held is not None and 0.0 < hold < held.newest.seconds(self.now)
         return None if ended else held
 
     @property
     def aside(self) -> Hypothesis | None:
         """What contradicts it; not a few poses of which nothing followed."""
         aside = self.state.aside
-        brief = aside is None or aside.told or aside.pose.seconds(self.now) < _BRIEF
+        brief = aside is None or aside.told or aside.newest.seconds(self.now) < _BRIEF
         return aside if brief else None
 
-    def _grown(self, known: Hypothesis) -> Array:
-        return known.pose.grown(self.now, self.state.drift, self.settings.axes)
+    def _grown(self, pose: CarriedPose) -> Array:
+        return pose.grown(self.now, self.state.drift, self.settings.axes)
 
     def _misfit(self, known: Hypothesis | None, found: Hypothesis) -> tuple[float, float]:
         """Squared distance in deviations, and minus twice the likelihood's logarithm, less 2 pi."""
@@ -256,7 +260,7 @@ class _Case:
 
     def _spread(self, known: Hypothesis, found: Hypothesis) -> Array:
         axes = self.settings.axes
-        spread: Array = (self._grown(known) + found.pose.covariance)[np.ix_(axes, axes)]
+        spread: Array = (self._grown(known.pose) + found.pose.covariance)[np.ix_(axes, axes)]
         return spread
 
     def _distance(self, offset: Array, spread: Array) -> float:
@@ -276,7 +280,7 @@ class _Case:
     def _near(self, known: Hypothesis, found: Hypothesis, slack: float) -> bool:
         """Whether only noise is beyond what a body goes, from where odometry had it or it was."""
         reach = np.multiply((_PACE, _SPIN), 1e-9 * (self.now.stamp_ns - known.near_ns))
-        stayed = known.pose.body(known.pose.since) @ self.now.odom_from_body.inverse()
+        stayed = known.pose.body(known.newest.since) @ self.now.odom_from_body.inverse()
         for start in (known.pose, replace(known.pose, map_from_odom=stayed)):
             off = start.offset(found.pose, self.now)
             for part, most in zip((PLACE, TURN), reach, strict=True):
@@ -287,13 +291,8 @@ class _Case:
 
     def _renewed(self, known: Hypothesis, found: Hypothesis, most: float) -> Hypothesis:
         """A hypothesis by its newest pose, with a support of so many s at most."""
-        support = min(known.support + min(known.pose.seconds(self.now), _STEP), most)
-        return replace(found, support=support, reachable=known.reachable)
-
-
-def _smallest(spread: Array, axes: list[int]) -> tuple[float, float]:
-    """The smallest jump that would be refused, m and rad."""
-    least, cut = np.linalg.inv(spread[np.ix_(axes, axes)]), sum(axis < 3 for axis in axes)
-    parts = least[:cut, :cut], least[cut:, cut:]
-    place, turn = (math.sqrt(_GATES[len(axes)] / np.linalg.eigvalsh(it)[-1]) for it in parts)
-    return place, turn
+        since = max(1e-9 * (self.now.stamp_ns - known.near_ns), 0.0)
+        support = min(known.support + min(since, _STEP), most)
+        measured = found.pose, self.now, self.state.drift, self.settings.axes
+        pose = known.pose.sharper(*measured)
+        return replace(found, pose=pose, support=support, reachable=known.reachable)

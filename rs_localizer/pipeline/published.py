@@ -28,8 +28,8 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences, select_inliers
 from rs_localizer.io.outputs import BodyPose, Localized, Twist
 from rs_localizer.io.transforms import NotYetError, Transform, TransformError, Transforms
-from rs_localizer.pipeline.carried_pose import Odometry
-from rs_localizer.pipeline.map_to_odom import CorrectionState, FoundPose, Settings, decide
+from rs_localizer.pipeline.carried_pose import FoundPose, Odometry
+from rs_localizer.pipeline.map_to_odom import CorrectionState, Settings, decide
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at, with_timing
 from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.solvers.table import find_solver
