@@ -20,12 +20,14 @@ import functools
 import heapq
 import importlib
 import importlib.util
+import itertools
 import math
 import os
 import random
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -180,7 +182,8 @@ class _Around:
         self._live, self._drive, self._drift, self._trouble = live, drive, drift, trouble
         self._missing = tf2.TransformException
         self.heard = Heard()
-        self._sure: tuple[Array, Array] | None = None  # the last ~/map_to_odom: turn, covariance
+        # Of ~/map_to_odom: stamp, turn, covariance.
+        self._sure: deque[tuple[int, Array, Array]] = deque(maxlen=200)
         self._base_ns = 0
         node, own = live._node, f"{live.namespace}/rs_localizer"
         self._moving = tf2.TransformBroadcaster(node)
@@ -237,15 +240,24 @@ class _Around:
     def _take_sure(self, message: PoseWithCovarianceStamped) -> None:
         q = message.pose.pose.orientation
         turn = from_numbers((0.0, 0.0, 0.0), (q.x, q.y, q.z, q.w)).rotation
-        self._sure = turn, np.array(message.pose.covariance).reshape(6, 6)
+        covariance = np.array(message.pose.covariance).reshape(6, 6)
+        self._sure.append((stamp_ns(message) - self._base_ns, turn, covariance))
 
     def _claimed(self, when: float) -> float:
-        """Standard deviation (m) of the body's place, as ``~/map_to_odom`` has it."""
-        if self._sure is None:
-            return math.nan
-        (turn, covariance), jacobian = self._sure, np.eye(6)
-        jacobian[:3, 3:] = -so3.hat(turn @ self._drive.odometry(when, self._drift).translation)
-        return math.sqrt((jacobian @ covariance @ jacobian.T)[:3, :3].trace())
+        """Standard deviation (m) of the body's place, as ``~/map_to_odom`` has it for this time.
+
+        TF interpolates between two transforms; the less certain one counts.
+        """
+        place, found = self._drive.odometry(when, self._drift).translation, [math.nan]
+        for (before, *first), (after, *second) in itertools.pairwise(self._sure):
+            if not before <= 1e9 * when <= after:
+                continue
+            for turn, covariance in (first, second):
+                jacobian = np.eye(6)
+                jacobian[:3, 3:] = -so3.hat(turn @ place)
+                moved = (jacobian @ covariance @ jacobian.T)[:3, :3]
+                found.append(math.sqrt(moved.trace()))
+        return float(np.nanmax(found)) if len(found) > 1 else math.nan
 
     def _send_odometry(self, at: float) -> None:
         odom = self._drive.odometry(at, self._drift)
@@ -322,11 +334,11 @@ def occlusions() -> list[str]:
                 100.0 * max(look.off for look in inside if look.found),
                 math.degrees(max(look.turned for look in inside if look.found)),
                 100.0 * _jump(inside, end, drift),
-                max(look.ratio for look in inside if look.found),
+                max(look.ratio for look in inside if look.claimed > 0.0),
             ])  # fmt: skip
     answered = sum(look.found is not None for look in clear)
     farthest = max(look.off for look in clear if look.found)
-    ratio = max(look.ratio for look in clear if look.found)
+    ratio = max(look.ratio for look in clear if look.claimed > 0.0)
     lines = [
         "| s without a view | lookups answered | largest error | jump | error over claimed |",
         "|---|---|---|---|---|",
@@ -401,7 +413,7 @@ def _line(name: str, heard: Heard, begin: float, end: float, after: float) -> st
     given = values.get("Last given pose", "")
     then = f"{100.0 * last[-1].off:.1f} cm" if last else "nothing"
     off = max((look.off for look in found), default=math.nan)
-    ratio = max((look.ratio for look in found), default=math.nan)
+    ratio = max((look.ratio for look in found if look.claimed > 0.0), default=math.nan)
     told = "; ".join(filter(None, [then, said, given]))
     return (
         f"| {name} | {len(found)} of {len(inside)} | {100.0 * off:.1f} cm | {ratio:.1f} | {told} |"

@@ -253,7 +253,7 @@ class Broadcaster:
         decision = self._decide(seen, config)
         if first:  # nobody shall have to wait for the time that it is stamped ahead
             self._sent_ns = 0
-            self._send_correction(seen.at.stamp_ns, seen.at.stamp_ns, config)
+            self._send_correction(seen.at.stamp_ns, config)
         return decision
 
     @property
@@ -315,9 +315,9 @@ class Broadcaster:
         if ahead_ns < self._sent_ns - _RESTART:
             self._sent_ns = 0
         if ahead_ns > self._sent_ns:
-            self._send_correction(newest_ns, ahead_ns, config)
+            self._send_correction(ahead_ns, config)
 
-    def _send_correction(self, now_ns: int, stamp_ns: int, config: NodeConfig) -> None:
+    def _send_correction(self, stamp_ns: int, config: NodeConfig) -> None:
         decision = self._decision
         if decision is None or (correction := decision.map_from_odom) is None:
             return
@@ -334,7 +334,7 @@ class Broadcaster:
             self._publisher.publish(
                 make_message(
                     LIVE[MAP_TO_ODOM],
-                    header=make_header(make_message, now_ns, self._map_frame),
+                    header=make_header(make_message, stamp_ns, self._map_frame),
                     pose=make_message("geometry_msgs/msg/PoseWithCovariance", **spread),
                 )
             )
