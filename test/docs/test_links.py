@@ -58,6 +58,9 @@ def test_modules_that_the_architecture_names_exist():
     assert len(modules) > 20
     folders = (pages.ROOT, pages.ROOT / "rs_localizer")
     assert {n for n in modules if not any((folder / n).is_file() for folder in folders)} == set()
+    (tree,) = pages.fenced("docs/architecture.md", "text")
+    known = {path.name for path in (pages.ROOT / "rs_localizer").rglob("*.py")}
+    assert set(re.findall(r"\w+\.py", tree)) <= known
 
 
 def test_the_tree_of_the_architecture_is_that_of_the_package():
@@ -65,6 +68,15 @@ def test_the_tree_of_the_architecture_is_that_of_the_package():
     named = {line.split()[0].rstrip("/") for line in tree.splitlines()[1:]}
     parts = {path.name for path in (pages.ROOT / "rs_localizer").iterdir()}
     assert named == {name for name in parts if name not in ("__pycache__", "compiled", "py.typed")}
+
+
+def test_tests_lie_in_the_folders_of_what_they_test():
+    """As CONTRIBUTING says; folders of their own have what is no part of the package."""
+    others = {"benchmarks", "docs", "examples", "real_ros"}
+    root = pages.ROOT / "test"
+    tests = {path.parent.relative_to(root) for path in root.rglob("test_*.py")}
+    ours = {folder for folder in tests if folder.parts and folder.parts[0] not in others}
+    assert {f for f in ours if not (pages.ROOT / "rs_localizer" / f).is_dir()} == set()
 
 
 def test_pictures_are_what_their_script_draws():
