@@ -184,8 +184,8 @@ def bend(seed: int) -> Iterator[str]:
         )
 
 
-def _inside(normalised: Sequence[Array]) -> str:
-    every = np.abs(np.concatenate([np.ravel(one) for one in normalised]))
+def _inside(normalized: Sequence[Array]) -> str:
+    every = np.abs(np.concatenate([np.ravel(one) for one in normalized]))
     return f"{100.0 * np.mean(every < 1.96):.0f}"
 
 
@@ -218,7 +218,7 @@ class _Errors:
     """Of all markers of one survey: in the frame of the first one, and of the shape."""
 
     off: tuple[Array, Array]  # (m,6) m and rad
-    normalised: tuple[Array, Array]  # (m,6) each coordinate by its own deviation
+    normalized: tuple[Array, Array]  # (m,6) each coordinate by its own deviation
     squared: float  # mean squared error by the own covariance
 
 
@@ -234,7 +234,7 @@ def surveys(seed: int, trials: int = 3) -> Iterator[str]:
             off = np.concatenate([one.off[k] for one in found])
             place, turn = (np.median(np.linalg.norm(x, axis=1)) for x in np.split(off, 2, axis=1))
             cells.append(f"{1e3 * place:8.2f} {np.degrees(turn):7.3f}")
-        inside = ", ".join(_inside([one.normalised[k] for one in found]) for k in range(2))
+        inside = ", ".join(_inside([one.normalized[k] for one in found]) for k in range(2))
         own = np.sqrt(np.mean([one.squared for one in found]))
         yield f"{scene:28}    {cells[0]} {cells[1]}     {inside}               {own:.2f}"
 

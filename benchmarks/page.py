@@ -1,10 +1,10 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``COMMAND | python -m benchmarks.page NAME``: what a bench prints, into docs/benchmarks.md.
+"""``COMMAND | python -m benchmarks.page NAME`` keeps what a bench prints, for docs/benchmarks.md.
 
-The page's prose is written by hand. Its figures stand in blocks after ``<!-- NAME -->``, each
-filled with ``results/NAME.txt``: what the bench printed, its commit and date. Without a name all
-blocks are filled anew.
+The text goes to ``results/NAME.txt`` with commit and date. The page is written by hand; its blocks
+after ``<!-- NAME -->`` are filled with these files, and it links to those without a block. Without
+a name all blocks are filled anew.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ def main() -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     page = PAGE.read_text(encoding="utf-8")
-    parser.add_argument("name", nargs="?", choices=blocks(page), help="of the block")
+    known = sorted({*blocks(page), *(file.stem for file in RESULTS.glob("*.txt"))})
+    parser.add_argument("name", nargs="?", choices=known, help="of the file")
     name = parser.parse_args().name
     if name is not None:
         printed = sys.stdin.read()

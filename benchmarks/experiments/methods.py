@@ -153,7 +153,7 @@ def _best(models: Array, trials: Trials, scale: float) -> Motions:
 
 
 def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
-    """Local optimisation and final refinement of the Localizer on all points."""
+    """Local optimization and final refinement of the Localizer on all points."""
     prior, _ = assumptions(
         camera().readout_time, Rig.of(camera()), LocalizerConfig(), find_solver("r6p_vcwt")
     )

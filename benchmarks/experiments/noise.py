@@ -78,7 +78,7 @@ def run(context: Context) -> Result:
             ),
             limited(
                 "noise.one_sample_suffices",
-                "local optimisation from one sample of inliers alone succeeds in 99 to 100 %",
+                "local optimization from one sample of inliers alone succeeds in 99 to 100 %",
                 "share of refined orientations at 1 px within ten times the median bound",
                 float(np.mean(refined < 10.0 * fifty)), least=0.98,
                 why="six points that happen to determine the motion badly start it where half of "

@@ -135,9 +135,10 @@ def write_summary(folder: Path, results: Mapping[str, Result], context: Context)
 
 
 def verdicts(claims: Sequence[Claim]) -> str:
-    """``12 held, 3 did not hold``."""
-    held = sum(claim.held for claim in claims)
-    return f"{held} held, {len(claims) - held} did not hold"
+    """Return how many claims held, and which ones did not, as ``12 held; not motion.poor``."""
+    held = f"{sum(claim.held for claim in claims)} held"
+    others = ", ".join(claim.name for claim in claims if not claim.held)
+    return f"{held}; not {others}" if others else held
 
 
 def rounded(value: float) -> str:

@@ -61,7 +61,7 @@ def run(context: Context) -> Result:
         "Real sequence",
         f"The paper's Fig. 6 on the bundled *real* phone ({len(places)} images of 330 points): "
         f"plain RANSAC, {_ITERATIONS} samples, inliers within {_THRESHOLD:g} px, the model of the "
-        "best sample without any optimisation, moved as a rigid body. The rolling-shutter solvers "
+        "best sample without any optimization, moved as a rigid body. The rolling-shutter solvers "
         "start from the best orientation of P3P's samples; five iterations.",
         [
             limited(

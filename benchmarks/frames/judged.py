@@ -33,7 +33,7 @@ Row = dict[str, str | float | int]
 
 FIGURES = (
     "recording", "ms",
-    # Squared normalised errors, of 6 and of 3 dimensions; at the stamp (s) and at mid-frame.
+    # Squared normalized errors, of 6 and of 3 dimensions; at the stamp (s) and at mid-frame.
     "pose_s", "pose", "twist", "turn_s", "turn", "way", "angular", "linear",
     "deg_s", "deg", "mm", "deg/s", "m/s",
 )  # fmt: skip
@@ -107,7 +107,7 @@ def quantile(values: Array, q: float) -> float:
 
 
 def sharpness(squared: Array) -> float:
-    """Claimed over actual deviation, from squared normalised errors of three dimensions."""
+    """Claimed over actual deviation, from squared normalized errors of three dimensions."""
     median = quantile(squared, 0.5)
     return math.sqrt(_MEDIAN / median) if median > 0.0 else math.nan
 
@@ -236,31 +236,31 @@ def _scored(result: Any, frame: Frame, condition: Condition) -> list[float]:
 
 
 def of_pose(pose: Any, truth: tuple[Array, ...]) -> tuple[float, ...]:
-    """Squared normalised errors of 6, 3 and 3 dimensions; deg and mm."""
+    """Squared normalized errors of 6, 3 and 3 dimensions; deg and mm."""
     turn = logarithm(truth[0] @ pose.rotation.T)  # in the axes of the map, as the covariance
     way = truth[1] - pose.position
     return (
-        normalised(np.concatenate([way, turn]), pose.covariance),
-        normalised(turn, pose.covariance[3:, 3:]),
-        normalised(way, pose.covariance[:3, :3]),
+        normalized(np.concatenate([way, turn]), pose.covariance),
+        normalized(turn, pose.covariance[3:, 3:]),
+        normalized(way, pose.covariance[:3, :3]),
         math.degrees(np.linalg.norm(turn)),
         1e3 * float(np.linalg.norm(way)),
     )
 
 
 def of_twist(twist: Any, truth: tuple[Array, ...]) -> list[float]:
-    """Squared normalised errors of 6, 3 and 3 dimensions; deg/s and m/s."""
+    """Squared normalized errors of 6, 3 and 3 dimensions; deg/s and m/s."""
     angular, linear = truth[2] - twist.angular, truth[3] - twist.linear
     return [
-        normalised(np.concatenate([linear, angular]), twist.covariance),
-        normalised(angular, twist.covariance[3:, 3:]),
-        normalised(linear, twist.covariance[:3, :3]),
+        normalized(np.concatenate([linear, angular]), twist.covariance),
+        normalized(angular, twist.covariance[3:, 3:]),
+        normalized(linear, twist.covariance[:3, :3]),
         math.degrees(np.linalg.norm(angular)),
         float(np.linalg.norm(linear)),
     ]
 
 
-def normalised(error: Array, covariance: Array) -> float:
+def normalized(error: Array, covariance: Array) -> float:
     """Squared Mahalanobis length; infinite where a covariance denies that there is an error."""
     if not np.any(error):
         return 0.0

@@ -141,7 +141,7 @@ def test_a_video_with_a_gyroscope(film, tmp_path, capsys):
     before, after = (Rotation.from_matrix(pose(times - late + d)[0]) for d in (-1e-4, 1e-4))
     add_telemetry(path, times, (before.inv() * after).as_rotvec() / 2e-4, 0.016)
     words = ["calibrate", str(path), *BOARD]
-    out = tmp_path / "shutter.yaml"
+    out = tmp_path / "camera.yaml"
     words += ["--calibration", str(tmp_path / "lens.yaml"), "--imu"]
     assert main([*words, "--out", str(out)]) == 0
     said = capsys.readouterr().out

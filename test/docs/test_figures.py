@@ -17,12 +17,19 @@ ROWS = [
     if "rs_localizer" in table.columns
     for row in table.rows
 ]
+REST = re.findall(
+    r"^\* (\[[\w-]+\]\(\.\./benchmarks/results/.+?)(?=\n\*|\n\n)",
+    PAGE.read_text(encoding="utf-8"),
+    re.MULTILINE | re.DOTALL,
+)
 
 
 def test_every_block_is_what_its_bench_printed():
     page = PAGE.read_text(encoding="utf-8")
     assert filled(page) == page
-    assert set(blocks(page)) == {file.stem for file in RESULTS.glob("*.txt")}
+    others = set(re.findall(r"\.\./benchmarks/results/([\w-]+)\.txt", page))
+    assert set(blocks(page)) | others == {file.stem for file in RESULTS.glob("*.txt")}
+    assert set(blocks(page)) & others == set()
     widest = max(len(line) for text in blocks(page).values() for line in text.splitlines())
     assert widest <= 100
 
@@ -39,6 +46,14 @@ def test_every_figure_of_readme_is_in_the_block_that_it_links_to(row):
         digits = len(number.partition(".")[2])
         near = [x for value in known for x in (value, 100.0 * value)]
         assert float(number) in {round(x, digits) for x in near}, number
+
+
+@pytest.mark.parametrize("item", REST, ids=[item[:20] for item in REST])
+def test_every_figure_of_the_rest_is_in_the_file_that_it_links_to(item):
+    link, said = re.match(r"\[[\w-]+\]\(\.\./(\S+)\), (.+)", item, re.DOTALL).groups()
+    known = set(NUMBER.findall((pages.ROOT / link).read_text(encoding="utf-8")))
+    figures = re.sub(r"`[^`]+`|figures .*? of the paper", "", said)
+    assert {number for number in NUMBER.findall(figures) if number not in known} == set()
 
 
 def test_the_picture_of_errors_is_of_the_run_whose_medians_are_printed():

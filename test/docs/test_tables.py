@@ -18,6 +18,7 @@ from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.topics import LIVE
 from rs_localizer.offline.frame_table import COLUMNS
 from rs_localizer.pipeline.inputs import INPUTS
+from rs_localizer.pipeline.refusal import IMU_REASONS, REASONS
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.diagnostics import State
 from rs_localizer.settings import FIRST, Kind, settings
@@ -51,9 +52,9 @@ def test_every_parameter_is_in_a_table_with_its_default(kind, where):
         assert read(default, known[name].default) == known[name].default, (page, name)
 
 
-def test_readme_and_the_help_begin_with_what_everybody_sets():
-    (table,) = [t for t in pages.all_tables("parameter", "default") if t.page == "README.md"]
-    assert [name for row in table.rows for name in pages.names_in(row[0])] == list(FIRST)
+def test_the_node_and_the_help_begin_with_what_everybody_sets():
+    first, *_ = [t for t in pages.all_tables("parameter", "default") if t.page == "docs/node.md"]
+    assert [name for row in first.rows for name in pages.names_in(row[0])] == list(FIRST)
     assert list(settings())[: len(FIRST)] == list(FIRST)
 
 
@@ -126,6 +127,14 @@ def test_every_notice_is_explained_and_given_somewhere():
     assert {name for head in heads for name in pages.names_in(head)} == set(Notice)
     code = "".join(path.read_text() for path in (pages.ROOT / "rs_localizer").rglob("*.py"))
     assert set(re.findall(r"\bNotice\.([A-Z_]+)", code)) == {notice.name for notice in Notice}
+
+
+def test_the_page_of_symptoms_names_what_exists():
+    known = {*Notice, *REASONS, *IMU_REASONS, *settings(), *INPUTS, "replay"}
+    said = pages.names_in(pages.prose("docs/wrong_poses.md"))
+    names = {name for name in said if re.fullmatch(r"[a-z_]+(\.[a-z_]+)?", name)}
+    assert names <= known
+    assert len(names & set(Notice)) > 10
 
 
 def test_every_state_is_explained():

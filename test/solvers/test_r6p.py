@@ -15,6 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.solvers import r6p
+from rs_localizer.solvers.minimal import solve_minimal
 
 BOUND = 1.0
 MONOMIALS = sorted(
@@ -202,3 +203,22 @@ def test_all_real_solutions_are_found_and_nothing_else(family):
     assert np.mean(distances(*found, *expected) < 1e-6) >= 0.999
     # Each of them once.
     assert abs(len(found[0]) - len(expected[0])) <= 0.001 * len(expected[0])
+
+
+@pytest.mark.parametrize(("off", "least", "most"), [(0.0, 0.25, 0.5), (0.02, 0.0, 0.0)])
+def test_a_plane_is_solved_from_the_true_orientation_alone(off, least, most):
+    """As docs/solvers.md says: 30 to 40 % of exact samples, none from 1 degree off."""
+    rng, count = np.random.default_rng(0), 200
+    points = rng.uniform(-1.0, 1.0, (count, 6, 3)) * [1.0, 1.0, 0.0]
+    tau = rng.uniform(-0.5, 0.5, (count, 6))
+    true = Rotation.from_rotvec(0.4 * rng.normal(size=(count, 3)))
+    c, w, t = (rng.normal(0.0, 0.1, (count, 1, 3)) for _ in range(3))
+    turned = np.einsum("hij,hnj->hni", true.as_matrix(), points)
+    seen = turned + tau[..., None] * (np.cross(w, turned) + t) + c + [0.0, 0.0, 4.0]
+    start = Rotation.from_rotvec(off * np.array([1.0, 0.0, 0.0])) * true
+    rays = seen[..., :2] / seen[..., 2:]
+    found = solve_minimal("r6p", points, rays, tau, rotation=start.as_matrix())[0]
+    apart = np.linalg.norm(found - true.as_matrix()[:, None], axis=(2, 3))
+    solved = np.any(np.isfinite(apart), axis=1)
+    assert least <= np.mean(solved) <= most
+    assert np.all(np.nanmin(apart[solved], axis=1, initial=np.inf) < 1e-6)
