@@ -24,13 +24,12 @@ from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.prior import assumptions
 from rs_localizer.estimation.ransac import optimize
 from rs_localizer.estimation.refine import EXPECTED_NOISE, refine
+from rs_localizer.estimation.searching import SCORE_SCALE
 from rs_localizer.solvers.minimal import solve_minimal
 from rs_localizer.solvers.table import find_solver
 
 _SIX = 6
 _TRIPLETS = np.array(list(combinations(range(_SIX), 3)))
-# Minimal models are scored at this multiple of the inlier threshold, as by the Localizer.
-_SCORE_SCALE = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +78,7 @@ def estimate(
     models = _models(method, trials, trials.truth.rotation if initial is None else initial)
     threshold = LocalizerConfig().inlier_threshold * max(1.0, noise)
     if models.shape[1] > 1:
-        return _best(models, trials, _SCORE_SCALE * threshold)
+        return _best(models, trials, SCORE_SCALE * threshold)
     if method.refined:
         return _refined(models[:, 0], trials, threshold)
     return _motions(models[:, 0])

@@ -36,7 +36,7 @@ _POOL_SCALE = 0.12
 # Minimal models are scored at this multiple of the inlier threshold: noise makes a six-point
 # model miss the other inliers. At 4 or 3 times a model between two groups of points that are four
 # thresholds apart was the best one in 13 or 6 of 80 frames.
-_SCORE_SCALE = 2.0
+SCORE_SCALE = 2.0
 _GLOBAL_SHUTTER_BLOCK = 48
 _BLOCK = 64
 # A start, or a motion of left-out points, draws at most so many: of a fast camera one pose explains
@@ -64,7 +64,7 @@ class MotionSearch:
         expected = self._noise, config.solver_iterations
         wide = max(GLOBAL_SHUTTER_SCALE * focal_length, threshold)
         self._rough = wide
-        score = (_SCORE_SCALE if self._optimizes else 1.0) * threshold
+        score = (SCORE_SCALE if self._optimizes else 1.0) * threshold
         scales = (wide, wide) if solver.rolling_shutter else (score, threshold)
         self._starts = Hypotheses(
             start, _GLOBAL_SHUTTER_BLOCK, *scales, *expected, optimized=self._optimizes
