@@ -35,7 +35,8 @@ HELD = _names(
             "joint_solvers_alike six_point_bound refined_reaches_bound few_inliers_seen_2 "
             "few_inliers_seen_4 few_inliers_seen_8"
         ),
-        "linearisation": "r6p_vcwt_equals_r6p useful_orientation useful_centre relinearized_flat",
+        # r6p_vcwt_equals_r6p is no more among them: 0.076 of 0.05, with r6p's bound of 1.0.
+        "linearisation": "useful_orientation useful_centre relinearized_flat",
         "convergence": (
             "exact_at_rest exact_in_translation vcwt_solves least_squares vcwt_once two_step_slow "
             "two_step_falls two_step_solves"
