@@ -13,7 +13,7 @@ import numpy as np
 from rs_localizer.cli import WORKING, read_counts, refuse_existing
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.markers.families import FAMILIES, family
-from rs_localizer.tools.printing import PAGES, page_files, plan, write_pages
+from rs_localizer.tools.printing import PAGES, largest_side, page_files, plan, write_pages
 
 if WORKING:
     from rs_localizer.io.atomic_files import atomic_files
@@ -23,7 +23,8 @@ if WORKING:
     from rs_localizer.markers.poses import Pose
     from rs_localizer.markers.prints import Charuco, Chessboard
 
-# Six markers that fill a page of A4 or letter.
+# Six markers, which fill a page. Where more would be smaller than this (m), each has a page of its
+# own: smaller ones are not seen from a few metres.
 _FAMILY, _GRID, _SIZE, _SQUARE = "4x4_50", "2x3", 0.06, 0.03
 # Of a marker's size, between those of a grid; of a square, the side of a ChArUco board's marker:
 # as large as leaves the marker enough white.
@@ -43,7 +44,8 @@ class Options(ResultOptions):
     charuco: str | None = option("instead: squares, along a row x rows", "5x7")
     family: str = option(f"of the markers: {', '.join(FAMILIES)}", "NAME", _FAMILY)
     size: float | None = option(
-        f"side of a marker (default: {_SIZE}) or of a board's squares ({_SQUARE})", "M",
+        f"side of a marker or of a board's squares (default: what fills the page, but at least "
+        f"{_SIZE} or {_SQUARE})", "M",
         limits=(0.0, math.inf), above=True,
     )  # fmt: skip
     first_id: int = option("id of the first marker", "N", 0, limits=(0, math.inf))
@@ -86,10 +88,12 @@ def _map(options: Options) -> MarkerMap:
     what = given[0] if given else "grid"
     counts = read_counts(getattr(options, what) or _GRID, f"--{what}")
     if what == "grid":
-        size = options.size or _SIZE
+        sides = (count + (count - 1) * _GAP for count in counts)
+        size = options.size or max(_SIZE, largest_side(options.page, *sides))
         first = options.first_id
         return MarkerMap(wall(options.family, counts, size, _GAP * size, first_id=first, pose=pose))
-    square = options.size or _SQUARE
+    squares = (count + (what == "chessboard") for count in counts)
+    square = options.size or max(_SQUARE, largest_side(options.page, *squares))
     if what == "chessboard":
         return MarkerMap(boards=(Chessboard(*counts, square, pose=pose),))
     kind, marker = family(options.family), _MARKER * square

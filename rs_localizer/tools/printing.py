@@ -38,6 +38,18 @@ class Page:
     text: str  # at its foot
 
 
+def largest_side(page: str, across: float, down: float) -> float:
+    """Return the side (m, whole 5 mm) of the largest squares of which so many fit on a page.
+
+    Args:
+        page: one of :data:`PAGES`, upright or on its side.
+        across, down: how many sides the print is wide and high.
+    """
+    rooms = (_room(width, height) for width, height in (PAGES[page], PAGES[page][::-1]))
+    side = max(min(width / across, height / down) for width, height in rooms)
+    return side // 5.0 * 5.0 / _MM
+
+
 def plan(marker_map: MarkerMap, page: str = "a4") -> list[Page]:
     """A page for a board or a wall of markers, or one for each marker where they do not fit.
 
@@ -94,10 +106,14 @@ def _paper(black: Array, page: str) -> tuple[float, float] | None:
     """The page, upright or on its side, on which rectangles fit."""
     size = (black[:, :2] + black[:, 2:]).max(axis=0) - black[:, :2].min(axis=0)
     for width, height in (PAGES[page], PAGES[page][::-1]):
-        room = width - 2 * _MARGIN, height - 2 * _MARGIN - _FOOT
-        if np.all(size <= np.array(room) + 1e-9):
+        if np.all(size <= np.array(_room(width, height)) + 1e-9):
             return width, height
     return None
+
+
+def _room(width: float, height: float) -> tuple[float, float]:
+    """Return the part of a sheet (mm) that is left between its margins and above its foot."""
+    return width - 2 * _MARGIN, height - 2 * _MARGIN - _FOOT
 
 
 def _marker(marker: Marker) -> Array:

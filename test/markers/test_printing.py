@@ -12,7 +12,7 @@ from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.prints import Charuco, Chessboard
-from rs_localizer.tools.printing import PAGES, PrintError, plan, write_pages
+from rs_localizer.tools.printing import PAGES, PrintError, largest_side, plan, write_pages
 
 PIXEL = 0.0254 / 300  # m, of the PNG files
 
@@ -52,6 +52,15 @@ def test_markers_that_do_not_fit_together_get_pages_of_their_own(tmp_path):
     assert side == pytest.approx(0.12, abs=3e-5)
     with pytest.raises(PrintError, match="takes 400 x 400 mm, more than a4 has room for"):
         plan(MarkerMap(wall("4x4_50", (1, 1), 0.4, 0.1)))
+
+
+@pytest.mark.parametrize(("page", "side"), [("a4", 0.07), ("a3", 0.1), ("letter", 0.065)])
+def test_the_largest_markers_fill_the_page(page, side):
+    found = largest_side(page, 2 + 1 / 3, 3 + 2 / 3)
+    assert found == pytest.approx(side)
+    assert len(plan(MarkerMap(wall("4x4_50", (2, 3), found, found / 3)), page)) == 1
+    larger = found + 0.0051
+    assert len(plan(MarkerMap(wall("4x4_50", (2, 3), larger, larger / 3)), page)) == 6
 
 
 def test_pdf_has_the_size_of_the_paper(tmp_path):
