@@ -33,7 +33,7 @@ def setting(
     read_only: bool = False,
     fixed: bool = False,
 ) -> Any:
-    """A dataclass field with what a user needs to know of it.
+    """Declare a dataclass field, with what a user needs to know of the setting.
 
     Args:
         default: its value, which also says its type; a member of an enumeration: one of its texts.
@@ -78,7 +78,7 @@ def check(config: Any, prefix: str = "") -> None:
 
 
 def type_of(default: Any) -> str:
-    """In words, what a setting with this default is."""
+    """Describe in words the type of a setting with this default."""
     if default == NO_NAMES:
         return "names, as [front, rear]"
     if isinstance(default, tuple):
@@ -177,7 +177,7 @@ class CalibrationErrors:
 
 
 class RefinementKind(StrEnum):
-    """What is made of the best minimal sample of a frame."""
+    """Ways to refine the best minimal sample of a frame."""
 
     NONE = "none"
     MOTION = "motion"
@@ -192,32 +192,36 @@ class LocalizerConfig:
         "r6p_vcwt", "Minimal solver that generates the hypotheses", choices=tuple(SOLVERS)
     )
     solver_iterations: int = setting(
-        5, "Most iterations of the iterative solvers, which stop where they converge", (1, 100)
+        5, "Most iterations of an iterative solver; it stops when it converges", (1, 100)
     )
     refinement: str = setting(
         RefinementKind.FULL,
-        "What follows the search; none: nothing, the best sample's model is published, without a "
-        "covariance; motion: least squares of the inliers, without priors; full: the posterior. "
-        "Frames are tracked by full alone",
+        "What follows the search; none: nothing, the model of the best sample is published without "
+        "a covariance; motion: least squares on the inliers, without priors; full: the posterior. "
+        "Only full tracks frames",
     )
     inlier_threshold: float = setting(
-        2.0, "Largest reprojection error of an inlier, in raw image pixels", (0.01, 1000.0)
+        2.0,
+        "Inlier threshold, in raw pixels; the gate is the larger of this and 3.5 standard "
+        "deviations of the noise, at most twice this",
+        (0.01, 1000.0),
     )
     max_iterations: int = setting(
         1000,
-        "Most minimal samples of a frame's motion; its global-shutter start takes up to 384",
+        "Most minimal samples of the motion search; the global-shutter search before it takes at "
+        "most 384",
         (1, 1_000_000),
     )
     confidence: float = setting(
         0.99,
-        "Probability of an all-inlier sample at which the search stops",
+        "The search stops when a sample without outliers has been drawn with this probability",
         (0.0, 0.999999),
     )
     min_inliers: int = setting(8, "Fewest inliers of an accepted pose", (7, 1_000_000))
     max_orientation_deviation: float = setting(
         0.07,
-        "Largest accepted standard deviation of the orientation about its worst axis, in rad, of "
-        "a stationary camera; three times as much where only unknown motion causes it",
+        "Largest accepted standard deviation of the orientation about its worst axis, in rad; if "
+        "only unknown motion causes the uncertainty, up to three times this is accepted",
         (0.001, 10.0),
     )
     seed: int = setting(0, "Seed of the random samples; every frame starts from it", (0, 2**31 - 1))
@@ -226,8 +230,8 @@ class LocalizerConfig:
     calibration: CalibrationErrors = field(default_factory=CalibrationErrors)
     map_deviation: float = setting(
         0.0,
-        "Standard deviation of the map's points, in m, of errors that neighbours share; it widens "
-        "covariances and gates",
+        "Standard deviation of the map's points, in m, with errors that neighbours share; it "
+        "widens covariances and gates",
         (0.0, 1000.0),
     )
 
@@ -241,7 +245,7 @@ class LocalizerConfig:
 
 
 def meant(name: str, known: Sequence[str], otherwise: str = "") -> str:
-    """The known name that an unknown one may stand for, as ``; did you mean it?``."""
+    """Return the known name that an unknown one may stand for, as ``; did you mean it?``."""
     close = difflib.get_close_matches(name, known, n=1)
     if close:
         return f"; did you mean {close[0]}?"
@@ -249,7 +253,7 @@ def meant(name: str, known: Sequence[str], otherwise: str = "") -> str:
 
 
 def localizer_config(settings: Mapping[str, Any]) -> LocalizerConfig:
-    """The settings of a localizer by keyword.
+    """Return the settings of a localizer by keyword.
 
     Raises:
         ValueError: for a value out of range, or a name that is no setting; then with the one that
@@ -327,8 +331,8 @@ class Imu:
     )
     wait: float = setting(
         0.02,
-        "How long a frame waits for the messages of its exposure before it is localized without "
-        "them, in s",
+        "Longest time that a frame waits for the messages of its exposure, in s; then it is "
+        "localized without them",
         (0.0, 1.0),
     )
 
@@ -342,8 +346,8 @@ class RigSettings:
 
     window: float = setting(
         0.02,
-        "Images of several cameras are one frame if the middles of their exposures lie within this "
-        "time, in s; cameras that run freely need half their period",
+        "Images of several cameras form one frame if the middles of their exposures lie within "
+        "this time, in s; cameras without a common trigger need half their period",
         (0.0, 1.0),
     )
 
@@ -398,28 +402,28 @@ class NodeConfig(LocalizerConfig):
     )
     tracking: bool = setting(
         True,
-        "Use the previous pose and twist as first guess and prior, with a rolling-shutter solver; "
-        "without a readout_time only errors of map and lens are tracked",
+        "Use the previous pose and twist as first guess and prior; needs a rolling-shutter solver "
+        "and a readout_time, without which only errors of map and lens are tracked",
     )
     output_lag: int = setting(
         0,
-        "Frames that a tracked result waits for: it is that of the frame so many before, whose "
-        "twist the later ones know, too; for maps, logs and filters with delayed states",
+        "Frames by which a tracked result is delayed, so that later frames improve its twist; for "
+        "maps, logs and filters with delayed states",
         (0, 5),
     )
     output_rate: float = setting(
         0.0,
-        "Rate of pose, twist and odometry, in Hz, each predicted to now by the motion of the last "
-        "tracked frames; 0: one of each image",
+        "Rate of pose, twist and odometry, in Hz, predicted to the current time from the motion of "
+        "the last tracked frames; 0: one output per image",
         (0.0, 1000.0),
     )
     max_prediction: float = setting(
-        0.1, "How long after the last pose output_rate goes on, in s", (0.0, 1.0)
+        0.1, "Longest prediction after the last pose, for output_rate, in s", (0.0, 1.0)
     )
     max_points: int = setting(
         20_000,
-        "Most points of a frame that are used: those with the best scores, or without scores "
-        "evenly over the image",
+        "Most points of a frame that are used: those with the best scores; without scores, evenly "
+        "chosen over the image",
         (7, 1_000_000),
     )
     base_frame: str = setting(
@@ -438,34 +442,34 @@ class NodeConfig(LocalizerConfig):
     )
     tf_rate: float = setting(
         20.0,
-        "Rate of map_to_odom on TF, in Hz, the last correction held between and without frames; 0: "
-        "once a frame",
+        "Rate of map_to_odom on TF, in Hz; the last correction is held between frames and without "
+        "them; 0: once per frame",
         (0.0, 1000.0),
     )
     hold: float = setting(
         0.0,
-        "How long the last correction is held where no frame gives a pose, in s; 0: for ever",
+        "Longest time that the last correction is held without a pose, in s; 0: for ever",
         (0.0, 1e6),
     )
     two_d_mode: bool = setting(
-        False, "Of map_to_odom, z, roll and pitch are zero, for robots on a floor"
+        False, "Set z, roll and pitch of map_to_odom to zero, for robots on a floor"
     )
     transform_tolerance: float = setting(
         0.2,
-        "How long to wait for a transform that is not there yet, and how far map_to_odom is "
+        "Longest wait for a transform that is not there yet, and time by which map_to_odom is "
         "stamped into the future, in s",
         (0.0, 10.0),
     )
     saved_pose_file: str = setting(
         "",
-        "File that keeps the last pose of map_to_odom and is started from, as from a click; empty: "
-        "none",
+        "File that keeps the last pose of map_to_odom; the node starts from it as from a click; "
+        "empty: none",
         fixed=True,
     )
     camera_file: str = setting(
         "",
-        "What calibrate writes of a camera: its lens, in place of camera_info's, and the settings "
-        "that are not given otherwise; empty: none",
+        "File of a camera by calibrate; its lens replaces that of camera_info, its settings count "
+        "unless they are given otherwise; empty: none",
         read_only=True,
     )
     map_file: str = setting(

@@ -2,17 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Am I lost? The probability that a pose lies outside its 99.9 % region.
 
-A frame shows it by what a right pose in the right map does not leave: outliers that lie together
-instead of everywhere, and are the same landmarks in the next frame, inliers in a part of what is
-seen only. Each is a number; the logarithm of their odds is a logistic regression's over sequences
-in right maps and in wrong ones (``python -m benchmarks.integrity --fit``), tempered, as successive
-frames err together. Where all of a map is wrong in the same way, nothing of that shows, but for the
-moment at which it begins: the pose lies where the frames before did not predict it. A hidden Markov
-chain adds both up. It has three states: right; wrong, and frames show it; wrong since a jump.
+A wrong pose leaves traces in a frame: outliers cluster, and are the same landmarks in the next
+frame; inliers fill only a part of the view. Each trace is a number, and a logistic regression turns
+them into log odds. It was fitted to sequences in right and wrong maps (``python -m
+benchmarks.integrity --fit``), and is tempered because successive frames err together. If a whole
+map is wrong in the same way, only the moment at which it begins is visible: the pose lies where the
+frames before did not predict it. A hidden Markov chain combines both. Its states are: right; wrong,
+and frames show it; wrong since a jump.
 
-What no image shows it does not know: a room that had been moved as a whole before the first frame,
-or a wall that is another one's copy while nothing else is seen. Landmarks that are gone make no
-pose wrong: :attr:`Integrity.stale` tells which they are.
+No image shows that a room had been moved as a whole before the first frame; or that a wall is a
+copy of another one while nothing else is in view. Landmarks that are gone do not make a pose wrong;
+:attr:`Integrity.stale` names them.
 """
 
 import math
@@ -30,30 +30,31 @@ from rs_localizer.estimation.residuals import likeness
 NAMES = (
     "share", "together", "apart", "persists", "spread", "filled", "count", "innovation", "lasting",
 )  # fmt: skip
-"""Of the numbers of a frame."""
-# Of the regression: constant, then those of NAMES; of the innovation only the jump tells.
+"""Names of the numbers of a frame."""
+# Of the regression: the constant, then the weights of NAMES; the innovation counts as a jump only.
 WEIGHTS = np.array([1.363, -0.855, 0.011, 0.365, 0.845, -4.351, -0.551, -0.653, 0.0, 0.0])
-# How much of a frame's odds count beside those of the frames before; chances per frame that a right
-# track goes wrong, and that a wrong one is right again; of a first pose, to be wrong in either way.
-# With weights that are fitted to poses alone, ten seconds of a right scene in the middle of the
-# image, with a fifth of its matches anywhere, add up to 0.78; with these to 0.02.
+# Weight of a frame's log odds beside those of earlier frames; probabilities per frame that a right
+# track goes wrong and that a wrong one recovers; probabilities that a first pose is wrong in either
+# way. A right scene in the middle of the image, with a fifth of its matches wrong, reaches 0.02
+# after ten seconds; with weights that are fitted to single poses it reached 0.78.
 TEMPER, GOES_WRONG, RECOVERS, FIRST = 0.4, 0.001, 0.3, (0.015, 0.005)
-# Logarithmic odds that an innovation is a jump, to where the pose is wrong or right again (constant
-# and factor), and the most that a jump may say.
+# Log odds that an innovation is a jump to a wrong or a right pose (constant and factor), and the
+# highest probability that a jump may give.
 JUMP, MOST_JUMP = (-15.57, 5.34), 0.65
 INNOVATION = NAMES.index("innovation")
 # Neighbours of a point in the map, and how many points are looked at.
 _NEIGHBOURS, _MOST = 4, 200
-# Makes one number of a landmark's place, which no other place shares to the last bit.
+# Turns the position of a landmark into one number, which no other position shares to the last bit.
 _KEY = np.sqrt([2.0, 3.0, 5.0])
-# A landmark that is there is never matched with this probability, of all that a map shows in a day.
+# A landmark counts as gone if one that is there would be missed as often with this probability; the
+# most landmarks that are remembered.
 _BY_CHANCE, _MOST_LANDMARKS = 1e-8, 20_000
-# What the least certain number may say, in odds.
+# Bound of a frame's log odds.
 _MOST_ODDS = 8.0
 
 
 def _together(points: Array, kept: BoolArray) -> float:
-    """How much inliers and outliers keep to themselves in the map, in deviations of chance."""
+    """Return how far inliers and outliers cluster in the map, in deviations of chance."""
     if len(points) > _MOST:
         chosen = np.linspace(0, len(points) - 1, _MOST).astype(int)
         points, kept = points[chosen], kept[chosen]
@@ -68,7 +69,7 @@ def _together(points: Array, kept: BoolArray) -> float:
 
 
 def _spread(kept: Array, seen: Array) -> float:
-    """Logarithm of the part of the points' area in the image that the inliers take."""
+    """Return the logarithm of the part of the points' area in the image that the inliers take."""
     if len(kept) < 3:
         return -3.0
     areas = [math.sqrt(max(_determinant(each), 1e-6)) for each in (kept, seen)]
@@ -76,13 +77,13 @@ def _spread(kept: Array, seen: Array) -> float:
 
 
 def _determinant(pixels: Array) -> float:
-    """Determinant of the covariance of pixels (n,2)."""
+    """Return the determinant of the covariance of pixels (n,2)."""
     x, y = (pixels - pixels.mean(axis=0)).T
     return float((x @ x) * (y @ y) - (x @ y) ** 2) / (len(pixels) - 1) ** 2
 
 
 def _innovation(estimate: Estimate, prior: Prior) -> float:
-    """Logarithm of one and the squared distance of the pose from the predicted one, a sixth."""
+    """Return ``log(1 + d) / 6``, d the squared distance of the pose from its prediction."""
     if prior.motion is None or prior.covariance is None:
         return 0.0
     spread = np.asarray(prior.covariance)[:6, :6] + estimate.covariance[:6, :6]
@@ -97,7 +98,7 @@ def _innovation(estimate: Estimate, prior: Prior) -> float:
 
 
 def _keys(points: Array) -> Array:
-    """One number (n,) of each landmark's place (n,3)."""
+    """Return one number (n,) of each landmark's place (n,3)."""
     keys: Array = (points * _KEY).sum(axis=1)
     return keys
 
@@ -142,7 +143,7 @@ class Integrity:
         self.reset()
 
     def reset(self) -> None:
-        """The next frame is the first; landmarks stay what they are."""
+        """Start anew with the next frame; landmarks stay what they are."""
         # Of the three states, after the last frame.
         self._chances = np.array([1.0 - sum(FIRST), *FIRST])
         self._is_first = True
@@ -156,7 +157,7 @@ class Integrity:
     def numbers(
         self, estimate: Estimate, points: ArrayLike, pixels: ArrayLike, prior: Prior | None
     ) -> Array:
-        """The numbers (9,) of the next frame, in the order of ``NAMES``.
+        """Return the numbers (9,) of the next frame, in the order of ``NAMES``.
 
         Args:
             estimate: of the frame.
@@ -188,7 +189,7 @@ class Integrity:
         )
 
     def _persists(self, points: Array, kept: BoolArray) -> float:
-        """Logarithm of the odds that a landmark is what it was in the last frame, against chance.
+        """Return the log odds that landmarks are what they were in the last frame, against chance.
 
         Chance matches are others in each frame; landmarks that have been moved are always off.
         """
@@ -204,7 +205,7 @@ class Integrity:
         return float(np.log(counts[0, 0] * counts[1, 1] / (counts[0, 1] * counts[1, 0])))
 
     def add(self, numbers: Array) -> float:
-        """The probability after a frame of these numbers."""
+        """Return the probability after a frame of these numbers."""
         said = min(max(float(WEIGHTS[0] + WEIGHTS[1:] @ numbers), -_MOST_ODDS), _MOST_ODDS)
         if not self._is_first:
             self._chances = _transitions(float(numbers[INNOVATION])) @ self._chances
@@ -215,7 +216,7 @@ class Integrity:
 
 
 def _transitions(innovation: float) -> Array:
-    """Chances (3,3) from each state of the frame before (columns) to those of the next."""
+    """Return the probabilities (3,3) of the next state (rows) for each last state (columns)."""
     odds = JUMP[0] + JUMP[1] * innovation
     jump = min(1.0 / (1.0 + math.exp(-odds)), MOST_JUMP)
     stays, goes = 1.0 - GOES_WRONG, GOES_WRONG

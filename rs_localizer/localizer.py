@@ -51,25 +51,26 @@ from rs_localizer.estimation.result import estimate_of, sample_estimate
 from rs_localizer.estimation.searching import MotionSearch
 from rs_localizer.solvers.table import find_solver, start_solver
 
-# A prediction may be off by this multiple of the inlier threshold.
+# A prediction may be wrong by this multiple of the inlier threshold.
 _PREDICTION_SCALE = 16.0
-# Points whose places are off by a standard deviation in either direction lie within so many of them
-# (95 % of Rayleigh's distribution).
+# With one standard deviation in each direction, 95 % of the points lie within so many of them
+# (Rayleigh's distribution).
 _MAP_GATE = 2.45
 # rad/s, twice the range of most gyroscopes (2000 deg/s).
 _FASTEST_RATE = 70.0
 _UNRANKED = np.zeros(0, np.int64)
-# A point is seen at the time of its row, which it decides: each look makes the error of that a
-# hundredth, the part of the image that a readout moves it.
+# A point is exposed at the time of its row, which depends on where it is seen. Each iteration
+# divides the error of that time by some hundred: by the inverse share of the image that a readout
+# moves it.
 _LOOKS = 2
-# Points that agree with a prediction's optimum, as a share of those that agreed before.
+# Least share of inliers near a prediction, over the share that agreed before.
 _STILL_TRACKED = 0.7
-# A gate is widened for noise that fills it up to so many times, by so much at least.
+# If noise fills a gate, it is widened up to this many times, by at least this factor at a time.
 _WIDEST, _LEAST_WIDER = 4.0, 1.25
 
 
 class _Inputs(NamedTuple):
-    """What :meth:`Localizer.find` is given."""
+    """The checked arguments of :meth:`Localizer.find`."""
 
     exposure: Exposure
     counts: Sequence[int]  # points of each camera, one after the other
@@ -112,7 +113,7 @@ class Localizer:
         )
         self._full = self.config.refinement == RefinementKind.FULL
         self._exposure = camera.exposure()
-        # Of as many spans as a rig of cameras that are in step has.
+        # A rig of cameras with a common trigger has few different spans.
         self._assume = lru_cache(16)(
             partial(assumptions, rig=camera, config=self.config, solver=self._solver)
         )
@@ -136,7 +137,7 @@ class Localizer:
 
     @property
     def camera(self) -> Camera:
-        """The camera of a rig of one; ``ValueError`` where there are several."""
+        """The only camera; ``ValueError`` if there are several."""
         if len(self.rig.cameras) > 1:
             raise ValueError(f"the rig has several cameras: {', '.join(self.rig.cameras)}")
         return next(iter(self.rig.cameras.values()))
@@ -155,17 +156,17 @@ class Localizer:
         """Estimate pose and velocities from one image, or from those of a rig.
 
         Args:
-            points: (n,3) in the map frame, metres; of a rig ``{name: (points, pixels)}``, or
-                ``(points, pixels, scores)``, of the cameras that have a part in the frame.
+            points: (n,3) in the map frame, metres. For a rig ``{name: (points, pixels)}``, or
+                ``(points, pixels, scores)``, of the cameras that take part in the frame.
             pixels: (n,2) raw image coordinates, first pixel centre at 0, 0.
             scores: (n,) quality of the matches, higher is better.
-            prior: what else is known of the motion. A prior motion is also a first guess; if the
+            prior: other knowledge of the motion. A prior motion is also a first guess; if the
                 points do not agree with it, it is dropped and the whole search runs.
             expected_share: share of inliers among the points that a prior motion should find.
-            turn: how the camera turned during the readout, as a gyroscope knows it. A prior
-                motion is then the one beside it.
-            stamps: of a rig, s at which the first row of each image was exposed, relative to
-                anything; None: all at once.
+            turn: rotation of the camera during the readout, by a gyroscope. A prior motion is then
+                the motion beside that rotation.
+            stamps: for a rig, times (s) at which the first row of each image was exposed, relative
+                to anything; None: all at once.
 
         Returns:
             an :class:`Estimate`, of a rig a :class:`RigEstimate`, or a :class:`Failure` with its
@@ -183,7 +184,7 @@ class Localizer:
         return self.accepted(self.find(points, pixels, scores, prior, expected_share, turn, stamps))
 
     def accepted(self, found: Estimate | Failure) -> Estimate | Failure:
-        """The same, or a :class:`Failure` where the orientation is too uncertain."""
+        """Return the estimate, or a :class:`Failure` if its orientation is too uncertain."""
         if not found or self.config.refinement == RefinementKind.NONE:
             return found
         failure = uncertain(found, self.config.max_orientation_deviation)
@@ -200,10 +201,10 @@ class Localizer:
         stamps: Mapping[str, float] | None = None,
         error_modes: ErrorModes | None = None,
     ) -> Estimate | Failure:
-        """As :meth:`localize`, however uncertain it is: the next frames may know better.
+        """Localize as :meth:`localize`, however uncertain: the next frames may know better.
 
-        ``error_modes``: of the map of these points, if it has them; they enter covariances. What
-        ``refinement`` does not use is ignored.
+        ``error_modes`` are those of the map of these points, if it has them; they enter
+        covariances. Arguments that ``refinement`` does not use are ignored.
         """
         if not self._full:
             prior = turn = None
@@ -238,7 +239,7 @@ class Localizer:
     def _sights(
         self, points: Any, pixels: Any, scores: Any, stamps: Mapping[str, float] | None
     ) -> tuple[Exposure, Sequence[int], Array, Array, Array | None]:
-        """As :func:`checked_of_rig`, of a camera alone or a rig."""
+        """Return sights as :func:`checked_of_rig`, for a single camera or a rig."""
         if self._alone:
             if isinstance(points, Mapping) or stamps is not None:
                 raise ValueError("images by names, and their stamps, are those of a Rig")
@@ -291,7 +292,7 @@ class Localizer:
         return self._accept(observed, best, posterior, observed.terms)
 
     def _track(self, observed: Observed, prior: Prior, expected_share: float) -> Estimate | Failure:
-        """The motion nearest to the prior one, if the points agree with it."""
+        """Find the motion nearest to the prior one, if the points agree with it."""
         assert prior.motion is not None
         threshold = self.config.inlier_threshold
         predicted = state_in(prior.motion, observed.centre)
@@ -318,7 +319,7 @@ class Localizer:
         pixels: ArrayLike | None = None,
         stamps: Mapping[str, float] | None = None,
     ) -> Array:
-        """How far (n,) px a motion shows the points of a frame from their pixels.
+        """Return the distances (n,) px between pixels and the points projected by a motion.
 
         Each at the time of the row that it is shown in; NaN behind the camera. Arguments as of
         :meth:`localize`.
@@ -337,7 +338,7 @@ class Localizer:
         return errors
 
     def known_of(self, prior: Prior | None, span: float) -> PriorTerms:
-        """What is known, beside its points, of a frame in the map's frame.
+        """Return the prior of a frame in the map's frame, from all knowledge beside its points.
 
         Args:
             prior: of which the motion counts; None: the settings alone.
@@ -370,7 +371,7 @@ class Localizer:
             gate = min(max(GATE / WIDEST_GATE * posterior.noise, _LEAST_WIDER * gate), most)
 
     def _gate(self, observed: Observed, state: Array) -> float:
-        """Inlier threshold (px) with room for what the map is known to be off."""
+        """Return the inlier threshold (px), widened by the declared deviation of the map."""
         threshold, deviation = self.config.inlier_threshold, self.config.map_deviation
         if not deviation > 0.0:
             return threshold
@@ -380,7 +381,7 @@ class Localizer:
         return math.hypot(threshold, _MAP_GATE * deviation * focal / max(depth, NEAREST))
 
     def _own_terms(self, observed: Observed, prior: Prior) -> PriorTerms:
-        """What is known of a frame by its own and by the velocities of those before.
+        """Return the prior of a frame from itself and from the velocities of earlier frames.
 
         Their poses, and so the predicted one, are off by the same calibration as this one.
         """

@@ -1,13 +1,14 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How far predictions ahead of the images are off, by how far the last ones were.
+"""Errors of predictions ahead of the images, learnt from the last ones.
 
-The motion model's accelerations fade within an image or two, which predicts the next image best.
-Real ones last longer, those of noise are over at once: a tenth of a second ahead, the first are off
-by more than the model says, the second by less. So the motions of the last images are carried on to
-each new one, and their errors compared with what was claimed: per horizon, a factor each for turn,
-place, angular and linear velocity. With the step ``e`` from prediction to estimate, ``P`` and ``C``
-their covariances, the expected squared error by what the image tells is, over the claimed one,
+The accelerations of the motion model fade within an image or two, which predicts the next image
+best. Real accelerations last longer, and those of noise end at once: a tenth of a second ahead, the
+model claims too small an error for the first and too large a one for the second. So the motions of
+the last images are extrapolated to each new one, and their errors are compared with the claimed
+ones. Each horizon has a factor for rotation, position, angular and linear velocity. Let ``e`` be
+the step from prediction to estimate, ``P`` and ``C`` their covariances. The expected squared error,
+given the image, over the claimed one is
 
     (e' P^-1 e + tr(P^-1 C)) / 3
 """
@@ -26,13 +27,15 @@ from rs_localizer.estimation.motion_window import MotionWindow, errors_ahead
 
 # Horizons, as parts of the longest one: at 30 Hz and 0.1 s, one, two and three images.
 _KNOTS = np.array([1.0, 2.0, 3.0]) / 3.0
-# Weight of the newest: some two dozen images count.
+# Weight of the newest image, so that some two dozen images count; weight of the first one.
 _NEWEST, _FIRST = 0.08, 0.5
-# One image counts as that much, at most.
+# Largest ratio of squared errors that one image may contribute.
 _MOST = 20.0
-# Accelerations that a window has learnt are never less; beside a gyroscope nobody has learnt them.
+# Smallest factor if the window has learnt its accelerations, and beside a gyroscope, where it has
+# not.
 _LEAST, _LEAST_UNLEARNT = 1.0, 0.1
-# Some twelve independent numbers tell of a factor: as wide as 95 % of F(3, 12), not chi-squared's.
+# A factor rests on some twelve independent numbers, so regions follow F(3, 12) instead of
+# chi-squared: the ratio of their 95 % bounds.
 _FEW = 1.3
 
 
@@ -90,7 +93,7 @@ class PredictionErrors:
                 self._factors[k] += newest * (np.minimum(ratios, _MOST) - self._factors[k])
 
     def widened(self, predicted: Estimate, seconds: float) -> Estimate:
-        """A prediction so many s after an image with the covariance that its like deserved."""
+        """Widen the covariance of a prediction this many s ahead by the errors of earlier ones."""
         told = self._told > 0.0
         if not told.any():
             return predicted

@@ -47,7 +47,7 @@ class Known:
 
 
 def known_cameras() -> list[Known]:
-    """The whole table."""
+    """Return the whole table."""
     with data.path(_TABLE).open(encoding="utf-8", newline="") as file:
         return [
             Known(
@@ -64,7 +64,7 @@ def known_cameras() -> list[Known]:
 
 
 def find_readout(name: str, mode: str = "") -> list[Known]:
-    """All modes whose camera has the words of the name, and whose mode has those of ``mode``.
+    """Return all modes whose camera has the words of ``name``, and whose mode those of ``mode``.
 
     Never one of several: who asks chooses.
 
@@ -91,7 +91,7 @@ def find_readout(name: str, mode: str = "") -> list[Known]:
 
 
 def as_json(entry: Known) -> dict[str, object]:
-    """An entry by identifiers with units."""
+    """Return an entry by identifiers with units."""
     values: dict[str, object] = {
         f"{key}_s" if isinstance(value, float) else key: value
         for key, value in asdict(entry).items()

@@ -1,12 +1,12 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Images that came before, bit for bit: of a camera that rests, or of a stream that hangs.
+"""Images that repeat an earlier one, bit for bit: the camera rests, or the stream hangs.
 
 Webcams in the dark and drivers that hang send the last image again under a new stamp, and so does a
-simulated camera at rest. Which of them it is, the prediction of the motion says: with the
-displacement ``d`` (2,) of a pixel from where the image has it to where the prediction does, the
-pixel's noise ``n``, the prediction's covariance ``P`` of the pose and the derivative ``J`` of the
-pixel by it, the camera has moved if, for some pixel,
+simulated camera at rest. The prediction of the motion tells them apart. Let ``d`` (2,) be the
+displacement of a pixel from its place in the image to its predicted place, and ``n`` its noise. Let
+``P`` be the predicted covariance of the pose, ``J`` the derivative of the pixel by the pose. The
+camera has moved if, for some pixel,
 
     d' (n^2 I + J P J')^-1 d > c^2
 """
@@ -55,7 +55,7 @@ class RepeatedImages:
         self._shown: dict[str, _Shown] = {}
 
     def copies(self, points: Any, pixels: Any) -> list[str]:
-        """Cameras of a frame whose pixels are those of their last image, bit for bit.
+        """Return the cameras of a frame whose pixels are those of their last image, bit for bit.
 
         Args:
             points, pixels: as of ``Localizer.localize``; what is no frame has no copies.
@@ -67,7 +67,7 @@ class RepeatedImages:
         ]
 
     def are_all(self, points: Any, pixels: Any) -> bool:
-        """Whether all images of a frame are copies, of the same points."""
+        """Return whether all images of a frame are copies, of the same points."""
         return all(
             (shown := self._shown.get(name)) is not None
             and all(map(np.array_equal, _image(name, points, pixels), (shown.points, shown.pixels)))
@@ -107,12 +107,12 @@ class RepeatedImages:
                 self._shown[name] = replace(shown, stale=True)
 
     def stale(self, copies: list[str]) -> list[str]:
-        """Those of these copies that a camera which moved cannot have seen."""
+        """Return those copies that a camera which has moved cannot have seen."""
         return [name for name in copies if self._shown[name].stale]
 
 
 def coasting(motion: Motion, covariance: Array, readouts: float) -> Prior:
-    """Where a motion leads with the velocities that it has: 0, as far as it is known, is rest.
+    """Predict where a motion leads with its velocities; unresolved ones count as rest.
 
     What accelerations may change is no doubt of that: a camera that rests then and now has none.
 
@@ -135,7 +135,7 @@ def coasting(motion: Motion, covariance: Array, readouts: float) -> Prior:
 def displacement(
     see: Callable[[Array], Array], points: Array, last: Motion, prior: Prior, noise: float
 ) -> float:
-    """How far a prediction moves the pixel that moves most, in its deviations.
+    """Return how far a prediction moves the pixel that moves most, in its deviations.
 
     Args:
         see: pixels (n,2) of points (n,3) in the axes of the motions; NaN behind the camera.
@@ -179,7 +179,7 @@ def _names(points: Any) -> list[str]:
 
 
 def _image(name: str, points: Any, pixels: Any) -> tuple[Any, Any]:
-    """Points and pixels of a camera in a frame; None where it has no part in it."""
+    """Return the points and pixels of a camera in a frame; None where it has no part in it."""
     image: Any = (points, pixels) if name == "" else ()
     if isinstance(points, Mapping):
         image = points.get(name, ())

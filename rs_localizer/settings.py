@@ -77,7 +77,7 @@ _OF_CAMERA = tuple(item.name for item in fields(CameraSettings))
 
 
 def camera_settings(values: Mapping[str, Any]) -> dict[str, Setting]:
-    """The settings that the cameras of ``values`` have of their own, by ``NAME.setting``."""
+    """Return settings that cameras of ``values`` have of their own, by ``NAME.setting``."""
     shared = settings()
     return {
         f"{camera}.{name}": replace(shared[name], default=values.get(name, shared[name].default))
@@ -87,7 +87,7 @@ def camera_settings(values: Mapping[str, Any]) -> dict[str, Setting]:
 
 
 def _cameras(values: Mapping[str, Any]) -> list[str]:
-    """The names of cameras; none where they are no names, which is refused elsewhere."""
+    """Return the names of cameras; none if they are no names, which is refused elsewhere."""
     given = as_tuple(values.get("cameras", NO_NAMES))
     return (
         [name for name in given if isinstance(name, str) and name] if type(given) is tuple else []
@@ -95,7 +95,7 @@ def _cameras(values: Mapping[str, Any]) -> list[str]:
 
 
 def settings(kind: Kind = NodeConfig) -> dict[str, Setting]:
-    """All settings of a node, by dotted name."""
+    """Return all settings of a node, by dotted name."""
     if kind not in _cached:
         found = dict(_walk(kind(), ""))
         _cached[kind] = {name: found[name] for name in (*FIRST, *found) if name in found}
@@ -112,7 +112,7 @@ def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
 
 
 def unknown(name: str, kind: Kind = NodeConfig) -> str | None:
-    """Fault of a name that is no setting; None for settings and what every node may have."""
+    """Return the fault of an unknown name; None for settings and what every node may have."""
     names = settings(kind)
     if name in names or name.split(".")[0] in _FOREIGN or _of_camera(name, kind):
         return None
@@ -120,7 +120,7 @@ def unknown(name: str, kind: Kind = NodeConfig) -> str | None:
 
 
 def _of_camera(name: str, kind: Kind) -> str:
-    """Which setting of a camera of a rig is meant by ``NAME.setting``; empty: none."""
+    """Return the setting of a rig's camera that ``NAME.setting`` means; empty if there is none."""
     group, _, last = name.rpartition(".")
     own = kind is NodeConfig and last in _OF_CAMERA and group and "." not in group
     return last if own and name not in settings(kind) else ""
@@ -131,7 +131,7 @@ def build(values: Mapping[str, Any]) -> NodeConfig: ...
 @overload
 def build(values: Mapping[str, Any], kind: type[Config]) -> Config: ...
 def build(values: Mapping[str, Any], kind: Any = NodeConfig) -> Any:
-    """Settings from values by dotted name; what is missing has its default.
+    """Return the settings with values by dotted name; missing ones have their defaults.
 
     Raises:
         ValueError: for a wrong value.
@@ -142,7 +142,7 @@ def build(values: Mapping[str, Any], kind: Any = NodeConfig) -> Any:
 
 
 def _of_cameras(values: Mapping[str, Any]) -> dict[str, CameraSettings]:
-    """Settings of each camera; ValueError for a camera that there is not."""
+    """Return settings by camera; ValueError for a camera that does not exist."""
     own = camera_settings(values)
     for name in values:
         if _of_camera(name, NodeConfig) and name not in own:
@@ -168,12 +168,12 @@ def _build(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
 
 
 def as_tuple(value: Any) -> Any:
-    """Tuple of what ROS and YAML have as a list or an array; anything else as it is."""
+    """Convert a list or array of ROS and YAML to a tuple; return anything else as it is."""
     return tuple(value) if isinstance(value, (list, array)) else value
 
 
 def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
-    """Values by dotted name of a ROS 2 params file, as far as it is meant for the node.
+    """Return values by dotted name of a ROS 2 params file, as far as it addresses the node.
 
     Args:
         path: the file.
@@ -202,7 +202,7 @@ def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
 
 
 def camera_values(path: Path) -> dict[str, Any]:
-    """Values by dotted name of a camera's file, as calibrate writes it; none of a lens alone.
+    """Return values by dotted name of a file of calibrate; none if it has a lens only.
 
     Raises:
         SettingsError: for parameters that cannot be used.

@@ -1,18 +1,18 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the camera's motion contradicts its readout time, scan direction or axis.
+"""A watch that compares readout time, scan direction and axis with the camera's motion.
 
-The poses before and after a frame say how fast the camera goes, ``v``; its image shows how far it
-goes while rows, or columns, are read. If that takes ``T_r`` over the rows, negative where they run
-against the direction that is set, and ``T_c`` over the columns (drivers that rotate images turn the
-scan sideways), the points of a frame are off by
+The poses before and after a frame give the camera's velocity ``v``; the image shows how far it goes
+while rows, or columns, are read. Let the rows take the time ``T_r``, negative if they run against
+the direction that is set. Let the columns take ``T_c``: drivers that rotate images turn the scan
+sideways. The points of a frame are then off by
 
     e = J d + (tau_r T_r + tau_c T_c) J v + J (tau_r m_r + tau_c m_c) + noise
 
-with the derivatives ``J`` by the pose, the pose's own error ``d``, and what errors of map and lens
-look like, ``m``, which is alike in neighbouring frames. A Kalman filter knows ``T_r, T_c``, whose
+``J`` is the derivative by the pose, ``d`` the error of the pose, and ``m`` the effect of errors of
+map and lens, which is alike in neighbouring frames. A Kalman filter estimates ``T_r, T_c``, whose
 evidence fades, and both ``m``, which wander. The right shutter is ``(T, 0)``, a global one ``(0,
-0)``, a reversed one ``(-T, 0)``; beside the first axis lies a shutter along the other one.
+0)``, a reversed one ``(-T, 0)``; off the first axis the shutter runs along the other one.
 """
 
 from __future__ import annotations
@@ -36,39 +36,41 @@ from rs_localizer.estimation.observations import find_usable, packed
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.residuals import linearized
 
-# Of the readout time: off by more, frames that stand alone are better than tracked ones. Errors of
-# a hand's turn rates, tracked over alone, where it is off by a factor of 1.3, 1.5, 1.7: 0.95, 1.3,
-# 1.5 (150 points, 0.3 px); known to a half, it is off by a third in the median.
+# If the readout time is off by more than this share, single frames are better than tracked ones.
+# The errors of a hand's angular velocity, tracked over single, are 0.95, 1.3 and 1.5 if it is off
+# by a factor of 1.3, 1.5 and 1.7 (150 points, 0.3 px). A time known to a half is off by a third in
+# the median.
 FAR_OFF = 0.5
-_MOST_POINTS = 200  # of a frame: more take longer than they are worth
-# Inlier thresholds within which points count: the axis may be the wrong one.
+_MOST_POINTS = 200  # of a frame: more points take longer than they are worth
+# Points count within this many inlier thresholds, because the axis may be the wrong one.
 _GATE = 3.0
-# Of one image, whose points tell velocities badly: those of usual cameras are some 0.1 rad, and
-# parts of the depth, per readout, beside a noise of 0.3 px.
+# The prior of the velocities in one image, whose points hardly determine them: usual cameras move
+# by some 0.1 rad, or shares of the depth, per readout, at a noise of 0.3 px.
 _OF_USUAL_SPEEDS = 0.3 / 0.1
-_LEAST_NOISE, _ROUNDS = 0.1, 3  # px, as little as cameras, lenses and maps have; of robust weights
-# Neighbours farther away (s), or of intervals less alike than this, say little.
+_LEAST_NOISE, _ROUNDS = 0.1, 3  # px, no real error is smaller; rounds of robust weights
+# Neighbours that are farther away (s), or whose intervals differ by more, tell little.
 _LONGEST_INTERVAL, _MOST_UNLIKE = 0.15, 2.5
-# Of a velocity, squared and by its variance: slower, its noise makes T seem shorter by a tenth.
+# Least squared velocity, over its variance: the noise of a slower one shortens T by a tenth.
 _LEAST_MOTION = 60.0
-# Before anything is known, in readout times; and what is left of it one frame later: of five
-# seconds at 30 Hz, a third.
+# Standard deviation of T before anything is known, in readout times, and the share of the evidence
+# that is left one frame later: a third after five seconds at 30 Hz.
 _ANY, _MEMORY = 3.0, math.exp(-1.0 / 150.0)
-# What map and lens are off by looks like so many rad, and parts of the depth, per readout, and
-# stays alike for a second: of tags before a real global shutter 0.1 to 0.3 ms are left of 20 so.
+# Errors of map and lens look like a motion by this many rad, or shares of the depth, per readout,
+# and stay alike for a second. With this, tags before a real global shutter show 0.1 to 0.3 ms of
+# 20.
 _LIKE_MOTION, _ALIKE = 0.002, math.exp(-1.0 / 30.0)
-# What wanders more is learnt from a tenth of each, of no more than four times as much. A camera
-# that shakes between its frames goes elsewhere within them, or shows a readout that takes longer
-# than the frames are apart: 0.1 deg at 11 to 47 Hz make 2 to 600 of it, or 60 ms; hands 1.3.
+# Stronger wandering is learnt from a tenth of each innovation, of at most four times the expected
+# one. A camera that vibrates between its frames moves otherwise within them, or shows a readout
+# that is longer than the interval: 0.1 deg at 11 to 47 Hz make 2 to 600 times, or 60 ms; hands 1.3.
 _LEARNING, _MOST_UNLIKELY, _SHAKEN = 0.1, 4.0, 1.5
-# Deviations at which a shutter is contradicted, if it is off by more than this share, too.
+# A shutter is contradicted beyond this many deviations, if it is also off by more than this share.
 _SURELY, _LEAST_DIFFERENCE = 4.0, 0.06
-# Where the setting is known to be right to this share, so many of so many frames are enough.
+# If the setting is known to this share, this many of this many frames are enough.
 _WELL_KNOWN, _ON, _CYCLE = 0.05, 3, 9
-# Of the setting: below, nothing tells the shutter from a global one.
+# Below this share of the setting nothing tells the shutter from a global one.
 _GLOBAL = 0.2
-# Logarithms of the odds of another shutter: to doubt, to doubt no more (a robot that drives slowly
-# shows neither), to be certain, and what is said of rest where that is a global one.
+# Logarithms of the odds of another shutter at which it is doubted, no longer doubted (a robot that
+# drives slowly shows neither) and certain, and of rest before a global shutter.
 _SUSPICIOUS, _SHOWN, _CERTAIN, _AT_REST = 4.0, -2.0, 8.0, 20.7
 
 
@@ -80,12 +82,12 @@ class MeasuredReadout:
     deviation: float  # s
 
     def contradicts(self, readout_time: float) -> bool:
-        """True if this readout time (s, of the assumed direction) must be wrong."""
+        """Return True if this readout time (s, of the assumed direction) must be wrong."""
         least = _LEAST_DIFFERENCE * max(abs(self.readout_time), readout_time)
         return abs(self.readout_time - readout_time) > max(_SURELY * self.deviation, least)
 
     def odds(self, one: float, other: float) -> float:
-        """Logarithm of the odds for one readout time (s) against another."""
+        """Return the logarithm of the odds for one readout time (s) against another."""
         far = [((value - self.readout_time) / self.deviation) ** 2 for value in (one, other)]
         return 0.5 * (far[1] - far[0])
 
@@ -94,7 +96,7 @@ class MeasuredReadout:
 
 
 class _Look(NamedTuple):
-    """A frame as its image shows it."""
+    """A frame whose points are linearized about its estimate."""
 
     time_ns: int
     found: Estimate
@@ -103,7 +105,7 @@ class _Look(NamedTuple):
     off: Array  # (2 n,) px, of the points if the camera did not move
 
     def over_columns(self) -> Array:
-        """The pose's step and velocity (12,) that fit the points, if they move over columns."""
+        """Return the pose's step and velocity (12,) that fit the points if rows are columns."""
         rows = np.r_[np.delete(self.rows, slice(6, 12), axis=1), _OF_USUAL_SPEEDS * np.eye(12)[6:]]
         motion = np.linalg.lstsq(rows, np.r_[self.off, np.zeros(6)], rcond=None)[0]
         return np.asarray(motion * np.tile(self.units, 2), np.float64)
@@ -157,7 +159,7 @@ class ShutterWatch:
         return _AT_REST if self.is_global else 0.0
 
     def widened(self, found: Estimate) -> Estimate:
-        """The last frame with room for what it is as well, if the shutter may be another."""
+        """Return the last frame with room for what it is as well, if the shutter may be another."""
         if not (self._reversed or self._across):
             return found
         own = np.r_[found.angular_velocity, found.linear_velocity]
@@ -256,14 +258,14 @@ class ShutterWatch:
             self.trusted, self._reversed, self._across = True, False, False
 
     def _along(self, axis: int) -> MeasuredReadout:
-        """The readout time along an axis, if the shutter moves along it."""
+        """Return the readout time along an axis, if the shutter moves along it."""
         other, spread = 1 - axis, self._covariance[:2, :2]
         gain = spread[axis, other] / spread[other, other]
         value = float(self._mean[axis] - gain * self._mean[other])
         return MeasuredReadout(value, math.sqrt(spread[axis, axis] - gain * spread[axis, other]))
 
     def _far(self, over_rows: float, over_columns: float) -> float:
-        """Half the squared distance of a shutter from what is known."""
+        """Return the half the squared distance of a shutter from what is known."""
         off = self._mean[:2] - (over_rows, over_columns)
         return 0.5 * float(off @ np.linalg.solve(self._covariance[:2, :2], off))
 
@@ -303,7 +305,7 @@ class ShutterWatch:
             self.trusted = True
 
     def _name(self, measured: MeasuredReadout, usual: float) -> str:
-        """The kind of the fault of the readout time that is set, if it has one; it is described."""
+        """Describe the fault of the set readout time and return its kind, if it has one."""
         self.fault, found, direction = "", measured.readout_time, self._direction
         if not measured.contradicts(usual):
             return ""

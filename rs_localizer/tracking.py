@@ -1,15 +1,15 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From frame to frame: the last motion predicts the next, and its prior makes the next better.
+"""Tracking from frame to frame: the last motion predicts the next one and is its prior.
 
-A single image sees the camera's velocity only through the shutter, and the linear part badly; two
-poses a frame apart show it well. The tracker brings both together: its state is one trajectory
-through the last frames (:mod:`rs_localizer.estimation.motion_window`), whose accelerations fade
-within an image or two while new ones come (Singer, "Estimating optimal tracking filter
-performance for manned maneuvering targets", 1970) and tell themselves how large they are. It
-predicts each frame, whose maximum a posteriori estimate has the prediction as prior; what the
-points say beside it joins the window. A gyroscope takes the place of the motion model's rotation
-where there is one (:mod:`rs_localizer.inertial.aiding`).
+A single image shows the camera's velocity only through the shutter, and the linear part badly; two
+poses a frame apart show it well. The tracker combines both. Its state is one trajectory through the
+last frames (:mod:`rs_localizer.estimation.motion_window`). Accelerations fade within an image or
+two while new ones come (Singer, "Estimating optimal tracking filter performance for manned
+maneuvering targets", 1970); their size is learnt. The trajectory predicts each frame and is the
+prior of its maximum a posteriori estimate. What the points add to the prior joins the window. A
+gyroscope, if there is one, replaces the rotation of the motion model
+(:mod:`rs_localizer.inertial.aiding`).
 """
 
 from __future__ import annotations
@@ -64,21 +64,21 @@ if TYPE_CHECKING:  # without a gyroscope nobody needs them
     from rs_localizer.inertial.status import InertialStatus
 
 
-# A prediction over a longer gap (s) says less than a fresh search costs.
+# After a longer gap (s) a prediction helps less than a fresh search.
 _LONGEST_GAP = 1.0
-# Frames in a row that are closer than a microsecond come in seconds or milliseconds.
+# If so many frames in a row are closer than a microsecond, times are seconds or milliseconds.
 _LEAST_STEP_NS, _MOST_TOO_CLOSE = 1000, 3
-# A nanosecond count below this is none of a video's; these are seconds and milliseconds of the
-# years 2001 to 2096.
+# No video has a nanosecond count below this; these are seconds and milliseconds of the years 2001
+# to 2096.
 _COUNTED, _SINCE_1970 = 1_000_000, ((10**9, 4 * 10**9), (10**12, 4 * 10**12))
-# Share of inliers of the last frames: weight of the newest.
+# Weight of the newest frame in the share of inliers of the last frames.
 _NEWEST = 0.3
-# Beside a gyroscope: how fast innovations change the expected variance of linear accelerations
-# (exponent), and by how much at most.
+# Beside a gyroscope: exponent with which innovations change the expected variance of linear
+# accelerations, and bounds of that change.
 _LEARNING, _LEAST_SCALE, _MOST_SCALE = 0.5, 0.3, 1e4
-# Squared distance of what was found by a search from the track: once in a million by chance.
+# Largest squared distance of a searched motion from the track: once in a million by chance.
 _MOST_INNOVATION = 62.0
-# Of a motion that is but a first guess.
+# Covariance of a motion that is only a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least acceleration that a configuration may have, rad/s^2 and m/s^2.
 _LEAST_ACCELERATION = 0.001
@@ -88,53 +88,53 @@ _LEAST_ACCELERATION = 0.001
 class FrameContext:
     """Knowledge of a frame beside its points."""
 
-    # s; velocities per readout say that much less of how far the camera goes.
+    # s; velocities per readout are more uncertain in m/s and rad/s by this.
     readout_time_deviation: float = 0.0
     error_modes: ErrorModes | None = None  # of the map of these points, if it has them
 
 
 ORDINARY = FrameContext()
-"""Of a frame of which nothing else is known."""
+"""Context of a frame without other knowledge."""
 
 
 @dataclass(slots=True)
 class _Track:
-    """What is remembered of the last frame with a pose."""
+    """The last frame with a pose, as far as the next one needs it."""
 
     estimate: Estimate
     time_ns: int
     share: float  # of inliers among the points
     window: MotionWindow
-    # Beside a gyroscope: how many times the configured linear accelerations, squared
+    # Beside a gyroscope: expected over configured variance of linear accelerations.
     linear_scale: float = 1.0
 
 
 @dataclass(slots=True)
 class _Seen:
-    """A frame of the last ones."""
+    """One of the last frames."""
 
     time_ns: int
-    found: Estimate | Failure  # by its own fit; then as the window tells
+    found: Estimate | Failure  # by its own fit; later by the window
     points: Any
     pixels: Any
     stamps: Mapping[str, float] | None = None
-    gate: float = 0.0  # px, of inliers; by its own fit, however often it is published anew
+    gate: float = 0.0  # px, of inliers; by its own fit, also if it is published again
 
 
 class Tracker:
     """Localizes the frames of one camera, or of one rig, in their order.
 
     Args:
-        localizer: to remember the motion, its camera must have a readout time, because the
-            velocities of one image are per readout, and its solver must be one for rolling
-            shutters, because a global shutter has no velocities.
-        inertial: of the gyroscope whose samples come with the frames of a camera alone, which needs
-            a readout time; None: there is none. Unless the motion is remembered, its bias is any
-            that a gyroscope may have, and the offset of its stamps the given one.
-        remembers_motion: whether frames tell the next ones how the camera moves.
-        output_lag: frames that :meth:`localize` waits for: its results are those of the frame so
-            many before, as the later ones tell, too; those without a gyroscope, of a camera alone.
-        max_prediction: s after the last frame until which :meth:`at` predicts.
+        localizer: the localizer of single frames. To remember the motion, its camera must have a
+            readout time, because the velocities of one image are per readout. Its solver must be
+            for rolling shutters, because a global shutter has no velocities.
+        inertial: settings of a gyroscope whose samples come with the frames of a single camera,
+            which needs a readout time; None: there is none. If the motion is not remembered, the
+            bias may be any that a gyroscope has, and the offset of its stamps is the given one.
+        remembers_motion: whether the motion of a frame predicts the next ones.
+        output_lag: frames by which results of :meth:`localize` are delayed, so that later frames
+            improve them; for a single camera without a gyroscope.
+        max_prediction: longest prediction of :meth:`at` after the last frame, s.
 
     Raises:
         ValueError: without a readout time, with a global-shutter solver, with something else than
@@ -189,7 +189,7 @@ class Tracker:
             self._aid.reset()
 
     def _watch(self) -> ShutterWatch:
-        """Who says that scan direction or readout time of a camera alone are contradicted."""
+        """Return the watch that compares the shutter of a single camera with its motion."""
         config, cameras = self.localizer.config, list(self.localizer.rig.cameras.values())
         timed = len(cameras) == 1 and cameras[0].readout_time > 0.0
         watched = timed and find_solver(config.solver).rolling_shutter
@@ -197,11 +197,11 @@ class Tracker:
 
     @property
     def inertial(self) -> InertialStatus | None:
-        """What became of the gyroscope; None without one."""
+        """Status of the gyroscope; None without one."""
         return None if self._aid is None else self._aid.status
 
     def stale(self, points: ArrayLike) -> BoolArray:
-        """Which landmarks (n,3) of a camera alone have often been seen, and never matched."""
+        """Return a mask of landmarks (n,3) of a single camera, often seen and never matched."""
         return self._integrity.stale(points)
 
     def mount(self, rig: Rig) -> None:
@@ -209,17 +209,17 @@ class Tracker:
         self.localizer = Localizer(rig, self.localizer.config)
 
     def _trusts_motion(self, context: FrameContext) -> bool:
-        """Whether how far the camera goes from frame to frame tells how it moves within one."""
+        """Return whether motion between frames predicts the motion within one."""
         least = min(camera.readout_time for camera in self.localizer.rig.cameras.values())
         known = self.readout_time_deviation(context) < FAR_OFF * least
         return self.remembers_motion and self.shutter.trusted and known
 
     def readout_time_deviation(self, context: FrameContext) -> float:
-        """How far (s) the readout time may be off, by who gives it or by the frames."""
+        """Return the standard deviation (s) of the readout time, as given or as frames show it."""
         return max(context.readout_time_deviation, self.shutter.error)
 
     def _follows(self, time_ns: int) -> bool:
-        """Whether the motion of the last frame with a pose predicts that at a time."""
+        """Return whether the motion of the last frame with a pose predicts a time."""
         track = self._track
         return track is not None and 0.0 < (time_ns - track.time_ns) * 1e-9 <= _LONGEST_GAP
 
@@ -233,7 +233,8 @@ class Tracker:
         before, self._last_ns = self._last_ns, time_ns
         step = _LEAST_STEP_NS if before is None else time_ns - before
         self._too_close = self._too_close + 1 if 0 < step < _LEAST_STEP_NS else 0
-        # Seconds or milliseconds since 1970, or milliseconds since the start, once are enough.
+        # One pair is enough for seconds or milliseconds since 1970, or milliseconds since the
+        # start.
         coarse = time_ns < _COUNTED or any(low <= time_ns < high for low, high in _SINCE_1970)
         if self._too_close >= (1 if coarse else _MOST_TOO_CLOSE):
             raise ValueError(
@@ -242,18 +243,18 @@ class Tracker:
             )
 
     def expect(self, time_ns: int, prior: Prior) -> None:
-        """Have the frame of this time found near a motion that others know.
+        """Let the frame at this time be found near a motion that others know.
 
-        Frames that the ones before predict are not: theirs is known better.
+        It is ignored if the frames before predict the motion, which they know better.
         """
         self._given = time_ns, prior
 
     def prediction(
         self, time_ns: int, span: float | None = None, context: FrameContext = ORDINARY
     ) -> Prior | None:
-        """Prediction of the motion at a time, of the last frames or others; None: there is none.
+        """Predict the motion at a time from the last frames or others; None if nothing is known.
 
-        ``span``: s, of the row times of the frame; None: as of the last one.
+        ``span`` is the time (s) of the frame's rows; None: that of the last frame.
         """
         track = self._track
         if track is None or not self._follows(time_ns):
@@ -269,17 +270,18 @@ class Tracker:
             return None
 
     def at(self, time_ns: int, imu: ImuSamples | None = None) -> Estimate | None:
-        """The motion at a time, in ns as :meth:`localize` takes it.
+        """Return the motion at a time, in ns as :meth:`localize` takes it.
 
-        Within the rows of one of the last frames it is that frame's, between frames what those
-        before and after tell, after them predicted, and as sure as such predictions deserved of
-        late. None before the last frames, more than ``max_prediction`` after them, and where the
-        orientation is too uncertain. Points are those of the frame that is nearest.
+        Within the rows of one of the last frames it is the motion of that frame. Between frames it
+        comes from the frames before and after. After them it is predicted, and its covariance is as
+        wide as recent predictions were wrong. Before the last frames, more than ``max_prediction``
+        after them, or if the orientation is too uncertain, it is None. Points are those of the
+        nearest frame.
 
         Args:
-            time_ns: when.
-            imu: samples from before the last frame with a pose until now: after it, the camera
-                turns as they say.
+            time_ns: the time, ns.
+            imu: samples from before the last frame with a pose until now; after that frame, the
+                camera rotates as they say.
         """
         track = self._track
         if track is None:
@@ -311,7 +313,7 @@ class Tracker:
         return there if self._accepted(there) else None
 
     def snapshot(self) -> Tracker:
-        """What :meth:`at` knows now, for another thread while frames are localized here."""
+        """Return a copy for :meth:`at` in another thread, while frames are localized here."""
         there = copy(self)
         there._seen = deque(map(copy, self._seen), LENGTH)
         there._track, there._errors = copy(self._track), copy(self._errors)
@@ -320,15 +322,15 @@ class Tracker:
         return there
 
     def _turned(self, time_ns: int, samples: ImuSamples | None) -> Estimate | None:
-        """The motion after the last frame, turning as a gyroscope says; None where it does not."""
+        """Return the motion after the last frame, rotated by a gyroscope; None without samples."""
         track = self._track
         if track is None or self._aid is None or not self._aid.agreed or not samples:
             return None
         span, half_ns = track.estimate.span, round(0.5e9 * track.estimate.span)
-        # The last frame's own rows are seen, too.
+        # The rows of the last frame are known, too.
         last_ns = max(self._aid.last_ns(samples), track.time_ns + half_ns)
         seen_ns = min(time_ns, last_ns)
-        # As if a frame had its last row there.
+        # The middle of a frame whose last row would be there.
         middle_ns = min(time_ns, last_ns - half_ns)
         if middle_ns < track.time_ns or time_ns > last_ns + half_ns:
             return None
@@ -351,13 +353,13 @@ class Tracker:
         return there
 
     def flush(self) -> list[Estimate | Failure]:
-        """The results that ``output_lag`` still holds back, at the end of a recording."""
+        """Return the results that ``output_lag`` still holds back, at the end of a recording."""
         held = list(self._seen)[max(len(self._seen) - self.output_lag, 0) :]
         self._seen.clear()
         return [self._accepted(seen.found) for seen in held]
 
     def _accepted(self, found: Estimate | Failure) -> Estimate | Failure:
-        """The same, or why none is told."""
+        """Return the estimate, or the reason why it is not published."""
         if found and self.shutter.refusal:
             return Failure(Reason.SCAN_AXIS, self.shutter.refusal)
         return self.localizer.accepted(found)
@@ -447,7 +449,7 @@ class Tracker:
     def _again(
         self, time_ns: int, points: Any, pixels: Any, imu: ImuSamples | None
     ) -> Estimate | Failure | None:
-        """The result of a frame that repeats the last image; None: it is one like any other.
+        """Return the result of a frame that repeats the last image; None if it does not.
 
         A camera that moved since cannot have seen it. Of one that rests, the image says what it
         said before, and no more: the track stays as it was.
@@ -471,7 +473,7 @@ class Tracker:
         return replace(found, time_ns=time_ns) if self.remembers_motion else found
 
     def _foreseen(self, time_ns: int, imu: ImuSamples | None) -> Prior | None:
-        """Prediction of what may be a copy: by a gyroscope, by the last velocities, by others."""
+        """Predict the motion of a possible copy: by gyroscope, last velocities, or others."""
         track = self._track
         if self._aid is not None and self._aid.agreed and imu:
             before = self._before(time_ns)
@@ -543,7 +545,7 @@ class Tracker:
         pixels: ArrayLike | None,
         prior: Prior | None,
     ) -> Estimate:
-        """The same with its integrity; of a rig, and without a covariance, it has none."""
+        """Return the estimate with its integrity; a rig, and no covariance, give none."""
         if isinstance(points, Mapping) or pixels is None or np.isnan(result.joint_covariance[0, 0]):
             return result
         numbers = self._integrity.numbers(result, points, pixels, prior)
@@ -552,7 +554,7 @@ class Tracker:
     def _prior(
         self, time_ns: int, turn: GyroRotation | None, span: float | None, context: FrameContext
     ) -> Prior | None:
-        """What is known of a frame of whose motion a gyroscope predicts no more than the turn."""
+        """Return the prior of a frame for which a gyroscope predicts only the rotation."""
         if not self.remembers_motion:
             return Prior(of_rest=self.shutter.of_rest) if turn is None else None
         prior = self.prediction(time_ns, span, context)
@@ -566,7 +568,7 @@ class Tracker:
         return without_gyro(prior, turn)
 
     def _published(self, seen: _Seen, motion: Gaussian) -> Estimate:
-        """The estimate of one of the last frames by that motion, with its residuals."""
+        """Return the estimate of one of the last frames with this motion, and its residuals."""
         assert isinstance(seen.found, Estimate)
         found = estimate_at(seen.found, motion)
         errors = self.localizer.reprojection_errors(found, seen.points, seen.pixels, seen.stamps)
@@ -592,7 +594,7 @@ class Tracker:
         self, time_ns: int, prior: Prior | None, result: Estimate, track: _Track | None,
         context: FrameContext,
     ) -> MotionWindow:  # fmt: skip
-        """The last frames and this one; where it denies them, it alone."""
+        """Return a window of the last frames and this one; if it denies them, of this one alone."""
         share = self.readout_time_deviation(context) / result.span
         alone = MotionWindow.begin(
             gaussian_of(result, time_ns), self.localizer.config.acceleration, share
@@ -612,12 +614,12 @@ class Tracker:
         return window if window.surprise < _MOST_INNOVATION else alone  # NaN is neither
 
     def _beside_gyro(self, track: _Track) -> Acceleration:
-        """Accelerations beside the turn that a gyroscope knows."""
+        """Return the accelerations beside the rotation that a gyroscope measures."""
         linear = math.sqrt(track.linear_scale) * self._without_gyro.linear
         return replace(self._without_gyro, linear=max(linear, _LEAST_ACCELERATION))
 
     def _before(self, time_ns: int) -> Before | None:
-        """What the last frame says of the motion beside what a gyroscope sees."""
+        """Return what the last frame knows of the motion beside the gyroscope's rotation."""
         track = self._track
         if track is None:
             return None
@@ -644,7 +646,7 @@ def _check_motion(localizer: Localizer) -> None:
 
 
 def _learnt(scale: float, prior: Prior | None, newest: Estimate) -> float:
-    """The scale of linear accelerations beside a gyroscope, by how far its prediction was off."""
+    """Return the scale of linear accelerations beside a gyroscope, from its prediction error."""
     if prior is None or prior.motion is None:
         return 1.0
     changed = scale * _innovation(prior, newest)[1] ** _LEARNING
@@ -652,7 +654,7 @@ def _learnt(scale: float, prior: Prior | None, newest: Estimate) -> float:
 
 
 def _innovation(prior: Prior, newest: Estimate) -> Array:
-    """Squared innovation over its expectation (2,): of the turn and of the displacement."""
+    """Return squared innovations over their expectations (2,): rotation, displacement."""
     assert prior.motion is not None
     assert prior.covariance is not None
     if np.isinf(prior.covariance.diagonal()).any():

@@ -30,7 +30,7 @@ _RESULTS = 7
 
 
 def bearings(camera: Camera, pixels: Array) -> tuple[Array, Array]:
-    """Rays and derivatives by raw pixels (n,2) as :meth:`Camera.rays_and_jacobian`, to rounding."""
+    """Return rays and derivatives at raw pixels (n,2), as :meth:`Camera.rays_and_jacobian` does."""
     lens = pinhole(camera)
     if lens is None or len(pixels) == 0:
         return camera.rays_and_jacobian(pixels)
@@ -41,13 +41,13 @@ def bearings(camera: Camera, pixels: Array) -> tuple[Array, Array]:
 
 
 def projected(camera: Camera, rays: Array) -> tuple[Array, Array]:
-    """Raw pixels (n,2) and derivatives by rays (n,2) as :meth:`Camera.distort`, to rounding."""
+    """Return raw pixels (n,2) and derivatives at rays (n,2), as :meth:`Camera.distort` does."""
     lens = pinhole(camera)
     return camera.distort(rays) if lens is None else _projected(rays, *lens)
 
 
 def seen_at(camera: Camera, points: Array) -> Array:
-    """Raw pixels (n,2) of points (n,3) as :meth:`Camera.project`, to rounding."""
+    """Return the raw pixels (n,2) of points (n,3), as :meth:`Camera.project` does."""
     lens = pinhole(camera)
     if lens is None:
         return camera.project(points)
@@ -58,7 +58,7 @@ def seen_at(camera: Camera, points: Array) -> Array:
 
 @lru_cache(64)  # of the cameras of a rig, and lenses that are tried
 def pinhole(camera: Camera) -> tuple[Array, Array, Array] | None:
-    """Focal lengths (2,), centre (2,) in delivered pixels, and coefficients (12,) of a pinhole."""
+    """Return focal lengths (2,), centre (2,) in delivered pixels, and coefficients (12,)."""
     D = camera.D
     if len(D) > 0 and (not camera.law.is_polynomial or np.any(D[_COEFFICIENTS:])):
         return None
@@ -71,7 +71,7 @@ def pinhole(camera: Camera) -> tuple[Array, Array, Array] | None:
 
 
 def _step(values: list[Lanes]) -> Vector:
-    """One step of Newton's method, and the derivatives (4) where it starts."""
+    """Return one step of Newton's method, and the derivatives (4) at its start."""
     u, v, x, y = values[:_PLACE]
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = values[_PLACE:]
     square = x * x + y * y
@@ -105,7 +105,7 @@ _step_lanes = traced(_step, _PLACE, _COEFFICIENTS)
 def _bearings(
     pixels: Array2, focal: Array1, centre: Array1, lens: Array1
 ) -> tuple[Array, Array, BoolArray]:
-    """Bearings (n,2), derivatives (n,2,2) of the pixels by them, and which (n,) are none.
+    """Return bearings (n,2), derivatives (n,2,2) of pixels by bearings, and a mask of failures.
 
     Beyond the fold of a lens, where its image runs back, nothing is seen.
     """
@@ -150,7 +150,7 @@ def _bearings(
 
 @entry
 def _projected(rays: Array2, focal: Array1, centre: Array1, lens: Array1) -> tuple[Array, Array]:
-    """Pixels (n,2), and their derivatives (n,2,2) by the rays."""
+    """Return the pixels (n,2), and their derivatives (n,2,2) by the rays."""
     k1, k2, p1, p2, k3, k4 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
     k5, k6, s1, s2, s3, s4 = lens[6], lens[7], lens[8], lens[9], lens[10], lens[11]
     count = len(rays)
@@ -180,7 +180,7 @@ def _projected(rays: Array2, focal: Array1, centre: Array1, lens: Array1) -> tup
 
 @entry
 def radial_slopes(rays: Array2, focal: Array1, lens: Array1) -> tuple[Array, Array]:
-    """Pixels (n,2) of rays (n,2) from the image's centre, and derivatives (n,2) by k1.
+    """Return pixels (n,2), from the image's centre, of rays (n,2); derivatives (n,2) by k1.
 
     Through a lens of :func:`pinhole`.
     """

@@ -28,7 +28,7 @@ def write(target: Array, source: Array) -> None:
 
 @kernel
 def median(values: Array) -> float:
-    """Median of values (n,), the larger of two middle ones; NaN of none.
+    """Return the median of values (n,), the larger of two middle ones; NaN of none.
 
     By Hoare's selection: NumPy's median, outer product and solve, with their indices and messages,
     were 47 of the 870 MB that the compiler takes for the default solver.

@@ -36,7 +36,7 @@ E = TypeVar("E", bound=StrEnum)
 
 
 def numbers(name: str, values: Any) -> Array:
-    """An array of float64 of its own; ValueError for anything that is no number."""
+    """Return a new float64 array of the values; ValueError for anything that is no number."""
     try:
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -44,7 +44,7 @@ def numbers(name: str, values: Any) -> Array:
 
 
 def pixel_count(name: str, value: Any) -> int:
-    """A whole number of pixels, also of a float as JSON has it (1280.0); otherwise ValueError."""
+    """Return a whole number of pixels, also of a float as in JSON (1280.0), or raise ValueError."""
     if isinstance(value, Real) and not isinstance(value, bool):
         number = float(value)
         if math.isfinite(number) and number == math.floor(number):
@@ -53,7 +53,7 @@ def pixel_count(name: str, value: Any) -> int:
 
 
 def choice(name: str, kind: type[E], value: Any) -> E:
-    """One of the values of an enumeration; ValueError for any other."""
+    """Return the member of an enumeration with this value; ValueError if there is none."""
     try:
         return kind(value)
     except ValueError:
@@ -128,7 +128,7 @@ def _check_unit(K: Array, width: int, height: int) -> None:
 
 
 def _matrix(K: Any) -> Array:
-    """A camera matrix (3,3), or its nine numbers as CameraInfo has them."""
+    """Return a camera matrix (3,3), also of its nine numbers in the order of CameraInfo."""
     matrix = numbers("K", K)
     matrix = matrix.reshape(3, 3) if matrix.shape == (9,) else matrix
     if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
@@ -247,7 +247,7 @@ class Camera:
     # -- row time ---------------------------------------------------------------------------
 
     def row_time(self, pixels: Array) -> Array:
-        """Row times (n,) of raw pixels (n,2): -0.5 at the first exposed row, 0.5 at the last."""
+        """Return row times (n,) of raw pixels (n,2): -0.5 at the first row, 0.5 at the last."""
         first, gradient = _rows_of(self)
         return first + np.asarray(pixels, float) @ gradient
 
@@ -270,7 +270,7 @@ class Camera:
         return float(sign * (first - 0.5 * (size - 1)) / (size - 1))
 
     def _scan(self) -> tuple[int, int, int]:
-        """Pixel axis along which the shutter moves, its sign, and the sensor's size there."""
+        """Return the pixel axis of the shutter's motion, its sign, and the sensor's size on it."""
         columns = self.scan_direction in (ScanDirection.LEFT_TO_RIGHT, ScanDirection.RIGHT_TO_LEFT)
         forward = self.scan_direction in (ScanDirection.TOP_TO_BOTTOM, ScanDirection.LEFT_TO_RIGHT)
         return (
@@ -301,14 +301,14 @@ class Camera:
         return math.sqrt(K[0, 0] / binning[0] * K[1, 1] / binning[1])
 
     def rays(self, pixels: Array) -> Array:
-        """Undistorted bearings (n,2), ``x/z, y/z``, of raw pixels (n,2).
+        """Return the undistorted bearings (n,2), ``x/z, y/z``, of raw pixels (n,2).
 
         NaN where the distortion model has no bearing for the pixel.
         """
         return self.rays_and_jacobian(pixels)[0]
 
     def rays_and_jacobian(self, pixels: Array) -> tuple[Array, Array]:
-        """Bearings (n,2) of :meth:`rays`, and the derivatives (n,2,2) of the pixels by them."""
+        """Return bearings (n,2) as :meth:`rays`, and derivatives (n,2,2) of the pixels by them."""
         pixels = np.ascontiguousarray(pixels, dtype=np.float64)
         sensor = pixels * self.binning + self._offset()
         if len(self.D) == 0 or len(sensor) == 0:
@@ -327,7 +327,7 @@ class Camera:
         return rays, jacobian
 
     def project(self, points: Array) -> Array:
-        """Raw pixels (n,2) of points (n,3) in the camera frame; NaN where the lens sees none.
+        """Return raw pixels (n,2) of points (n,3) in the camera frame; NaN if the lens sees none.
 
         Lenses of more than 180 degrees see what lies behind the image plane.
         """
@@ -339,7 +339,7 @@ class Camera:
         return self.distort(points[:, :2] / depth[:, None])[0]
 
     def bearings(self, pixels: Array) -> Array:
-        """Unit vectors (n,3) from the camera towards what raw pixels (n,2) show; NaN for none.
+        """Return unit vectors (n,3) from the camera through raw pixels (n,2); NaN if there is none.
 
         Unlike :meth:`rays`, also of what lies behind the image plane.
         """
@@ -368,11 +368,11 @@ class Camera:
         return self.law.sphere if len(self.D) else None
 
     def pixel_jacobian(self, rays: Array) -> Array:
-        """Derivatives (n,2,2) of the raw pixel by the ray at rays (n,2)."""
+        """Return the derivatives (n,2,2) of the raw pixel by the ray at rays (n,2)."""
         return self.distort(np.asarray(rays, float))[1]
 
     def inside(self, pixels: Array) -> NDArray[np.bool_]:
-        """Mask (n,) of raw pixels (n,2) that lie in the delivered image."""
+        """Return a mask (n,) of the raw pixels (n,2) that lie in the delivered image."""
         limit = np.array(self.size) - 0.5
         inside: NDArray[np.bool_] = np.all((pixels > -0.5) & (pixels < limit), axis=1)
         return inside  # NaN compares false
@@ -383,7 +383,7 @@ class Camera:
         return DistortionModel(self.distortion_model).law
 
     def distort(self, rays: Array) -> tuple[Array, Array]:
-        """Raw pixels (n,2) of rays (n,2), and their derivatives (n,2,2) by the ray."""
+        """Return the raw pixels (n,2) of rays (n,2), and their derivatives (n,2,2) by the ray."""
         count = len(rays)
         if len(self.D) == 0 or count == 0:
             focal = np.array([self.K[0, 0], self.K[1, 1]])
@@ -397,7 +397,7 @@ class Camera:
 
 @lru_cache(64)  # of the cameras of a rig, and lenses that are tried
 def _rows_of(camera: Camera) -> tuple[float, Array]:
-    """Row time of the first pixel, and its derivative (2,) by the pixel."""
+    """Return the row time of the first pixel, and its derivative (2,) by the pixel."""
     axis, sign, size = camera._scan()
     gradient = np.zeros(2)
     gradient[axis] = sign * camera.binning[axis] / (size - 1)

@@ -19,7 +19,7 @@ from rs_localizer.core.lens_laws import LensLaw, Seen, onto_sensor, sphere_law
 
 
 def see(bearings: Array, D: Array) -> Seen:
-    """Places where bearings (n,3) are seen, in focal lengths, with all derivatives."""
+    """Return the places (n,2) that bearings (n,3) hit, in focal lengths, with all derivatives."""
     xi, alpha = D[:2]
     x, y, z = bearings.T
     first = np.sqrt((bearings**2).sum(axis=1))
@@ -41,7 +41,7 @@ def see(bearings: Array, D: Array) -> Seen:
 
 
 def look(places: Array, D: Array) -> Array:
-    """Bearings (n,3) of places (n,2) in focal lengths from the centre; NaN where there is none."""
+    """Return bearings (n,3) of places (n,2) in focal lengths from the centre; NaN where none is."""
     xi, alpha = D[:2]
     square = (places**2).sum(axis=1)
     with np.errstate(invalid="ignore"):

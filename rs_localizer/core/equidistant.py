@@ -21,7 +21,7 @@ _SMALL = 1e-9  # of the distance along the axis
 
 
 def _radius(angle: Array, D: Array) -> tuple[Array, Array]:
-    """Radii of angles in focal lengths, and their derivatives."""
+    """Return radii of angles, in focal lengths, and their derivatives."""
     powers = np.array([1.0, *D[:4]])
     square = angle**2
     radius, rate = np.zeros_like(angle), np.zeros_like(angle)
@@ -31,14 +31,14 @@ def _radius(angle: Array, D: Array) -> tuple[Array, Array]:
 
 
 def widest(D: Array) -> float:
-    """The angle (rad) up to which radii grow, at most pi: beyond it the image runs back."""
+    """Return the angle (rad) up to which radii grow, at most pi; beyond it the image runs back."""
     roots = np.roots([9.0 * D[3], 7.0 * D[2], 5.0 * D[1], 3.0 * D[0], 1.0])
     folds = [root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0.0]
     return float(np.sqrt(min([np.pi**2, *folds])))
 
 
 def see(bearings: Array, D: Array) -> Seen:
-    """Places where bearings (n,3) are seen, with all derivatives; NaN beyond :func:`widest`."""
+    """Return the places that bearings (n,3) hit, with derivatives; NaN beyond :func:`widest`."""
     z = bearings[:, 2]
     across = np.hypot(bearings[:, 0], bearings[:, 1])
     angle = np.where((angle := np.arctan2(across, z)) < widest(D), angle, np.nan)
@@ -64,7 +64,7 @@ def see(bearings: Array, D: Array) -> Seen:
 
 
 def look(places: Array, D: Array) -> Array:
-    """Bearings (n,3) of places (n,2) in focal lengths from the centre; NaN where there is none."""
+    """Return bearings (n,3) of places (n,2) in focal lengths from the centre; NaN where none is."""
     radius = np.hypot(places[:, 0], places[:, 1])
     most = widest(D)
     low, high = np.zeros_like(radius), np.full_like(radius, most)

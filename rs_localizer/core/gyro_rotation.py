@@ -64,7 +64,7 @@ class GyroRotation:
         rate_noise: float = 0.0,
         delay: float = 0.0,
     ) -> GyroRotation:
-        """The turn of body rates (k,3), rad per readout, at row times (k,).
+        """Return the rotation with body rates (k,3), rad per readout, at row times (k,).
 
         Raises:
             ValueError: fewer than two samples, or times that do not increase.
@@ -77,12 +77,12 @@ class GyroRotation:
         return cls(tau, *turn_of(tau, rates), error, rate_noise, delay)
 
     def at(self, tau: float) -> tuple[Array, Array]:
-        """Rotation (3,3) camera_then_from_camera_at_tau_0 and body rate (3,) at ``tau``."""
+        """Return rotation (3,3) camera_then_from_camera_at_tau_0 and body rate (3,) at ``tau``."""
         rotations, rates = _turn_at_rows(np.array([tau], np.float64), *self.spline)
         return rotations[0], rates[0]
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
-        """Rotations (n,3,3) and body rates (n,3) at row times (n,).
+        """Return the rotations (n,3,3) and body rates (n,3) at row times (n,).
 
         Beyond the samples, where cubics would run away, the camera turns on at the mean rate.
         """
@@ -169,7 +169,7 @@ def late_at(tau: float, times: Array1, cubics: Array3, parabola: Array2) -> tupl
 
 @entry
 def turn_of(tau: Array1, rates: Array2) -> tuple[Array, Array, Array, Array, Array, float]:
-    """Fields of a :class:`GyroRotation` of rates (k,3) at row times (k,)."""
+    """Return the fields of a :class:`GyroRotation` with rates (k,3) at row times (k,)."""
     cubics = spline(tau, rates)
     rotations = rotations_at_knots(tau, cubics)
     moments, squares = np.zeros((3, 3)), np.zeros(3)
@@ -207,7 +207,7 @@ _LEAST_FRONT = 1e-3
 def gyro_compensated(
     rays: Array, tau: Array, by_ray: Array, gradient: Array, turn: GyroRotation
 ) -> tuple[Array, Array]:
-    """Bearings (n,2) and derivatives (n,2,2) of the pixels by them, with a known turn taken out.
+    """Return bearings (n,2) without a known rotation, and derivatives (n,2,2) of pixels by them.
 
     Row by row the bearings are turned back into the axes of the middle row, so that all that
     follows sees a camera that hardly turns. A point's row is measured with its pixel, and with it

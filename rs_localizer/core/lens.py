@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of a calibration: distortion, focal lengths, centre.
 
-Most of what a calibration may have wrong is radial: an image point at ``r`` from the axis moves
-along the radius by ``r (a r^2 + b r^4)``; a little is tangential, ``c`` and ``d`` (Brown,
-"Close-range camera calibration", 1971); lenses with powers of the angle have nothing tangential.
-Which coefficients these are, the lens law says. Distances are in parts of that of the image's
-corner, also those of the centre, and focal lengths are off by parts of themselves, so that the
-coefficients of all cameras are of one size.
+Most errors of a calibration are radial: an image point at ``r`` from the axis moves along the
+radius by ``r (a r^2 + b r^4)``. A small part is tangential, ``c`` and ``d`` (Brown, "Close-range
+camera calibration", 1971); lenses with powers of the angle have no tangential part. The lens law
+names the coefficients. Distances, also of the centre, are in units of the distance of the image's
+corner, and errors of focal lengths are relative. So the coefficients of all cameras have one size.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ _remembered = lru_cache(64)
 
 @_remembered
 def corner_of(camera: Camera) -> float:
-    """Distance of the image's corners from its middle, in focal lengths.
+    """Return the distance of the image's corners from its middle, in focal lengths.
 
     A region of the sensor may lie far from the axis: then that of its farthest corner from there.
     """
@@ -44,12 +43,12 @@ def corner_of(camera: Camera) -> float:
 
 @_remembered
 def coefficients_of(camera: Camera) -> int:
-    """Number of coefficients that may be off."""
+    """Return the number of coefficients that may be in error."""
     return _distorting(camera) + _OF_MATRIX
 
 
 def with_lens(camera: Camera, coefficients: Array) -> Camera:
-    """The camera with coefficients (k,) beside its own; the last ones may be left out."""
+    """Return the camera with coefficients (k,) added to its own; the last ones may be left out."""
     distortion, K = _distortion_of(camera), camera.K.copy()
     changes = np.zeros(coefficients_of(camera))
     changes[: len(coefficients)] = coefficients
@@ -63,7 +62,7 @@ def with_lens(camera: Camera, coefficients: Array) -> Camera:
 
 
 def by_lens(camera: Camera, towards: Array) -> Array:
-    """Derivatives (n,2,k) by all coefficients of the pixels of rays (n,2) or bearings (n,3)."""
+    """Return derivatives (n,2,k) of the pixels of rays (n,2) or bearings (n,3) by coefficients."""
     projected = _law_of(camera).see(towards, camera.K, _distortion_of(camera))
     correctable = projected.by_coefficients[:, :, : _distorting(camera)]
     columns = np.concatenate([correctable, projected.by_matrix], axis=2)
@@ -82,7 +81,7 @@ def _law_of(camera: Camera) -> LensLaw:
 
 
 def _model_of(camera: Camera) -> str:
-    """Whose coefficients may be off: a camera without any is a pinhole, whatever its model."""
+    """Return the model whose coefficients may be in error; a camera without any is a pinhole."""
     return camera.distortion_model if len(camera.D) else DistortionModel.PLUMB_BOB
 
 
@@ -92,7 +91,7 @@ def _distortion_of(camera: Camera) -> Array:
 
 @_remembered
 def _scales_of(camera: Camera) -> Array:
-    """Changes of OpenCV's parameters by one of the coefficients (k,)."""
+    """Return the change of OpenCV's parameters per unit of each coefficient (k,)."""
     corner = corner_of(camera)
     focal = np.diag(camera.K)[:2]
     law = _law_of(camera)

@@ -45,7 +45,7 @@ class Sphere(NamedTuple):
     look: Callable[[Array, Array], Array]  # places, D: bearings (n,3) of any length
 
     def project(self, bearings: Array, K: Array, D: Array) -> Projection:
-        """Projection as of a law, of bearings (n,3) in place of rays: ``by_ray`` is (n,2,3)."""
+        """Project bearings (n,3) in the place of rays; ``by_ray`` is (n,2,3)."""
         seen, focal = self.see(bearings, D), np.diag(K)[:2]
         by_matrix = np.zeros((len(bearings), 2, 4))
         for axis in range(2):
@@ -80,7 +80,7 @@ class LensLaw(NamedTuple):
     limits: tuple[tuple[float, float], ...] | None = None
 
     def see(self, towards: Array, K: Array, D: Array) -> Projection:
-        """Projection of rays (n,2) or bearings (n,3): ``by_ray`` is (n,2,2) or (n,2,3)."""
+        """Project rays (n,2) or bearings (n,3); ``by_ray`` is (n,2,2) or (n,2,3)."""
         if towards.shape[1] == 2:
             return self.project(towards, K, D)
         assert self.sphere is not None  # who else has bearings
@@ -119,7 +119,7 @@ def _undistort(pixels: Array, K: Array, D: Array) -> Array:
 
 
 def onto_sensor(bearings: Array, below: Array, by_bearing: Array, by_coefficients: Array) -> Seen:
-    """``x, y`` of bearings (n,3) divided by a number each.
+    """Divide ``x, y`` of bearings (n,3) by one number each.
 
     Args:
         below: (n,) the numbers.
@@ -141,7 +141,7 @@ def sphere_law(
     coefficients: int,
     limits: tuple[tuple[float, float], ...] | None = None,
 ) -> LensLaw:
-    """The law of a lens that sees bearings (n,3) of any direction.
+    """Return the law of a lens that sees bearings (n,3) of any direction.
 
     Args:
         see: of bearings and D.

@@ -21,7 +21,7 @@ from rs_localizer.native import entry, inlined, kernel
 def pose_of(
     motion: Numbers, shake: Array2, joint: Array2, turn: Turning, tau: float, beyond: float
 ) -> tuple[Array, Array, Array]:
-    """Position (3,), rotation (3,3) map_from_camera and covariance (6,6): place, then turn.
+    """Return position (3,), rotation (3,3) map_from_camera, and covariance (6,6), position first.
 
     Args:
         motion: at the middle row, with the known turn.
@@ -65,7 +65,7 @@ def twist_of(
     motion: Numbers, shake: Array2, joint: Array2, turn: Turning, tau: float,
     beyond: tuple[float, float],
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Linear and angular velocity (3,) in camera axes, and their covariance (6,6); per readout.
+    """Return linear and angular velocity (3,) per readout, camera axes, and covariance (6,6).
 
     Args:
         motion, shake, joint, turn, tau: as of :func:`pose_of`.
@@ -119,7 +119,7 @@ def twist_of(
 
 @inlined
 def _better_known(turn: Turning, tau: float, covariance: Array) -> bool:
-    """True if the gyroscope alone knows the rate better; the covariance (6,6) is its own then."""
+    """Return True if the gyroscope alone knows the rate better; the covariance is then its own."""
     if not turn.tau[0] <= tau <= turn.tau[-1]:
         return False
     late = turn.delay * change_at(tau, turn.tau, turn.rates)
@@ -140,7 +140,7 @@ def _better_known(turn: Turning, tau: float, covariance: Array) -> bool:
 
 @kernel
 def _shaken(shake: Array, tau: float, count: int) -> tuple[Array, Array, Array, Array]:
-    """So many polynomials at a row time, their rates, the turn (3,) that they make, its rate.
+    """Return polynomials at a row time, their rates, the rotation (3,) they make, and its rate.
 
     Before the first and after the last row the camera stays as it was.
     """
@@ -160,13 +160,13 @@ def _shaken(shake: Array, tau: float, count: int) -> tuple[Array, Array, Array, 
 
 @kernel
 def _columns(joint: Array) -> int:
-    """Number of polynomials that a joint covariance is of."""
+    """Return the number of polynomials in a joint covariance."""
     return (len(joint) - PARAMETERS) // 3
 
 
 @kernel
 def _propagated(jacobian: Array, covariance: Array) -> Array:
-    """Symmetric to the bit."""
+    """Return the propagated covariance, symmetric to the bit."""
     propagated = jacobian @ covariance @ jacobian.T
     for i in range(len(propagated)):
         for j in range(i):

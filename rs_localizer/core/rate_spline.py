@@ -37,7 +37,7 @@ def rate_in(cubic: Array, since: float, rate: Array) -> None:
 
 @kernel
 def change_at(time: float, times: Array, cubics: Array) -> Array:
-    """Derivative (3,) of a spline of rates."""
+    """Return the derivative (3,) of a spline of rates at a time."""
     place = place_of(time, times)
     since = time - times[place]
     change = np.empty(3)
@@ -51,7 +51,7 @@ def change_at(time: float, times: Array, cubics: Array) -> Array:
 
 @entry
 def spline(times: Array1, values: Array2) -> Array:
-    """Natural cubic spline (k-1,4,3) through values (k,3) at times (k,): powers from each start."""
+    """Return the natural cubic spline (k-1,4,3) through values (k,3) at times (k,)."""
     count = len(times)
     # Second derivatives by Thomas' algorithm; zero at both ends.
     second = np.zeros((count, 3))
@@ -82,7 +82,7 @@ def spline(times: Array1, values: Array2) -> Array:
 
 @kernel
 def turn_in(cubic: Array, time: float) -> tuple[float, float, float]:
-    """Rotation vector of the turn from the start of an interval to a time in it."""
+    """Return the rotation vector from the start of an interval to a time in it."""
     x, moment_x = _turn_about(cubic, time, 0)
     y, moment_y = _turn_about(cubic, time, 1)
     z, moment_z = _turn_about(cubic, time, 2)
@@ -95,7 +95,7 @@ def turn_in(cubic: Array, time: float) -> tuple[float, float, float]:
 
 @kernel
 def _turn_about(cubic: Array, time: float, axis: int) -> tuple[float, float]:
-    """Integral of the rate, and its moment over the time, so that none is divided by."""
+    """Return the integral of the rate, and its moment over the time, without a division."""
     a, b, c, d = cubic[0, axis], cubic[1, axis], cubic[2, axis], cubic[3, axis]
     whole = time * (a + time * (b / 2.0 + time * (c / 3.0 + time * d / 4.0)))
     return whole, time * time * ((b + time * c) / 12.0 + 0.075 * time * time * d)
@@ -121,7 +121,7 @@ def turn_on(angle: tuple[float, float, float], rotation: Array, turned: Array) -
 
 @kernel
 def place_of(time: float, times: Array) -> int:
-    """The interval that a time lies in; the first or the last of times outside."""
+    """Return the interval of a time; the first or last one if the time lies outside."""
     place: int = 0
     while place < len(times) - 2 and times[place + 1] < time:
         place += 1
@@ -130,7 +130,7 @@ def place_of(time: float, times: Array) -> int:
 
 @entry
 def rotations_at_knots(times: Array1, cubics: Array3) -> Array:
-    """Rotations (k,3,3), camera_then_from_camera_at_time_0, at the knots of a spline of rates."""
+    """Return rotations (k,3,3), camera_then_from_camera_at_time_0, at the knots of the spline."""
     count = len(times)
     rotations = np.empty((count, 3, 3))
     write(rotations[0], np.eye(3))
@@ -148,7 +148,7 @@ def rotations_at_knots(times: Array1, cubics: Array3) -> Array:
 def turns_at(
     wanted: Array1, times: Array1, cubics: Array3, rotations: Array3
 ) -> tuple[Array, Array]:
-    """Rotations (n,3,3) and rates (n,3) at times (n,) of a spline of rates; see `GyroRotation`."""
+    """Return rotations (n,3,3) and rates (n,3) at times (n,) of a spline of rates."""
     turns, rates = np.empty((len(wanted), 3, 3)), np.empty((len(wanted), 3))
     for i in range(len(wanted)):
         place = place_of(wanted[i], times)
@@ -160,7 +160,7 @@ def turns_at(
 
 @kernel
 def multiplied(left: Array, right: Array) -> Array:
-    """Product of two (3,3) matrices."""
+    """Return the product of two (3,3) matrices."""
     product = np.empty((3, 3))
     for i in range(3):
         for j in range(3):

@@ -28,7 +28,7 @@ def rectify(
     depths: ArrayLike | None = None,
     tau: float = 0.0,
 ) -> Array:
-    """Pixels where a global shutter would have seen what a rolling shutter saw at these.
+    """Return the pixels where a global shutter would have seen what these pixels show.
 
     Args:
         camera: that took the image.
@@ -65,7 +65,7 @@ def transferred(
     wanted: tuple[Array, Array],
     depths: ArrayLike | None = None,
 ) -> Array:
-    """Pixels where a camera elsewhere would have seen what these show.
+    """Return the pixels where a camera at another pose would have seen what these pixels show.
 
     Args:
         camera: that took the image.

@@ -99,7 +99,7 @@ class Rig:
 
     @classmethod
     def of(cls, camera: Camera) -> Rig:
-        """A camera alone, whose axes are those of the rig."""
+        """Return a rig of one camera, with the camera's axes."""
         return cls({"camera": camera}, {"camera": (np.eye(3), np.zeros(3))})
 
     @property
@@ -110,7 +110,7 @@ class Rig:
     def exposure(
         self, names: Sequence[str] | None = None, stamps: Mapping[str, float] | None = None
     ) -> Exposure:
-        """Times at which, and places from where, some of the cameras see a frame.
+        """Return the times and places from which some of the cameras see a frame.
 
         Args:
             names: of the cameras that have a part in it; None: all.
@@ -226,18 +226,18 @@ class Side(NamedTuple):
     axes: Array | None  # (3,3) side_from_camera; None: all that the camera sees, in its axes
 
     def turned(self, camera_from_rig: Array) -> Array:
-        """side_from_rig (3,3)."""
+        """Return the rotation (3,3) side_from_rig."""
         return camera_from_rig if self.axes is None else self.axes @ camera_from_rig
 
     def towards(self, rays: Array) -> Array:
-        """Bearings (n,3) in the camera's axes of rays (n,2) of this side; of all, the rays."""
+        """Return bearings (n,3), in camera axes, of rays (n,2) of this side; of all, the rays."""
         if self.axes is None:
             return rays
         towards: Array = np.column_stack([rays, np.ones(len(rays))]) @ self.axes
         return towards
 
     def pixel_jacobian(self, rays: Array) -> Array:
-        """Derivatives (n,2,2) of the raw pixel by rays (n,2) of this side."""
+        """Return the derivatives (n,2,2) of the raw pixel by rays (n,2) of this side."""
         if self.axes is None:
             return projected(self.camera, rays)[1]
         camera = self.camera
@@ -255,7 +255,7 @@ class Mounts(NamedTuple):
 
     @classmethod
     def one(cls, gradient: Array) -> Mounts:
-        """Mounts of a camera alone."""
+        """Return the mounts of a single camera."""
         return cls(np.eye(3)[None], np.zeros((1, 3)), np.asarray(gradient, float)[None])
 
 
@@ -282,7 +282,7 @@ class Exposure:
         return len(self.cameras) == 1
 
     def ahead(self, pixels: Array | None = None) -> Exposure:
-        """Exposure of a camera alone, by what it sees before its image plane.
+        """Return the exposure of a single camera that sees only what lies before its image plane.
 
         Args:
             pixels: (n,2) raw; where some show more than that, the exposure is as it was.
@@ -295,7 +295,7 @@ class Exposure:
         return replace(self, sides=(Side(self.cameras[0], 0, None),), mounts=first)
 
     def look(self, place: int, pixels: Array) -> tuple[Array, Array, IntArray]:
-        """Rays (n,2) of raw pixels (n,2) of a camera, their derivatives, and sides.
+        """Return rays (n,2) of a camera's raw pixels (n,2), their derivatives, and their sides.
 
         NaN where it has none; (n,2,2) of the pixels by the rays; (n,) of which side they are.
         """
@@ -314,13 +314,13 @@ class Exposure:
         return rays, by_ray, chosen + own[0]
 
     def row_time(self, place: int, pixels: Array) -> Array:
-        """Row times (n,) of raw pixels (n,2) of a camera."""
+        """Return the row times (n,) of raw pixels (n,2) of a camera."""
         rows = self.cameras[place].row_time(pixels)
         times: Array = rows * self.readouts[place] + self.middles[place]
         return times
 
     def by(self, camera: Camera) -> Exposure:
-        """The same through another lens of a camera alone."""
+        """Return the exposure of a single camera through another lens."""
         sides = tuple(side._replace(camera=camera) for side in self.sides)
         return replace(self, cameras=(camera,), sides=sides)
 
@@ -332,13 +332,13 @@ class ByCamera(np.ndarray[Any, Any]):
 
     @classmethod
     def of(cls, values: Array, places: Mapping[str, slice]) -> ByCamera:
-        """Values (n,) of all cameras and where those of each are."""
+        """Split values (n,) of all cameras at the places of each camera."""
         split = np.asarray(values).view(cls)
         split._places = places
         return split
 
     def like(self, values: Array) -> ByCamera:
-        """Other values of the same points."""
+        """Return other values of the same points."""
         return ByCamera.of(values, self._places)
 
     def __array_finalize__(self, source: Any) -> None:
@@ -369,7 +369,7 @@ class RigEstimate(Estimate):
 
     @classmethod
     def of(cls, estimate: Estimate, exposure: Exposure, counts: Sequence[int]) -> RigEstimate:
-        """The estimate of a frame of a rig, of whose cameras each has so many points."""
+        """Return the estimate of a frame of a rig; ``counts`` are the points of each camera."""
         ends = np.cumsum(counts).tolist()
         places = {
             name: slice(end - count, end)
@@ -381,7 +381,7 @@ class RigEstimate(Estimate):
         return cls(**values, time=exposure.time, names=exposure.names)
 
     def at_time(self, time: float) -> RigEstimate:
-        """The motion at a time in s, by the clock of the stamps, with the covariance of then."""
+        """Return the motion at a time (s, clock of the stamps), with its covariance then."""
         # Not by super(): a dataclass with slots is made anew.
         moved = Estimate.at_time(self, time - self.time)
         assert isinstance(moved, RigEstimate)

@@ -31,7 +31,7 @@ smaller than 1e-4 of their squares, and turn the middle row as little."""
 
 
 def _resolved() -> tuple[Array, Array]:
-    """Combinations (28,18) of the functions, and each function as a sum of them (18,28).
+    """Return combinations (28,18) of the functions, and the functions as their sums (18,28).
 
     Those of an ordinary vibration are independent of each other, and of size 1.
     """
@@ -82,5 +82,5 @@ def shake_at(tau: Array1, coefficients: Array2) -> Array:
 
 
 def within_rows(tau: float) -> float:
-    """The row time itself, or that of the first or last row before or after them."""
+    """Return a row time limited to the first and the last row."""
     return min(max(tau, -0.5), 0.5)

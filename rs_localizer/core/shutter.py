@@ -8,9 +8,9 @@ the last. Over the readout the camera turns and its centre moves, both under con
 
     camera_point(tau) = exp(-[tau omega + tau^2/2 alpha]x) (R X + t - tau v - tau^2/2 a)
 
-with ``R, t`` the pose camera_from_map at ``tau = 0``, ``omega`` the camera's body rate in rad per
-readout and ``v`` the velocity of its centre in metres per readout, both along the camera axes at
-``tau = 0``, and their changes ``alpha`` and ``a``. The minimal solvers know no accelerations.
+``R, t`` is the pose camera_from_map at ``tau = 0``. ``omega`` is the camera's body rate in rad per
+readout, ``v`` the velocity of its centre in metres per readout, both in the camera axes at ``tau =
+0``; ``alpha`` and ``a`` are their changes. The minimal solvers have no accelerations.
  In the literature's letters (Kukelova et al., ACCV 2018): ``w = -omega``; model A
 there has ``exp(tau [w]x) R X + t + tau t_drift``, so ``t_drift = w x t - v``.
 """
@@ -50,40 +50,40 @@ class Motion:
     linear_acceleration: Array = field(default_factory=lambda: np.zeros(3), kw_only=True)
 
     def at(self, tau: float) -> tuple[Array, Array]:
-        """Rotation (3,3) and translation (3,) camera_from_map at row time ``tau``."""
+        """Return the rotation (3,3) and translation (3,) camera_from_map at row time ``tau``."""
         turn = so3.exp(-self.angle_at(tau))
         return turn @ self.rotation, turn @ (self.translation - self.way_at(tau))
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
-        """Rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
+        """Return the rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
         return _at_rows(numbers_of(self), np.ascontiguousarray(tau, np.float64))
 
     def angle_at(self, tau: Any) -> Array:
-        """Rotation vector (3,) of the turn from the middle row to ``tau``."""
+        """Return the rotation vector (3,) of the turn from the middle row to ``tau``."""
         angle: Array = tau * self.angular_velocity + 0.5 * tau * tau * self.angular_acceleration
         return angle
 
     def way_at(self, tau: Any) -> Array:
-        """Displacement (3,) of the centre since the middle row, in camera axes at tau = 0."""
+        """Return the displacement (3,) of the centre since the middle row, in axes of tau = 0."""
         displacement: Array = (
             tau * self.linear_velocity + 0.5 * tau * tau * self.linear_acceleration
         )
         return displacement
 
     def angular_velocity_at(self, tau: float) -> Array:
-        """Body rate (3,) at ``tau``, rad per readout, in the camera axes of that moment."""
+        """Return the body rate (3,), rad per readout, in the camera axes at ``tau``."""
         rate = self.angular_velocity + tau * self.angular_acceleration
         body_rate: Array = so3.right_jacobian(self.angle_at(tau)) @ rate
         return body_rate
 
     def linear_velocity_at(self, tau: float) -> Array:
-        """Velocity (3,) of the camera centre in the camera axes at ``tau``, m per readout."""
+        """Return the velocity (3,) of the centre, m per readout, in the camera axes at ``tau``."""
         velocity = self.linear_velocity + tau * self.linear_acceleration
         return so3.exp(-self.angle_at(tau)) @ velocity
 
 
 def numbers_of(motion: Motion) -> Numbers:
-    """A motion as kernels take it."""
+    """Return the numbers of a motion, as kernels take them."""
     return (
         np.ascontiguousarray(motion.rotation, np.float64),
         np.ascontiguousarray(motion.translation, np.float64),
@@ -95,14 +95,14 @@ def numbers_of(motion: Motion) -> Numbers:
 
 
 def motion_of(numbers: Numbers) -> Motion:
-    """The motion that a kernel gave."""
+    """Return the motion with these numbers."""
     *velocities, change, acceleration = numbers
     return Motion(*velocities, angular_acceleration=change, linear_acceleration=acceleration)
 
 
 @entry
 def _at_rows(motion: Numbers, tau: Array1) -> tuple[Array, Array]:
-    """Rotations (n,3,3) and translations (n,3) at row times (n,)."""
+    """Return the rotations (n,3,3) and translations (n,3) at row times (n,)."""
     rotation, translation, angular, linear, change, acceleration = motion
     rotations, translations = np.empty((len(tau), 3, 3)), np.empty((len(tau), 3))
     angle = np.empty(3)
@@ -127,7 +127,7 @@ def _at_rows(motion: Numbers, tau: Array1) -> tuple[Array, Array]:
 
 @entry
 def carried(motion: Numbers, readouts: float, fading: float) -> tuple[Numbers, Array]:
-    """The motion some readout times later, or before, and its derivative (18,18)."""
+    """Return the motion some readout times later or earlier, and its derivative (18,18)."""
     rotation, translation, angular, linear, change, acceleration = motion
     left = math.exp(-readouts / fading)
     # What a unit of acceleration adds to the velocity and to the way.
@@ -176,7 +176,7 @@ _ROW_TIME_TOLERANCE = 1e-12
 def project_rolling(
     camera: Camera, poses_at: Callable[[Array], tuple[Array, Array]], points: Array
 ) -> tuple[Array, Array]:
-    """Raw pixels and row times at which a moving rolling-shutter camera sees points.
+    """Return the raw pixels and row times at which a moving rolling shutter sees points.
 
     Solves the implicit equation ``row_time(project(pose(tau), X)) = tau`` for each point.
 

@@ -19,7 +19,7 @@ _SMALL_ANGLE = 1e-3
 
 @kernel
 def coefficients(angle_squared: float) -> tuple[float, float, float]:
-    """``sin(a)/a``, ``(1 - cos a)/a^2`` and ``(a - sin a)/a^3``, finite and accurate at zero."""
+    """Return ``sin(a)/a``, ``(1 - cos a)/a^2`` and ``(a - sin a)/a^3``, accurate at zero, too."""
     if angle_squared < _SMALL_ANGLE**2:
         return (
             1.0 - angle_squared / 6.0 * (1.0 - angle_squared / 20.0),
@@ -37,7 +37,7 @@ def coefficients(angle_squared: float) -> tuple[float, float, float]:
 
 @entry
 def exp(vector: Array1) -> Array:
-    """Rotation matrix (3,3) of a rotation vector (3,) (Rodrigues' formula)."""
+    """Return the rotation matrix (3,3) of a rotation vector (3,) (Rodrigues' formula)."""
     x, y, z = vector[0], vector[1], vector[2]
     s, c, _ = coefficients(x * x + y * y + z * z)
     matrix = np.empty((3, 3))
@@ -55,7 +55,7 @@ def exp(vector: Array1) -> Array:
 
 @entry
 def quaternion(matrix: Array2) -> Array:
-    """Unit quaternion (4,) ``x y z w`` with ``w >= 0`` of a rotation matrix (3,3)."""
+    """Return the unit quaternion (4,) ``x y z w`` with ``w >= 0`` of a rotation matrix (3,3)."""
     # Shepperd's choice of the largest component keeps the division well conditioned.
     q = np.empty(4)
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
@@ -87,7 +87,7 @@ def quaternion(matrix: Array2) -> Array:
 
 @entry
 def log(matrix: Array2) -> Array:
-    """Rotation vector (3,), of angle 0 to pi, of a rotation matrix (3,3)."""
+    """Return the rotation vector (3,), of angle 0 to pi, of a rotation matrix (3,3)."""
     q = quaternion(matrix)
     sine_squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
     sine = np.sqrt(sine_squared)
@@ -100,7 +100,7 @@ def log(matrix: Array2) -> Array:
 
 
 def hat(vector: Array) -> Array:
-    """Skew matrices (..., 3, 3) with ``hat(v) @ x == cross(v, x)`` of vectors (..., 3)."""
+    """Return skew matrices (..., 3, 3) with ``hat(v) @ x == cross(v, x)`` of vectors (..., 3)."""
     vector = np.ascontiguousarray(vector, float)
     if vector.ndim == 1:
         return hat_of(vector)
@@ -112,7 +112,7 @@ def hat(vector: Array) -> Array:
 
 
 def right_jacobian(vector: Array) -> Array:
-    """Right Jacobian (3,3) of the exponential at a rotation vector (3,).
+    """Return the right Jacobian (3,3) of the exponential at a rotation vector (3,).
 
     ``exp(a + d) = exp(a) exp(right_jacobian(a) d)`` to first order.
     """
@@ -121,7 +121,7 @@ def right_jacobian(vector: Array) -> Array:
 
 @entry
 def hat_of(vector: Array1) -> Array:
-    """One of :func:`hat`, for kernels."""
+    """Return the skew matrix (3,3) of a vector (3,); kernels call it."""
     matrix = np.zeros((3, 3))
     matrix[0, 1], matrix[0, 2] = -vector[2], vector[1]
     matrix[1, 0], matrix[1, 2] = vector[2], -vector[0]
@@ -131,7 +131,7 @@ def hat_of(vector: Array1) -> Array:
 
 @entry
 def right_jacobian_of(vector: Array1) -> Array:
-    """:func:`right_jacobian`, for kernels."""
+    """Return :func:`right_jacobian` of a rotation vector (3,); kernels call it."""
     x, y, z = vector[0], vector[1], vector[2]
     _, second, third = coefficients(x * x + y * y + z * z)
     jacobian = np.empty((3, 3))
@@ -145,7 +145,7 @@ def right_jacobian_of(vector: Array1) -> Array:
 
 
 def exp_many(vectors: Array) -> Array:
-    """Rotation matrices (n,3,3) of rotation vectors (n,3)."""
+    """Return the rotation matrices (n,3,3) of rotation vectors (n,3)."""
     vectors = np.ascontiguousarray(vectors, dtype=np.float64)
     return _exp_many(vectors)
 

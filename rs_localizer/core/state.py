@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Places of a motion's numbers: in its state, and in a step or a covariance.
 
-A state holds rotation (9, row-major) and translation (3), camera_from_map at the middle row, the
-angular and linear velocities (3, 3) and the accelerations (3, 3) there, per readout and per
-readout squared (:class:`rs_localizer.core.shutter.Motion`). A step has three parameters for the
-rotation; it is what :func:`rs_localizer.estimation.refine.apply_step` applies.
+A state holds rotation (9, row-major) and translation (3), camera_from_map at the middle row. Then
+follow the angular and linear velocities (3, 3) and the accelerations (3, 3) there, per readout and
+per readout squared (:class:`rs_localizer.core.shutter.Motion`). A step has three parameters for the
+rotation; :func:`rs_localizer.estimation.refine.apply_step` applies it.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ POSE_SIZE = STATE_TRANSLATION.stop
 
 
 def rotation_of(state: Array) -> Array:
-    """Rotation (3,3) camera_from_map at the middle row."""
+    """Return the rotation (3,3) camera_from_map at the middle row."""
     return state[:9].reshape(3, 3)
 
 
 @entry
 def step_between(state: Out[Array1], other: Array1) -> Array:
-    """The step (18,) that leads from one state to another."""
+    """Return the step (18,) that leads from one state to another."""
     turn, step = np.empty((3, 3)), np.empty(PARAMETERS)
     for i in range(3):
         moved = state[POSE_SIZE - 3 + i]

@@ -78,7 +78,7 @@ class Estimate(Motion):
         return own + self.calibration_covariance + self.undetected_covariance
 
     def with_joint_covariance(self, joint_covariance: Array, **fields: Any) -> Self:
-        """The estimate with what other frames tell of it: fields, and a covariance of its own.
+        """Return the estimate with a covariance that other frames have determined.
 
         What arcs take from the old covariance, by what it ties to them, the new one may not have:
         of what is beside it stays what widens any.
@@ -111,7 +111,7 @@ class Estimate(Motion):
         return turn[:3], turn[3:] if tau == within_rows(tau) else np.zeros(3)
 
     def turned(self, turn: GyroRotation, delay: tuple[float, float]) -> Estimate:
-        """The same with the gyroscope's rotation, beside which its motion was estimated."""
+        """Return the same with the gyroscope's rotation, beside which its motion was estimated."""
         return replace(
             self,
             angular_velocity=self.angular_velocity + turn.rate,
@@ -121,7 +121,7 @@ class Estimate(Motion):
         )
 
     def without_gyro(self) -> Motion:
-        """The motion without the gyroscope's rotation."""
+        """Return the motion without the gyroscope's rotation."""
         if self.turn is None:
             return self
         return Motion(
@@ -134,12 +134,12 @@ class Estimate(Motion):
         )
 
     def turned_beside(self, tau: float) -> Array:
-        """Rotation (3,3) by which the camera is turned beside that motion at ``tau``."""
+        """Return the rotation (3,3) by which the camera is turned beside that motion at ``tau``."""
         shaken = so3.exp(-self.shake_at(tau)[0])
         return shaken if self.turn is None else self.turn.at(tau)[0] @ shaken
 
     def at(self, tau: float) -> tuple[Array, Array]:
-        """Rotation (3,3) and translation (3,) camera_from_map at row time ``tau``.
+        """Return the rotation (3,3) and translation (3,) camera_from_map at row time ``tau``.
 
         Raises:
             ValueError: beyond the rows; :meth:`at_time` goes on.
@@ -159,7 +159,7 @@ class Estimate(Motion):
         return turned @ rotation, turned @ translation
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
-        """Rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
+        """Return the rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
         rotations, translations = Motion.at_rows(self.without_gyro(), tau)
         if self.turn is None and not len(self.shake):
             return rotations, translations
@@ -170,7 +170,7 @@ class Estimate(Motion):
         return turned @ rotations, np.einsum("nij,nj->ni", turned, translations)
 
     def angular_velocity_at(self, tau: float) -> Array:
-        """Body rate (3,) at ``tau``, rad per readout, in the camera axes of that moment."""
+        """Return the body rate (3,), rad per readout, in the camera axes at ``tau``."""
         turn, rate = self.shake_at(tau)
         body_rate = so3.exp(-turn) @ Motion.angular_velocity_at(self.without_gyro(), tau)
         shaken: Array = body_rate + so3.right_jacobian(turn) @ rate
@@ -181,13 +181,13 @@ class Estimate(Motion):
         return turned
 
     def linear_velocity_at(self, tau: float) -> Array:
-        """Velocity (3,) of the camera centre in the camera axes at ``tau``, m per readout."""
+        """Return the velocity (3,) of the centre, m per readout, in the camera axes at ``tau``."""
         velocity = Motion.linear_velocity_at(self.without_gyro(), tau)
         turned: Array = self.turned_beside(tau) @ velocity
         return turned
 
     def at_time(self, seconds: float) -> Estimate:
-        """The motion so many s after its middle row, with the covariance of then.
+        """Return the motion this many seconds after its middle row, with its covariance then.
 
         Within the rows it is the frame's own; beyond them it goes on under the acceleration that
         it had, of which the covariance knows how uncertain it is.
@@ -263,7 +263,7 @@ class Estimate(Motion):
 
 @entry
 def _widening(added: Array2, scale: Array1) -> Array:
-    """The positive semidefinite part of a symmetric matrix (n,n); ``scale``: (n,) its units."""
+    """Return the positive semidefinite part of a symmetric matrix (n,n), ``scale`` its units."""
     units = np.outer(scale, scale)
     values, vectors = np.linalg.eigh(added / units)
     part: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T * units
@@ -271,7 +271,7 @@ def _widening(added: Array2, scale: Array1) -> Array:
 
 
 def beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:
-    """Variances of the turn (rad^2) and of its rate, per readout, that no row has seen.
+    """Return variances of the rotation (rad^2) and its rate, per readout, outside of the rows.
 
     A camera that shakes within the rows shakes outside, too, in a phase that nobody knows: it is
     taken to go on at one of the rates that it had. What gyroscopes have seen, is known.

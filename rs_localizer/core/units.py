@@ -39,7 +39,7 @@ class CameraState:
 
 
 def camera_state(motion: Motion, camera: Camera | Rig, tau: float = 0.0) -> CameraState:
-    """An estimate in SI units, at one of its rows.
+    """Return an estimate in SI units, at one of its rows.
 
     Args:
         motion: an :class:`rs_localizer.Estimate`, or any motion; of a rig a ``RigEstimate``, of

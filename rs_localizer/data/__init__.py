@@ -14,7 +14,7 @@ HAND_MOTION = "motion/tum_vi_room5.txt.gz"
 
 
 def path(name: str) -> Path:
-    """Place of a bundled recording on disk.
+    """Return the path of a bundled recording.
 
     Raises:
         FileNotFoundError: when the package was installed without it.

@@ -23,7 +23,7 @@ _MARGIN = _REACH + 1 + _WINDOW + 1
 
 
 def refined(image: NDArray[np.uint8], corners: IntArray, levels: IntArray, step: float) -> Array:
-    """Corners (n,2) in pixels of the image, the centre of the first one at 0, 0.
+    """Return the corners (n,2) in pixels of the image, the centre of the first one at 0, 0.
 
     Args:
         image: (h,w)
@@ -50,7 +50,7 @@ def refined(image: NDArray[np.uint8], corners: IntArray, levels: IntArray, step:
 
 
 def _offsets(image: NDArray[np.uint8], corners: IntArray) -> Array:
-    """From whole pixels (n,2) of an image to the corners beside them (n,2)."""
+    """Return offsets (n,2) from whole pixels (n,2) of an image to the corners beside them."""
     around = np.arange(-_MARGIN, _MARGIN + 1)
     padded = np.pad(image, _MARGIN, mode="edge")
     columns, rows = corners[:, :1] + _MARGIN + around, corners[:, 1:] + _MARGIN + around
@@ -65,7 +65,7 @@ def _offsets(image: NDArray[np.uint8], corners: IntArray) -> Array:
 
 
 def _strength(patches: Array) -> Array:
-    """The smaller eigenvalue of the second moments (n,s,s) in patches (n,s+4,s+4)."""
+    """Return the smaller eigenvalue of the second moments (n,s,s) in patches (n,s+4,s+4)."""
     dx = _smooth(patches[:, :, 2:] - patches[:, :, :-2], 1)
     dy = _smooth(patches[:, 2:] - patches[:, :-2], 2)
     xx, yy, xy = _window(dx * dx), _window(dy * dy), _window(dx * dy)
@@ -74,14 +74,14 @@ def _strength(patches: Array) -> Array:
 
 
 def _smooth(values: Array, axis: int) -> Array:
-    """By 1, 2, 1 along an axis, for Sobel's gradients."""
+    """Smooth by 1, 2, 1 along an axis, for Sobel's gradients."""
     first = np.moveaxis(values, axis, 0)
     smooth: Array = np.moveaxis(first[:-2] + 2.0 * first[1:-1] + first[2:], 0, axis)
     return smooth
 
 
 def _window(values: Array) -> Array:
-    """Sums over windows."""
+    """Return the sums over windows."""
     side = 2 * _WINDOW + 1
     windows = np.lib.stride_tricks.sliding_window_view(values, (side, side), (1, 2))
     sums: Array = windows.sum(axis=(3, 4))
@@ -89,7 +89,7 @@ def _window(values: Array) -> Array:
 
 
 def _vertex(before: Array, peak: Array, after: Array) -> Array:
-    """Where (n,) the parabola through three values has its vertex, at most a pixel away."""
+    """Return the vertex (n,) of the parabola through three values, at most a pixel away."""
     bend = before - 2.0 * peak + after
     apart = 0.5 * (before - after)
     vertex: Array = np.divide(apart, bend, np.zeros_like(bend), where=bend < 0.0)
@@ -134,7 +134,7 @@ class _Method:
 
 
 def _root(descriptors: NDArray[Any]) -> Descriptors:
-    """SIFT as COLMAP has it: L1-normalised, square roots, times 512 in bytes.
+    """Convert SIFT as COLMAP does: L1-normalized, square roots, times 512 in bytes.
 
     Arandjelovic, Zisserman, *Three things everyone should know to improve object retrieval*, CVPR
     2012. Euclidean distances of these numbers are Hellinger distances of the histograms.
@@ -193,7 +193,7 @@ _PER_CELL = 8
 
 
 def balanced(pixels: Array, scores: Array, size: tuple[int, int], most: int) -> IntArray:
-    """Rows (k,) of at most so many keypoints: of each cell of a grid the best, then the second ...
+    """Return rows (k,) of the best keypoints of each cell of a grid, then of the second best ...
 
     Args:
         pixels: (n,2)
@@ -251,7 +251,7 @@ class FeatureExtractor:
         self._detector = self._method.create(most)
 
     def extract(self, image: Gray) -> Features:
-        """The keypoints of an image (h,w)."""
+        """Return the keypoints of an image (h,w)."""
         height, width = image.shape
         if max(height, width) <= _LONGEST_SIDE:
             return self._extract(image)
@@ -298,7 +298,7 @@ class FeatureExtractor:
 
 
 def _single(values: Array) -> Array:
-    """What is left of numbers in single precision."""
+    """Round numbers to single precision."""
     return values.astype(np.float32).astype(np.float64)
 
 
@@ -310,7 +310,7 @@ _SHIFT = 4
 
 
 def draw_features(image: NDArray[np.uint8], features: Features) -> NDArray[np.uint8]:
-    """The image (h,w,3) with a circle around what each descriptor describes."""
+    """Return the image (h,w,3) with a circle around the region of each descriptor."""
     picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
     middles = np.rint(features.pixels * 2**_SHIFT).astype(int).tolist()
     radii = np.maximum(features.sizes / 2, _LEAST_RADIUS) * 2**_SHIFT

@@ -71,13 +71,13 @@ class Index:
     _search_within: Any
 
     def nearest(self, queries: Descriptors) -> Nearest:
-        """Among all of them, for queries (q,d)."""
+        """Find the two nearest of all descriptors for queries (q,d)."""
         raise NotImplementedError
 
     def nearest_within(
         self, queries: Descriptors, pixels: Array, visible: Visible
     ) -> tuple[Nearest, IntArray]:
-        """Among those predicted near pixels (q,2); also each one's own nearest query (v,)."""
+        """Find the nearest landmarks predicted near pixels (q,2), and their nearest query (v,)."""
         result, count = Nearest.none(len(queries)), len(visible.landmarks)
         owners = np.full(count, -1, np.int64)
         near = Near(pixels, visible.landmarks, visible.pixels, visible.gate)
@@ -106,7 +106,7 @@ class _BinaryIndex(Index):
 
     @staticmethod
     def _packed(descriptors: Descriptors) -> NDArray[Any]:
-        """Bytes (n,d) as words (n,w), w a multiple of four; the bytes that are added are zero."""
+        """Pack bytes (n,d) into words (n,w), w a multiple of four; added bytes are zero."""
         count, width = descriptors.shape
         chunk = _WORD_BYTES * _WORDS_AT_ONCE
         padded = np.zeros((count, -(-width // chunk) * chunk), np.uint8)
@@ -154,7 +154,7 @@ class _RealIndex(Index):
 
 
 def make_index(descriptors: Descriptors, *, binary: bool) -> Index:
-    """The search for descriptors (n,d) that are bits or numbers."""
+    """Return the search index of descriptors (n,d), for bits or numbers."""
     return _BinaryIndex(descriptors) if binary else _RealIndex(descriptors)
 
 
@@ -172,14 +172,14 @@ _BORDER_PIXELS = 33
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchView:
-    """What the image may show."""
+    """The landmarks that an image may show."""
 
     landmarks: IntArray  # (v,)
     gate: float  # px around the prediction
 
 
 def find_view(camera: Camera, prior: Prior, points: Array, least_gate: float) -> SearchView:
-    """The landmarks that some row may see, and how far from the prediction.
+    """Return the landmarks that some row may see, and the widest distance from a prediction.
 
     Args:
         camera: of the image.
@@ -203,7 +203,7 @@ def find_view(camera: Camera, prior: Prior, points: Array, least_gate: float) ->
 
 
 def predict(camera: Camera, prior: Prior, points: Array, view: SearchView) -> Visible:
-    """Where the image should show the landmarks of a view: each at the time of its own row."""
+    """Predict the pixels of the landmarks of a view, each at the time of its own row."""
     assert prior.motion is not None
     near, gate = view.landmarks, view.gate
     if len(near) == 0:
@@ -216,7 +216,7 @@ def predict(camera: Camera, prior: Prior, points: Array, view: SearchView) -> Vi
 
 
 def _project(camera: Camera, motion: Motion, points: Array) -> Array:
-    """Raw pixels (n,2) of points (n,3), each at the time of its own row; NaN behind the camera.
+    """Project points (n,3) to raw pixels (n,2), each at the time of its row; NaN behind.
 
     One step of what :func:`rs_localizer.core.shutter.project_rolling` does until no digit changes:
     to a small part of a pixel, in a fifth of the time.
@@ -235,7 +235,7 @@ def _project(camera: Camera, motion: Motion, points: Array) -> Array:
 
 
 def _bearings(camera: Camera) -> tuple[Array, Array]:
-    """Bounds (2,), (2,) of the bearings in the image; infinite where a lens sees sideways."""
+    """Return bounds (2,), (2,) of the bearings in the image; infinite if the lens sees sideways."""
     width, height = camera.size
     u = np.linspace(-0.5, width - 0.5, _BORDER_PIXELS)
     v = np.linspace(-0.5, height - 0.5, _BORDER_PIXELS)
@@ -250,7 +250,7 @@ def _bearings(camera: Camera) -> tuple[Array, Array]:
 
 
 def _bearing_deviation(covariance: Array, depth: float) -> float:
-    """Standard deviation of the bearing of a point at this depth, at the first or last row."""
+    """Return the standard deviation of a point's bearing at a depth, at the first or last row."""
     turn, move, angular, linear = (
         float(np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1]) for k in (0, 3, 6, 9)
     )
@@ -324,7 +324,7 @@ class Matcher:
         return _accepted(matches, owners, chosen, settings.ratio)
 
     def choose(self, keypoints: Keypoints) -> MatchBy:
-        """By what they are compared; descriptors say more than the numbers of a tracker.
+        """Choose what is compared: ids, or descriptors, which say more than a tracker's numbers.
 
         Raises:
             MatchError: when keypoints and map have nothing in common to be compared by.
@@ -363,7 +363,7 @@ class Matcher:
         return Matches(rows, self._order[places[rows]], scores, MatchBy.ID)
 
     def _anywhere(self, queries: Descriptors) -> tuple[Nearest, IntArray]:
-        """The two nearest of all landmarks, and for each query its rival (q,)."""
+        """Return the two nearest of all landmarks, and for each query its rival (q,)."""
         assert self._index is not None
         assert self.map.descriptors is not None
         nearest = self._index.nearest(queries)
@@ -385,7 +385,7 @@ class Matcher:
         camera: Camera,
         prior: Prior,
     ) -> tuple[Nearest, IntArray]:
-        """The same among the landmarks that are predicted near each query."""
+        """Find the two nearest of the landmarks predicted near each query, and its rival (q,)."""
         assert self._index is not None
         view = find_view(camera, prior, self.map.points, gate)
         visible = predict(camera, prior, self.map.points, view)
@@ -396,7 +396,7 @@ class Matcher:
 
 
 def correspondences(matches: Matches, keypoints: Keypoints, landmarks: Map) -> Correspondences:
-    """The matches as a cloud of correspondences would give them, landmark's id included."""
+    """Return the matches as a cloud of correspondences, with the ids of the landmarks."""
     points, pixels = landmarks.points[matches.landmarks], keypoints.pixels[matches.keypoints]
     kinds: list[tuple[str, Any]] = [(name, landmarks.point_type) for name in "xyz"]
     kinds += [("u", "<f4"), ("v", "<f4")]
@@ -424,7 +424,7 @@ def correspondences(matches: Matches, keypoints: Keypoints, landmarks: Map) -> C
 
 
 def _best(keypoints: Keypoints, most: int) -> IntArray:
-    """The best keypoints, in their own order."""
+    """Return the best keypoints, in their own order."""
     count = len(keypoints)
     if count <= most:
         return np.arange(count)
@@ -434,7 +434,7 @@ def _best(keypoints: Keypoints, most: int) -> IntArray:
 
 
 def _accepted(nearest: Nearest, owners: IntArray, rows: IntArray, ratio: float) -> Matches:
-    """Matches that pass; the score is how much nearer the first landmark is than the second."""
+    """Accept matches by ratio; the score is how much nearer the first landmark is."""
     first, second = nearest.distances[:, 0], nearest.distances[:, 1].copy()
     rivals = np.isfinite(second)
     if np.any(rivals):

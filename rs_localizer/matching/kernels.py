@@ -31,7 +31,7 @@ _BYTES, _ONES = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
 
 @kernel
 def _count_bits(word: Any) -> Any:
-    """How many bits of a 64-bit word are set.
+    """Count the set bits of a 64-bit word.
 
     By sums of neighbouring bits, pairs, quads and bytes, as LLVM knows it: one instruction.
     """
@@ -53,7 +53,7 @@ def _insert(distance: float, index: int, distances: Any, indices: Any) -> None:
 
 @inlined
 def _hamming(query: Any, columns: Any, start: int, count: int, distances: Any) -> None:
-    """Distances of one descriptor (w,) to ``count`` columns of (w,n)."""
+    """Write the distances of one descriptor (w,) to ``count`` columns of (w,n)."""
     for word in range(0, len(query), 4):
         a, b, c, d = query[word], query[word + 1], query[word + 2], query[word + 3]
         # Slices, not indices into the whole: these loops become vector instructions.
@@ -83,7 +83,7 @@ def _hamming(query: Any, columns: Any, start: int, count: int, distances: Any) -
 def nearest_binary(
     queries: WordArray2, columns: WordArray2, distances: Out[Array2], indices: Out[IntArray2]
 ) -> None:
-    """Among all landmarks (w,n), for queries (q,w)."""
+    """Find the nearest of all landmarks (w,n) for queries (q,w)."""
     block = np.empty(_BLOCK, np.int64)
     for start in range(0, columns.shape[1], _BLOCK):
         count = min(columns.shape[1] - start, _BLOCK)
@@ -110,7 +110,7 @@ class Near(NamedTuple):
 
 
 class BestFound(NamedTuple):
-    """What a search fills in."""
+    """Results of a search, which it fills in."""
 
     distances: Out[Array2]  # (q,2)
     indices: Out[IntArray2]  # (q,2)
@@ -136,7 +136,7 @@ def _is_near(near: Near, q: int, k: int) -> bool:
 def nearest_binary_within(
     queries: WordArray2, rows: WordArray2, near: Near, best: BestFound
 ) -> None:
-    """Among the landmarks of rows (n,w) that are predicted near the keypoint."""
+    """Find the nearest of the landmarks, rows (n,w), that are predicted near the keypoint."""
     lines = near.predicted[:, 1].copy()
     for q in range(len(queries)):
         v = near.pixels[q, 1]
@@ -154,7 +154,7 @@ def nearest_binary_within(
 def nearest_real_within(
     queries: SingleArray2, rows: SingleArray2, near: Near, best: BestFound
 ) -> None:
-    """As :func:`nearest_binary_within`, by the Euclidean distance of rows of numbers."""
+    """Find the nearest as :func:`nearest_binary_within`, by Euclidean distance of numbers."""
     lines = near.predicted[:, 1].copy()
     for q in range(len(queries)):
         v = near.pixels[q, 1]
@@ -170,7 +170,7 @@ def nearest_real_within(
 
 @entry
 def in_view(points: Array2, state: Array1, low: Array1, high: Array1, depths: Out[Array1]) -> None:
-    """Depths (n,) of points (n,3) that some row may see; 0 of the others.
+    """Write the depths (n,) of points (n,3) that some row may see, and 0 for the others.
 
     A bearing moves by half its change per readout at most, to first order.
 
@@ -199,7 +199,7 @@ def in_view(points: Array2, state: Array1, low: Array1, high: Array1, depths: Ou
 
 @entry
 def move(points: Array2, state: Array1, rows: Array1, moved: Out[Array2]) -> None:
-    """Points (n,3) in the axes of the camera at row times (n,), into (n,3).
+    """Move points (n,3) into the axes of the camera at row times (n,).
 
     ``exp(-tau [omega]x) (R X + t - tau v)``, the turn about one axis by Rodrigues' formula.
 

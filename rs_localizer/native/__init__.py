@@ -41,7 +41,7 @@ class _Kernel:
 
 
 def _edited(level: str) -> frozenset[str]:
-    """The modules whose sources are no longer those that the native module was built from.
+    """Return the modules whose sources differ from those that the native module was built from.
 
     An installed package has no record of its sources, and trusts its module.
     """
@@ -61,7 +61,7 @@ def _edited(level: str) -> frozenset[str]:
 
 
 def _load() -> tuple[Any, frozenset[str], bool]:
-    """The native module, what does not fit in it, and whether Numba has to compile that.
+    """Return the native module, the modules that do not fit it, and whether Numba compiles them.
 
     Raises:
         ImportError: neither is there; the text says what to type.

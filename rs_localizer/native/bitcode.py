@@ -57,7 +57,7 @@ def main(folder: Path, cpu: str, triple: str, modules: Sequence[str] = ()) -> No
 
 
 def _prepare() -> None:
-    """Have Numba only make LLVM's modules, and the same ones wherever and however often."""
+    """Make Numba emit LLVM's modules only, and the same ones in every process."""
     codegen.JITCodeLibrary.get_pointer_to_function = lambda self, name: 0
     codegen.JITCPUCodegen._add_module = lambda self, module: None
     codegen.JITCodeLibrary._finalize_specific = lambda self: None
@@ -106,7 +106,7 @@ class _Linker:
         codegen.CPUCodeLibrary._get_module_for_linking = self._linking
 
     def _for_linking(self, library: Any) -> Any:
-        """The module that goes into a caller: an empty one for a large kernel."""
+        """Return the module that goes into a caller: an empty one for a large kernel."""
         if id(library) in self._shared:
             return self._shared[id(library)][1]
         module = self._linking(library)
@@ -194,7 +194,7 @@ class _Linker:
 
 
 def _thunk(number: int, symbol: str, types_of: list[str]) -> str:
-    """LLVM's text of a function that takes the numbers of a call from one array of 64-bit slots."""
+    """Return LLVM's text of a function that takes arguments from one array of 64-bit slots."""
     lines, taken = (
         [f'declare i32 @"{symbol}"({", ".join(types_of)})'],
         ["ptr %result", "ptr %error"],
@@ -250,7 +250,7 @@ class _Result:
         return code
 
     def _layout(self, kind: Any) -> tuple[int, int]:
-        """Size and alignment in bytes."""
+        """Return the size and alignment in bytes."""
         if isinstance(kind, types.Array):
             return _POINTER * (5 + 2 * kind.ndim), _POINTER
         if isinstance(kind, types.BaseTuple) and len(kind) > 0:

@@ -213,7 +213,7 @@ def _environment(level: str, is_host: bool) -> dict[str, str]:
 
 
 def _key(level: str) -> str:
-    """The digest of all that the kernels of a level are compiled from and with."""
+    """Return the digest of all sources and tools that the kernels of a level are compiled with."""
     if (assembled := ASSEMBLED / level / "kernels.s").is_file():
         return hashlib.sha256(assembled.read_bytes()).hexdigest()[:16]
     sha = hashlib.sha256(json.dumps(sources.digests()).encode())
@@ -225,7 +225,7 @@ def _key(level: str) -> str:
 
 
 def _compiled(level: str, key: str) -> Path:
-    """The folder with what Numba makes for a level, compiled unless it is there."""
+    """Return the folder with Numba's output for a level, and compile it if it is missing."""
     kept = Path(os.environ.get(OBJECTS) or sources.PACKAGE.parent / ".kernels" / "objects")
     folder = kept / f"{level}-{key}"
     if (folder / "about.json").is_file():

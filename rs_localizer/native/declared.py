@@ -75,7 +75,7 @@ def declaration(function: Callable[..., Any]) -> Declaration:
 
 
 def _kind(annotation: Any, module: str) -> Kind | None:
-    """The kind of an annotation, or of its text in a module that postpones evaluation."""
+    """Return the kind of an annotation, or of its text in a module that postpones evaluation."""
     annotation = getattr(annotation, "__forward_arg__", annotation)  # of a named tuple's field
     if isinstance(annotation, str):
         annotation = eval(annotation, vars(importlib.import_module(module)))
@@ -96,7 +96,7 @@ def _kind(annotation: Any, module: str) -> Kind | None:
 
 
 def encode(kind: Kind, classes: list[Any]) -> str:
-    """One kind of an argument for the native module; classes are numbered as they occur.
+    """Encode one kind of argument for the native module; classes are numbered as they occur.
 
     A scalar is its code. An array is ``r`` or, where the kernel writes to it, ``w``, the code of
     its elements and its dimensions. A tuple is ``t``, the number of its class (two digits; 99 for
@@ -133,14 +133,14 @@ def refuse(declared: Declaration, arguments: Sequence[Any]) -> NoReturn:
 
 
 def fits(declared: Declaration, arguments: Sequence[Any]) -> bool:
-    """True if an entry takes these arguments."""
+    """Return True if an entry takes these arguments."""
     return len(arguments) == len(declared.arguments) and not any(
         map(_fault, declared.arguments.values(), arguments)
     )
 
 
 def _fault(kind: Kind, value: Any) -> tuple[str, str, str] | None:
-    """Where in an argument something is wrong, what is wanted there and what was found."""
+    """Return where an argument is wrong, what is wanted there and what was found."""
     match kind:
         case Scalar(code):
             if not _is_scalar(code, value):

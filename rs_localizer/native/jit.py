@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels run by Numba: for who edits them, and for the build, which compiles them all.
 
-Nothing of this is imported where the native module fits the sources. Machine code is kept in the
-checkout, in a folder named by the digest of a kernel's file and of all that it imports, because
-Numba itself would run old code after a callee changed in another file.
+If the native module fits the sources, nothing of this is imported. Machine code is kept in the
+checkout, in a folder named by the digest of a kernel's file and of all files that it imports.
+Without that digest Numba would run old code after a callee in another file has changed.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def uncallable(name: str) -> str:
 
 
 def _writable(argument: Any) -> Any:
-    """An argument whose read-only arrays are copied: to Numba they are of another type."""
+    """Copy the read-only arrays of an argument, which are of another type to Numba."""
     if isinstance(argument, tuple):
         parts = [_writable(part) for part in argument]
         return argument._make(parts) if hasattr(argument, "_make") else tuple(parts)
@@ -190,7 +190,7 @@ def folder() -> Path:
 
 
 def is_ours(path: Path) -> bool:
-    """True if nobody else can put files into a folder: what is there runs in this process."""
+    """Return True if nobody else can write to a folder, whose files run in this process."""
     for each in (path, *path.parents):
         try:
             about = each.stat()

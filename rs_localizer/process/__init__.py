@@ -9,7 +9,7 @@ _THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")
 
 
 def limit_threads() -> None:
-    """Let BLAS use one thread, whatever the user has said; before NumPy is imported.
+    """Limit BLAS to one thread, whatever the user has set; call it before NumPy is imported.
 
     How many there are changes the last bits of results, and they spin while they wait for each
     other. Only programs call this: in a library it is not ours to decide.

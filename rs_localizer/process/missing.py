@@ -39,7 +39,7 @@ _PIP = {
 
 
 def explain(error: ImportError) -> str:
-    """The sentence for an import that failed."""
+    """Return the sentence that explains an import that failed."""
     name = (error.name or "").partition(".")[0]
     # What is there and broken (built for another NumPy, say) tells of itself.
     if not isinstance(error, ModuleNotFoundError):

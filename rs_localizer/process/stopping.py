@@ -61,7 +61,7 @@ class StopRequest:
 
     @contextlib.contextmanager
     def at_once(self, code: int | None = 0, text: str = "") -> Iterator[None]:
-        """While importing: a signal ends the process here and now.
+        """End the process at once on a signal, within the context: for imports.
 
         An import takes long, and an exception inside it may be lost or come out as another one. No
         results exist meanwhile.
@@ -120,7 +120,7 @@ class StopSignals(StopRequest):
         self._interrupt(frame)
 
     def _repeat(self, lost: "sys.UnraisableHookArgs") -> None:
-        """Not reported: an interrupt within a finalizer comes again."""
+        """Repeat an interrupt that a finalizer has lost."""
         if lost.exc_type is KeyboardInterrupt:
             self._due = True
             signal.setitimer(signal.ITIMER_REAL, _PERIOD)
@@ -152,7 +152,7 @@ def _is_fragile(frame: FrameType | None) -> bool:
 
 
 def _is_handled(error: BaseException | None) -> bool:
-    """True if a KeyboardInterrupt is what somebody cleans up after."""
+    """Return True if some code cleans up after a KeyboardInterrupt."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None

@@ -31,7 +31,7 @@ _CONVERGED = 1e-9
 
 
 def inputs(size: int) -> int:
-    """Number of values before the solver's own state, for samples of ``size`` points."""
+    """Return the number of values before the solver's own state, for samples of ``size`` points."""
     return 6 * size + 9
 
 
@@ -73,10 +73,10 @@ def scatter(work: Array, offset: int, start: int, model: Array) -> None:
 
 @kernel
 def into_rig(models: Array, camera: IntArray, mounts: Mounts) -> None:
-    """Turn models (k,18,h) of cameras (h,) into those of their rig.
+    """Turn models (k,18,h) of cameras (h,) into models of their rig.
 
-    ``exp(tau [w]x) R X + C + tau t`` in the axes of a camera is, with all four turned into those of
-    the rig and ``C`` moved by the camera's centre, the same model of the rig.
+    A camera's model is ``exp(tau [w]x) R X + C + tau t`` in its axes. The rig has the same model,
+    with all four rotated into the axes of the rig and ``C`` moved by the camera's centre.
     """
     turned = np.empty(3)
     for h in range(len(camera)):
@@ -95,7 +95,7 @@ def into_rig(models: Array, camera: IntArray, mounts: Mounts) -> None:
 
 @kernel
 def converged(work: Array, change: int) -> bool:
-    """True if value ``change``, as of :meth:`Sample.stepped`, is that of no more steps."""
+    """Return True if value ``change``, as of :meth:`Sample.stepped`, is that of no more steps."""
     moving = False
     for lane in range(LANES):
         moving = moving or work[change * LANES + lane] > _CONVERGED**2
@@ -111,7 +111,7 @@ def unpack(
     w: Out[Array3],
     t: Out[Array3],
 ) -> None:
-    """Models (k,18,h) as rows ``first ...`` of rotations (.,k,3,3) and the vectors (.,k,3)."""
+    """Write models (k,18,h) to rows ``first ...`` of rotations (.,k,3,3) and vectors (.,k,3)."""
     for s in range(models.shape[0]):
         for i in range(models.shape[2]):
             row = first + i
@@ -138,13 +138,13 @@ class Sample:
         self.state: Vector = list(values[6 * size + 9 :])
 
     def rotated_points(self) -> list[Vector]:
-        """The points in the frame of the initial rotation."""
+        """Return the points in the frame of the initial rotation."""
         return [multiply(self.rotation, x) for x in self.points]
 
     def with_results(
         self, points: Sequence[Vector], rotation: Sequence[Vector], state: Vector
     ) -> Vector:
-        """The values in their order again, with what a step has changed."""
+        """Return the values in their order again, with what a step has changed."""
         return [
             *(x for point in points for x in point),
             *(x for ray in self.rays for x in ray),
@@ -156,7 +156,7 @@ class Sample:
     def stepped(
         self, points: Sequence[Vector], rotation: Sequence[Vector], state: Vector, *steps: Vector
     ) -> Vector:
-        """As :meth:`with_results` after an iteration by these steps (rad), their square behind.
+        """Append steps (rad) and their square to :meth:`with_results` of an iteration.
 
         A sample that has converged stays what it is, whatever the others in its lanes do.
         """

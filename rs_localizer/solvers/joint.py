@@ -29,6 +29,6 @@ def solve_batch(
     iterations: int,
     models: Out[Array3],
 ) -> None:
-    """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    """Solve a batch; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
     _solve_vct_w(points, rays, tau, samples, rotations, iterations, models[0:1])
     _solve_vcwt(points, rays, tau, samples, rotations, iterations, models[1:2])

@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The equations that all linear rolling-shutter solvers share.
 
-Double-linearised model of Kukelova, Albl, Sugimoto, Pajdla, "Linear solution to the minimal
+Double-linearized model of Kukelova, Albl, Sugimoto, Pajdla, "Linear solution to the minimal
 absolute pose rolling shutter problem", ACCV 2018, eq. (5), with ``r`` the row time:
 
     lambda x = (I + r [w]x) (I + [v]x) X + C + r t
 
 Rows ``(-1, 0, a)`` and ``(0, -1, b)`` of ``[x]x`` for ``x = (a, b, 1)`` give two equations per
 point. ``C_x, t_x`` occur only in the first kind, ``C_y, t_y`` only in the second, and with the
-same coefficients ``1, r``: one orthogonal transformation of the rows, which depends on the row
-times alone, removes these four unknowns from all but the first two equations of either kind and
-keeps least squares what it is.
+same coefficients ``1, r``. So one orthogonal transformation of the rows, which depends on the row
+times only, removes these four unknowns from all but the first two equations of either kind.
+Being orthogonal, it leaves the least-squares solution as it is.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ Column = tuple[Vector, Vector]  # coefficients of one unknown in the equations o
 
 
 def lateral_column(count: int) -> Vector:
-    """Coefficients of ``C_x`` in the equations of the first kind, and of ``C_y`` in the second."""
+    """Return the coefficients of ``C_x`` in the first kind of equations, ``C_y`` in the second."""
     return [-1.0] * count
 
 
 def rotation_columns(points: Sequence[Vector], rays: Sequence[Vector]) -> list[Column]:
-    """Coefficients of a vector u that enters as ``u x P`` for points P of the camera frame."""
+    """Return coefficients of a vector u that enters as ``u x P``, P points of the camera frame."""
     first: list[Vector] = []
     second: list[Vector] = []
     for (x, y, z), (a, b) in zip(points, rays, strict=True):
@@ -46,12 +46,12 @@ def rotation_columns(points: Sequence[Vector], rays: Sequence[Vector]) -> list[C
 
 
 def depth_column(rays: Sequence[Vector]) -> Column:
-    """Coefficients of a translation along z."""
+    """Return the coefficients of a translation along z."""
     return [a for a, _ in rays], [b for _, b in rays]
 
 
 def right_hand_side(points: Sequence[Vector], rays: Sequence[Vector]) -> Column:
-    """What the points themselves contribute, on the right of the equations."""
+    """Return the right-hand side of the equations: what the points themselves contribute."""
     return (
         [x - a * z for (x, _, z), (a, _) in zip(points, rays, strict=True)],
         [y - b * z for (_, y, z), (_, b) in zip(points, rays, strict=True)],
@@ -59,7 +59,7 @@ def right_hand_side(points: Sequence[Vector], rays: Sequence[Vector]) -> Column:
 
 
 def times_row(column: Column, tau: Vector) -> Column:
-    """A column multiplied by the row times."""
+    """Return a column multiplied by the row times."""
     return (
         [r * value for r, value in zip(tau, column[0], strict=True)],
         [r * value for r, value in zip(tau, column[1], strict=True)],
@@ -67,19 +67,19 @@ def times_row(column: Column, tau: Vector) -> Column:
 
 
 def minus(left: Column, right: Column) -> Column:
-    """The difference of two columns."""
+    """Return the difference of two columns."""
     return difference(left[0], right[0]), difference(left[1], right[1])
 
 
 def difference(left: Vector, right: Vector) -> Vector:
-    """The difference of two vectors."""
+    """Return the difference of two vectors."""
     return [x - y for x, y in zip(left, right, strict=True)]
 
 
 def solve(
     lateral: Sequence[Vector], columns: Sequence[Column], right: Column
 ) -> tuple[Vector, Vector, Vector]:
-    """Least squares with unknowns that occur in one kind of equation only.
+    """Solve least squares with unknowns that occur in one kind of equation only.
 
     Args:
         lateral: coefficients of the unknowns that have one copy per kind (``C_x, t_x`` in the
@@ -110,7 +110,7 @@ def solve(
 
 
 def fold(rotation: Sequence[Vector], v: Vector) -> list[Vector]:
-    """The initial rotation followed by the rotation nearest to ``I + [v]x``."""
+    """Return the initial rotation followed by the rotation nearest to ``I + [v]x``."""
     turn = nearest_rotation(v)
     columns = [multiply(turn, [row[j] for row in rotation]) for j in range(3)]
     return [[columns[j][i] for j in range(3)] for i in range(3)]

@@ -49,7 +49,7 @@ def _trace_product(m: Symmetric, n: Symmetric) -> Any:
 
 
 def _real_root(c2: Any, c1: Any, c0: Any) -> Any:
-    """A real root of ``x^3 + c2 x^2 + c1 x + c0``: the one outside its extrema."""
+    """Return a real root of ``x^3 + c2 x^2 + c1 x + c0``: the one outside its extrema."""
     discriminant = c2 * c2 - 3.0 * c1
     spread = sqrt(select(discriminant > 0.0, discriminant, 0.0))
     left = (-c2 - spread) / 3.0
@@ -74,7 +74,7 @@ def _real_root(c2: Any, c1: Any, c0: Any) -> Any:
 
 
 def _lines(m: Symmetric) -> tuple[Vector, Vector]:
-    """The two lines of a degenerate conic; NaN where they are not real."""
+    """Return the two lines of a degenerate conic; NaN where they are not real."""
     full = [[m[0], m[1], m[2]], [m[1], m[3], m[4]], [m[2], m[4], m[5]]]
     a = [-value for value in _adjugate(m)]
     adjugate = [[a[0], a[1], a[2]], [a[1], a[3], a[4]], [a[2], a[4], a[5]]]
@@ -105,7 +105,7 @@ def _lines(m: Symmetric) -> tuple[Vector, Vector]:
 
 
 def _polish(depths: Vector, cosines: Vector, squares: Vector) -> Vector:
-    """Newton steps on the three quadrics (squares of the sides 12, 13, 23)."""
+    """Return the newton steps on the three quadrics (squares of the sides 12, 13, 23)."""
     b12, b13, b23 = cosines
     x, y, z = depths
     for _ in range(_DEPTH_STEPS):
@@ -126,7 +126,7 @@ def _polish(depths: Vector, cosines: Vector, squares: Vector) -> Vector:
 
 
 def _pose(depths: Vector, bearings: list[Vector], points: list[Vector]) -> tuple[Vector, Vector]:
-    """Rotation (row-major) and C that take the points to their places on the bearings."""
+    """Return rotation (row-major) and C that take the points to their places on the bearings."""
     seen = [[d * v for v in y] for d, y in zip(depths, bearings, strict=True)]
 
     def frame(corners: list[Vector]) -> list[Vector]:
@@ -206,7 +206,7 @@ def solve_batch(
     iterations: int,
     models: Out[Array3],
 ) -> None:
-    """Arguments and result as in :mod:`rs_localizer.solvers.batch`; takes no initial rotation."""
+    """Solve a batch as in :mod:`rs_localizer.solvers.batch`; no initial rotation is taken."""
     work = np.empty(_INPUTS * LANES)
     solutions = np.empty(SOLUTIONS * MODEL_SIZE * LANES)
     for start in range(0, len(samples), LANES):

@@ -51,7 +51,7 @@ _CONVERGED = 1e-7  # the longest last step; another one would be about its squar
 
 
 def _begin(values: list[Lanes]) -> Vector:
-    """Rotated points and the coefficients of A(v)."""
+    """Return the rotated points and the coefficients of A(v)."""
     sample = Sample(values, SAMPLE_SIZE)
     points, rays, tau = sample.rotated_points(), sample.rays, sample.tau
     turned = linear.rotation_columns(points, rays)
@@ -76,7 +76,7 @@ def _begin(values: list[Lanes]) -> Vector:
 
 
 def _polish(a: list[list[Vector]], v: Vector) -> tuple[Vector, Vector, Any]:
-    """Newton steps on ``A(v) [w; 1] = 0``: v, w, and the square of the last step."""
+    """Return the newton steps on ``A(v) [w; 1] = 0``: v, w, and the square of the last step."""
 
     def matrix(v: Vector) -> list[Vector]:
         return [[entry[0] + dot(entry[1:], v) for entry in row] for row in a]
@@ -99,7 +99,7 @@ def _polish(a: list[list[Vector]], v: Vector) -> tuple[Vector, Vector, Any]:
 
 
 def _solution(values: list[Lanes]) -> Vector:
-    """The model of one eigenvalue, and v; NaN where it is none."""
+    """Return the model of one eigenvalue, and v; NaN where it is none."""
     sample = Sample(values[: _INPUTS + _A], SAMPLE_SIZE)
     relations, (y, bound) = values[-_CANDIDATE:-2], values[-2:]
     a = [[sample.state[16 * i + 4 * j : 16 * i + 4 * j + 4] for j in range(4)] for i in range(6)]
@@ -146,7 +146,7 @@ def _solve(
     points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3, bound: float,
     models: Out[Array3], turns: Out[Array3],
 ) -> None:  # fmt: skip
-    """As :func:`solve_batch`; ``turns`` (20,3,h) gets v, or is empty (0,3,1)."""
+    """Solve a batch as :func:`solve_batch`; ``turns`` (20,3,h) gets v, or is empty (0,3,1)."""
     models[:] = np.nan
     work = lane_array(_INPUTS + _A)
     room = lane_array(rank_drop.WORK)
@@ -185,7 +185,7 @@ def solve_batch(
     points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
     models: Array, bound: float = BOUND,
 ) -> None:  # fmt: skip
-    """Arguments and result as in :mod:`rs_localizer.solvers.batch`; not iterative.
+    """Solve a batch as in :mod:`rs_localizer.solvers.batch`, without iterations.
 
     Args:
         bound: of |v|.

@@ -35,7 +35,7 @@ _SIZE = (_INPUTS + _STATE) * LANES
 
 
 def _swung_rotation_columns(sample: Sample, w: Vector) -> list[linear.Column]:
-    """Coefficients of v in ``(I + r [w]x) (v x X)``: the equations seen from the turned rows."""
+    """Return coefficients of v in ``(I + r [w]x) (v x X)``, the equations from rotated rows."""
     first: list[Vector] = []
     second: list[Vector] = []
     for x, (a, b), r in zip(sample.points, sample.rays, sample.tau, strict=True):
@@ -46,12 +46,12 @@ def _swung_rotation_columns(sample: Sample, w: Vector) -> list[linear.Column]:
 
 
 def _turned(sample: Sample, v: Vector) -> list[Vector]:
-    """``X + v x X``."""
+    """Return ``X + v x X``."""
     return [[p + d for p, d in zip(x, cross(v, x), strict=True)] for x in sample.points]
 
 
 def _at_rows(sample: Sample, points: list[Vector], w: Vector) -> list[Vector]:
-    """``P + r w x P``."""
+    """Return ``P + r w x P``."""
     return [
         [p + r * d for p, d in zip(x, cross(w, x), strict=True)]
         for x, r in zip(points, sample.tau, strict=True)
@@ -59,13 +59,13 @@ def _at_rows(sample: Sample, points: list[Vector], w: Vector) -> list[Vector]:
 
 
 def _translation_column(sample: Sample, vector: Vector) -> linear.Column:
-    """``q . vector`` for both kinds of equations."""
+    """Return ``q . vector`` for both kinds of equations."""
     x, y, z = vector
     return [a * z - x for a, _ in sample.rays], [b * z - y for _, b in sample.rays]
 
 
 def _first_step(sample: Sample, w: Vector, t: Vector | None) -> tuple[Vector, Vector, Vector]:
-    """v, C and t given w, and given t where it is not None."""
+    """Return v, C and t for a given w, and for a given t unless it is None."""
     rays, tau = sample.rays, sample.tau
     depth = linear.depth_column(rays)
     right = linear.right_hand_side(_at_rows(sample, sample.points, w), rays)
@@ -82,7 +82,7 @@ def _first_step(sample: Sample, w: Vector, t: Vector | None) -> tuple[Vector, Ve
 
 
 def _second_step(sample: Sample, v: Vector, c: Vector, t: Vector | None) -> tuple[Vector, Vector]:
-    """w and t given v, C, and given t where it is not None."""
+    """Return w and t for given v and C, and for a given t unless it is None."""
     rays, tau = sample.rays, sample.tau
     turned = _turned(sample, v)
     right = linear.minus(linear.right_hand_side(turned, rays), _translation_column(sample, c))
@@ -138,7 +138,7 @@ def solve_vc_wt(
     iterations: int,
     models: Out[Array3],
 ) -> None:
-    """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    """Solve a batch, v and C first; arguments as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty(_SIZE)
     for start in range(0, len(samples), LANES):
         gather(points, rays, tau, samples, rotations, start, work)
@@ -161,7 +161,7 @@ def solve_vct_w(
     iterations: int,
     models: Out[Array3],
 ) -> None:
-    """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    """Solve a batch, v, C and t first; arguments as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty(_SIZE)
     for start in range(0, len(samples), LANES):
         gather(points, rays, tau, samples, rotations, start, work)
@@ -184,7 +184,7 @@ def solve_vct_wt(
     iterations: int,
     models: Out[Array3],
 ) -> None:
-    """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    """Solve a batch, t in both steps; arguments as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty(_SIZE)
     for start in range(0, len(samples), LANES):
         gather(points, rays, tau, samples, rotations, start, work)

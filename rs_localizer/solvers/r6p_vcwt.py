@@ -34,7 +34,7 @@ _CHANGE = _INPUTS + _STATE - 1
 
 
 def _solve(sample: Sample, v: Vector | None) -> tuple[Vector, Vector, Vector, Vector]:
-    """v, C, w, t with v^ in the product with w; None stands for v^ = 0."""
+    """Return v, C, w, t with v^ in the product with w; None stands for v^ = 0."""
     points, rays, tau = sample.points, sample.rays, sample.tau
     rotation = linear.rotation_columns(points, rays)
     if v is None:
@@ -100,7 +100,7 @@ def solve_batch(
     iterations: int,
     models: Out[Array3],
 ) -> None:
-    """Relinearised; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    """Solve a batch, relinearized, with arguments as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty((_INPUTS + _STATE) * LANES)
     for start in range(0, len(samples), LANES):
         gather(points, rays, tau, samples, rotations, start, work)
@@ -122,7 +122,7 @@ def solve_batch_frozen(
     iterations: int,
     models: Out[Array3],
 ) -> None:
-    """With v^ frozen, as published; arguments and result as :func:`solve_batch`."""
+    """Solve a batch with v^ frozen, as published; arguments as of :func:`solve_batch`."""
     work = np.empty((_INPUTS + _STATE) * LANES)
     for start in range(0, len(samples), LANES):
         gather(points, rays, tau, samples, rotations, start, work)

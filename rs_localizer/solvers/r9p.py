@@ -32,7 +32,10 @@ _INPUTS = inputs(SAMPLE_SIZE)
 
 
 def _angular_velocity(matrix: list[Vector], v: Vector) -> Vector:
-    """Skew part of ``R_RS (I + [v]x)^-1``, with the inverse ``(I - [v]x + v v^T)/(1 + v.v)``."""
+    """Return the skew part of ``R_RS (I + [v]x)^-1``.
+
+    The inverse is ``(I - [v]x + v v^T)/(1 + v.v)``.
+    """
     x, y, z = v
     scale = 1.0 / (dot(v, v) + 1.0)
     inverse = [
@@ -50,7 +53,7 @@ def _angular_velocity(matrix: list[Vector], v: Vector) -> Vector:
 
 
 def unknowns(sample: Sample, *, fix_trace: bool) -> tuple[Vector, Vector, Vector, list[Vector]]:
-    """v, C, t and the rows of R_RS in the frame of the initial rotation."""
+    """Return v, C, t and the rows of R_RS in the frame of the initial rotation."""
     points, rays, tau = sample.rotated_points(), sample.rays, sample.tau
     depth = linear.depth_column(rays)
     swept = [[r * x[k] for x, r in zip(points, tau, strict=True)] for k in range(3)]
@@ -119,7 +122,7 @@ def solve_batch(
     iterations: int,
     models: Out[Array3],
 ) -> None:
-    """Trace fixed; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    """Solve a batch, trace fixed, with arguments as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty(_INPUTS * LANES)
     model = np.empty(MODEL_SIZE * LANES)
     for start in range(0, len(samples), LANES):
@@ -138,7 +141,7 @@ def solve_batch_as_published(
     iterations: int,
     models: Out[Array3],
 ) -> None:
-    """With the gauge free, as published; arguments and result as :func:`solve_batch`."""
+    """Solve a batch, gauge free, as published; arguments as of :func:`solve_batch`."""
     work = np.empty(_INPUTS * LANES)
     model = np.empty(MODEL_SIZE * LANES)
     for start in range(0, len(samples), LANES):

@@ -37,7 +37,7 @@ Exponents = tuple[int, int, int]
 
 
 def _monomials(degree: int) -> list[Exponents]:
-    """Exponents of x, y, z of all monomials of that degree."""
+    """Return the exponents of x, y, z of all monomials of that degree."""
     powers = itertools.product(range(degree, -1, -1), repeat=3)
     return [(x, y, z) for x, y, z in powers if x + y + z == degree]
 
@@ -64,7 +64,7 @@ def _subsets(size: int) -> list[tuple[int, ...]]:
 
 
 def _terms(size: int) -> Any:
-    """Laplace's expansion of all minors of ``size`` rows along their last column.
+    """Expand all minors of ``size`` rows along their last column (Laplace).
 
     Returns:
         (minor, place, 2): a row, and the number of the smaller minor of the other rows; minors
@@ -80,7 +80,7 @@ def _terms(size: int) -> Any:
 
 
 def _expand(size: int) -> Any:
-    """Traced: a minor (up to its sign) from the last entries of its rows and smaller minors."""
+    """Trace a minor (up to its sign) from the last entries of its rows and smaller minors."""
     count = _COUNT[size - 1]
 
     def expand(values: list[Lanes]) -> Vector:
@@ -114,7 +114,7 @@ def _collect(
     matrix: Array, column: int, terms: Any, smaller: Array, begin: int, stride: int, count: int,
     operands: Array,
 ) -> None:  # fmt: skip
-    """What :func:`_expand` takes."""
+    """Collect the operands that :func:`_expand` takes."""
     size = len(terms)
     for i in range(size):
         row, others = terms[i]
@@ -126,7 +126,7 @@ def _collect(
 
 @inlined
 def find_relations(matrix: Array, offset: int, work: Array, relations: Array) -> None:
-    """The relations of the quotient ring.
+    """Compute the relations of the quotient ring.
 
     Args:
         matrix: holds the 6x4 matrix from value ``offset`` on (96 values).
@@ -151,7 +151,7 @@ def find_relations(matrix: Array, offset: int, work: Array, relations: Array) ->
 
 @inlined
 def _triangularize(work: Array, axis: Array) -> None:
-    """Householder QR of the quartics, the monomials of degree four first; room for a column."""
+    """Triangularize the quartics by Householder QR, with the monomials of degree four first."""
     zero, one = uniform(0.0), uniform(1.0)
     for k in range(_MINORS):
         pivot = SOLUTIONS + k
@@ -196,7 +196,7 @@ def _back_substitute(work: Array, relations: Array) -> None:
 
 @inlined
 def fill_multiplication(relations: Array, h: Array) -> None:
-    """Multiplication by y as a matrix, stored as in :mod:`rs_localizer.core.simd.eigenvalues`."""
+    """Write the matrix of multiplication by y, for :mod:`rs_localizer.core.simd.eigenvalues`."""
     for i in range((SOLUTIONS + 1) ** 2):
         store(h, i, uniform(0.0))
     for i in range(SOLUTIONS):
@@ -210,7 +210,7 @@ def fill_multiplication(relations: Array, h: Array) -> None:
 
 
 def solution_at(relations: Sequence[Any], y: Any) -> Vector:
-    """x, y, z at the eigenvalue y, from the relations there; for traced code."""
+    """Return x, y, z at the eigenvalue y, from the relations there; for traced code."""
     powers = [1.0, y, y * y, y * y * y]
     powers.append(powers[2] * powers[2])
     columns = [[0.0] * len(_CUBICS) for _ in _PLANAR]

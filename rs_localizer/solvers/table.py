@@ -56,7 +56,7 @@ class Solver:
 
 @functools.cache
 def find_solver(name: str) -> Solver:
-    """The solver of that name.
+    """Return the solver with that name.
 
     Raises:
         ValueError: unknown name.
@@ -75,5 +75,5 @@ def find_solver(name: str) -> Solver:
 
 
 def start_solver(solver: Solver) -> Solver:
-    """The global-shutter solver whose pose a search begins with: a global-shutter one itself."""
+    """Return the global-shutter solver that begins a search; a global-shutter solver: itself."""
     return find_solver(_START) if solver.rolling_shutter else solver

@@ -11,7 +11,7 @@ from rs_localizer.core.simd.tracing import Vector, select, sqrt
 
 
 def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
-    """Scalar product of two vectors of equal length."""
+    """Return the scalar product of two vectors of equal length."""
     total: Any = 0.0
     for x, y in zip(a, b, strict=True):
         total = x * y + total
@@ -19,7 +19,7 @@ def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
 
 
 def cross(a: Sequence[Any], b: Sequence[Any]) -> Vector:
-    """Vector product of two 3-vectors."""
+    """Return the vector product of two 3-vectors."""
     return [
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
@@ -28,12 +28,12 @@ def cross(a: Sequence[Any], b: Sequence[Any]) -> Vector:
 
 
 def multiply(matrix: Sequence[Sequence[Any]], vector: Sequence[Any]) -> Vector:
-    """Matrix times vector; the matrix is a list of rows."""
+    """Multiply a matrix, given as a list of rows, and a vector."""
     return [dot(row, vector) for row in matrix]
 
 
 def triangularize(columns: list[Vector], count: int) -> None:
-    """Householder QR in place: reflect so that the first ``count`` columns are upper triangular.
+    """Reflect columns in place so that the first ``count`` are upper triangular (Householder QR).
 
     ``columns`` are equally long lists; all of them are reflected. Entries below the diagonal of
     the first ``count`` columns are left undefined. A column without length below its diagonal
@@ -67,14 +67,14 @@ def back_substitute(columns: Sequence[Vector], right: Sequence[Any]) -> Vector:
 
 
 def least_squares(columns: list[Vector], right: Vector) -> Vector:
-    """Least-squares solution of ``sum_j columns[j] x_j = right`` by Householder QR."""
+    """Solve ``sum_j columns[j] x_j = right`` in the least-squares sense, by Householder QR."""
     system = [*[list(column) for column in columns], list(right)]
     triangularize(system, len(columns))
     return back_substitute(system[:-1], system[-1])
 
 
 def nearest_rotation(v: Sequence[Any]) -> list[Vector]:
-    """The rotation nearest to ``I + [v]x`` (its polar factor): by ``atan |v|`` about ``v``."""
+    """Return the rotation by ``atan |v|`` about ``v``, the polar factor of ``I + [v]x``."""
     x, y, z = v
     q = 1.0 / sqrt(dot(v, v) + 1.0)
     c = q * q / (q + 1.0)

@@ -29,7 +29,7 @@ _SWEEPS = 8  # per eigenvalue of the slowest lane; the usual number is below two
 
 @inlined
 def reduce_to_hessenberg(h: Array, n: int, axis: Array) -> None:
-    """Similarity transformation to upper Hessenberg form, in place.
+    """Transform matrices to upper Hessenberg form by similarity, in place.
 
     Args:
         h: matrices of size n.
@@ -69,7 +69,7 @@ def reduce_to_hessenberg(h: Array, n: int, axis: Array) -> None:
 
 @inlined
 def _sweep(h: Array, n: int, first: Array, last: Array, bulge: Array) -> None:
-    """One implicit double shift in the window ``first .. last`` of every lane.
+    """Apply one implicit double shift to the window ``first .. last`` of every lane.
 
     Args:
         h: Hessenberg matrices of size n.
@@ -174,7 +174,7 @@ def _deflate(
 def _shift(
     h: Array, n: int, lane: int, begin: int, end: int, exceptional: bool, bulge: Array
 ) -> None:
-    """First column of (H - a)(H - b) in the window, a and b being eigenvalues of its last 2x2."""
+    """Write the first column of (H - a)(H - b), with eigenvalues a, b of the window's last 2x2."""
     row = (n + 1) * LANES
     at = (end * (n + 1) + end) * LANES + lane
     up = at - row - LANES
@@ -195,7 +195,7 @@ def _shift(
 def real_eigenvalues(
     h: Array, n: int, bound: float, work: Array, counts: Any, eigenvalues: Array
 ) -> None:
-    """Real eigenvalues of absolute value up to ``bound``, in no particular order.
+    """Write the real eigenvalues of absolute value up to ``bound``, in no particular order.
 
     Args:
         h: Hessenberg matrices of size n; destroyed. One with NaN or infinity has no eigenvalues.

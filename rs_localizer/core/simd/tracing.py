@@ -3,12 +3,11 @@
 """Straight-line SIMD code for Numba, written as plain Python arithmetic.
 
 A minimal solver is a few hundred multiplications on a system of fixed size, needed for thousands
-of samples. :func:`traced` turns a Python function on numbers into a Numba-callable function that
-works on ``LANES`` samples at once: the Python function runs once, at compile time, on
-:class:`Lanes` objects that record every operation as one LLVM vector instruction. Loops over
-rows and columns are thereby unrolled, intermediate matrices live in registers and on the stack,
-and nothing is left to an auto-vectorizer. Values of the lanes never mix, and a structural zero
-(the Python number 0.0) costs nothing.
+of samples. A call of :func:`traced` turns a Python function on numbers into a function for kernels
+that works on ``LANES`` samples at once. The Python function runs once, at compile time, on
+:class:`Lanes` objects, which record every operation as one LLVM vector instruction. This unrolls
+loops over rows and columns; intermediate matrices live in registers and on the stack. Values of the
+lanes never mix, and a structural zero (the Python number 0.0) costs nothing.
 """
 
 from __future__ import annotations
@@ -120,12 +119,12 @@ class Mask:
 
 
 def sqrt(number: Any) -> Any:
-    """Square root, of lanes (NaN where negative) or of a number."""
+    """Return the square root of lanes (NaN where negative) or of a number."""
     return number._sqrt() if isinstance(number, Lanes) else math.sqrt(number)
 
 
 def select(condition: Any, if_true: Any, if_false: Any) -> Any:
-    """Lane by lane one value or the other; of a plain truth value, the whole one."""
+    """Select one of two values, lane by lane; a plain truth value selects for all lanes."""
     if not isinstance(condition, Mask):
         return if_true if condition else if_false
     chosen = condition.builder.select(condition.value, _operand(if_true), _operand(if_false))

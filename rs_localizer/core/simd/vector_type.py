@@ -67,7 +67,7 @@ def _element(context: Any, builder: Any, array_type: Any, array: Any, index: Any
 
 @_inline
 def load(typingctx: Any, array: Any, index: Any) -> Any:
-    """The value ``index`` of an array."""
+    """Return the value ``index`` of an array."""
 
     def emit(context: Any, builder: Any, call: Any, args: Any) -> Any:
         index = context.cast(builder, args[1], call.args[1], types.int64)
@@ -122,7 +122,7 @@ absolute = _unary("llvm.fabs")
 
 @_inline
 def where_less(typingctx: Any, left: Any, right: Any, if_true: Any, if_false: Any) -> Any:
-    """Lane by lane ``if_true`` where left < right, else (NaN too) ``if_false``."""
+    """Select ``if_true`` in lanes with left < right, and ``if_false`` in the others, NaN too."""
 
     def emit(context: Any, builder: Any, call: Any, args: Any) -> Any:
         return builder.select(builder.fcmp_ordered("<", args[0], args[1]), args[2], args[3])

@@ -37,7 +37,7 @@ __all__ = ["absolute", "lane_array", "load", "root", "store", "uniform", "where_
 
 @kernel
 def lane_array(count: int) -> Array:
-    """A new array of ``count`` values that begin at cache lines: no load touches two of them."""
+    """Return a new array of ``count`` vectors aligned to cache lines: no load touches two lines."""
     raw: Array = np.zeros((count + 1) * LANES)
     skip = (-raw.ctypes.data // 8) % LANES
     return raw[skip : skip + count * LANES]
