@@ -33,7 +33,7 @@ WORKING = True
 def earlier_result(
     args: Any, mark: str, place: Path | None = None, names: Sequence[str] | None = None
 ) -> Sequence[str]:
-    """Names of an earlier result in a directory, which a new one is to replace.
+    """Return names of an earlier result in a directory, which a new one is to replace.
 
     Args:
         mark: a file that each result has.
@@ -80,7 +80,7 @@ def write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
 
 
 def import_ros(name: str, what: str) -> Any:
-    """A module of ``rs_localizer.ros.graph``, by name: all else works without ROS.
+    """Import a module of ``rs_localizer.ros.graph`` by name: all else works without ROS.
 
     Raises:
         ValueError: without ROS, which ``what`` needs.
@@ -95,7 +95,7 @@ def import_ros(name: str, what: str) -> Any:
 
 
 def read_counts(text: str, option: str) -> tuple[int, int]:
-    """Columns and rows of ``6x4``; raises UsageError for anything else."""
+    """Read columns and rows of ``6x4``; raise UsageError for anything else."""
     try:
         columns, rows = (int(word) for word in text.split("x"))
     except ValueError:
@@ -107,6 +107,6 @@ def read_counts(text: str, option: str) -> tuple[int, int]:
 
 @contextmanager
 def stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
-    """A progress bar for a person who waits, none in a log; what counts."""
+    """Show a progress bar to a person who waits, and none in a log; yield what counts."""
     with tqdm(total=total, desc=name, disable=None) as bar:
         yield bar.update

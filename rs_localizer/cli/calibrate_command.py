@@ -158,13 +158,13 @@ def _out(args: Options) -> Path:
 
 
 def _beside(args: Options, name: str) -> Path:
-    """The file beside ``OUT.yaml``, as ``OUT_map.yaml``."""
+    """Return the path of a file beside ``OUT.yaml``, as ``OUT_map.yaml``."""
     out = _out(args)
     return out.with_name(f"{out.stem}_{name}")
 
 
 def _lens_files(args: Options, cameras: Sequence[str] = ("",)) -> dict[str, Path]:
-    """Files of lenses alone by camera, where they are wanted; of a rig, ``FILE_NAME`` of each."""
+    """Return the files of single lenses by camera, if wanted; for a rig ``FILE_NAME`` of each."""
     file = args.camera_info
     if file is None:
         return {}
@@ -174,7 +174,7 @@ def _lens_files(args: Options, cameras: Sequence[str] = ("",)) -> dict[str, Path
 def _calibrated(
     args: Options, source: _Input, camera: Camera, config: NodeConfig
 ) -> CameraCalibration:
-    """Calibration of a camera by its images, printed."""
+    """Calibrate a camera by its images and print the result."""
     intrinsics = args.intrinsics or source.new_lens
     shown = covered(camera.size, (image.pixels for image in source.images))
     print(f"all images together show the map in {shown:.0%} of the image")
@@ -282,7 +282,7 @@ def _write(
     config: NodeConfig,
     refused: str,
 ) -> bool:
-    """FILE.yaml, and beside it the map as it was found; and what comes next.
+    """Write FILE.yaml, beside it the map as it was found, and print what comes next.
 
     Args:
         refused: why the shutter is not known, then it is left out; or ''.
@@ -325,7 +325,7 @@ def _write(
 def _deviations(
     found: Sequence[CameraCalibration], maps: Sequence[MarkerMap], config: NodeConfig
 ) -> dict[str, float]:
-    """The settings of what lenses and maps may be off by.
+    """Return the settings of the deviations of lens and map.
 
     Args:
         found: with lenses that were estimated, of which the worst counts; else those that were
@@ -348,7 +348,7 @@ def _write_files(
     args: Options, values: Mapping[str, Any], lens: Mapping[str, Any],
     cameras: Mapping[str, Camera], writers: Writers, remarks: Sequence[str],
 ) -> None:  # fmt: skip
-    """FILE.yaml, what goes beside it, and the lenses alone where they are wanted."""
+    """Write FILE.yaml, the files beside it, and the single lenses if they are wanted."""
     for name, file in _lens_files(args, list(cameras)).items():
         writers[file] = partial(write_calibration, camera=cameras[name])
     write = partial(write_camera_file, values=values, lens=lens, remarks=remarks)
@@ -356,7 +356,7 @@ def _write_files(
 
 
 def _next(args: Options, lens: bool, shape: Path | None) -> str:
-    """The command that makes poses of this recording with what was found.
+    """Return the command that makes poses of this recording with the calibration.
 
     Args:
         lens: whether that of the file takes the place of camera_info's.
@@ -427,14 +427,14 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
 
 
 def _without_k3(camera: Camera) -> Camera:
-    """With the four coefficients that Kalibr knows, if the lens does not need a fifth."""
+    """Return the camera with Kalibr's four coefficients, if the lens does not need a fifth."""
     if camera.distortion_model != DistortionModel.PLUMB_BOB or np.any(camera.D[4:]):
         return camera
     return replace(camera, D=np.r_[camera.D, np.zeros(4)][:4])
 
 
 def _tell_tf(path: Path, found: Mounted, own: str, first: str) -> None:
-    """Difference to what TF of a bag says of a camera's frame in that of the first one."""
+    """Print how TF of a bag differs from a camera's estimated pose in the first one's frame."""
     with open_bag(path) as bag:
         given = transform_between(bag, own, first)
     if given is not None:
@@ -447,7 +447,7 @@ def _tell_tf(path: Path, found: Mounted, own: str, first: str) -> None:
 def _parts(
     rig: Mapping[str, Mounted], recordings: Mapping[str, Recording], config: NodeConfig
 ) -> RigParts:
-    """The rig that was found, in the axes of its first camera and by its clock."""
+    """Return the estimated rig in the axes of its first camera and by its clock."""
     cameras = {}
     for name, one in rig.items():
         own = recordings[name].calibration

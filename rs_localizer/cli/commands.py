@@ -157,7 +157,7 @@ def main(
 
 
 def parse(name: str, module: ModuleType, words: Sequence[str]) -> tuple[Any, CommonOptions]:
-    """The options of a command, and those of all.
+    """Parse the options of a command, and the common ones.
 
     Raises:
         UsageError: for words that it does not understand.
@@ -174,7 +174,7 @@ def parse(name: str, module: ModuleType, words: Sequence[str]) -> tuple[Any, Com
 
 
 def _paths(options: Any) -> list[Path]:
-    """All paths among the options of a command."""
+    """Return all paths among the options of a command."""
     values = itertools.chain.from_iterable(
         value if isinstance(value, list) else [value] for value in vars(options).values()
     )
@@ -182,7 +182,7 @@ def _paths(options: Any) -> list[Path]:
 
 
 def _chosen(given: Sequence[str]) -> tuple[str, Sequence[str]]:
-    """The command, of one or two words, and its options, which may stand before it, too."""
+    """Return the command, of one or two words, and its options, which may stand before it."""
     before = list(itertools.takewhile(lambda word: word.startswith("-"), given))
     words = given[len(before) :]
     for count in (2, 1):
@@ -222,7 +222,7 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _said(name: str, error: Exception) -> int | None:
-    """Say what went wrong; the exit code, None for a fault in the program."""
+    """Print what went wrong and return the exit code; None for a fault in the program."""
     match error:
         case BrokenPipeError():  # nobody reads any more
             with contextlib.suppress(OSError, ValueError):
@@ -240,7 +240,7 @@ def _said(name: str, error: Exception) -> int | None:
 
 @contextlib.contextmanager
 def _output(common: CommonOptions) -> Iterator[io.StringIO | None]:
-    """Within ``with``, what is printed cannot steer the terminal; kept, where it is not shown."""
+    """Keep printed text from steering the terminal, within the context; yield hidden text."""
     if common.json or common.quiet:
         # No bar either, which is for a person who waits.
         sys.stderr.isatty = lambda: False  # type: ignore[method-assign]
@@ -259,7 +259,7 @@ _NEXT = "next: "
 
 
 def _json(name: str, result: Any, printed: str) -> str:
-    """The figures of a command and what comes next, or the lines that it has printed."""
+    """Return the figures of a command and what comes next, or the lines that it has printed."""
     lines = printed.splitlines()
     content: dict[str, Any] = {"text": lines} if result is None else {"result": result}
     following = [line.removeprefix(_NEXT) for line in lines if line.startswith(_NEXT)]

@@ -88,7 +88,7 @@ def run(options: Options) -> None:
 
 
 def read_frames(path: Path, most: int | None = None) -> list[FrameMessages]:
-    """The frames, or the first ones, of a recording of correspondences.
+    """Return the frames, or the first ones, of a recording of correspondences.
 
     Raises:
         BagError: when it cannot be read.

@@ -76,7 +76,7 @@ def run(options: Options) -> Figures:
 
 
 def _coverage(path: Path, posed: int, met: int, true: int) -> str:
-    """Share of what the truth knows that has been localized, as a sentence."""
+    """Return the share of the truth that has been localized, as a sentence."""
     try:
         with open_bag(path) as bag:
             topics = (CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC)

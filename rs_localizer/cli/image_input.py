@@ -65,12 +65,12 @@ class ImageOptions(LensOptions):
 
 
 def given_lens(options: ImageOptions) -> Camera | None:
-    """The camera of ``--camera``, if there is one."""
+    """Return the camera of ``--camera``, if there is one."""
     return None if options.calibration is None else read_calibration(options.calibration)
 
 
 def shutter_values(args: ImageOptions) -> dict[str, Any]:
-    """The settings that were given, or that stand beside the images of a bag, by dotted name."""
+    """Return the settings that were given, or that a bag has, by dotted name."""
     beside, calibration = args.recording / PARAMETERS, args.calibration
     given = args.params is not None or (calibration is not None and camera_values(calibration))
     if not given and is_bag(args.recording) and beside.exists():
@@ -86,7 +86,7 @@ def shutter_values(args: ImageOptions) -> dict[str, Any]:
 
 
 def telemetry_of(path: Path) -> Telemetry | None:
-    """Telemetry of a video; None: there is none, or stabilization has made it wrong.
+    """Return the telemetry of a video; None without any, or if stabilization has spoilt it.
 
     Raises:
         ValueError: for telemetry that cannot be read.
@@ -100,12 +100,12 @@ def _has_telemetry(path: Path) -> bool:
 
 
 def _can_read() -> bool:
-    """True with the extra ``video``: PyAV has one clock for images and gyroscope."""
+    """Return True with the extra ``video``: PyAV has one clock for images and gyroscope."""
     return all(importlib.util.find_spec(name) is not None for name in ("telemetry_parser", "av"))
 
 
 def tell_telemetry(args: ImageOptions, used: float | None = None) -> None:
-    """Say what a video knows of its camera, and what is not used of it.
+    """Say what a video knows of its camera, and which of it is not used.
 
     Args:
         args: of the video.
@@ -138,7 +138,7 @@ def tell_telemetry(args: ImageOptions, used: float | None = None) -> None:
 
 
 def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> None:
-    """Images that could not be used, and other messages that are kept."""
+    """Print images that could not be used, and other messages that are kept."""
     for detail in refused.values():
         print(f"images that cannot be used are left out, the first one because {detail}")
     if carried:
@@ -147,7 +147,7 @@ def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> Non
 
 
 def tell_times(clock: ImageClock | None, readout_time: float = 0.0, period: float = 0.0) -> None:
-    """Say where the times of images are from that have been read, and what speaks against them.
+    """Say where the times of the images come from, and what speaks against them.
 
     Args:
         readout_time: s, as it was given.
@@ -172,7 +172,7 @@ class Source:
 
 @contextlib.contextmanager
 def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
-    """Images of a recording with the lens of ``--camera`` or, of a bag, its camera_info.
+    """Open the images of a recording with the lens of ``--camera`` or the bag's camera_info.
 
     Args:
         args: of one camera.

@@ -38,7 +38,7 @@ class TargetOptions:
 
 
 def read_checked_map(path: Path) -> MarkerMap:
-    """The map of a file; warns of sizes in other units."""
+    """Read the map of a file, and warn of sizes in other units."""
     marker_map = read_marker_map(path)
     for fault in other_units(marker_map):
         print(f"warning: {path}: {fault}", file=sys.stderr)
@@ -46,7 +46,7 @@ def read_checked_map(path: Path) -> MarkerMap:
 
 
 def find_map(args: TargetOptions) -> MarkerMap:
-    """The map that was given, or that of the board.
+    """Return the given map, or the map of the given board.
 
     Raises:
         UsageError: when it is neither, or both.

@@ -32,7 +32,7 @@ class UsageError(ValueError):
 
 
 def argument(help: str, metavar: str, default: Any = MISSING) -> Any:  # noqa: A002
-    """A field that is given by its place; a list takes one or more.
+    """Declare a field that is given by its place; a list takes one or more.
 
     Args:
         help: what it is.
@@ -56,7 +56,7 @@ def option(
     above: bool = False,
     required: bool = False,
 ) -> Any:
-    """A field that is given by ``--its-name``.
+    """Declare a field that is given by ``--its-name``.
 
     Args:
         help: what it does; a default that is no None, False or empty list is added.
@@ -204,7 +204,7 @@ def _add(group: argparse._ActionsContainer, kind: type[Any], item: Any) -> None:
 
 
 def _element(hint: Any) -> tuple[Any, Any]:
-    """Type of one value, and how many there are: None for one, ``list``, or a number."""
+    """Return the type of one value, and the count: None for one, ``list``, or a number."""
     if isinstance(hint, types.UnionType):
         hint = next(part for part in hint.__args__ if part is not type(None))
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
@@ -216,7 +216,7 @@ def _element(hint: Any) -> tuple[Any, Any]:
 
 
 def read(kind: type[T], namespace: argparse.Namespace) -> T:
-    """The options that a parser has found."""
+    """Read the options that a parser has found."""
     hints = typing.get_type_hints(kind)
     given = {}
     for item in fields(kind):  # type: ignore[arg-type]
@@ -229,7 +229,7 @@ def read(kind: type[T], namespace: argparse.Namespace) -> T:
 
 
 def path(text: str) -> Path:
-    """A place on this machine; a URL is none."""
+    """Return a path on this machine; refuse a URL."""
     if _URL.match(text):
         raise argparse.ArgumentTypeError(
             f"must be a path of this machine, got {text}: mount it, or copy it here"
@@ -244,7 +244,7 @@ def number(
     above: bool = False,
     kind: type[float] | type[int] = float,
 ) -> Callable[[str], float]:
-    """A finite number from ``minimum`` to ``maximum``, for ``add_argument(type=...)``.
+    """Return a parser of finite numbers in a range, for ``add_argument(type=...)``.
 
     Args:
         above: the minimum itself is refused.

@@ -114,19 +114,19 @@ def _check_place(options: Options) -> None:
 
 
 def _settings(options: Options) -> NodeConfig:
-    """The settings that the options give."""
+    """Return the settings that the options give."""
     files = {"map_file": options.map, "camera_file": options.calibration}
     given = {name: str(file) for name, file in files.items() if file is not None}
     return build(given_values(options) | given)
 
 
 def _name(recording: Path) -> str:
-    """A recording's own name, for what is made of it."""
+    """Return a recording's own name, for its results."""
     return recording.resolve().with_suffix("").name
 
 
 def _pictures(recording: Path) -> str:
-    """Content of a recording without matches, as ``is a video``; empty: it has matches."""
+    """Describe a recording without matches, as ``is a video``; empty if it has matches."""
     if not is_bag(recording):
         return holds_images(recording)
     with open_bag(recording) as bag:
@@ -162,12 +162,12 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
 
 
 def _map_file(place: Path) -> Path:
-    """The landmarks of the result of map build, or of a file."""
+    """Return the file of the landmarks, also in a result of map build."""
     return place / MAP if (place / MAP).is_file() else place
 
 
 def _detection(options: Options, recording: Path, out: Path) -> detect_command.Options:
-    """Options of ``detect`` that find the matches of images."""
+    """Return the options of ``detect`` that find the matches of images."""
     from rs_localizer.cli import detect_command
 
     place = options.map

@@ -48,7 +48,7 @@ def check_there(recordings: Sequence[Path]) -> None:
 
 
 def cameras_of(args: T, recordings: Sequence[Path], config: NodeConfig) -> dict[str, OfRig[T]]:
-    """The cameras of recordings, by name: of one bag, or of a recording of each."""
+    """Return the cameras of recordings by name: of one bag, or of a recording of each."""
     if len(recordings) > 1:
         names = [re.sub(r"\W", "_", path.stem, flags=re.ASCII) for path in recordings]
         topics: list[dict[str, Any]] = [{"recording": path} for path in recordings]
@@ -75,7 +75,7 @@ def cameras_of(args: T, recordings: Sequence[Path], config: NodeConfig) -> dict[
 def _in_one_bag(
     path: Path, given: Sequence[str] | None
 ) -> tuple[list[str], list[dict[str, Any]], list[str]]:
-    """Names of the cameras of a bag, the topics of each, and its frame."""
+    """Return names of the cameras of a bag, the topics of each, and its frame."""
     if not is_bag(path):
         raise UsageError(f"--rig needs the recordings of several cameras, or one bag; got {path}")
     with open_bag(path) as bag:
@@ -89,7 +89,7 @@ def _in_one_bag(
 
 
 def mounting_lines(name: str, first: str, mounted: Extrinsics, deviations: Array) -> list[str]:
-    """Mounting of a camera beside the first one, and its clock; deviations (7,) in rad, m, s."""
+    """Describe a camera's mount beside the first one, and its clock; deviations (7,) rad, m, s."""
     turn = Rotation.from_matrix(mounted.axes).as_quat(canonical=True)
     turned, moved = np.degrees(deviations[:3]), 1e3 * deviations[3:6]
     return [
@@ -113,7 +113,7 @@ class MapCamera(Generic[T]):
 
 
 def map_cameras(args: T, recordings: Sequence[Path], config: NodeConfig) -> list[MapCamera[T]]:
-    """The cameras of recordings; those of a rig in the axes of the first.
+    """Return the cameras of recordings; those of a rig in the axes of the first.
 
     Raises:
         UsageError: when it is not known how they are mounted, or what their shutters are.
@@ -155,7 +155,7 @@ def map_cameras(args: T, recordings: Sequence[Path], config: NodeConfig) -> list
 
 
 def _by_tf(sources: Mapping[str, OfRig[T]]) -> dict[str, Transform]:
-    """Poses of the cameras by TF of a bag, in the axes of the first of them."""
+    """Return poses of the cameras by TF of a bag, in the axes of the first of them."""
     first = next(iter(sources.values()))
     path = first.args.recording
     if not is_bag(path):

@@ -18,7 +18,7 @@ if WORKING:
 
 
 def given_values(args: Any) -> dict[str, Any]:
-    """The values of a camera's file, of a params file, and single ones, by dotted name.
+    """Return the values of a camera's file, a params file and ``-p``, by dotted name.
 
     Each goes over those before.
 
@@ -44,12 +44,12 @@ def given_values(args: Any) -> dict[str, Any]:
 
 
 def given_settings(args: Any) -> NodeConfig:
-    """The settings of :func:`given_values`."""
+    """Return the settings of :func:`given_values`."""
     return build(given_values(args))
 
 
 def remapped(options: Any, known: Sequence[str] = (*INPUTS, IMAGE)) -> dict[str, str]:
-    """Topics that were given by ``-r``, by input; images are one.
+    """Return the topics that ``-r`` gives, by input; images are one.
 
     Raises:
         UsageError: for what is no input.
@@ -64,5 +64,5 @@ def remapped(options: Any, known: Sequence[str] = (*INPUTS, IMAGE)) -> dict[str,
 
 
 def given_topics(options: Any) -> dict[str, str | None]:
-    """Topics of the localizer's inputs."""
+    """Return the topics of the localizer's inputs."""
     return {name: topic for name, topic in remapped(options).items() if name in INPUTS}

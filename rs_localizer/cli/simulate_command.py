@@ -122,7 +122,7 @@ class Options(MotionOptions, CameraOptions, ResultOptions):
 
 
 def camera_of(args: Options) -> Camera:
-    """The camera of ``--camera``, or a webcam; its shutter is what the options say."""
+    """Return the camera of ``--camera``, or a webcam; its shutter is what the options say."""
     lens = Camera(640, 480, pinhole_matrix(500.0, 500.0, 319.5, 239.5), readout_time=_READOUT_TIME)
     values = dict[str, Any]()
     if args.camera is not None:
@@ -134,7 +134,7 @@ def camera_of(args: Options) -> Camera:
 
 
 def motion_of(args: Options) -> TrueMotion:
-    """The recorded motion, or one at constant velocity."""
+    """Return the recorded motion, or one at constant velocity."""
     angular, linear = args.angular_velocity, args.linear_velocity
     if args.trajectory is not None:
         if (angular, linear) != (None, None):
@@ -152,7 +152,7 @@ def motion_of(args: Options) -> TrueMotion:
 
 
 def stamps_of(args: Options, camera: Camera, motion: TrueMotion) -> list[int]:
-    """Times at which the frames begin, ns; ValueError when there are none."""
+    """Return the times at which the frames begin, ns; ValueError when there are none."""
     start_ns = motion.intervals_ns[0][0] + round(args.start * 1e9)
     end_ns = math.inf if args.duration is None else start_ns + round(args.duration * 1e9)
     every = frame_stamps(motion, camera, _POINTS.rate)
@@ -163,7 +163,7 @@ def stamps_of(args: Options, camera: Camera, motion: TrueMotion) -> list[int]:
 
 
 def world_of(args: Options, motion: TrueMotion, rng: np.random.Generator) -> Scene | Array:
-    """Surroundings of a motion: a scene to be rendered, or the points (n,3) of a room."""
+    """Return surroundings of a motion: a scene to be rendered, or the points (n,3) of a room."""
     if args.images:
         return SCENES[args.walls](sampled_states(motion))
     ways = [
@@ -177,7 +177,7 @@ def see(
     args: Options, world: Scene | Array, camera: Camera, motion: TrueMotion, stamps: list[int],
     place: int = 0,
 ) -> Iterator[SimulatedFrame | RenderedFrame]:  # fmt: skip
-    """Frames that a camera sees; ``place`` is its own among the random numbers."""
+    """Return the frames that a camera sees; ``place`` is its own among the random numbers."""
     seed = args.seed + place
     if isinstance(world, Scene):
         noise = _PICTURES.noise if args.noise is None else args.noise

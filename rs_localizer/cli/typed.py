@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def typed(executable: str, *words: str) -> str:
-    """The command line that runs an executable of this package here, with these arguments."""
+    """Return the command line that runs an executable of this package here."""
     return shlex.join([*_program(executable), *words])
 
 

@@ -37,7 +37,7 @@ class OutputError(ValueError):
 
 @contextlib.contextmanager
 def atomic_directory(directory: Path, earlier: Iterable[str] = ()) -> Iterator[Path]:
-    """Within ``with``, make a directory of the same name elsewhere, which then takes its place.
+    """Make a directory elsewhere within the context, which then takes the place of the old one.
 
     One that is there and empty, as a mount point may be, is filled.
 
@@ -69,7 +69,7 @@ def atomic_directory(directory: Path, earlier: Iterable[str] = ()) -> Iterator[P
 
 @contextlib.contextmanager
 def atomic_files(*files: Path) -> Iterator[tuple[Path, ...]]:
-    """Within ``with``, write to the paths that are yielded; those written then become the files.
+    """Yield paths to write to within the context; the written ones then become the files.
 
     All files of a folder change together.
 
@@ -94,7 +94,7 @@ def atomic_files(*files: Path) -> Iterator[tuple[Path, ...]]:
 
 
 def content(directory: Path) -> list[str]:
-    """Names in a directory; none if it is not there.
+    """Return the names in a directory; none if it is not there.
 
     Workplaces do not count, nor does what each disk has.
     """
@@ -150,14 +150,14 @@ def check_writable(place: Path) -> None:
 
 
 def remove_unfinished() -> None:
-    """Removal of what a process leaves that ends in the middle of its work."""
+    """Remove what a process has left that ended in the middle of its work."""
     for path in tuple(_unfinished):
         shutil.rmtree(path, ignore_errors=True)
 
 
 @contextlib.contextmanager
 def write_errors(path: Path) -> Iterator[None]:
-    """Faults of the file system within ``with`` name the path.
+    """Name the path in faults of the file system within the context.
 
     Writing to a full disk fails without saying which one.
     """
@@ -176,7 +176,7 @@ def write_errors(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _workplace(parent: Path) -> Iterator[Path]:
-    """Within ``with``, a locked directory beside the results."""
+    """Lock a directory beside the results for the context, and yield it."""
     resume(parent)
     work, lock = parent / f"{_UNFINISHED}{secrets.token_hex(8)}", None
     _unfinished.add(work)  # before it is there: a signal may come while it is made
@@ -196,7 +196,7 @@ def _workplace(parent: Path) -> Iterator[Path]:
 
 
 def _workplaces(folder: Path) -> list[Path]:
-    """Workplaces of this user in a folder; those of others are none of our business."""
+    """Return the workplaces of this user in a folder; other users' are left alone."""
     try:
         with os.scandir(folder) as items:
             found = [
@@ -242,7 +242,7 @@ def _lock(work: Path, wait: bool) -> int:
 
 
 def _commit(work: Path, folder: str, names: Sequence[str], earlier: Sequence[str] = ()) -> None:
-    """Have the results take their names, those of them that were made.
+    """Give the finished results their names.
 
     Args:
         work: the workplace, beside which the names are.
@@ -276,7 +276,7 @@ def _write_journal(work: Path, text: str) -> None:
 
 
 def _read_journal(work: Path) -> tuple[Path, list[str], list[str]] | None:
-    """Folder of the results, their names, and the names that go; None: there is no journal.
+    """Return the folder of the results, their names, and the names that go; None without journal.
 
     One that would reach beyond the folder of its workplace is none: an archive may have brought it.
     """
@@ -325,7 +325,7 @@ def _change_back(work: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Have a file on the disk, or a folder with all that is in it."""
+    """Write a file, or a folder with all that is in it, to the disk."""
     if path.is_symlink():
         return
     if path.is_dir():
@@ -338,7 +338,7 @@ def _sync(path: Path) -> None:
 
 
 def _sync_folders(*folders: Path) -> None:
-    """Have the names in folders on the disk, where the file system can do it."""
+    """Write the names in folders to the disk, if the file system can do it."""
     for folder in folders:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
@@ -352,7 +352,7 @@ def _sync_folders(*folders: Path) -> None:
 
 @contextlib.contextmanager
 def _renamed(names: dict[Path, Path]) -> Iterator[None]:
-    """Within ``with``, faults name the final path."""
+    """Name the final path in faults within the context."""
     try:
         yield
     except ValueError as error:
@@ -366,7 +366,7 @@ def _renamed(names: dict[Path, Path]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Signals wait while several names change."""
+    """Delay signals within the context, while several names change."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         yield

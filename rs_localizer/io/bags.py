@@ -66,7 +66,7 @@ limit_rosbags()
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """The message types of ROS 2 Jazzy, of detections and of videos in packets."""
+    """Return the message types of ROS 2 Jazzy, of detections and of videos in packets."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in _DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
@@ -74,7 +74,7 @@ def typestore() -> Typestore:
 
 
 def make_message(type_name: str, **fields: Any) -> Any:
-    """A message for :class:`BagWriter` of a type such as ``geometry_msgs/msg/Pose``.
+    """Make a message for :class:`BagWriter` of a type such as ``geometry_msgs/msg/Pose``.
 
     Every field has to be given; number arrays as NumPy arrays of the field's type.
     """
@@ -95,12 +95,12 @@ class BagReader:
         }
 
     def count(self, topics: Collection[str]) -> int:
-        """Number of messages that the recording holds on these topics."""
+        """Return the number of messages that the recording holds on these topics."""
         counts = self._reader.topics
         return sum(counts[topic].msgcount for topic in topics if topic in counts)
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Topic, time of recording in ns and message, in the order of that time.
+        """Yield topic, time of recording (ns) and message, in the order of that time.
 
         Raises:
             BagError: for a topic that is not in the recording, or damaged data.
@@ -156,7 +156,7 @@ def open_bag(path: Path | str) -> Iterator[BagReader]:
 
 
 def _fields_of(name: str, defined: Mapping[str, Any]) -> Any:
-    """The fields of a message type with all that they hold, names replaced by their fields."""
+    """Return the fields of a message type, with type names replaced by their fields."""
 
     def expanded(item: Any) -> Any:
         if isinstance(item, (tuple, list)):
@@ -167,14 +167,14 @@ def _fields_of(name: str, defined: Mapping[str, Any]) -> Any:
 
 
 def is_bag(path: Path) -> bool:
-    """True for a recording by what it holds, and no video or folder of images."""
+    """Return True for a recording, by its content; False for a video or a folder of images."""
     if path.is_dir():
         return (path / METADATA).exists() or bool(data_files(path))
     return bool(magic(path))
 
 
 def _listed(path: Path) -> tuple[list[Path] | None, bool]:
-    """The files that a folder's metadata lists, and whether its messages or files are packed.
+    """Return the files that a folder's metadata lists, and whether its content is packed.
 
     None: there is none that can be used. A recorder that was killed leaves its data without it, or
     an empty one.
@@ -215,7 +215,7 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def _as_ros2(message: Any, type_name: str) -> Any:
-    """A message of ROS 1 with the field names of ROS 2 (``header.seq`` stays as an extra)."""
+    """Convert a message of ROS 1 to the field names of ROS 2 (``header.seq`` stays as an extra)."""
     if type_name != "sensor_msgs/msg/CameraInfo":
         return message
     # ROS 2 spells D, K, R and P in lower case.

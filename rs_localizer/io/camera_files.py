@@ -68,7 +68,7 @@ class CalibrationError(ValueError):
 
 
 def read_calibration(path: Path | str) -> Camera:
-    """Camera of a calibration file (see the module); its readout time is 0 where it is not said.
+    """Read the camera of a calibration file (see the module); an unknown readout time is 0.
 
     Args:
         path: the file; ``FILE#NAME`` chooses one of several cameras in it.
@@ -92,7 +92,7 @@ def read_calibration(path: Path | str) -> Camera:
 
 @contextlib.contextmanager
 def calibration_faults(path: Path, kind: str, unusable: str) -> Iterator[None]:
-    """Faults within ``with`` of a file, and of what it says, name the file."""
+    """Name the file in faults within the context, of the file and of its content."""
     with file_faults(path, CalibrationError, kind):
         try:
             yield
@@ -130,7 +130,7 @@ T = TypeVar("T")
 
 
 def _choose(cameras: Mapping[str, T], name: str | None) -> T:
-    """The only camera of a file, or the one that is named."""
+    """Return the only camera of a file, or the one that is named."""
     if not cameras:
         raise ValueError("it has no camera")
     if name is None and len(cameras) == 1:
@@ -150,7 +150,7 @@ _TAG = re.compile(r"!!opencv[-_a-z]*")
 
 
 def _load_tree(text: str) -> Any:
-    """Mappings, lists and plain values of a file's text; YamlError for any other."""
+    """Return mappings, lists and plain values of a file's text; YamlError for anything else."""
     if text.lstrip()[:1] == "<":
         raise YamlError("it is XML, which OpenCV's FileStorage writes as .yaml or .json, too")
     return load_yaml(_TAG.sub("", _DIRECTIVE.sub("", text)))
@@ -166,7 +166,7 @@ def _gyroflow_camera(tree: dict[str, Any]) -> Camera:
 
 
 def lens_camera(lens: dict[str, Any]) -> Camera:
-    """The camera of :func:`lens_parameters`.
+    """Return the camera of :func:`lens_parameters`.
 
     Raises:
         ValueError, KeyError, TypeError: when something is missing or impossible.
@@ -177,7 +177,7 @@ def lens_camera(lens: dict[str, Any]) -> Camera:
 
 
 def _named_camera(tree: dict[str, Any]) -> Camera | None:
-    """The camera of a file of ROS or OpenCV, or of its usual names; None: it has no matrix."""
+    """Return the camera of a file of ROS or OpenCV, or with its usual names; None: no matrix."""
     K, D = (_first(tree, names) for names in (_K, _D))
     if K is None:
         return None
@@ -205,12 +205,12 @@ def _named_camera(tree: dict[str, Any]) -> Camera | None:
 
 
 def _first(tree: dict[str, Any], names: tuple[str, ...]) -> Any:
-    """The first of the names that the tree has; None: it has none."""
+    """Return the value of the first of these names that the tree has; None if it has none."""
     return next((tree[name] for name in names if tree.get(name) is not None), None)
 
 
 def _values(item: Any) -> Array:
-    """Numbers of a list, or of a matrix of ROS or OpenCV."""
+    """Return the numbers of a list, or of a matrix of ROS or OpenCV."""
     return np.array(item["data"] if isinstance(item, dict) else item, np.float64).ravel()
 
 
@@ -232,12 +232,12 @@ _HALF = 0.5
 
 
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
-    """The camera matrix (3,3)."""
+    """Return the camera matrix (3,3)."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def colmap_camera(text: str, chosen: str | None) -> Camera:
-    """The camera with the number ``chosen``, or the only one.
+    """Return the camera with the number ``chosen``, or the only one.
 
     Raises:
         ValueError: when there are several, or for a model that is not supported.
@@ -257,14 +257,14 @@ def colmap_camera(text: str, chosen: str | None) -> Camera:
 
 
 def pixel_intrinsics(camera: Camera) -> tuple[Array, Array]:
-    """Focal lengths (2,) and centre (2,) in px of the delivered image; 0, 0 is its first corner."""
+    """Return focal lengths (2,) and centre (2,), px of the delivered image, corner at 0, 0."""
     roi, binning = camera.roi, np.array(camera.binning, float)
     offset = np.zeros(2) if roi is None else np.array([roi.x_offset, roi.y_offset], float)
     return np.diag(camera.K)[:2] / binning, (camera.K[:2, 2] - offset) / binning + _HALF
 
 
 def colmap_parameters(camera: Camera) -> dict[str, Any]:
-    """``model`` and ``params`` that COLMAP knows a camera's delivered images by.
+    """Return ``model`` and ``params`` by which COLMAP knows a camera's delivered images.
 
     Raises:
         ValueError: for coefficients that no model of COLMAP has.
@@ -301,13 +301,13 @@ def _is_kalibr(tree: Any) -> bool:
 
 
 def _is_camera(item: Any) -> bool:
-    """True for one of several cameras, in Kalibr's file or in that of ``calibrate --rig``."""
+    """Return True for one of several cameras, of Kalibr's file or of ``calibrate --rig``."""
     ours = isinstance(item, dict) and {"camera_matrix", "image_width"} <= set(item)
     return ours or _is_kalibr(item)
 
 
 def kalibr_camera(tree: dict[str, Any]) -> Camera:
-    """The lens of one camera of a camchain.
+    """Return the lens of one camera of a camchain.
 
     Raises:
         ValueError, KeyError, TypeError: when something is missing or impossible.
@@ -330,7 +330,7 @@ def kalibr_camera(tree: dict[str, Any]) -> Camera:
 
 
 def kalibr_fields(camera: Camera) -> dict[str, Any]:
-    """Entries of Kalibr's camchain for a camera's lens.
+    """Return the entries of Kalibr's camchain for a camera's lens.
 
     Raises:
         ValueError: for a lens that it has no name for, or a binned or cropped image.
@@ -354,7 +354,7 @@ def kalibr_fields(camera: Camera) -> dict[str, Any]:
 
 
 def lens_parameters(camera: Camera) -> dict[str, Any]:
-    """``lens`` of a ROS params file, for :func:`read_calibration`; nodes pass over it."""
+    """Return ``lens`` of a ROS params file, for :func:`read_calibration`; nodes ignore it."""
     return {
         "image_width": camera.width,
         "image_height": camera.height,

@@ -28,7 +28,7 @@ class Calibration:
     roi: Roi | None
 
     def camera(self, readout_time: float, scan_direction: str) -> Camera:
-        """The camera with what CameraInfo does not know: how its shutter moves.
+        """Return the camera with the motion of its shutter, which CameraInfo does not have.
 
         Raises:
             MessageError: for a calibration that no camera can have, saying what was found.
@@ -51,7 +51,7 @@ class Calibration:
             raise MessageError(str(error)) from error
 
     def with_lens(self, lens: Camera) -> Calibration:
-        """The same image, of a camera with another lens.
+        """Return the calibration of the same image with another lens.
 
         Raises:
             MessageError: for a lens that is of another image.
@@ -106,7 +106,7 @@ _RATIONAL = 8  # coefficients of OpenCV's models and more
 
 
 def _lens(said: str, D: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
-    """The model and its coefficients, where what is said can mean one lens only.
+    """Return the model and its coefficients, if the message can mean one lens only.
 
     Drivers of ideal and simulated cameras name no model; others fill D with zeros, or write
     OpenCV's coefficients, which mean the same in all lengths, under the name of the shortest.

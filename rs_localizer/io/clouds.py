@@ -79,7 +79,7 @@ def read_correspondences(message: Any) -> Correspondences:
 
 
 def thinned(cloud: Correspondences, most: int, size: tuple[int, int]) -> Correspondences:
-    """The cloud with no more than ``most`` rows, in their order.
+    """Return the cloud with at most ``most`` rows, in their order.
 
     Those with the best scores; without scores, as many of each part of the image as there are.
 
@@ -120,12 +120,12 @@ class _Rows:
         return name in (self.table.dtype.names or ())
 
     def columns(self, *names: str) -> Array:
-        """Fields of one real number each as an array (n, len(names))."""
+        """Return fields of one real number each as an array (n, len(names))."""
         return np.stack([self.values[name] for name in names], axis=1)
 
 
 def _read_rows(message: Any, required: Sequence[str], optional: Sequence[str]) -> _Rows:
-    """The rows of a sensor_msgs/PointCloud2 with these fields; unusable rows are dropped."""
+    """Return the rows of a sensor_msgs/PointCloud2 with these fields, without unusable rows."""
     table = _view(message, required, optional)
     values: dict[str, Array] = {}
     finite = np.ones(len(table), dtype=np.bool_)
@@ -145,7 +145,7 @@ def _read_rows(message: Any, required: Sequence[str], optional: Sequence[str]) -
 
 
 def _view(message: Any, required: Sequence[str], optional: Sequence[str]) -> NDArray[Any]:
-    """The known fields of a cloud as a structured array (n,) over the message's own data."""
+    """Return the known fields of a cloud as a structured array (n,) over the message's own data."""
     width, height = int(message.width), int(message.height)
     point_step, row_step = int(message.point_step), int(message.row_step)
     if width == 0 or height == 0:
@@ -182,7 +182,7 @@ def _view(message: Any, required: Sequence[str], optional: Sequence[str]) -> NDA
 
 @lru_cache(maxsize=16)
 def _row_type(fields: tuple[Field, ...], point_step: int, big_endian: bool) -> np.dtype[Any]:
-    """Structured type of one row; a camera's clouds all have the same."""
+    """Return the structured type of one row; a camera's clouds all have the same."""
     if point_step > _LONGEST_ROW:
         raise MessageError(f"point_step is {point_step}, more than {_LONGEST_ROW}")
     names = [field[0] for field in fields]
@@ -208,7 +208,7 @@ def _row_type(fields: tuple[Field, ...], point_step: int, big_endian: bool) -> n
 
 
 def select_inliers(table: NDArray[Any], inliers: NDArray[np.bool_], residuals: Array) -> Any:
-    """Packed little-endian rows (k,) of a cloud's table that were kept, with their residual.
+    """Return packed little-endian rows (k,) of the inliers in a cloud's table, with residuals.
 
     Args:
         table: (n,) :attr:`Correspondences.table`.
@@ -230,7 +230,7 @@ def _packed(row_type: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def make_cloud(make: Make, stamp: int, frame: str, rows: NDArray[Any]) -> Any:
-    """A sensor_msgs/PointCloud2 of packed little-endian rows (k,), of numbers or arrays of them."""
+    """Make a sensor_msgs/PointCloud2 of packed little-endian rows (k,)."""
     row_type = rows.dtype
     fields = [
         make(
@@ -308,7 +308,7 @@ def read_map(message: Any) -> Map:
 
 
 def _marks(rows: _Rows, message: Any) -> tuple[Ids | None, Descriptors | None]:
-    """Ids (n,) and descriptors (n,d) that the points are recognized by."""
+    """Return ids (n,) and descriptors (n,d) by which the points are recognized."""
     if not rows.has("id") and not rows.has("descriptor"):
         names = ", ".join(str(item.name) for item in message.fields)
         raise MessageError(f"the cloud has neither a field id nor descriptor; found {names}")

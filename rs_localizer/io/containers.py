@@ -37,7 +37,7 @@ _OTHERS = (".jpg", ".jpeg", ".png", ".yaml", ".txt", ".csv", ".json", ".mp4")
 
 
 def magic(path: Path) -> bytes:
-    """First bytes of a file, of those that may be recordings; empty: it is none."""
+    """Return the first bytes of a file that may be a recording; empty if it cannot be one."""
     with contextlib.suppress(OSError), path.open("rb") as file:
         start = file.read(16)
         kind = next((known for known in (*_SUFFIX, ZSTD) if start.startswith(known)), b"")
@@ -46,7 +46,7 @@ def magic(path: Path) -> bytes:
 
 
 def _has_messages(path: Path) -> bool:
-    """True for a database that is a recording, and not one of COLMAP, say; a damaged one may be."""
+    """Return True for a database that may be a recording (a damaged one, too), not COLMAP's."""
     try:
         with contextlib.closing(
             sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
@@ -58,7 +58,7 @@ def _has_messages(path: Path) -> bool:
 
 
 def data_files(folder: Path) -> list[Path]:
-    """The files of a folder that are recordings, in the order of the numbers in their names."""
+    """Return files of a folder that are recordings, in the order of the numbers in their names."""
     files = [
         file for file in folder.iterdir() if file.suffix.lower() not in _OTHERS and magic(file)
     ]
@@ -70,7 +70,7 @@ def data_files(folder: Path) -> list[Path]:
 def storage(
     path: Path, files: list[Path] | None, packed: bool, unpack: Callable[[Path, Path], object]
 ) -> Iterator[list[Path]]:
-    """Within ``with``, what rosbags opens of a recording: files, or a folder with its metadata.
+    """Yield what rosbags opens of a recording: files, or a folder with its metadata.
 
     Args:
         path: of a file, or of a folder.
@@ -157,7 +157,7 @@ _RECORD = struct.Struct("<BQ")
 
 
 def _chunks(file: BinaryIO) -> Iterator[tuple[int, int, int, int]]:
-    """First and last time (ns), and bytes packed and unpacked, of the chunks that the index has."""
+    """Yield first and last time (ns), packed and unpacked bytes of the chunks in the index."""
     file.seek(-_FOOTER_BYTES, 2)
     summary = int.from_bytes(file.read(17)[9:], "little")
     file.seek(summary)
@@ -178,7 +178,7 @@ def _chunks(file: BinaryIO) -> Iterator[tuple[int, int, int, int]]:
 
 
 def _most_at_a_time(chunks: Iterable[tuple[int, int, int, int]]) -> tuple[int, int]:
-    """Bytes, packed and unpacked, of the chunks that are open at once as they are read by time."""
+    """Return packed and unpacked bytes of the chunks that are open at once, read by time."""
     changes = sorted(
         change
         for start, end, packed, unpacked in chunks
@@ -220,7 +220,7 @@ def _too_large(packed: int, most: int) -> UnpackingError:
 
 
 def _zstd() -> Any:
-    """The module that rosbags unpacks with: of Python from 3.14 on, else of a package."""
+    """Return the module with which rosbags unpacks: Python's own from 3.14 on, else a package."""
     reader = vars(rosbags.rosbag2.reader)
     return reader["zstd"] if "zstd" in reader else reader["zstandard"]
 
@@ -254,7 +254,7 @@ def unpack_file(packed: Path, out: Path) -> None:
 
 
 def limit_rosbags() -> None:
-    """Have rosbags read chunks by these decompressors, and no QoS of recordings."""
+    """Make rosbags read chunks by these decompressors, and ignore the QoS of recordings."""
     limited: dict[str, Callable[[bytes], bytes]] = {"zstd": unpack_zstd, "bz2": _unpack_bz2}
     if importlib.util.find_spec("lz4") is not None:  # else it packs 255 times at most by its format
         limited["lz4"] = _unpack_lz4

@@ -38,7 +38,7 @@ class ImageClock:
     _absolute: bool = False
 
     def relative(self, own_ns: int | None) -> int | None:
-        """Stamp of the next image of a video, by its presentation time; None: not known.
+        """Return the stamp of a video's next image by its presentation time; None if unknown.
 
         Raises:
             TimesError: when the file has no times and no rate was given.
@@ -46,7 +46,7 @@ class ImageClock:
         return self._stamp(own_ns)
 
     def absolute(self, own_ns: int) -> int:
-        """Stamp of the next file of a folder whose names are times."""
+        """Return the stamp of the next file of a folder whose names are times."""
         self._absolute = True
         stamp = self._stamp(own_ns)
         assert stamp is not None
@@ -77,7 +77,7 @@ class ImageClock:
         return None if own_ns is None else self._zero_ns + own_ns
 
     def at(self, own_ns: int) -> int | None:
-        """Stamp of a moment of a video's clock, after its first image; None: with a rate."""
+        """Return the stamp of a time of a video's clock after its first image; None with a rate."""
         return self._zero_ns + own_ns if self.rate is None and self._images else None
 
     @property
@@ -87,7 +87,7 @@ class ImageClock:
         return (self._timed - 1) * 1e9 / span if span > 0 else None
 
     def description(self) -> str:
-        """Origin of the stamps, in one sentence."""
+        """Describe the origin of the stamps in one sentence."""
         own = "the names of the files" if self._absolute else "the presentation times of the video"
         source = own if self.rate is None else f"--rate {self.rate:g}"
         own_rate = self.own_rate
@@ -96,7 +96,7 @@ class ImageClock:
         return f"times: {source}{pace}; the first image at {round(first_ns * 1e-9, 3):.14g} s"
 
     def fault(self) -> str | None:
-        """Fault of the images' times, or else of a given rate."""
+        """Describe the fault of the images' times, or of a given rate."""
         own_rate = self.own_rate
         if self.missing is not None or self.rate is None or own_rate is None:
             return self.missing
@@ -110,7 +110,7 @@ class ImageClock:
         )
 
     def slow_motion(self) -> str | None:
-        """Sentence on a video that plays at another rate than it was taken at; None: as it was."""
+        """Describe a video that plays at another rate than it was taken at; None if it does not."""
         pace = self.rate or self.own_rate
         if self.captured is None or pace is None:
             return None
@@ -130,7 +130,7 @@ class ImageClock:
 
 
 def readout_fault(readout_time: float, period: float) -> str | None:
-    """Fault of a readout that takes longer than from one image to the next.
+    """Describe the fault of a readout that is longer than the interval of images.
 
     Args:
         readout_time: s.

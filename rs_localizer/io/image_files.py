@@ -32,7 +32,7 @@ _AS_IT_IS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENT
 
 
 def packed_image(file: Path) -> tuple[bytes, str]:
-    """The bytes of a JPEG or PNG and its format, as of a sensor_msgs/CompressedImage.
+    """Return the bytes of a JPEG or PNG and its format, as of a sensor_msgs/CompressedImage.
 
     Raises:
         MessageError: for what OpenCV cannot decode, or would decode to too much.
@@ -56,7 +56,7 @@ def packed_image(file: Path) -> tuple[bytes, str]:
 
 
 def _claimed_size(data: bytes) -> tuple[int, int]:
-    """Width and height by the header, which a decoder allocates at once.
+    """Return width and height of the header, which a decoder allocates at once.
 
     Raises:
         MessageError: when it cannot be read, or turns the image.

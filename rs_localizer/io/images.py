@@ -90,7 +90,7 @@ class Image:
 
 
 def most_pixels(packed: int) -> int:
-    """Pixels that an image of a camera may have that is packed to so many bytes."""
+    """Return the most pixels that an image of so many packed bytes may have."""
     return min(_ALIKE + _DENSEST * packed, MOST_PIXELS)
 
 
@@ -150,7 +150,7 @@ def read_compressed_image(message: Any) -> Image:
 
 
 def in_color(message: Any, image: Image) -> NDArray[np.uint8]:
-    """The pixels of a message: (h,w,3) of colours of 8 bits, else gray ones (h,w)."""
+    """Return the pixels of a message: (h,w,3) for 8-bit colours, otherwise grey ones (h,w)."""
     height, width = image.pixels.shape
     if hasattr(message, "format"):
         data = np.frombuffer(bytes(message.data), np.uint8)
@@ -168,7 +168,7 @@ COLORS = ("bgr8", "rgb8")
 
 
 def decode(packed: bytes, format_: str) -> Gray:
-    """The pixels (h,w) of a JPEG or PNG; ``format_`` is what is said of it.
+    """Decode the pixels (h,w) of a JPEG or PNG; ``format_`` is the format that is claimed.
 
     Raises:
         MessageError: for anything else, or an image that is truncated or damaged.
@@ -212,7 +212,7 @@ def check_size(size: tuple[int, int], count: int, what: str) -> None:
 
 
 def _claimed_size(data: bytes, name: str) -> tuple[int, int] | None:
-    """Width and height by the header, which the decoder allocates at once; None: not found."""
+    """Return width and height of the header, which the decoder allocates; None: not found."""
     if name == "PNG":
         return struct.unpack_from(">II", data, 16) if len(data) >= 24 else None
     position = 2
@@ -227,7 +227,7 @@ def _claimed_size(data: bytes, name: str) -> tuple[int, int] | None:
 
 
 def _still_png(data: bytes) -> bytes:
-    """The chunks of a still image; those of animations crash OpenCV 5.0 when they are damaged.
+    """Return the chunks of a still image; damaged ones of animations crash OpenCV 5.0.
 
     Raises:
         MessageError: when a chunk is longer than the data; the decoder allocates what it claims.
@@ -244,7 +244,7 @@ def _still_png(data: bytes) -> bytes:
 
 
 def _ends_with(data: Gray, mark: bytes) -> bool:
-    """True if the mark is at the end; zeros may follow, of drivers that send whole buffers."""
+    """Return True if the mark is at the end; zeros may follow, of whole buffers."""
     last = np.flatnonzero(data)
     end = int(last[-1]) + 1 if len(last) else 0
     return data[max(0, end - len(mark)) : end].tobytes() == mark
@@ -259,7 +259,7 @@ def _gray(raw: NDArray[Any], encoding: _Encoding) -> Gray:
 
 
 def _eight_bits(image: NDArray[Any]) -> Gray:
-    """Eight bits of sixteen: the upper ones that the image uses, as sensors fill 10 or 12.
+    """Reduce sixteen bits to the upper eight that are used, as sensors fill 10 or 12.
 
     Where those have few values, as of a thermal image, or beside a pixel that is always bright,
     all between nearly the darkest and nearly the brightest one; none is spread over several.

@@ -89,7 +89,7 @@ def _checked(values: Vector, name: str, unit: str, most: float) -> Vector:
 def make_reading(
     stamp_ns: int, rate: Array, force: Array, frame: str, variances: tuple[float, float] = (0, 0)
 ) -> Any:
-    """A sensor_msgs/Imu of rosbags, without an orientation.
+    """Make a sensor_msgs/Imu of rosbags, without an orientation.
 
     Of a rate (3,) in rad/s and a force (3,) in m/s^2 (NaN: not measured), with their variances (0:
     not known).

@@ -27,13 +27,13 @@ class MessageError(ValueError):
 
 
 def stamp_ns(message: Any) -> int:
-    """Stamp of a message's header in integer nanoseconds."""
+    """Return the stamp of a message's header in integer nanoseconds."""
     stamp = message.header.stamp
     return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
 
 
 def frame_id(message: Any, what: str) -> str:
-    """Frame of a message's header; without a name, nothing can be said about poses in it."""
+    """Return the frame of a message's header, or refuse an empty one: poses need a frame."""
     name = str(message.header.frame_id)
     if not name:
         raise MessageError(f"header.frame_id is empty; it must name {what}")
@@ -41,7 +41,7 @@ def frame_id(message: Any, what: str) -> str:
 
 
 def make_header(make: Make, stamp: int, frame: str) -> Any:
-    """A header with a stamp in nanoseconds."""
+    """Return a header with a stamp in nanoseconds."""
     seconds, nanoseconds = divmod(stamp, _NANOSECONDS)
     return make(
         "std_msgs/msg/Header",
@@ -51,13 +51,13 @@ def make_header(make: Make, stamp: int, frame: str) -> Any:
 
 
 def make_vector(make: Make, vector: Array, kind: str = "Vector3") -> Any:
-    """A Vector3, or a Point, of geometry_msgs with the values of a vector (3,)."""
+    """Return a Vector3, or a Point, of geometry_msgs with the values of a vector (3,)."""
     x, y, z = vector.tolist()
     return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
 
 def make_quaternion(make: Make, rotation: Array) -> Any:
-    """A geometry_msgs/Quaternion of a rotation matrix (3,3)."""
+    """Return a geometry_msgs/Quaternion of a rotation matrix (3,3)."""
     from rs_localizer.core import so3  # kernels, which readers do not need
 
     x, y, z, w = so3.quaternion(np.ascontiguousarray(rotation)).tolist()

@@ -85,13 +85,13 @@ class Localized:
 
 
 def _sent(covariance: Array) -> Array:
-    """A covariance (6,6) as messages have it (36,): -1 on the diagonal where there is none."""
+    """Return a covariance (6,6) as in messages (36,), with -1 on the diagonal if there is none."""
     known: Array = -np.eye(6) if np.isnan(covariance[0, 0]) else covariance
     return known.ravel()
 
 
 def messages(frame: Localized, make: Make) -> dict[str, Any]:
-    """The messages of a frame by output topic (see :data:`TYPES`), the same for node and replay.
+    """Return the messages of a frame by topic (:data:`TYPES`), for node and replay alike.
 
     Without a readout time there is neither twist nor odometry: zeros would be a claim. Where the
     twist is unknown, those with covariance say so.
@@ -102,7 +102,7 @@ def messages(frame: Localized, make: Make) -> dict[str, Any]:
 def each_message(
     frame: Localized, make: Make, wanted: Collection[str]
 ) -> Iterator[tuple[str, Any]]:
-    """Those of these topics, one after the other; each is built when it is asked for."""
+    """Yield the messages of these topics; each is built when it is asked for."""
     twist, known = frame.twist, frame.known_twist is not None
     if twist is not None and not known:
         twist = _UNKNOWN

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What readers of files need: text, YAML and JSON of people and programs, all with limits.
+"""Readers of text, YAML and JSON of people and programs, all with limits.
 
 Files come from others. What is larger than anybody writes, packs much more than it holds, or kills
 the library that reads it, is refused in a sentence.
@@ -41,7 +41,7 @@ class YamlError(ValueError):
 
 @contextlib.contextmanager
 def file_faults(path: Path, fault: type[ValueError], kind: str = "YAML") -> Iterator[None]:
-    """Faults of reading a text file, and of what it holds, within ``with`` name the file."""
+    """Name the file in faults of reading a text file and of its content."""
     try:
         yield
     except OSError as error:
@@ -51,7 +51,7 @@ def file_faults(path: Path, fault: type[ValueError], kind: str = "YAML") -> Iter
 
 
 def read_text(path: Path, encoding: str = "utf-8") -> str:
-    """Text of a file that somebody wrote.
+    """Read the text of a file.
 
     Raises:
         YamlError: for one that is longer than anybody writes, or does not end.
@@ -68,7 +68,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     """PyYAML's, without what takes much more time or memory than its text does."""
 
     def flatten_mapping(self, node: Any) -> None:
-        """Merges (``<<``) are copies, of copies where these merge, too."""
+        """Refuse merges (``<<``), which copy mappings, and copies of copies."""
         if any(key.tag == "tag:yaml.org,2002:merge" for key, _ in node.value):
             raise YamlError("it merges mappings (<<), which parameters of ROS do not either")
 
@@ -80,7 +80,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 
 
 def load_yaml(text: str) -> Any:
-    """Content of the text, YAML or JSON: mappings, lists, and plain values.
+    """Return the content of the text, YAML or JSON: mappings, lists, and plain values.
 
     Raises:
         YamlError: for anything else, saying what was found.
@@ -116,7 +116,7 @@ def parameter_blocks(tree: Any, node: str = "", path: str = "") -> Iterator[tupl
 
 
 def flat(tree: dict[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names of nested mappings, and their values."""
+    """Yield the dotted names of nested mappings, and their values."""
     for key, value in tree.items():
         if isinstance(value, dict):
             yield from flat(value, f"{prefix}{key}.")
@@ -125,7 +125,7 @@ def flat(tree: dict[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _checked(tree: Any, most: int) -> Any:
-    """The tree; refused, with a YamlError, where it is larger or deeper than anything written."""
+    """Return the tree, or raise a YamlError if it is larger or deeper than any written one."""
     waiting, count = [(tree, 0)], 0
     while waiting:
         value, depth = waiting.pop()
@@ -150,7 +150,7 @@ _MEASURED, _LARGE = 8, 2**27
 
 
 def most_unpacked(packed: int) -> int:
-    """Bytes that so many packed bytes of a message or a text may become."""
+    """Return the most bytes that so many packed bytes of a message or a text may become."""
     return min(BEST_PACKED * packed + _ALIKE, max(_LARGE, _MEASURED * packed))
 
 
@@ -177,7 +177,7 @@ class LimitedError(ValueError):
 def run_limited(
     script: Path, task: dict[str, Any], memory: int, seconds: int
 ) -> dict[str, NDArray[Any]]:
-    """Arrays of numbers or of text, by name, that ``python SCRIPT TASK.json OUT.npz`` leaves.
+    """Return the arrays that ``python SCRIPT TASK.json OUT.npz`` leaves, by name.
 
     Args:
         script: run by its path.

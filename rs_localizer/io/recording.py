@@ -41,7 +41,7 @@ def write_frame(
     pixels: Array,
     ids: NDArray[np.int64],
 ) -> None:
-    """Camera info and correspondences of an image: points (n,3), raw pixels (n,2), ids (n,)."""
+    """Write camera info and correspondences of an image: points (n,3), pixels (n,2), ids (n,)."""
     bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, stamp_ns), stamp_ns)
     cloud = make_correspondences(stamp_ns, points, pixels, ids)
     bag.write(CORRESPONDENCES_TOPIC, cloud, stamp_ns)
@@ -50,7 +50,7 @@ def write_frame(
 def make_correspondences(
     stamp_ns: int, points: Array, pixels: Array, ids: NDArray[np.int64]
 ) -> Any:
-    """A sensor_msgs/PointCloud2 of points (n,3), raw pixels (n,2) and ids (n,)."""
+    """Make a sensor_msgs/PointCloud2 of points (n,3), raw pixels (n,2) and ids (n,)."""
     rows = np.empty(len(points), _ROW)
     for column, name in enumerate("xyz"):
         rows[name] = points[:, column]
@@ -59,7 +59,7 @@ def make_correspondences(
 
 
 def make_image(stamp_ns: int, encoding: str, data: bytes, frame: str = CAMERA_FRAME) -> Any:
-    """The sensor_msgs/CompressedImage of a ``jpeg`` or ``png``."""
+    """Make the sensor_msgs/CompressedImage of a ``jpeg`` or ``png``."""
     return make_message(
         "sensor_msgs/msg/CompressedImage",
         header=make_header(make_message, stamp_ns, frame),
@@ -69,7 +69,7 @@ def make_image(stamp_ns: int, encoding: str, data: bytes, frame: str = CAMERA_FR
 
 
 def make_camera_info(camera: Camera, stamp_ns: int, frame: str = CAMERA_FRAME) -> Any:
-    """The sensor_msgs/CameraInfo of a camera."""
+    """Make the sensor_msgs/CameraInfo of a camera."""
     roi = camera.roi or Roi(0, 0, 0, 0)
     return make_message(
         "sensor_msgs/msg/CameraInfo",

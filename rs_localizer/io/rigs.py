@@ -55,7 +55,7 @@ class RigParts(NamedTuple):
 
 
 def read_camchain(path: Path | str) -> RigParts:
-    """The cameras of a camchain or of ``calibrate --rig``.
+    """Read the cameras of a camchain or of ``calibrate --rig``.
 
     Without ``T_cam_imu``, a camchain is in the axes of its first camera.
 
@@ -69,7 +69,7 @@ def read_camchain(path: Path | str) -> RigParts:
 
 
 def mounted_lenses(parts: RigParts) -> dict[str, Any]:
-    """``lens`` of the params file of a rig; :func:`node_parameters` are its settings."""
+    """Return ``lens`` of the params file of a rig; :func:`node_parameters` are its settings."""
     return {
         name: lens_parameters(camera)
         | {_MOUNT: _matrix(*parts.camera_from_rig[name]).ravel().tolist()}
@@ -165,7 +165,7 @@ def _rigid(name: str, values: Any) -> Array:
 
 
 def node_parameters(parts: RigParts) -> dict[str, Any]:
-    """The node's parameters for a rig, but for where its cameras are, which TF says."""
+    """Return the node's parameters for a rig, without the extrinsics, which come from TF."""
     own: dict[str, Any] = {}
     for name, camera in parts.cameras.items():
         values = (camera.readout_time, str(camera.scan_direction))

@@ -65,7 +65,7 @@ class Telemetry:
 
 
 def has_telemetry(path: Path) -> bool:
-    """True for a file that looks as if it had any, without reading it."""
+    """Return True for a file that seems to have telemetry, without reading it."""
     with path.open("rb") as file:
         looked_at = file.read(_LOOKED_AT)
         file.seek(max(0, path.stat().st_size - _LOOKED_AT))
@@ -74,7 +74,7 @@ def has_telemetry(path: Path) -> bool:
 
 
 def _tracks(file: BinaryIO) -> bytes:
-    """The box of an MP4 that lists its tracks: megabytes, of long videos; empty: none."""
+    """Return the box of an MP4 that lists its tracks, megabytes for long videos; may be empty."""
     at = file.seek(0)
     while len(start := file.read(16)) >= 8:
         size, kind = struct.unpack(">I4s", start[:8])
@@ -88,7 +88,7 @@ def _tracks(file: BinaryIO) -> bytes:
 
 @functools.lru_cache(maxsize=1)
 def read_telemetry(path: Path) -> Telemetry | None:
-    """The telemetry of a video; None: it has no gyroscope.
+    """Read the telemetry of a video; None if it has no gyroscope.
 
     Raises:
         TelemetryError: when it cannot be read, or is more than such a file can hold.
@@ -106,7 +106,7 @@ def read_telemetry(path: Path) -> Telemetry | None:
 
 
 def interpreted(found: dict[str, Any]) -> Telemetry | None:
-    """Telemetry of the numbers and words of :mod:`rs_localizer.io.telemetry_process`.
+    """Interpret numbers and words of :mod:`rs_localizer.io.telemetry_process`.
 
     Raises:
         TelemetryError: for numbers that no gyroscope gives.
@@ -136,7 +136,7 @@ def interpreted(found: dict[str, Any]) -> Telemetry | None:
 
 
 def _plausible(times: Array, rates: Array) -> tuple[Array, Array]:
-    """The readings that are numbers of a gyroscope, at times that rise; nearly all have to be."""
+    """Return the plausible readings of a gyroscope, at rising times; nearly all have to be."""
     usable = np.isfinite(times) & np.all(np.abs(rates) < _FASTEST, axis=1)
     latest = np.maximum.accumulate(np.where(usable, times, -np.inf))
     usable &= np.append(-np.inf, latest[:-1]) < times if len(times) else usable
@@ -149,7 +149,7 @@ def _plausible(times: Array, rates: Array) -> tuple[Array, Array]:
 
 
 def _of_orientations(rows: Array) -> tuple[Array, Array]:
-    """Times (n,) s and rates (n,3) rad/s of a camera that writes how it is turned instead (DJI).
+    """Return times (n,) s and rates (n,3) rad/s of a camera that writes orientations (DJI).
 
     The library has orientations of a camera with x right, y up and z back. GoPros write both: rates
     from their orientations are those of the gyroscope, by scales of 1.00 +- 0.01 about each axis.
@@ -179,7 +179,7 @@ def _number(value: Any) -> float:
 
 
 def _spread(forces: Array, times: Array) -> Array:
-    """Specific forces (k,3) at the times (n,) of the gyroscope.
+    """Interpolate specific forces (k,3) at the times (n,) of the gyroscope.
 
     The library numbers both alike, so that those of a slower accelerometer come too early: they
     are as long as the gyroscope's, at a rate of their own.

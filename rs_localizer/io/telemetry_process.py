@@ -15,7 +15,7 @@ import numpy as np
 
 
 def extract(parser: Any) -> dict[str, Any]:
-    """Arrays of a ``telemetry_parser.Parser``: readings, orientations, and what else is said.
+    """Extract readings, orientations and metadata of a ``telemetry_parser.Parser``.
 
     Returns:
         ``gyroscope`` and ``accelerometer`` (n,4) ms and three numbers, ``turns`` (k,5) ms and
@@ -44,7 +44,7 @@ def _readings(samples: list[dict[str, Any]], name: str) -> Any:
 
 
 def _values(groups: list[dict[str, Any]]) -> dict[str, Any]:
-    """Values by name, whatever group they stand in; of one name, and of a list, the first."""
+    """Return values by name from all groups; of one name, and of a list, the first."""
     found: dict[str, Any] = {}
     for part in reversed([part for group in groups for part in group.values()]):
         if isinstance(part, dict):

@@ -55,7 +55,7 @@ class Trajectory:
         return len(self.stamps_ns)
 
     def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Trajectory:
-        """The poses of some rows."""
+        """Return the poses of some rows."""
         return Trajectory(self.stamps_ns[rows], self.positions[rows], self.quaternions[rows])
 
 
@@ -71,7 +71,7 @@ class Twists:
         return len(self.stamps_ns)
 
     def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Twists:
-        """The twists of some rows."""
+        """Return the twists of some rows."""
         return Twists(self.stamps_ns[rows], self.angular[rows], self.linear[rows])
 
 
@@ -117,7 +117,7 @@ def write_twists(path: Path | str, twists: Twists, about: Sequence[str] = ()) ->
 
 
 def split_at_gaps(trajectory: Trajectory) -> list[Trajectory]:
-    """Parts without a pause longer than three times the median spacing.
+    """Split at pauses longer than three times the median spacing.
 
     A recording that lost track for a while says nothing of the motion meanwhile.
     """
@@ -130,7 +130,7 @@ def split_at_gaps(trajectory: Trajectory) -> list[Trajectory]:
 
 
 def parse_stamp(text: str) -> int:
-    """Nanoseconds of a decimal number of seconds, exact (also ``1.5e9``)."""
+    """Parse a decimal number of seconds to exact nanoseconds (also ``1.5e9``)."""
     seconds = Decimal(text)
     # Compared first: the integer of 1e999999999 would fill the memory.
     if not seconds.is_finite() or abs(seconds) >= _LATEST:
@@ -139,7 +139,7 @@ def parse_stamp(text: str) -> int:
 
 
 def format_stamp(stamp_ns: int) -> str:
-    """Seconds with nine decimals."""
+    """Format seconds with nine decimals."""
     seconds, nanoseconds = divmod(abs(int(stamp_ns)), 1_000_000_000)
     return f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
 
@@ -151,7 +151,7 @@ def _open(path: Path, mode: Literal["r", "w"]) -> TextIO:
 
 
 def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64], Array]:
-    """Times in ns and the other columns; comments, headings and empty lines are skipped."""
+    """Return times (ns) and the other columns, without comments, headings and empty lines."""
     stamps, numbers, table = array("q"), array("q"), array("d")  # lists take ten times the memory
     for number, line in _lines(path):
         words = line.replace(",", " ").split()
@@ -234,7 +234,7 @@ class Motions:
 def read_motions(
     path: Path, pose_topic: str | None = None, twist_topic: str | None = None
 ) -> Motions:
-    """Poses and twists of a TUM file, a directory made by replay, or a recording.
+    """Read poses and twists of a TUM file, a directory made by replay, or a recording.
 
     Args:
         pose_topic, twist_topic: where a recording has them; default: its only PoseStamped or
@@ -291,7 +291,7 @@ def _sentence(bag: BagReader, fault: str, topics: Collection[str]) -> str:
 
 
 def _by_stamp(bag: BagReader, topic: str) -> dict[int, Any]:
-    """Messages in the order of their stamps, one for each."""
+    """Return the messages by stamp, in its order, one for each."""
     messages = {stamp_ns(message): message for _, _, message in bag.messages([topic])}
     return dict(sorted(messages.items()))
 

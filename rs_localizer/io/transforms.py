@@ -43,7 +43,7 @@ class Transform:
         return Transform(self.rotation.T, -self.rotation.T @ self.translation)
 
     def __matmul__(self, other: Transform) -> Transform:
-        """``a_from_b @ b_from_c = a_from_c``."""
+        """Return ``a_from_c`` of ``a_from_b @ b_from_c``."""
         return Transform(
             self.rotation @ other.rotation, self.rotation @ other.translation + self.translation
         )
@@ -53,7 +53,7 @@ class Transforms(Protocol):
     """Answers what one frame is in another: TF, or the transforms of a recording."""
 
     def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
-        """``target_from_source`` at a time; None: the latest.
+        """Return ``target_from_source`` at a time (ns); None: the latest.
 
         Raises:
             NotYetError: when it is known for earlier times, and may still come.
@@ -61,7 +61,7 @@ class Transforms(Protocol):
         """
 
     def moves(self, target: str, source: str) -> bool:
-        """True where the transform may differ from one time to the next.
+        """Return True if the transform may change with time.
 
         Raises:
             TransformError: when it is not known at all.
@@ -69,7 +69,7 @@ class Transforms(Protocol):
 
 
 def read_transform(message: Any) -> Transform:
-    """The transform of a geometry_msgs/Transform.
+    """Return the transform of a geometry_msgs/Transform.
 
     Raises:
         TransformError: for a number that is not finite, or no unit quaternion.
@@ -81,7 +81,7 @@ def read_transform(message: Any) -> Transform:
 def from_numbers(
     translation: tuple[float, float, float], quaternion: tuple[float, float, float, float]
 ) -> Transform:
-    """The transform of a translation in m and a quaternion ``x y z w``.
+    """Return the transform of a translation in m and a quaternion ``x y z w``.
 
     Raises:
         TransformError: for a number that is not finite, or no unit quaternion.
@@ -106,7 +106,7 @@ def from_numbers(
 def make_transform(
     make: Make, stamp_ns: int, parent: str, child: str, parent_from_child: Transform
 ) -> Any:
-    """A geometry_msgs/TransformStamped."""
+    """Return a geometry_msgs/TransformStamped."""
     return make(
         "geometry_msgs/msg/TransformStamped",
         header=make_header(make, stamp_ns, parent),
@@ -126,7 +126,7 @@ class UnusableTransforms:
         self._faults: dict[tuple[str, str], str] = {}  # by parent and child, the last one
 
     def read(self, stamped: Any) -> Transform | None:
-        """The transform of a geometry_msgs/TransformStamped; None: it is none, which is kept."""
+        """Read a geometry_msgs/TransformStamped; keep the fault of an unusable one, return None."""
         names = _name(stamped.header.frame_id), _name(stamped.child_frame_id)
         try:
             link = read_transform(stamped.transform)
@@ -142,7 +142,7 @@ class UnusableTransforms:
         return next(faults, "")
 
     def explain(self, text: str) -> str:
-        """A sentence on frames without a transform, with the last of the faults."""
+        """Return a sentence on frames without a transform, with the last of the faults."""
         faults = [fault for fault in list(self._faults.values()) if fault not in text]
         return f"{text}; {faults[-1]}" if faults else text
 
@@ -160,7 +160,7 @@ class _Links:
         self.links.insert(index, (parent, link))
 
     def at(self, stamp: int | None) -> tuple[str, Transform]:
-        """Parent and transform at a time; None: the latest."""
+        """Return parent and transform at a time (ns); None: the latest."""
         if not self.stamps or stamp is None or stamp == self.stamps[-1]:
             return self.links[-1]
         index = bisect_right(self.stamps, stamp)
@@ -210,7 +210,7 @@ class TransformTree:
             track.add(stamp_of(stamped), parent, link)
 
     def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
-        """``target_from_source`` at a time; None: the latest that all its links have."""
+        """Return ``target_from_source`` at a time (ns); None: the latest that all links have."""
         target, source = _name(target), _name(source)
         if target == source:
             return Transform(np.eye(3), np.zeros(3))
@@ -225,12 +225,12 @@ class TransformTree:
         return of_target[meeting].inverse() @ of_source[meeting]
 
     def moves(self, target: str, source: str) -> bool:
-        """True if a link between the two frames comes with a time."""
+        """Return True if a link between the two frames comes with a time."""
         target, source = _name(target), _name(source)
         return target != source and self._latest(target, source) is not None
 
     def _latest(self, target: str, source: str) -> int | None:
-        """The last time (ns) at which all links are known; None: they are all static."""
+        """Return the last time (ns) at which all links are known; None if they are all static."""
         self._check(target, source)
         ways = [list(self._above(name, None)[0]) for name in (target, source)]
         meeting = next((name for name in ways[0] if name in ways[1]), None)
@@ -250,7 +250,7 @@ class TransformTree:
     def _above(
         self, name: str, stamp_ns: int | None
     ) -> tuple[dict[str, Transform], TransformError | None]:
-        """A frame in itself and in all that it hangs on, up to the root or a gap, and that gap."""
+        """Return a frame in itself and in its ancestors, up to the root or a gap, and that gap."""
         here = Transform(np.eye(3), np.zeros(3))
         found = {name: here}
         while name in self._tracks:

@@ -74,7 +74,7 @@ class Video:
 
     @property
     def fault(self) -> str | None:
-        """That images are missing, after all have been read: the end of a file is not believed."""
+        """Fault of a video with damaged or missing images: the end of a file is not believed."""
         step = _NEAR * self.lasts / max(self.claimed, 1)  # an edit list hides images, not the end
         ends_early = not self.lasts or self.until + step < self.lasts
         if self.damaged:
@@ -108,7 +108,7 @@ class Video:
                     yield compress(frame.to_ndarray(format="bgr24"), seconds if is_new else None)
 
     def _decoded(self, packet: Any) -> list[Any]:
-        """The images of a packet; of a damaged one none, as OpenCV has it."""
+        """Decode the images of a packet; a damaged one has none, as in OpenCV."""
         import av
 
         try:
@@ -167,7 +167,7 @@ def _container(path: Path, most: int) -> Iterator[Any]:
 
 
 def _stream(container: Any, most: int) -> Any:
-    """The first stream of images that has a decoder and no more than so many pixels."""
+    """Return the first stream of images that has a decoder and at most so many pixels."""
     streams = [stream for stream in container.streams.video if stream.codec_context is not None]
     for stream in streams:
         if 0 < stream.width * stream.height <= most:
@@ -181,7 +181,7 @@ def _stream(container: Any, most: int) -> Any:
 
 
 def _captured(notes: Mapping[str, str]) -> float | None:
-    """Images per second that a phone took; None: the file does not say."""
+    """Return the images per second that a phone took; None if the file does not say."""
     try:
         rate = float(notes.get("com.android.capture.fps", "nan"))
     except ValueError:
@@ -190,7 +190,7 @@ def _captured(notes: Mapping[str, str]) -> float | None:
 
 
 def has_times(path: Path | str) -> bool:
-    """True for a video with presentation times; a single image needs none.
+    """Return True for a video with presentation times; a single image needs none.
 
     Raises:
         VideoError: when it cannot be read.
@@ -200,7 +200,7 @@ def has_times(path: Path | str) -> bool:
 
 
 def compress(color: Any, seconds: float | None) -> VideoImage:
-    """An image (h,w,3) or (h,w) of a video as it is kept: JPEG and grey."""
+    """Compress an image (h,w,3) or (h,w) of a video to the form that is kept: JPEG and grey."""
     _, jpeg = cv2.imencode(".jpg", color, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     grey = color if color.ndim == 2 else cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)
     return VideoImage(jpeg.tobytes(), np.asarray(grey, np.uint8), seconds)

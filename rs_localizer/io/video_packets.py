@@ -58,7 +58,7 @@ class PacketDecoder:
         self._open: dict[int, Packet] = {}  # without an image so far, by their numbers
 
     def decode(self, message: Any, beside: Any) -> Iterator[tuple[Packet, VideoImage | str]]:
-        """The images that are known with this packet, or why there is none of an earlier one.
+        """Yield the images that this packet completes, or why an earlier one has none.
 
         Raises:
             MessageError: for what no decoder is known for.
@@ -85,7 +85,7 @@ class PacketDecoder:
             yield self._open.pop(min(self._open)), _LOST
 
     def rest(self) -> Iterator[tuple[Packet, VideoImage | str]]:
-        """The images that have been held back, and the packets that have none."""
+        """Yield the images that have been held back, and the packets that have none."""
         if self._context is not None:
             yield from self._images(None)
         for number in sorted(self._open):

@@ -37,7 +37,7 @@ _EVERY, _SIZES = 10, 9
 
 
 def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = None) -> Array | None:
-    """Pixels (n,2) of the inner corners of a chessboard in the order of ``board.points``.
+    """Return the pixels (n,2) of a chessboard's inner corners, in the order of ``board.points``.
 
     The board is taken for one whose top left square is black. When it looks the same turned by
     half (columns + rows is even; a square board also turned by a quarter), the order is the one
@@ -68,7 +68,7 @@ def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = Non
 
 
 def _repaired(smooth: Gray, board: Chessboard, corners: Array, window: int) -> Array | None:
-    """The same, but corners that lie inside of squares, where OpenCV puts some, looked for again.
+    """Return corners (n,2) with those that OpenCV put inside of squares searched again.
 
     The others say where; None: there are none.
     """
@@ -90,7 +90,7 @@ def _repaired(smooth: Gray, board: Chessboard, corners: Array, window: int) -> A
 
 
 def _no_saddles(smooth: Gray, board: Chessboard, corners: Array) -> NDArray[np.bool_]:
-    """Corners (n,) around which opposite squares are not alike and neighbouring ones different."""
+    """Return a mask (n,) of corners whose opposite squares differ or whose neighbours are alike."""
     grid = corners.reshape(board.rows, board.columns, 2)
     along, down = (np.asarray(np.gradient(grid, axis=axis)) for axis in (1, 0))
 
@@ -137,7 +137,7 @@ class BoardSizes:
                 self._sizes.append((columns, rows))
 
     def fault(self) -> str | None:
-        """The size that most of the images show, where it is another one."""
+        """Describe the size of board that most of the images show, if it is another one."""
         if self._board is None or not self._sizes:
             return None
         size, count = Counter(self._sizes).most_common(1)[0]
@@ -153,7 +153,7 @@ class BoardSizes:
 def find_charuco(
     image: Gray, board: Charuco, ids: NDArray[np.int64], quads: Array
 ) -> tuple[NDArray[np.int64], Array]:
-    """Inner corners of a ChArUco board that are seen, and their pixels.
+    """Return the ids of visible inner corners of a ChArUco board, and their pixels.
 
     Args:
         image: gray.
@@ -193,7 +193,7 @@ _LEAST_MARKERS = 3
 
 
 def flat_misfit(points: Array, pixels: Array) -> float:
-    """Distance of markers of one plane from where a homography has them, in their sides.
+    """Return how far coplanar markers lie from a homography, in their sides.
 
     No calibration is needed. NaN: the points are not of one plane; infinite: corners go the other
     way round, as of a mirrored map.
@@ -220,7 +220,7 @@ def flat_misfit(points: Array, pixels: Array) -> float:
 
 
 def charuco_fault(board: Charuco, ids: NDArray[np.int64], quads: Array) -> str | None:
-    """Layout of the board that fits instead, where its markers (m,) are elsewhere: (m,4,2) px.
+    """Describe the layout that fits instead, if markers (m,) lie elsewhere: (m,4,2) px.
 
     The other layout or exchanged sizes put each marker one square or more beside its place.
     """
@@ -249,7 +249,7 @@ def charuco_fault(board: Charuco, ids: NDArray[np.int64], quads: Array) -> str |
 
 
 def _shrunk(image: Gray) -> tuple[Gray, int]:
-    """An image in which a board is found soon, and by what whole number it is smaller."""
+    """Return a smaller image, in which a board is found soon, and the factor."""
     height, width = image.shape
     scale = -(-max(height, width) // _LARGEST_SEARCH)
     if scale == 1:
@@ -261,7 +261,7 @@ def _shrunk(image: Gray) -> tuple[Gray, int]:
 
 
 def _around(board: Charuco, index: int, quad: Array) -> list[tuple[int, Array, float]]:
-    """Inner corners at the square of a marker: row in the board, predicted pixel, window."""
+    """Return inner corners at the square of a marker: row in the board, predicted pixel, window."""
     column, row = board.cells[index]
     # Corners of the square in units of the marker, which is the unit square here.
     rim = 0.5 * (board.square / board.marker - 1.0)
@@ -292,7 +292,7 @@ def _smooth(image: Gray) -> Gray:
 
 
 def _refine(smooth: Gray, corners: Array, window: int) -> Array:
-    """Saddles near the corners, to a fraction of a pixel: (n,2)."""
+    """Return the saddles (n,2) near the corners, to a fraction of a pixel."""
     start = np.ascontiguousarray(np.reshape(corners, (-1, 1, 2)), np.float32)
     refined = cv2.cornerSubPix(smooth, start, (window, window), (-1, -1), _REFINE_CRITERIA)
     return np.asarray(refined, np.float64).reshape(-1, 2)
@@ -301,7 +301,7 @@ def _refine(smooth: Gray, corners: Array, window: int) -> Array:
 def ordered(
     grid: Array, previous: Array | None, possible: Callable[[Array], bool] = lambda grid: True
 ) -> Array:
-    """Pixels (n,2) of a grid (rows,columns,2) in the order of its print, row by row.
+    """Return the pixels (n,2) of a grid (rows,columns,2) in the order of its print, row by row.
 
     Of the orders that are ``possible``, the one that is closest to the ``previous`` pixels (n,2);
     without them, the one that reads as text does.
@@ -321,7 +321,7 @@ def ordered(
 
 
 def _starts_black(grid: Array, image: Gray) -> bool:
-    """True if the first square between the corners, as the one diagonally before it, is black."""
+    """Return True if the first square between the corners, and the one before it, is black."""
     first = grid[0:2, 0:2].mean(axis=(0, 1))
     second = grid[0:2, 1:3].mean(axis=(0, 1))
     (x, y), (u, v) = np.rint(first).astype(int), np.rint(second).astype(int)

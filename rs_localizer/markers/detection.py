@@ -93,7 +93,7 @@ class MarkerDetector:
         self._last_board_ns = 0
 
     def detect(self, image: Gray, stamp_ns: int = 0) -> Detections:
-        """All corners of the map that an image shows.
+        """Detect all corners of the map that an image shows.
 
         Args:
             image: (h,w) uint8.
@@ -157,7 +157,7 @@ class MarkerDetector:
         return key in self._places or key in self._on_boards
 
     def _corners(self, observations: MarkerQuads) -> tuple[IntArray, Array, Array]:
-        """Rows, pixels and scores of the single markers."""
+        """Return the rows, pixels and scores of the single markers."""
         rows = [
             self._places.get((observations.family.kind, i), -1) for i in observations.ids.tolist()
         ]
@@ -170,7 +170,7 @@ class MarkerDetector:
     def _board(
         self, image: Gray, board: Board, observations: list[MarkerQuads], stamp_ns: int
     ) -> tuple[IntArray, Array]:
-        """Rows of the board's points, and their pixels."""
+        """Return the rows of the board's points, and their pixels."""
         if isinstance(board, Charuco):
             (item,) = (item for item in observations if item.family.kind == board.family.kind)
             last = board.first_id + len(board.cells)
@@ -190,7 +190,7 @@ class MarkerDetector:
 
 
 def _finders(marker_map: MarkerMap) -> list[tuple[MarkerFinder, MarkerFinder]]:
-    """For each kind of family, one that knows the map's ids, if that is faster, and one of all."""
+    """Return two finders per kind of family: of the map's ids, if it is faster, and of all ids."""
     families: dict[str, Family] = {}
     ids: dict[str, set[int]] = {}
     for marker, _ in marker_map.all_markers():
@@ -210,7 +210,7 @@ def _finders(marker_map: MarkerMap) -> list[tuple[MarkerFinder, MarkerFinder]]:
 
 
 def _different(ids: IntArray, quads: Array, exact: NDArray[np.bool_]) -> IntArray:
-    """Rows of quadrilaterals to keep when OpenCV (4.6) gives one marker twice."""
+    """Return rows of quadrilaterals to keep if OpenCV (4.6) gives one marker twice."""
     keep: list[int] = []
     for m in range(len(ids)):
         if keep and ids[keep[-1]] == ids[m]:
@@ -224,18 +224,18 @@ def _different(ids: IntArray, quads: Array, exact: NDArray[np.bool_]) -> IntArra
 
 
 def _twice(ids: IntArray) -> IntArray:
-    """Those that occur more than once."""
+    """Return the ids that occur more than once."""
     values, counts = np.unique(ids, return_counts=True)
     return values[counts > 1]
 
 
 def _sides(quads: Array) -> Array:
-    """Shortest side (m,) of quadrilaterals (m,4,2)."""
+    """Return the shortest side (m,) of quadrilaterals (m,4,2)."""
     return np.asarray(np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).min(axis=1))
 
 
 def _spacings(pixels: Array) -> Array:
-    """Distance (n,) of each pixel (n,2) to the next one."""
+    """Return the distance (n,) of each pixel (n,2) to its nearest neighbour."""
     apart = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
     np.fill_diagonal(apart, np.inf)
     nearest = apart.min(axis=1)

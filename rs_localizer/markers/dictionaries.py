@@ -29,11 +29,11 @@ _aruco: Any = getattr(cv2, "aruco", None)
 
 
 class DictionaryError(ValueError):
-    """This OpenCV cannot do it; the message says what is missing."""
+    """A request that this OpenCV cannot serve; the message says what is missing."""
 
 
 def pattern(family: Family, id_: int) -> NDArray[np.bool_]:
-    """Cells (n,n) of an upright marker with its black border; true is white."""
+    """Return the cells (n,n) of an upright marker with its black border; true is white."""
     if not 0 <= id_ < family.count:
         raise ValueError(f"{family.name} has the ids 0 to {family.count - 1}, found {id_}")
     inside = np.rot90(_bits(family, id_), _turns(family))
@@ -67,7 +67,7 @@ class MarkerFinder:
             )
 
     def find(self, image: Gray) -> tuple[NDArray[np.int64], Array]:
-        """Ids (m,) and corners (m,4,2), clockwise from the upright print's top left one.
+        """Return ids (m,) and corners (m,4,2), clockwise from the upright print's top left one.
 
         The corners are within a pixel or so (see :mod:`rs_localizer.markers.edges`).
         """
@@ -103,7 +103,7 @@ def _dictionary(family: Family) -> Any:
 
 
 def _part(family: Family, ids: NDArray[np.int64]) -> Any:
-    """A dictionary of some ids, that are told apart by as many bits as the family's."""
+    """Return a dictionary of some ids, which corrects as many bits as the whole family does."""
     whole = _dictionary(family)
     part = _aruco.getPredefinedDictionary(getattr(_aruco, family.constant))  # a copy
     part.bytesList = np.ascontiguousarray(whole.bytesList[ids])
@@ -117,7 +117,7 @@ def _bits(family: Family, id_: int) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=32)
 def _turns(family: Family) -> int:
-    """Quarters, anticlockwise, by which OpenCV's pattern has to be turned to be upright."""
+    """Return the quarter turns, anticlockwise, that make OpenCV's pattern upright."""
     bits = _bits(family, 0)
     for turns in range(4):
         if int("".join(map(str, np.rot90(bits, turns).ravel())), 2) == family.first:

@@ -78,7 +78,7 @@ def edge_points(
 def _sample(
     image: NDArray[np.uint8], x: float, y: float, dx: float, dy: float, profile: Array
 ) -> bool:
-    """Gray levels from a point on; false where they leave the image."""
+    """Sample grey levels along a line from a point; return False if they leave the image."""
     last = len(profile) - 1
     if _outside(image, x, y) or _outside(image, x + last * dx, y + last * dy):
         return False
@@ -100,7 +100,7 @@ def _outside(image: NDArray[np.uint8], x: float, y: float) -> bool:
 
 @inlined
 def _edge(profile: Array, levels: tuple[float, float], step: float, rises: Array) -> float:
-    """The place (samples) of the steepest unbroken rise, which is added to the rises; NaN: none.
+    """Return the place (samples) of the steepest unbroken rise, and add it to the rises; or NaN.
 
     Any weight but the slope itself draws an edge along a row of pixels to their middle or rim, by
     up to 0.15 px.
@@ -171,7 +171,7 @@ _MOST_MOVE_CELLS, _MOST_MOVE_PIXELS = 0.7, 2.0
 
 @kernel
 def _fit(s: Array, e: Array, used: NDArray[np.bool_], parabola: bool, c: Array) -> int:
-    """Least squares of e = c0 + c1 s + c2 s^2 over the used points; how many those are."""
+    """Fit e = c0 + c1 s + c2 s^2 to the used points by least squares; return their number."""
     n, s1, s2, s3, s4, e0, e1, e2 = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(s)):
         if used[k]:
@@ -199,7 +199,7 @@ def _fit(s: Array, e: Array, used: NDArray[np.bool_], parabola: bool, c: Array) 
 
 @inlined
 def _depth(q: Array, at: int) -> float:
-    """The lesser distance (px) of the far corners from the side that corner ``at`` begins."""
+    """Return the smaller distance (px) of the far corners from the side that starts at ``at``."""
     a, b = q[at], q[(at + 1) % 4]
     dx, dy = b[0] - a[0], b[1] - a[1]
     c, d = q[(at + 2) % 4], q[(at + 3) % 4]
@@ -209,7 +209,7 @@ def _depth(q: Array, at: int) -> float:
 
 @kernel
 def _end(q: Array, before: int, at: int, width: float, length: float) -> float:
-    """The share of a side that the next one, which is smeared over a width, disturbs."""
+    """Return the share of a side that the next side, smeared over a width, disturbs."""
     after = (at + 1) % 4
     ux, uy = q[at, 0] - q[before, 0], q[at, 1] - q[before, 1]
     vx, vy = q[after, 0] - q[at, 0], q[after, 1] - q[at, 1]
@@ -220,13 +220,13 @@ def _end(q: Array, before: int, at: int, width: float, length: float) -> float:
 
 @kernel
 def _width(rises: Array) -> float:
-    """Over how many px motion smears an edge: an even smear has a twelfth of its square."""
+    """Return the width (px) of motion's smear of an edge, whose variance is width^2 / 12."""
     return math.sqrt(12.0 * max(rises[VARIANCE] - _SHARP_VARIANCE, 0.0))
 
 
 @inlined
 def _levels(rises: Array, at: int, cell: float) -> tuple[float, float]:
-    """The level half way up the edge of a side, and how far around it to go; else NaN.
+    """Return the level half way up the edge of a side, and the range around it; else NaN.
 
     Where its rises (4,5) of the round before are whole.
     """
@@ -283,7 +283,7 @@ def _side(
 
 @kernel
 def _left(s: Array, e: Array, used: NDArray[np.bool_], c: Array) -> float:
-    """The sum of the squares that a fit leaves of the used points."""
+    """Return the sum of squared residuals of the used points."""
     squares = 0.0
     for k in range(len(s)):
         if used[k]:
@@ -313,7 +313,7 @@ def _fit_twice(s: Array, e: Array, parabola: bool, c: Array) -> bool:
 
 @inlined
 def _corner(q: Array, at: int, before: Array, after: Array) -> tuple[float, float]:
-    """Meeting point of the tangents of two sides, taken at the sides' ends in this corner."""
+    """Return the intersection of the tangents of two sides at their common corner."""
     p, r = (at + 3) % 4, (at + 1) % 4
     # The side that ends here, at s = 1.
     ux, uy = q[at, 0] - q[p, 0], q[at, 1] - q[p, 1]

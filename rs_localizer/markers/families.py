@@ -61,7 +61,7 @@ LEAST_SIDE = 12.0
 
 
 def family(name: object) -> Family:
-    """The family of a name: ``4x4_50``, ``apriltag_36h11``, ``aruco_original`` and so on.
+    """Return the family with a name: ``4x4_50``, ``apriltag_36h11``, ``aruco_original`` ...
 
     OpenCV's spelling (``DICT_4X4_50``) and that of AprilTag's own library (``tag36h11``) do, too.
 

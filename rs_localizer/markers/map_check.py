@@ -18,7 +18,7 @@ _OTHER_UNIT, _LARGEST, _LARGEST_SQUARE = 20.0, 5.0, 2.0
 
 
 def other_units(marker_map: MarkerMap) -> Iterator[str]:
-    """Signs of sizes that are not in metres, as sentences."""
+    """Yield sentences about sizes that do not seem to be in metres."""
     for board in marker_map.boards:
         if (large := board.square) > _LARGEST_SQUARE:
             yield (
@@ -37,7 +37,7 @@ def other_units(marker_map: MarkerMap) -> Iterator[str]:
 
 
 def whole_markers(detections: Detections, end: int) -> dict[int, IntArray]:
-    """Rows of the detections for each single marker of which all four corners were found."""
+    """Return the rows of detections of each single marker whose four corners were all found."""
     place = {int(id_): row for row, id_ in enumerate(detections.ids) if id_ < end}
     markers = sorted({id_ // 4 for id_ in place})
     corners = {m: [place.get(4 * m + k, -1) for k in range(4)] for m in markers}
@@ -51,7 +51,7 @@ Fit = Callable[[Camera, Array, Array], Predict | None]
 
 
 def still_fit(camera: Camera, points: Array, pixels: Array) -> Predict | None:
-    """The fit of a camera that does not move, or of a global shutter."""
+    """Return the projection by the best pose of a still camera or a global shutter."""
     rays = np.ascontiguousarray(camera.rays(pixels))
     try:
         solved, turn, shift = cv2.solvePnP(points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
@@ -62,13 +62,13 @@ def still_fit(camera: Camera, points: Array, pixels: Array) -> Predict | None:
 
 
 def still_residual(camera: Camera, points: Array, pixels: Array) -> float:
-    """Error of the best still pose of points (n,3) at pixels (n,2), px rms; NaN: there is none."""
+    """Return the error (px rms) of the best still pose of points (n,3) at pixels (n,2), or NaN."""
     predict = still_fit(camera, points, pixels)
     return np.nan if predict is None else _rms(predict(points) - pixels)
 
 
 def _rms(errors: Array) -> float:
-    """Root mean square of the lengths of errors (n,2)."""
+    """Return the root mean square of the lengths of errors (n,2)."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
 

@@ -46,7 +46,7 @@ _CHESSBOARD, _CHARUCO = _BOARDS = "chessboard", "charuco"
 
 
 def is_marker_file(path: Path) -> bool:
-    """True for a file of markers, by its name."""
+    """Return True if the name is that of a file of markers."""
     return path.suffix.lower() in SUFFIXES
 
 
@@ -60,7 +60,7 @@ def read_marker_map(path: Path | str) -> MarkerMap:
 
 
 def read_any(path: Path, kind: Family | None = None) -> tuple[MarkerMap, str]:
-    """A marker map of any format, and the name of the format; raises as above.
+    """Read a marker map of any format; return it with the name of the format.
 
     Args:
         kind: of the markers of apriltag_ros; None: as the file says, or the usual one.
@@ -241,7 +241,7 @@ def _pose_entry(pose: Pose) -> dict[str, Any]:
 
 
 def _rounded(values: Iterable[float]) -> list[float]:
-    """Without the rounding errors of a fitted pose: 0.16 and not 0.16000000000000003."""
+    """Round the errors of a fitted pose away: 0.16 instead of 0.16000000000000003."""
     return [round(float(value), 12) + 0.0 for value in values]
 
 
@@ -284,13 +284,13 @@ class _Entry:
         return value
 
     def identify(self, name: str) -> int:
-        """The id of a tag, which tells errors where they are."""
+        """Return the id of a tag, and note it for the messages of errors."""
         number: int = self.take(name, int)
         self.where += f" (id {number})"
         return number
 
     def numbers(self, names: Iterable[str]) -> list[float]:
-        """Numbers by their names; a missing one is 0."""
+        """Return numbers by their names; a missing one is 0."""
         return [float(self.take(name, _NUMBER, 0.0)) for name in names]
 
     def entries(self, name: str, one: str) -> list[_Entry]:
@@ -303,7 +303,7 @@ class _Entry:
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
-        """Faults within are about this entry."""
+        """Name this entry in the errors that are raised within the context."""
         try:
             yield
         except _EntryError:

@@ -56,7 +56,7 @@ class MarkerMap:
             )
 
     def all_markers(self) -> Iterator[tuple[Marker, str]]:
-        """Every marker, those of ChArUco boards too, and the name of what it belongs to."""
+        """Yield every marker, also of ChArUco boards, with the name of its board."""
         for marker in self.markers:
             yield marker, marker.name
         for board in self.boards:
@@ -85,7 +85,7 @@ class MarkerMap:
         return {"map_deviation": float(np.sqrt(counts @ deviations**2 / counts.sum()))}
 
     def with_points(self, points: Array, deviation: float | None = None) -> MarkerMap:
-        """The same map with its corners (n,3) elsewhere, of boards to a deviation (m)."""
+        """Return the map with corners at (n,3) m, of boards known to a deviation (m)."""
         sizes = [len(item.points) for item in (*self.markers, *self.boards)]
         parts = np.split(points, np.cumsum(sizes)[:-1])
         own = len(self.markers)
@@ -111,7 +111,7 @@ def wall(
     first_id: int = 0,
     pose: Pose | None = None,
 ) -> tuple[Marker, ...]:
-    """A grid of markers, ids row by row from the top left.
+    """Return a grid of markers, ids row by row from the top left.
 
     Args:
         family_name: see :func:`rs_localizer.markers.families.family`.

@@ -14,7 +14,7 @@ _KNOWN, _FOREIGN = (230, 120, 0), (0, 150, 255)
 
 
 def draw_detections(image: Gray, detections: Detections) -> NDArray[np.uint8]:
-    """The image (h,w,3) with the outlines and numbers of markers: blue those of the map."""
+    """Return the image (h,w,3) with outlines and numbers of markers; those of the map are blue."""
     picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
     for item in detections.markers:
         for own, color in ((item.mapped, _KNOWN), (~item.mapped, _FOREIGN)):

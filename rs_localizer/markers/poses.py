@@ -41,19 +41,19 @@ class Pose:
         object.__setattr__(self, "rotation", rotation)
 
     def __call__(self, points: Array) -> Array:
-        """Points (n,3) of the print in the map frame."""
+        """Transform points (n,3) of the print to the map frame."""
         return np.asarray(points @ self.rotation.T + self.position)
 
 
 def quaternion_of_rotation(rotation: Array) -> Array:
-    """Unit quaternion (4,) ``x y z w`` of a rotation matrix (3,3)."""
+    """Return the unit quaternion (4,) ``x y z w`` of a rotation matrix (3,3)."""
     from rs_localizer.core import so3  # kernels: a command that shows its help imports none
 
     return so3.quaternion(np.ascontiguousarray(rotation))
 
 
 def rotation_of_quaternion(quaternion: ArrayLike) -> Array:
-    """Rotation matrix (3,3) of ``x y z w`` of unit length, but for the rounding of what is written.
+    """Return the rotation matrix (3,3) of ``x y z w``, of unit length up to rounding.
 
     Raises:
         ValueError: for anything but four finite values of that length.
@@ -73,7 +73,7 @@ def rotation_of_quaternion(quaternion: ArrayLike) -> Array:
 
 
 def finite(values: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
-    """Values as an array of this shape; ``ValueError`` for anything else, saying what it is."""
+    """Return the values as an array of this shape, or raise a ``ValueError`` that names them."""
     try:
         array = np.array(values, np.float64)
     except (TypeError, ValueError):

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prints that can be seen: single markers, and boards of squares, in the map frame.
 
-The frame of a print has its origin in the middle (of the black square of a marker, of the whole
-pattern of squares of a board), x to the right, y up, and z out of the paper toward the viewer.
+The frame of a print has its origin in the middle of a marker's black square, or of a board's whole
+pattern of squares. Its x points to the right, y up, and z out of the paper towards the viewer.
 Corners of a marker are in OpenCV's order: top left, top right, bottom right, bottom left of the
 upright print seen from its front. Corners of boards go row by row from the top left one.
 """
@@ -57,7 +57,7 @@ class Marker:
 
     @classmethod
     def at(cls, family_name: str, id_: int, size: float, pose: Pose | None = None) -> Self:
-        """A square marker: ``size`` (m) is the side of its black square, without white rim."""
+        """Return a square marker; ``size`` (m) is the side of its black square, without the rim."""
         _positive(size, "size")
         return cls(family(family_name), id_, (pose or Pose())(size * _UNIT_SQUARE))
 
@@ -68,7 +68,7 @@ class Marker:
 
     @property
     def pose(self) -> Pose:
-        """That of the square that fits the corners best."""
+        """Pose of the square that best fits the four corners."""
         return _square_pose(self.corners)
 
     @property
@@ -111,7 +111,7 @@ class _Board:
         return _PAPER * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
     def with_points(self, points: Array, deviation: float | None = None) -> Self:
-        """The board with its points at (n,3) in the map, known to a deviation (m)."""
+        """Return the board with its points at (n,3) in the map, known to a deviation (m)."""
         shape = (points - self.pose(self.flat)) @ self.pose.rotation
         return replace(self, shape=shape, deviation=deviation)
 
@@ -224,7 +224,7 @@ def _side(corners: Array) -> float:
 
 
 def _square_pose(corners: Array) -> Pose:
-    """Pose of the best square; ValueError when it fits badly."""
+    """Return the pose of the square that best fits four corners; ValueError if it fits badly."""
     side, middle = _side(corners), corners.mean(axis=0)
     if side == 0.0:
         raise ValueError("all corners are the same point")

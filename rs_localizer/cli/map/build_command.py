@@ -42,7 +42,7 @@ if WORKING:
 
 
 def shutter_of(args: Options) -> tuple[float | None, str | None]:
-    """Readout time and scan direction, given or beside the images; None: not known."""
+    """Return readout time and scan direction, given or from the images; None if unknown."""
     values = shutter_values(args)
     settings = build(values)
     # 0 is a global shutter where the user says so, and unknown in a file.
@@ -52,7 +52,7 @@ def shutter_of(args: Options) -> tuple[float | None, str | None]:
 
 
 def look_at_images(args: Options, points: Sequence[_Point], looker: Looker) -> Looked:
-    """Look at the images that are kept: so many a second, and those in which points are given."""
+    """Look at so many images a second, and at those in which points are given."""
     with opened(args, calibrated=False) as source, tqdm(
         total=source.total, unit="image", desc="look", disable=None
     ) as bar:  # fmt: skip
@@ -128,7 +128,7 @@ def _points(options: Options) -> list[_Point]:
 
 
 def _distances(options: Options, names: list[str]) -> list[Distance]:
-    """Before minutes of work: each point of a distance is given in two images."""
+    """Return the given distances, after checking that each point is given in two images."""
     if options.markers is not None and (options.point or options.distance):
         raise UsageError("give either --markers or --point and --distance")
     if options.point and not options.distance:

@@ -46,7 +46,7 @@ def run(options: Options) -> Figures:
 
 
 def read(options: Options) -> tuple[Map | MarkerMap, str]:
-    """The map that the options name, and the name of its format."""
+    """Read the map that the options name; return it with the name of its format."""
     if not is_marker_file(options.file):
         # Frames are the localizer's business: files of landmarks do not name one.
         return read_map_file(options.file, MAP_FRAME), "landmarks"

@@ -98,7 +98,7 @@ def run(args: Options) -> None:
 def _recorded(
     of: MapCamera[Options], landmarks: Map | None
 ) -> tuple[RigCamera, tuple[Correspondences, ...]]:
-    """A camera, and what it saw of the map."""
+    """Return a camera and the correspondences with the map that it saw."""
     config, args = of.config, of.args
     with open_bag(args.recording) as bag:
         topics = find_topics(bag, given_topics(args)).without(IMU)
@@ -114,7 +114,7 @@ def _recorded(
 
 
 def _deviations(args: Options, landmarks: Map, map_deviation: float) -> Array | None:
-    """Standard deviation of each landmark as it is known, m; None: not at all."""
+    """Return the known standard deviation (m) of each landmark; None if none is known."""
     every = map_deviation if map_deviation > 0.0 else np.inf
     if not args.hold:
         return np.full(len(landmarks), every) if map_deviation > 0.0 else None
@@ -205,7 +205,7 @@ def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
 
 
 def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:
-    """Times of images, ns, by their names: times in ns, or numbers at a rate.
+    """Return times of images (ns) by their names: times in ns, or numbers at a rate.
 
     Raises:
         UsageError: for names that are neither.

@@ -108,7 +108,7 @@ def _markers(args: Options) -> tuple[Marker, ...]:
 
 
 def _filmed(given: MapCamera[Options], spotter: Spotter) -> Filmed:
-    """A camera, and the markers of each image."""
+    """Return a camera and the markers of each image."""
     args, config, spotted = given.args, given.config, dict[int, Spotted]()
     camera: Camera | None = None
     with opened(args) as source:
@@ -131,7 +131,7 @@ def _filmed(given: MapCamera[Options], spotter: Spotter) -> Filmed:
 def _tell(
     found: Survey, every: Array, cameras: Sequence[MapCamera[Options]], filmed: Sequence[Filmed]
 ) -> None:
-    """The table of the markers, with their deviations (m,6)."""
+    """Print the table of the markers, with their deviations (m,6)."""
     fit = found.fit
     print(f"noise of the corners     {fit.deviation:.3f} px, {np.mean(fit.inliers):.1%} fit")
     for given, images, result, count in zip(
@@ -177,7 +177,7 @@ def _tell(
 
 
 def _tell_frame(found: Survey) -> None:
-    """Effect of the origin's own errors on all other poses in its frame, printed."""
+    """Print the effect of the origin's own errors on all other poses in its frame."""
     origin = found.markers[0]
     turn = np.degrees(np.linalg.norm(found.deviations_of_shape[0, 3:]))
     far = int(np.argmax([np.linalg.norm(marker.pose.position) for marker in found.markers]))

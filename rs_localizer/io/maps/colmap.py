@@ -164,7 +164,7 @@ _IS_TABLE = "SELECT count(*) FROM sqlite_master WHERE type='table' AND name='des
 
 
 def read_colmap(folder: Path, frame: str, database: Path | None = None) -> Map:
-    """The landmarks of a model.
+    """Read the landmarks of a model.
 
     Args:
         folder: of the model.

@@ -25,7 +25,7 @@ _UNDEFINED, _SIFT = -1, 0
 
 
 def read(folder: str) -> dict[str, Any]:
-    """Points, images and cameras of a model; what belongs to one of them stands in one row."""
+    """Read points, images and cameras of a model; what belongs to one of them stands in one row."""
     import pycolmap
 
     pycolmap.logging.minloglevel = 3
@@ -59,18 +59,18 @@ def _pose(image: Any) -> Any:
 
 
 def _called(member: Any) -> Any:
-    """Value of what is a property in some versions and a method in others."""
+    """Return the value of what is a property in some versions and a method in others."""
     return member() if callable(member) else member
 
 
 def _camera(number: int, camera: Any) -> str:
-    """Line of ``cameras.txt``."""
+    """Return the line of ``cameras.txt``."""
     values = " ".join(repr(float(value)) for value in camera.params)
     return f"{number} {camera.model.name} {camera.width} {camera.height} {values}"
 
 
 def describe(found: dict[str, Any], database: str) -> dict[str, Any]:
-    """Descriptors (k,d) of the points that have any, and which points (n,) these are.
+    """Return descriptors (k,d) of the points that have any, and the mask (n,) of these points.
 
     A landmark's descriptor is the medoid of those of the images that see it: the one nearest to
     the others.
@@ -105,12 +105,12 @@ def describe(found: dict[str, Any], database: str) -> dict[str, Any]:
 
 
 def _numeric(descriptors: Any) -> bool:
-    """True if they are compared as numbers; COLMAP keeps SIFT as bytes, but numbers they are."""
+    """Return True if descriptors are compared as numbers, as SIFT, which COLMAP keeps as bytes."""
     return bool(descriptors.dtype.kind == "f" or descriptors.shape[1] == _SIFT_WIDTH)
 
 
 def _medoid(rows: Any) -> int:
-    """The row with the least sum of distances to the others."""
+    """Return the row with the least sum of distances to the others."""
     if len(rows) < 3:
         return 0
     if _numeric(rows):

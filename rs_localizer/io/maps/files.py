@@ -79,7 +79,7 @@ def write_npz(path: Path, landmarks: Map) -> None:
 
 
 def _checked(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
-    """Bytes that an array will take, if its header and its size in the archive agree."""
+    """Return the bytes that an array takes, if its header and its size in the archive agree."""
     name = info.filename
     if info.compress_type not in _COMPRESSIONS:
         raise MapError(f"{name} is packed by method {info.compress_type}, which NumPy never uses")
@@ -101,7 +101,7 @@ def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
 
 
 def _size(file: IO[bytes], name: str) -> tuple[int, int, int]:
-    """Bytes of a member's header, and by it how many numbers of how many bytes follow."""
+    """Return bytes of a member's header, and the count and the bytes of its numbers."""
     version = np.lib.format.read_magic(file)
     readers = {
         (1, 0): np.lib.format.read_array_header_1_0,

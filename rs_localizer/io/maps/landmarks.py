@@ -68,7 +68,7 @@ class Map:
         return len(self.points)
 
     def equals(self, other: Map) -> bool:
-        """True if both are the same to the last bit, in the same frame."""
+        """Return True if both maps are the same to the last bit, in the same frame."""
         return (
             self.frame == other.frame
             and np.array_equal(self.points, other.points)
@@ -98,7 +98,7 @@ def make_map(
     covariances: NDArray[Any] | None = None,
     error_modes: NDArray[Any] | None = None,
 ) -> Map:
-    """A map of arrays as read, with the shapes of :class:`Map`.
+    """Make a map of arrays as read, with the shapes of :class:`Map`.
 
     Landmarks with a value that is not finite are dropped and counted.
 
