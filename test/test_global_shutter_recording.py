@@ -11,7 +11,7 @@ from benchmarks.data import GLOBAL_SHUTTER_TAGS
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.pose_at_time import twist_at
 
 # Of 6 dimensions: what 95 % of a chi-squared variable lie below.
@@ -21,7 +21,7 @@ REGION = 12.59
 def replayed(count, **settings):
     """What the node would publish, a pose of each of so many frames, and what it would say."""
     frames, notices = [], []
-    localizer = FrameLocalizer(NodeConfig(**settings), lambda _, text: notices.append(text))
+    localizer = CameraFrames(NodeConfig(**settings), lambda _, text: notices.append(text))
     with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
         for topic, _, message in bag.messages(("/camera/camera_info", "/camera/correspondences")):
             if topic == "/camera/camera_info":

@@ -30,7 +30,7 @@ from rs_localizer.io.trajectories import TrajectoryError, read_tum, read_twists
 from rs_localizer.io.video import Video, VideoError
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.settings import build, load_params_file, parse_assignment
 
 _PARAMS = b"""
@@ -197,7 +197,7 @@ class _Localizer:
 
     def __call__(self, message: Any) -> object:
         # A new one each time, so that a number says all of an execution.
-        node = FrameLocalizer(NodeConfig(readout_time=0.03))
+        node = CameraFrames(NodeConfig(readout_time=0.03))
         node.calibrate(read_camera_info(seeds.camera_info(whole=True)))
         if self._landmarks is None:
             node.localize(self._good)  # so that the other one is tracked

@@ -35,7 +35,7 @@ if WORKING:
     from rs_localizer.io.trajectories import Motions, Trajectory, Twists
     from rs_localizer.markers.detection import MarkerDetector
     from rs_localizer.offline.results import Track
-    from rs_localizer.pipeline.frames import FrameLocalizer
+    from rs_localizer.pipeline.camera_frames import CameraFrames
     from rs_localizer.settings import build, load_params_file
     from rs_localizer.tools import errors
     from rs_localizer.tools.simulation.renderer import Renderer, in_order
@@ -140,7 +140,7 @@ def _localized(
     answers, rows = dict[str, dict[int, Localized]](), dict[str, dict[str, float]]()
     off = dict[str, dict[str, errors.Errors]]()
     for solver in _METHODS:
-        localizer, track = FrameLocalizer(build(_settings(solver, readout_time))), Track()
+        localizer, track = CameraFrames(build(_settings(solver, readout_time))), Track()
         answers[solver] = found = dict[int, Localized]()
         with stage(f"{title}, {solver}", len(frames)) as step:
             for stamp, info, cloud in frames:

@@ -38,6 +38,7 @@ from rs_localizer.pipeline.inputs import (
     Input,
     Results,
     Role,
+    frame_localizer,
     input_named,
     inputs_of,
     with_role,
@@ -365,7 +366,7 @@ def prepare(
         raise BagError(f"{bag.path} has {topics.frames} and no map; give one with --map")
     if DETECTIONS in topics.of and not config.marker_map:
         raise BagError(f"{bag.path} has {topics.frames}; -p marker_map:=FILE says where tags are")
-    localizer = FrameLocalizer(config, notice, find_transforms(bag, topics, config))
+    localizer = frame_localizer(config, notice, find_transforms(bag, topics, config))
     localizer.load_files()
     return topics, localizer
 

@@ -21,11 +21,12 @@ from rs_localizer.io.clouds import EmptyCloudError, read_map
 from rs_localizer.io.detections import APRILTAG_TYPE, ISAAC_TYPE
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import MessageError
-from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 
 if TYPE_CHECKING:
     from rs_localizer.config import NodeConfig
     from rs_localizer.io.outputs import Localized
+    from rs_localizer.io.transforms import Transforms
     from rs_localizer.pipeline.frames import FrameLocalizer
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
@@ -58,7 +59,7 @@ class Input:
     """One input.
 
     ``read`` takes a message and returns what it says, which ``use`` gives to the localizer (frames
-    that are read as ``Correspondences``: ``FrameLocalizer.localize_cloud``). Both raise
+    that are read as ``Correspondences``: ``CameraFrames.localize_cloud``). Both raise
     ``MessageError`` for what cannot be used; it is refused for the reason ``refused``.
     """
 
@@ -66,7 +67,7 @@ class Input:
     type: str  # of its messages
     about: str  # what they hold
     role: Role
-    use: Callable[[FrameLocalizer, Any], Results]
+    use: Callable[[Any, Any], Results]
     refused: Reason
     read: Callable[[Any], Any] = _as_it_is
     said: str = ""  # what a user is told that is missing
@@ -201,3 +202,20 @@ def _of_camera(item: Input, name: str) -> Input:
     if item.topic == topics.CAMERA_INFO:
         return replace(own, use=lambda localizer, found: localizer.calibrate(found, name))
     return replace(own, use=lambda localizer, message: localizer.add(name, item.topic, message))
+
+
+def frame_localizer(
+    config: NodeConfig, notice: Notify = unheard, transforms: Transforms | None = None
+) -> FrameLocalizer:
+    """Who localizes the frames of a camera, or of a rig, by these settings.
+
+    Raises:
+        ValueError: for settings that the localizer refuses.
+    """
+    if config.of_cameras:
+        from rs_localizer.pipeline.rig_frames import RigFrames
+
+        return RigFrames(config, notice, transforms)
+    from rs_localizer.pipeline.camera_frames import CameraFrames
+
+    return CameraFrames(config, notice, transforms)

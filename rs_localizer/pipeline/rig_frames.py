@@ -7,23 +7,39 @@ is complete when all cameras that are awaited have come, or when one comes that 
 frame. A camera that has been missing from some frames in a row is no longer awaited until it comes
 again. What is left out is said: an image that comes after its frame, and one of a clock that is
 ahead of the others, or has gone back alone. When all clocks go back, a recording has started over.
+:class:`RigFrames` localizes the frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.reasons import Notice
-from rs_localizer.core.rig import ByCamera, RigEstimate
-from rs_localizer.io.clouds import Correspondences
-from rs_localizer.io.outputs import CameraShare
-from rs_localizer.pipeline.refusal import Notify
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Notice, Reason
+from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
+from rs_localizer.io.camera_info import Calibration
+from rs_localizer.io.clouds import (
+    Correspondences,
+    Keypoints,
+    read_correspondences,
+    read_keypoints,
+)
+from rs_localizer.io.outputs import CameraShare, Localized
+from rs_localizer.io.topics import CORRESPONDENCES
+from rs_localizer.io.transforms import Transform, TransformError, Transforms
+from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline import what_fits
+from rs_localizer.pipeline.frames import FrameLocalizer, is_timed
+from rs_localizer.pipeline.inputs import INPUTS
+from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
+from rs_localizer.tracking import FrameContext, Tracker
 
 # Frames in a row without a camera after which it is not awaited: it may have lost one or two.
 _ABSENT = 3
@@ -180,3 +196,168 @@ def share_of(image: CameraImage, result: RigEstimate) -> CameraShare:
     kept = np.asarray(result.residuals[name][inliers])
     rms = float(np.sqrt(kept @ kept / max(len(kept), 1)))
     return CameraShare(name, len(inliers), len(kept), rms, image.start_ns)
+
+
+class RigFrames(FrameLocalizer):
+    """Localizes the frames of several cameras with names; see :class:`FrameLocalizer`.
+
+    The rig has the axes of its first camera whose ``camera_info`` has come; where the others are,
+    TF says, at the time of the frame.
+    """
+
+    def __init__(
+        self, config: NodeConfig, notice: Notify = unheard, transforms: Transforms | None = None
+    ) -> None:
+        self._assembler = FrameAssembler(config.cameras, config.rig.window, notice)
+        self._mounts: dict[str, Transform] = {}  # on the first camera, where they are known
+        super().__init__(config, notice, transforms)
+
+    def _new_tracker(self, config: NodeConfig, cameras: Mapping[str, Camera]) -> Tracker:
+        tracks = config.tracking and is_timed(config, cameras)
+        localizer = Localizer(self._mounted_cameras(cameras), config)
+        return Tracker(localizer, None, tracks, max_prediction=config.max_prediction)
+
+    def _apply_settings(self, config: NodeConfig) -> None:
+        before = self._config.rig
+        super()._apply_settings(config)
+        if config.rig != before:
+            self._assembler = FrameAssembler(config.cameras, config.rig.window, self._notice)
+
+    def _forget_frames(self) -> None:
+        pass  # what waits for other images is no previous frame
+
+    def _mounted_cameras(self, cameras: Mapping[str, Camera]) -> Rig:
+        """The rig of the cameras whose mounting is known; before there is one, of any."""
+        mounts = self._mounts or dict.fromkeys(cameras, Transform(np.eye(3), np.zeros(3)))
+        return Rig(
+            {name: cameras[name] for name in mounts},
+            {name: (it.rotation, it.translation) for name, it in mounts.items()},
+        )
+
+    @property
+    def rig(self) -> Rig:
+        """The rig of the cameras, as far as they are known."""
+        return self._mounted_cameras(self._cameras)
+
+    def reset(self) -> None:
+        """Forget the previous frames."""
+        self._assembler.reset()
+        super().reset()
+
+    def _use_camera(self, name: str, calibration: Calibration) -> None:
+        known, axes = name in self.calibrations, self.camera_frame
+        self.calibrations[name] = calibration
+        self._mounts.pop(name, None)
+        if known or self.camera_frame != axes:  # else it is one more of the rig
+            self._mounts = {}  # relative to other axes
+            self._apply_settings(self._config)
+
+    def add(self, name: str, kind: str, message: Any) -> Iterator[Localized | Refusal]:
+        """Take an image of a camera by its name; the results of frames that it completes."""
+        if name not in self.calibrations:
+            text = f"no usable camera_info of {name} has come yet"
+            self._notice(Notice.NO_IMAGES, f"{name} is left out: {text}")
+            yield Refusal(Reason.NO_CAMERA_INFO, text)
+            return
+        own, camera = self._config.of_cameras[name], self._cameras[name]
+        cloud = self._read(name, kind, message, camera)
+        if not isinstance(cloud, Refusal):
+            cloud = self._stream.unset(cloud.stamp_ns) or cloud
+        if isinstance(cloud, Refusal):
+            yield cloud
+            return
+        cloud = self._checked(cloud, name)
+        start_ns = cloud.stamp_ns + round(own.stamp_offset * 1e9)
+        middle_ns = start_ns - round(camera.first_row_time * own.readout_time * 1e9)
+        image = CameraImage(name, start_ns, middle_ns, cloud)
+        for images in self._assembler.add(image):
+            yield self._localize_frame(images)
+
+    def flush(self) -> list[Localized | Refusal]:
+        """The results of images that still wait for other cameras' images: none will come."""
+        return [self._localize_frame(frame) for frame in self._assembler.flush()]
+
+    def _read(
+        self, name: str, kind: str, message: Any, camera: Camera
+    ) -> Correspondences | Refusal:
+        """Correspondences of one camera's message."""
+        read: Callable[[Any], Any]
+        read = read_correspondences if kind == CORRESPONDENCES else read_keypoints
+        found: Correspondences | Keypoints | Refusal
+        found = read_or_refuse(read, message, INPUTS[kind].refused)
+        if isinstance(found, Refusal):
+            return replace(found, detail=f"{name}: {found.detail}")
+        if isinstance(found, Correspondences):
+            return found
+        by = self._landmarks.how(found)
+        if isinstance(by, Refusal):
+            return by
+        return self._landmarks.match(found, self._config.matching, camera, None)
+
+    def _localize_frame(self, images: Sequence[CameraImage]) -> Localized | Refusal:
+        reference = images[0].cloud
+        others = {image.cloud.frame for image in images} - {reference.frame}
+        if others:
+            return Refusal(
+                Reason.BAD_CLOUD,
+                f"the points of {images[0].camera} are in frame {reference.frame!r}, others in "
+                f"{', '.join(map(repr, sorted(others)))}: cameras of a rig see one map",
+            )
+        refusal = self._stream.follow(images[0].start_ns, reference.frame)
+        if refusal is not None:
+            return refusal
+        refusal = self._mount(images)
+        images = [image for image in images if image.camera in self._mounts]
+        if not images:
+            assert refusal is not None
+            return refusal
+        # Seconds since the first image: nothing is lost of stamps since 1970.
+        origin_ns = images[0].start_ns
+        starts = {image.camera: 1e-9 * (image.start_ns - origin_ns) for image in images}
+        matches = {image.camera: matches_of(image.cloud, images) for image in images}
+        context = FrameContext(error_modes=self._landmarks.error_modes)
+        result = self._tracker.localize(origin_ns, matches, stamps=starts, context=context)
+        if not result:
+            refusal = Refusal(result.reason, result.detail)
+            localizer = self._tracker.localizer
+            return self._explained(
+                refusal,
+                lambda: what_fits.cameras_apart(localizer, matches, starts),
+                Notice.EXTRINSICS,
+            )
+        assert isinstance(result, RigEstimate)
+        self._landmarks.lacking = False  # who sends correspondences needs none
+        return self.mounted(self._localized(images, result, origin_ns))
+
+    def _mount(self, images: Sequence[CameraImage]) -> Refusal | None:
+        """Look up where cameras are that move; why one of this frame is not known."""
+        frame, stamp_ns = self.camera_frame, images[0].cloud.stamp_ns or None
+        mounts, refusal = dict(self._mounts), None
+        for image in images:
+            name = image.camera
+            own = self.calibrations[name].frame
+            try:
+                if name in mounts and not self.transforms.moves(own, frame):
+                    continue
+                mounts[name] = self.transforms.lookup(own, frame, stamp_ns)
+            except TransformError as error:
+                mounts.pop(name, None)
+                text = f"from {frame!r} to {own!r} of camera {name}: {error}"
+                refusal = Refusal(Reason.NO_TRANSFORM, text)
+                self._notice(Notice.NO_IMAGES, f"{name} is left out: no transform {text}")
+        if any(mounts.get(name) is not self._mounts.get(name) for name in {*mounts, *self._mounts}):
+            self._mounts = {name: mounts[name] for name in self._config.cameras if name in mounts}
+            if self._mounts:
+                self._tracker.mount(self.rig)
+        return refusal
+
+    def _localized(
+        self, images: Sequence[CameraImage], result: RigEstimate, origin_ns: int
+    ) -> Localized:
+        """Pose and twist of the rig's axes at the published moment."""
+        config, first = self._config, images[0].cloud
+        time_ns = origin_ns + round(1e9 * result.time)
+        stamp_ns = time_ns if config.pose_time == PoseTime.MID_FRAME else first.stamp_ns
+        moment = stamp_ns, (stamp_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
+        made = self._camera_result(joined(config.cameras, images), result, moment)
+        return replace(made, cameras=tuple(share_of(image, result) for image in images))

@@ -18,6 +18,7 @@ from rs_localizer.offline.replay import inlier_columns
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.pose_at_time import pose_at, published_moment, twist_at
 from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.rig_frames import RigFrames
 from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.adjust.spline import LEAST_FRAMES, stretches
 from rs_localizer.tools.smoothing import PosedFrame, Smoothed, smooth
@@ -196,7 +197,7 @@ def _motion(
 ) -> tuple[Smoothed, IntArray]:
     """The motion through frames, and the moments (m,) ns that are published of inputs (m,)."""
     config, calibration = localizer.config, localizer.calibration
-    if config.of_cameras:
+    if isinstance(localizer, RigFrames):
         rig, posed = localizer.rig, [_rig_frame(frame) for frame in frames]
         if config.pose_time != PoseTime.MID_FRAME:
             return smooth(rig, posed), inputs

@@ -28,7 +28,7 @@ from rs_localizer.io.outputs import Localized, messages
 from rs_localizer.io.recording import CAMERA_FRAME, write_frame
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.offline.replay import TF_TYPE, find_topics, find_transforms, replay
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import broadcast
 from rs_localizer.settings import build, load_params_file
@@ -112,11 +112,11 @@ def flight(tmp_path_factory) -> Flight:
     return Flight(path, *truth, odometry)
 
 
-def localizer(config: NodeConfig, transforms: Any) -> FrameLocalizer:
-    return FrameLocalizer(config, transforms=transforms)
+def localizer(config: NodeConfig, transforms: Any) -> CameraFrames:
+    return CameraFrames(config, transforms=transforms)
 
 
-def replayed(flight: Flight, config: NodeConfig) -> tuple[list[Localized], FrameLocalizer]:
+def replayed(flight: Flight, config: NodeConfig) -> tuple[list[Localized], CameraFrames]:
     with open_bag(flight.path) as bag:
         topics = find_topics(bag)
         used = localizer(config, find_transforms(bag, topics, config))

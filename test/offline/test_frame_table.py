@@ -24,7 +24,7 @@ from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.offline import frame_table
 from rs_localizer.offline.frame_table import COLUMNS, read_parquet, schema
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 
 SETTINGS = {"readout_time": 0.03}
@@ -118,7 +118,7 @@ def test_the_same_bytes_from_one_process_and_from_two(flights: list[Path], tmp_p
 @pytest.mark.parametrize("count", [6, 7])
 def test_each_row_is_in_the_table_once_however_many_there_are(monkeypatch, count):
     monkeypatch.setattr(frame_table, "_ROWS", 3)  # at a time, of a thousand
-    table = frame_table.FrameTable("flight", FrameLocalizer(NodeConfig()))
+    table = frame_table.FrameTable("flight", CameraFrames(NodeConfig()))
     for stamp_ns in range(count, 0, -1):
         table.add(stamp_ns, Refusal(Reason.TOO_FEW_POINTS, "none"))
     assert table.table()["stamp_ns"].to_pylist() == list(range(1, count + 1))

@@ -17,13 +17,13 @@ from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import find_topics, find_transforms, replay
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.tools import smoothed
 from rs_localizer.tools.smoothed import smooth_frames
 
 CONFIG = NodeConfig(readout_time=0.03)
 SECOND = 10**9
-Recorded = tuple[FrameLocalizer, list[Localized], list[int]]
+Recorded = tuple[CameraFrames, list[Localized], list[int]]
 """With what it was localized, the frames, the stamps of all images."""
 
 
@@ -35,7 +35,7 @@ def recorded(
     path = tmp_path_factory.mktemp("smoothed") / "flight"
     words = "--trajectory tum_vi_room5 --start 20 --duration 6 --points 40 --outliers 0"
     assert main(["simulate", str(path), *words.split(), "--seed", "3"]) == 0
-    localizer = FrameLocalizer(CONFIG)
+    localizer = CameraFrames(CONFIG)
     with open_bag(path) as bag:
         topics = find_topics(bag)
         frames = [frame for a in replay(bag, topics, localizer) if (frame := a.result)]
@@ -86,7 +86,7 @@ def test_frames_of_a_vibrating_camera_keep_their_own_poses(tmp_path: Path) -> No
     record(path, *words.split(), *shaking)
     with open_bag(path) as bag:
         topics = find_topics(bag)
-        localizer = FrameLocalizer(CONFIG, transforms=find_transforms(bag, topics, CONFIG))
+        localizer = CameraFrames(CONFIG, transforms=find_transforms(bag, topics, CONFIG))
         frames = [frame for a in replay(bag, topics, localizer) if (frame := a.result)]
         stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
     (part,) = smooth_frames(localizer, frames, stamps, None)

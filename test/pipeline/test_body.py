@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import rs_localizer.pipeline.frames
+import rs_localizer.pipeline.camera_frames
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.scanning import ScanDirection
@@ -26,7 +26,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized, messages
 from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import Broadcast, broadcast
 from rs_localizer.pipeline.refusal import Refusal
@@ -171,7 +171,7 @@ class KnowsTheMotion(Localizer):
 
 @pytest.fixture(autouse=True)
 def known_motion(monkeypatch) -> None:
-    monkeypatch.setattr(rs_localizer.pipeline.frames, "Localizer", KnowsTheMotion)
+    monkeypatch.setattr(rs_localizer.pipeline.camera_frames, "Localizer", KnowsTheMotion)
 
 
 @pytest.fixture
@@ -186,7 +186,7 @@ def localize(
         config = NodeConfig(
             **({"readout_time": READOUT_TIME, "base_frame": "base_link"} | settings)
         )
-        frames = FrameLocalizer(config, transforms=transforms)
+        frames = CameraFrames(config, transforms=transforms)
         frames.take_zero_for_time(recorded_ns=0)
         frames.calibrate(
             read_camera_info(make_camera_info(**({} if roi is None else {"roi": roi})))

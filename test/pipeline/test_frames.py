@@ -18,7 +18,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters, read_camchain
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.settings import build, camera_values, write_camera_file
 from rs_localizer.tools.simulation.scene import room
@@ -60,7 +60,7 @@ def message_of(frame: SimulatedFrame) -> Any:
 
 
 def test_reasons_of_refusals(make_camera_info):
-    frames = FrameLocalizer(NodeConfig(readout_time=READOUT_TIME))
+    frames = CameraFrames(NodeConfig(readout_time=READOUT_TIME))
     messages = map(message_of, simulated())
     assert refused(frames.localize(next(messages)))[0] == "no_camera_info"
     with pytest.raises(MessageError, match="not calibrated"):
@@ -85,7 +85,7 @@ def test_reasons_of_refusals(make_camera_info):
 def test_inliers_are_the_rows_that_were_kept(make_camera_info):
     seen = simulated()[0]
     seen.points[0, 1] = seen.pixels[3, 1] = np.nan
-    frames = FrameLocalizer(NodeConfig(readout_time=READOUT_TIME))
+    frames = CameraFrames(NodeConfig(readout_time=READOUT_TIME))
     frames.calibrate(read_camera_info(make_camera_info()))
     frame = localized(frames.localize(message_of(seen)))
     assert frame.dropped == 2
@@ -97,7 +97,7 @@ def test_inliers_are_the_rows_that_were_kept(make_camera_info):
 
 @pytest.mark.parametrize("pose_time", list(PoseTime))
 def test_without_a_readout_time_there_is_a_pose_but_no_twist(make_camera_info, pose_time):
-    frames = FrameLocalizer(NodeConfig(stamp_offset=0.5, pose_time=pose_time))
+    frames = CameraFrames(NodeConfig(stamp_offset=0.5, pose_time=pose_time))
     frames.calibrate(read_camera_info(make_camera_info()))
     seen = simulated(motion=STILL)[0]
     frame = localized(frames.localize(message_of(seen)))
@@ -112,7 +112,7 @@ def test_without_a_readout_time_there_is_a_pose_but_no_twist(make_camera_info, p
 def test_a_lens_that_is_off_is_noticed_after_a_second(make_camera_info, bend, told):
     notices: list[tuple[str, str]] = []
     config = NodeConfig(readout_time=READOUT_TIME)
-    frames = FrameLocalizer(config, lambda *words: notices.append(words))
+    frames = CameraFrames(config, lambda *words: notices.append(words))
     frames.calibrate(read_camera_info(make_camera_info()))
     seen, rng = simulated(motion=STILL)[0], np.random.default_rng(1)
     away = (seen.pixels - [319.5, 239.5]) / 500.0
@@ -129,7 +129,7 @@ def test_a_lens_that_is_off_is_noticed_after_a_second(make_camera_info, bend, to
 def test_a_new_camera_counts_from_the_next_frame_on(make_camera_info):
     notices: list[tuple[str, str]] = []
     settings = {"readout_time": READOUT_TIME, "scan_direction": "left_to_right"}
-    frames = FrameLocalizer(NodeConfig(**settings), lambda *words: notices.append(words))
+    frames = CameraFrames(NodeConfig(**settings), lambda *words: notices.append(words))
     messages = map(message_of, simulated("left_to_right"))
     for _ in range(2):  # the same again
         frames.calibrate(read_camera_info(make_camera_info()))
@@ -149,7 +149,7 @@ def test_a_new_camera_counts_from_the_next_frame_on(make_camera_info):
 @pytest.mark.parametrize("direction", list(ScanDirection))
 def test_signs_and_frames_against_the_true_motion(make_camera_info, direction, pose_time):
     """The real localizer on simulated messages; velocities by differences of true poses."""
-    frames = FrameLocalizer(
+    frames = CameraFrames(
         # Exact pixels count as good to a hundredth, beside which the usual prior weighs something.
         NodeConfig(
             readout_time=READOUT_TIME,
@@ -178,7 +178,7 @@ def test_signs_and_frames_against_the_true_motion(make_camera_info, direction, p
 def test_the_lens_of_a_camera_file_takes_the_place_of_camera_info(tmp_path, make_camera_info):
     file, K = tmp_path / "camera.yaml", np.array([[400.0, 0, 319], [0, 400, 239], [0, 0, 1]])
     write_camera_file(file, {}, lens_parameters(Camera(640, 480, K)))
-    frames = FrameLocalizer(NodeConfig(camera_file=str(file)))
+    frames = CameraFrames(NodeConfig(camera_file=str(file)))
     frames.load_files()
     frames.calibrate(read_camera_info(make_camera_info(width=640, height=480)))
     assert tuple(K.ravel()) == frames.calibrations[""].K
@@ -201,7 +201,7 @@ def test_the_lenses_of_a_rig_are_those_of_its_file(tmp_path, make_camera_info):
     assert again.time_offset == {"a": 0.0, "b": 0.01}
     assert again.cameras["b"].readout_time == 0.02
     np.testing.assert_array_equal(again.camera_from_rig["a"][1], [0.1, 0.0, 0.0])
-    frames = FrameLocalizer(build({**camera_values(file), "camera_file": str(file)}))
+    frames = CameraFrames(build({**camera_values(file), "camera_file": str(file)}))
     frames.load_files()
     for name, camera in cameras.items():
         frames.calibrate(read_camera_info(make_camera_info(width=640, height=480)), name)
@@ -211,7 +211,7 @@ def test_the_lenses_of_a_rig_are_those_of_its_file(tmp_path, make_camera_info):
 def test_refinement_turns_off_what_knows_more_than_the_points_of_a_frame(make_camera_info):
     """However the settings come; asked for again, all of it is back."""
     wanted = NodeConfig(readout_time=READOUT_TIME, publish_tf="map_to_camera", refinement="none")
-    frames = FrameLocalizer(replace(wanted, publish_tf="none"))
+    frames = CameraFrames(replace(wanted, publish_tf="none"))
     frames.calibrate(read_camera_info(make_camera_info()))
 
     def told(config: NodeConfig) -> list[Localized]:

@@ -19,7 +19,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms import Transform, TransformTree, make_transform
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 
 from .clouds import cloud_of
@@ -122,7 +122,7 @@ def test_pose_and_twist_are_right_whatever_is_turned_or_late(direction, make_cam
         stamp_offset=STAMP_OFFSET,
         imu=Imu(time_offset=IMU_OFFSET, estimate_time_offset=False),
     )
-    localizer = FrameLocalizer(config, transforms=tree)
+    localizer = CameraFrames(config, transforms=tree)
     K = np.array([[FOCAL, 0.0, CENTRE[0]], [0.0, FOCAL, CENTRE[1]], [0.0, 0.0, 1.0]])
     localizer.calibrate(read_camera_info(make_camera_info(k=K.ravel())))
     rng = np.random.default_rng(1)

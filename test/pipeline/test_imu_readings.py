@@ -25,7 +25,7 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.trajectories import read_motions
 from rs_localizer.io.transforms import Transform, TransformError, TransformTree, make_transform
 from rs_localizer.offline.replay import imu_first
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.camera_frames import CameraFrames, Refusal
 from rs_localizer.pipeline.imu_readings import in_camera_axes
 
 READOUT_TIME = 0.03
@@ -115,7 +115,7 @@ def fly(
     tree = TransformTree()
     if mounting is not False:
         tree.add(mounting or flight.mounting, static=True)
-    frames = FrameLocalizer(config, lambda name, _: flown.notices.update((name,)), tree)
+    frames = CameraFrames(config, lambda name, _: flown.notices.update((name,)), tree)
 
     def changed() -> Iterable[Item]:
         comes = {"/imu": round(1e9 * late)}

@@ -15,7 +15,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagError
 from rs_localizer.io.topics import GIVEN_POSES
 from rs_localizer.offline.replay import NO_FRAMES, find_topics
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.inputs import INPUTS, Role
 from rs_localizer.pipeline.refusal import REASONS, Refusal
 
@@ -48,7 +48,7 @@ def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name, tmp_p
         "{map_frame: map, markers: [{family: 4x4_50, id: 0, size: 0.1, position: [0, 0, 0], "
         "quaternion: [0, 0, 0, 1]}]}"
     )
-    localizer = FrameLocalizer(NodeConfig(marker_map=str(wall)))
+    localizer = CameraFrames(NodeConfig(marker_map=str(wall)))
     localizer.load_files()
     refusal = item.take(localizer, broken)
     assert isinstance(refusal, Refusal)

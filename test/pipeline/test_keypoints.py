@@ -17,7 +17,7 @@ from rs_localizer.io.clouds import make_cloud, read_keypoints, read_map
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Localized
 from rs_localizer.matching import Matcher
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
@@ -63,9 +63,9 @@ class Notices(list[tuple[str, str]]):
 
 def localizer(
     make_camera_info: Any, notices: Notices | None = None, **settings: Any
-) -> FrameLocalizer:
+) -> CameraFrames:
     given = NodeConfig(**{"readout_time": READOUT_TIME, **settings})
-    result = FrameLocalizer(given, Notices() if notices is None else notices)
+    result = CameraFrames(given, Notices() if notices is None else notices)
     result.calibrate(read_camera_info(make_camera_info()))
     return result
 
@@ -125,7 +125,7 @@ def test_keypoints_that_give_no_pose(frames, make_camera_info):
     few = keypoints(frames[2], "id")
     few.width = 5
     assert refused(node.localize_keypoints(few))[0] == "too_few_points"
-    unknown = FrameLocalizer(NodeConfig())
+    unknown = CameraFrames(NodeConfig())
     unknown.use_map(read_map(map_cloud(LANDMARKS)))
     assert refused(unknown.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_camera_info"
     # None of this left a trace.

@@ -25,7 +25,7 @@ from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.localizer import Localizer
 from rs_localizer.offline.replay import find_topics, replay
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.shutter_watch import MeasuredReadout, ShutterWatch
 from rs_localizer.tools.simulation.scene import room
@@ -75,7 +75,7 @@ class Watched:
     def __init__(self, count: int = FRAMES, seen: Any = None, **settings: Any) -> None:
         self.clouds = [message for message, _ in seen or frames_with_truth()]
         self.said: list[tuple[str, str]] = []
-        self.frames = FrameLocalizer(NodeConfig(**settings), lambda *said: self.said.append(said))
+        self.frames = CameraFrames(NodeConfig(**settings), lambda *said: self.said.append(said))
         self.frames.calibrate(CALIBRATION)
         self.results = [self.frames.localize(message) for message in self.clouds[:count]]
 
@@ -121,7 +121,7 @@ def test_a_robot_that_drives_slowly_is_hardly_ever_doubted():
     world = room(motion.state(0, np.linspace(0, 2.5, 6)).positions, np.random.default_rng(0), 5000)
     seen, doubted = FrameSettings(100, 0.7, 0.2), []
     for seed in range(4, 10):
-        frames = FrameLocalizer(NodeConfig(readout_time=READOUT))
+        frames = CameraFrames(NodeConfig(readout_time=READOUT))
         frames.calibrate(CALIBRATION)
         for frame in simulate_frames(CAMERA, motion, world, seen, seed=seed):
             cloud = cloud_of(frame.stamp_ns + 10**18, frame.points, frame.pixels)
@@ -133,7 +133,7 @@ def test_a_robot_that_drives_slowly_is_hardly_ever_doubted():
 def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm():
     # Its images were exposed 5 ms rms beside their stamps; `calibrate` says 12.9 +- 1.1 ms.
     notices: list[str] = []
-    frames = FrameLocalizer(NodeConfig(readout_time=0.0129), lambda name, _: notices.append(name))
+    frames = CameraFrames(NodeConfig(readout_time=0.0129), lambda name, _: notices.append(name))
     with open_bag(data.path(data.WEBCAM)) as bag:
         assert sum(bool(answer.result) for answer in replay(bag, find_topics(bag), frames)) > 100
     assert frames.shutter.measured is not None
@@ -164,7 +164,7 @@ def within(error: np.ndarray, covariance: np.ndarray) -> bool:
 
 @pytest.mark.parametrize("tracking", [True, False])
 def test_a_global_shutter_is_known_within_a_second_and_has_no_twist(tracking):
-    frames = FrameLocalizer(NodeConfig(readout_time=READOUT, tracking=tracking))
+    frames = CameraFrames(NodeConfig(readout_time=READOUT, tracking=tracking))
     with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
         answers = replay(bag, find_topics(bag), frames)
         found = [found for (*_, found), _ in zip(answers, range(40), strict=False)]
@@ -289,7 +289,7 @@ def test_a_camera_that_shakes_between_its_frames_is_not_contradicted(amplitude, 
 
 
 def test_a_real_camera_told_the_other_axis_is_refused():
-    frames = FrameLocalizer(NodeConfig(readout_time=0.0129, scan_direction="left_to_right"))
+    frames = CameraFrames(NodeConfig(readout_time=0.0129, scan_direction="left_to_right"))
     with open_bag(data.path(data.WEBCAM)) as bag:
         results = [answer.result for answer in replay(bag, find_topics(bag), frames)]
     # It moves slowly. Before, 13 of 121 images were refused, and not for this.

@@ -23,7 +23,7 @@ from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.map_files import read_marker_map
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 
 READOUT = 0.02
@@ -116,9 +116,9 @@ def test_pixels_and_corners_are_those_of_our_own_detector(walls: Path) -> None:
     assert np.median(np.linalg.norm(apart, axis=1)) < 0.4
 
 
-def localizer(walls: Path, notices: list[tuple[str, str]]) -> FrameLocalizer:
+def localizer(walls: Path, notices: list[tuple[str, str]]) -> CameraFrames:
     config = NodeConfig(readout_time=READOUT, marker_map=str(walls / "marker_map.yaml"))
-    made = FrameLocalizer(config, lambda name, text: notices.append((name, text)))
+    made = CameraFrames(config, lambda name, text: notices.append((name, text)))
     made.load_files()
     with open_bag(walls) as bag:
         (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("CameraInfo"))
@@ -207,7 +207,7 @@ def test_what_cannot_be_used_is_refused(walls: Path, tmp_path: Path, capsys: Any
         read_detections(
             SimpleNamespace(header=header, detections=[SimpleNamespace(corners=[1, 2, 3])])
         )
-    assert isinstance(FrameLocalizer(NodeConfig()).localize_detections(None), Refusal)
+    assert isinstance(CameraFrames(NodeConfig()).localize_detections(None), Refusal)
     path = written(walls, tmp_path / "tags", [array(APRILTAG_TYPE, header, tags)])
     assert main(["replay", str(path), "--out", str(tmp_path / "out")]) == 1
     assert "-p marker_map:=FILE says where tags are" in capsys.readouterr().err

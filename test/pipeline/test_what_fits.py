@@ -19,7 +19,7 @@ from rs_localizer.io.images import Image
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.marker_detector import FrameDetector
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.pipeline.what_fits import Mistakes, mistake_of, of_refused, what_fits
@@ -125,7 +125,7 @@ def cloud(t, pixels):
 
 def test_node_and_replay_say_it(make_camera_info):
     told = []
-    frames = FrameLocalizer(NodeConfig(readout_time=READOUT), lambda *notice: told.append(notice))
+    frames = CameraFrames(NodeConfig(readout_time=READOUT), lambda *notice: told.append(notice))
     info = {"k": K.ravel(), "width": 640, "height": 480, "d": []}
     frames.calibrate(read_camera_info(make_camera_info(**info)))
     mirror, times = MISTAKES["left to right"], np.arange(4) / 30.0

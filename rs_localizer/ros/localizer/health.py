@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import make_header
 from rs_localizer.io.outputs import Localized
-from rs_localizer.pipeline.frames import DOUBTFUL
+from rs_localizer.pipeline.camera_frames import DOUBTFUL
 from rs_localizer.pipeline.imu_readings import ImuState, in_words
 from rs_localizer.pipeline.inputs import Role, input_named, said
 from rs_localizer.pipeline.map_to_odom import Decision, Standing

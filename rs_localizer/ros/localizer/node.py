@@ -31,9 +31,10 @@ from rs_localizer.io.topics import (
     LIVE,
     POSE,
 )
+from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.given_pose import read_given_pose
-from rs_localizer.pipeline.inputs import Input, Results, Role, inputs_of
+from rs_localizer.pipeline.inputs import Input, Results, Role, frame_localizer, inputs_of
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.localizer import tf
 from rs_localizer.ros.localizer.broadcaster import Broadcaster
@@ -91,20 +92,21 @@ class Publisher:
             for name, kind in types.items()
         }
         self._map_view = MapView(node)
-        self._motion: FrameLocalizer | None = None  # that of the last frame, for other threads
+        self._motion: CameraFrames | None = None  # that of the last frame, for other threads
         self._newest_ns = 0
 
     def publish(self, frame: Localized) -> None:
         """Publish a frame, in the worker's thread."""
         frames, config = self._frames, self._frames.config
-        ticks = config.output_rate > 0.0 and frames.predicts
-        self._motion = frames.snapshot() if ticks else None
+        camera = frames if isinstance(frames, CameraFrames) else None
+        ticks = config.output_rate > 0.0 and camera is not None and camera.predicts
+        self._motion = camera.snapshot() if camera is not None and ticks else None
         self._send(frame, [INLIERS] if ticks else TYPES)
         if not ticks or config.publish_tf == PublishTf.MAP_TO_ODOM:
             self._broadcaster.publish(frame, config)
         self._map_view.show(frame.map_frame, frames.map_points)
-        if self._wanted(CAMERA_MARKER) and (corners := frames.view_corners) is not None:
-            marker = MarkerArray(markers=[camera_marker(frame, corners)])
+        if camera is not None and self._wanted(CAMERA_MARKER):
+            marker = MarkerArray(markers=[camera_marker(frame, camera.view_corners)])
             self._publishers[CAMERA_MARKER].publish(marker)
         if math.isfinite(frame.estimate.integrity):
             self._publishers[INTEGRITY].publish(integrity_message(frame))
@@ -160,7 +162,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         tf.check(config)
 
     def open(self, config: NodeConfig) -> None:
-        frames = FrameLocalizer(config, self.refusals.notice, self._broadcaster.tf)
+        frames = frame_localizer(config, self.refusals.notice, self._broadcaster.tf)
         frames.load_files()
         self._say_map(frames)
         self._broadcaster.configure(config)

@@ -162,7 +162,7 @@ def test_life_cycle_of_a_node_with_other_names(recording, start_node, peer, tmp_
 
 def test_a_signal_while_a_frame_takes_long(recording, start_node, peer):
     slow = (
-        "import sys, time; from rs_localizer.pipeline.frames import FrameLocalizer as F\n"
+        "import sys, time; from rs_localizer.pipeline.camera_frames import CameraFrames as F\n"
         "def wait(self, message): print('a slow frame', flush=True); time.sleep(9999)\n"
         "F.localize = wait\n"
         "from rs_localizer.ros.main import main; sys.exit(main())"

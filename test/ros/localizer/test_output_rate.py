@@ -10,7 +10,7 @@ from rs_localizer.io.bags import typestore
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 
 from ..conftest import RUN  # noqa: TID252 - Python has a package "test"
 from .robot import READOUT_TIME, SHUTTER, Robot, inputs, record
@@ -19,7 +19,7 @@ from .robot import READOUT_TIME, SHUTTER, Robot, inputs, record
 def test_odometry_between_and_after_images(tmp_path, start_node, peer):
     """By a simulated clock, 25 ms after each image; then the images stop."""
     record(tmp_path / "flight")
-    offline = FrameLocalizer(NodeConfig(readout_time=READOUT_TIME))
+    offline = CameraFrames(NodeConfig(readout_time=READOUT_TIME))
     start_node(*SHUTTER, "-p", "output_rate:=50.0", "-p", "use_sim_time:=true")
     robot = Robot(peer)
     clock = peer.node.create_publisher(Clock, "/clock", 10)
@@ -57,7 +57,7 @@ def test_odometry_between_and_after_images(tmp_path, start_node, peer):
 def test_odometry_while_a_frame_is_localized(tmp_path, start_node, peer):
     """By a simulated clock; the fifth frame takes for ever."""
     slow = (
-        "import time; from rs_localizer.pipeline.frames import FrameLocalizer as F\n"
+        "import time; from rs_localizer.pipeline.camera_frames import CameraFrames as F\n"
         "localize, count = F.localize, iter(range(1000))\n"
         "def wait(self, message):\n"
         "    if next(count) == 4: print('a slow frame', flush=True); time.sleep(9999)\n"

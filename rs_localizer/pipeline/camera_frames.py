@@ -1,0 +1,279 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of one camera: correspondences, keypoints by a map, or tags of another detector."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rs_localizer import matching
+from rs_localizer.config import NodeConfig
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Notice, Reason
+from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.io.clouds import (
+    Correspondences,
+    Keypoints,
+    read_correspondences,
+    read_keypoints,
+)
+from rs_localizer.io.outputs import Localized
+from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline import what_fits
+from rs_localizer.pipeline.cloud_checks import stale_landmarks
+from rs_localizer.pipeline.frames import FrameLocalizer, is_timed
+from rs_localizer.pipeline.imu_readings import inertial_settings
+from rs_localizer.pipeline.pose_at_time import middle_row_ns, published_moment
+from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
+from rs_localizer.tracking import FrameContext, Tracker
+
+if TYPE_CHECKING:
+    from rs_localizer.inertial.samples import ImuSamples
+
+# From this chance on of a wrong pose or map, it is more probable than not.
+DOUBTFUL = 0.5
+# Smooth errors (px, root mean square; median of so many frames) that nobody has who calibrated
+# well: surveyed tags before a calibrated lens have 0.2.
+_MUCH, _FRAMES = 0.3, 30
+
+
+class CameraFrames(FrameLocalizer):
+    """Localizes the frames of one camera, without a name; see :class:`FrameLocalizer`."""
+
+    def _new_tracker(self, config: NodeConfig, cameras: Mapping[str, Camera]) -> Tracker:
+        (camera,) = cameras.values()
+        timed = is_timed(config, cameras)
+        tracks = config.tracking and timed
+        inertial = inertial_settings(config) if timed else None
+        lag = config.output_lag if tracks else 0
+        return Tracker(Localizer(camera, config), inertial, tracks, lag, config.max_prediction)
+
+    def _forget_frames(self) -> None:
+        # Of the last frames, by time of the middle row: with what their results are published.
+        self._waiting: dict[int, Correspondences] = {}
+        # The newest of them that has a pose, without its rows.
+        self._newest: Correspondences | None = None
+        self._smooth_errors: deque[float] = deque(maxlen=_FRAMES)
+        self._faults: set[str] = set()  # of the shutter, which have been noticed
+
+    @property
+    def _camera(self) -> Camera:
+        (camera,) = self._cameras.values()
+        return camera
+
+    @property
+    def _context(self) -> FrameContext:
+        """Knowledge of the next frame."""
+        return FrameContext(self._config.readout_time_deviation, self._landmarks.error_modes)
+
+    def _middle_row_ns(self, stamp_ns: int) -> int:
+        """Time at which the middle row of the image with this stamp was exposed."""
+        return middle_row_ns(self._config, self._camera, stamp_ns)
+
+    @property
+    def view_corners(self) -> Array:
+        """Bearings (4,3) of the image's corners, in camera axes."""
+        width, height = np.array(self._camera.size) - 1.0
+        corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+        return self._camera.bearings(corners)
+
+    def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
+        """True if readings of the frame with this stamp may yet come within so many s."""
+        time_ns = self._middle_row_ns(stamp_ns)
+        return self.imu.awaits(self._tracker, self._config, time_ns, patience)
+
+    def localize(self, message: Any) -> Localized | Refusal:
+        """Localize one sensor_msgs/PointCloud2 of correspondences; never raises for bad ones."""
+        cloud = read_or_refuse(read_correspondences, message, Reason.BAD_CLOUD)
+        return cloud if isinstance(cloud, Refusal) else self.localize_cloud(cloud)
+
+    def localize_cloud(self, cloud: Correspondences) -> Localized | Refusal:
+        """Localize correspondences, however they came."""
+        refusal = self._stream.follow(cloud.stamp_ns, cloud.frame)
+        if refusal is not None:
+            return refusal
+        result = self._localize(cloud)
+        if result:
+            self._landmarks.lacking = False  # who sends correspondences needs none
+        return self._delayed(result, cloud.stamp_ns)
+
+    def localize_keypoints(self, message: Any) -> Localized | Refusal:
+        """Localize one sensor_msgs/PointCloud2 of keypoints; never raises for bad ones.
+
+        Tracked, landmarks are first looked for where the motion predicts them only, then, if that
+        gives no pose, all over the map.
+        """
+        keypoints = read_or_refuse(read_keypoints, message, Reason.BAD_KEYPOINTS)
+        if isinstance(keypoints, Refusal):
+            return keypoints
+        if self.map is not None:
+            refusal = self._stream.follow(keypoints.stamp_ns, self.map.frame)
+            if refusal is not None:
+                return refusal
+        by = self._landmarks.how(keypoints)
+        if isinstance(by, Refusal):
+            return by
+        if (cloud := self._landmarks.repeated(keypoints)) is not None:
+            return self._delayed(self._localize(cloud), keypoints.stamp_ns)
+        if by == matching.MatchBy.DESCRIPTOR:
+            time_ns = self._middle_row_ns(keypoints.stamp_ns)
+            if self.map is not None:
+                self._expect(time_ns, self.map.frame)
+            prior = self._tracker.prediction(time_ns, context=self._context)
+            result = None if prior is None else self._localize_by_map(keypoints, prior)
+            # Without its mounting a pose is none the worse.
+            if result or (result is not None and result.reason is Reason.NO_TRANSFORM):
+                return self._delayed(result, keypoints.stamp_ns)
+        return self._delayed(self._localize_by_map(keypoints, None), keypoints.stamp_ns)
+
+    def localize_detections(self, message: Any) -> Localized | Refusal:
+        """Localize one AprilTagDetectionArray by ``marker_map``; never raises for bad ones."""
+        if self._tags is None:
+            return Refusal(Reason.NO_MAP, "detections need the setting marker_map")
+        cloud = self._tags.match(message)
+        return cloud if isinstance(cloud, Refusal) else self.localize_cloud(cloud)
+
+    def _localize_by_map(self, keypoints: Keypoints, prior: Prior | None) -> Localized | Refusal:
+        cloud = self._landmarks.match(keypoints, self._config.matching, self._camera, prior)
+        return cloud if isinstance(cloud, Refusal) else self._localize(cloud)
+
+    def _localize(self, cloud: Correspondences) -> Localized | Refusal:
+        if not self.calibrations:
+            return Refusal(Reason.NO_CAMERA_INFO, "no usable camera_info has come yet")
+        config, frame = self._config, self.camera_frame
+        cloud = self._checked(cloud)
+        time_ns, context = self._middle_row_ns(cloud.stamp_ns), self._context
+        self._expect(time_ns, cloud.frame)
+
+        def localized(samples: ImuSamples | None) -> Estimate | Failure:
+            matches = cloud.points, cloud.pixels, cloud.scores
+            return self._tracker.localize(time_ns, *matches, imu=samples, context=context)
+
+        self.imu.track(self._tracker, config, time_ns, frame, self.transforms, localized)
+        result = self._tracker.newest
+        assert result is not None
+        if result:
+            ahead = (cloud.points[result.inliers] - result.position) @ result.rotation[2]
+            self._stream.pace(time_ns, result, float(np.median(ahead)), config)
+            self._pose_prior.judge(result)
+            if self.predicts:
+                self._newest = replace(cloud, table=cloud.table[:0], dropped=0)
+        if self._tracker.output_lag > 0:
+            self._waiting[time_ns] = cloud
+            while len(self._waiting) > self._tracker.output_lag + 1:
+                del self._waiting[next(iter(self._waiting))]
+        self._report_shutter()
+        published = self._published(cloud, result)
+        if self._tracker.repeats and result:
+            self._notice(
+                Notice.STILL_IMAGE,
+                "the pixels are those of the last image, bit for bit, and nothing says that the "
+                "camera moves: it counts once",
+            )
+        if not published:
+            matches = cloud.points, cloud.pixels, what_fits.ids_of(cloud)
+            localizer = self._tracker.localizer
+            published = self._explained(published, lambda: what_fits.what_fits(localizer, *matches))
+        return published
+
+    def _expect(self, time_ns: int, map_frame: str) -> None:
+        """Tell the tracker what others know of the pose at a time, if it knows nothing itself."""
+        if not (self.calibrations and self._pose_prior.given):
+            return
+        if self._tracker.prediction(time_ns) is not None:
+            return
+        prior = self._pose_prior.prior(
+            time_ns, map_frame, self.camera_frame, self._config, self.transforms
+        )
+        if prior is not None:
+            self._tracker.expect(time_ns, prior)
+
+    def _report_shutter(self) -> None:
+        shutter = self._tracker.shutter
+        if shutter.fault and shutter.kind not in self._faults:
+            self._faults.add(shutter.kind)
+            self._notice(Notice.READOUT_TIME, shutter.fault)
+
+    def _published(self, cloud: Correspondences, result: Estimate | Failure) -> Localized | Refusal:
+        """A result of the body at the published moment."""
+        if not result:
+            return Refusal(result.reason, result.detail)
+        if result.integrity > DOUBTFUL:
+            text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
+            self._notice(Notice.DOUBTFUL, text)
+        elif said := stale_landmarks(cloud, self._tracker.stale(cloud.points)):
+            self._notice(Notice.STALE_LANDMARKS, said)
+        if result.left_out:
+            self._notice(Notice.DOUBTFUL, result.left_out)
+        if not len(result.shake):  # vibration moves points smoothly, too
+            self._smooth_errors.append(result.model_error)
+        if len(self._smooth_errors) == _FRAMES:
+            off = float(np.median(self._smooth_errors))
+            if off > _MUCH:
+                self._notice(
+                    Notice.LENS,
+                    f"residuals vary smoothly over the image ({off:.1f} px rms): recalibrate the "
+                    "lens, or survey the map again; until then poses allow for it",
+                )
+        moment = published_moment(self._config, self._camera, cloud.stamp_ns)
+        return self._mounted_result(cloud, result, moment)
+
+    def _mounted_result(
+        self, cloud: Correspondences, estimate: Estimate, moment: tuple[int, float]
+    ) -> Localized | Refusal:
+        deviation = self._tracker.readout_time_deviation(self._context)
+        return self.mounted(self._camera_result(cloud, estimate, moment, deviation))
+
+    def _delayed(self, newest: Localized | Refusal, stamp_ns: int) -> Localized | Refusal:
+        """The result that ``output_lag`` asks for once the frame of this stamp has come."""
+        tracker = self._tracker
+        if tracker.output_lag == 0 or tracker.newest_ns != self._middle_row_ns(stamp_ns):
+            return newest
+        return self._late(tracker.delayed)
+
+    def _late(self, found: Estimate | Failure) -> Localized | Refusal:
+        """The result of a frame that has waited."""
+        if not found:
+            return Refusal(found.reason, found.detail)
+        return self._published(self._waiting[found.time_ns], found)
+
+    def flush(self) -> list[Localized | Refusal]:
+        """The results that ``output_lag`` has held back: no more images will come."""
+        return list(map(self._late, self._tracker.flush()))
+
+    @property
+    def predicts(self) -> bool:
+        """True if frames are tracked, so that :meth:`at` knows the motion between them."""
+        return self._tracker.remembers_motion
+
+    def snapshot(self) -> CameraFrames:
+        """What :meth:`at` knows now, for another thread while frames are localized here."""
+        there = copy(self)
+        there._tracker = self._tracker.snapshot()
+        return there
+
+    def at(self, stamp_ns: int) -> Localized | Refusal | None:
+        """Pose and twist at a time of the images' clock, without inliers.
+
+        None before the last frames, more than ``max_prediction`` after them, and where frames do
+        not know how the camera moves (:attr:`predicts`).
+        """
+        if not self.predicts or self._newest is None:
+            return None
+        newest_ns, samples = self._tracker.newest_ns, None
+        if newest_ns is not None and stamp_ns > newest_ns:
+            known = self._tracker, self._config, stamp_ns, self.camera_frame, self.transforms
+            samples = self.imu.ahead(*known)
+        found = self._tracker.at(stamp_ns, samples)
+        if found is None:
+            return None
+        cloud = replace(self._newest, stamp_ns=stamp_ns)
+        return self._mounted_result(cloud, found, (stamp_ns, 0.0))
