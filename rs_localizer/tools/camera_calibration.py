@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.camera import Camera
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools.adjust.bodies import is_flat
 from rs_localizer.tools.adjust.fit import Fit, cheaper, cost_at, fit, image_speeds
@@ -30,7 +30,6 @@ from rs_localizer.tools.adjust.variables import (
     Unknowns,
     start_state,
 )
-from rs_localizer.tools.first_lens import as_fisheye
 from rs_localizer.tools.imu_mount import MountFound, NoMount, gyro_samples, mount_of, with_gyro
 from rs_localizer.tools.readout_belief import (
     Block,
@@ -98,11 +97,6 @@ def cut(state: Unknowns, start: float, end: float) -> Unknowns | None:
 
 
 _LEAST_IMAGES = 20
-# Where a plain lens leaves out more than this part of the keypoints, a fisheye is tried, and taken
-# if most of these fit by it: 0.88 of a fisheye's rim (rendered). Of nine real boards before plain
-# lenses seven lose up to 1 %, one 6 % (0.02 of which a fisheye fits), and 54 % where a hand bends
-# the sheet (0.44).
-_LEFT_OUT, _MOST_OF_THEM = 0.05, 0.7
 # Keypoints of all images together: each image keeps its part. A fisheye of 285 images with 352
 # corners each took minutes longer, for a lens and a readout time that errors of the corners limit.
 _MOST_SIGHTS = 40_000
@@ -170,8 +164,7 @@ def calibrate(
         camera: its lens, and the axis and assumed direction of its scan; not its readout time.
         images: with at least a dozen correspondences each; those that show nothing say when the
             camera took images.
-        intrinsics: the lens is to be found, also whether it is a fisheye, which a first lens, from
-            images that move, does not tell; otherwise it is known to a percent or two.
+        intrinsics: the lens is to be found; otherwise it is known to a percent or two.
         imu: how it goes with the camera is to be found; its turns then help to find all else.
         own_stamps: stamps are the camera's; otherwise those of a file, which are the images' own
             only where they are uneven.
@@ -185,17 +178,17 @@ def calibrate(
     if len(images) < _LEAST_IMAGES:
         raise ValueError(f"{len(images)} images show the map, at least {_LEAST_IMAGES} are needed")
     stamps = examine((taken - taken[0]) * 1e-9)
-    posed, fitted = _fitted(camera, images, stamps.interval, intrinsics, done)
-    every, fits = sum(len(image.points) for image in images), np.count_nonzero(fitted.inliers)
-    plain = fitted.camera.distortion_model == DistortionModel.PLUMB_BOB
-    if intrinsics and plain and fits < (1.0 - _LEFT_OUT) * every:
-        seen = within(posed.observations, fitted.state.spline).subset(fitted.inliers)
-        with suppress(ValueError):
-            alike = as_fisheye(fitted.camera, seen.pixels)
-            fisheye = replace(camera, K=alike.K, D=alike.D, distortion_model=alike.distortion_model)
-            other = _fitted(fisheye, images, stamps.interval, intrinsics, lambda: None)
-            if np.count_nonzero(other[1].inliers) > fits + _MOST_OF_THEM * (every - fits):
-                camera, (posed, fitted) = fisheye, other
+    results = localize_each(camera, images, done)
+    localized = sum(map(bool, results))
+    if localized < _LEAST_IMAGES:
+        failures = [str(result) for result in results if not result]
+        raise ValueError(
+            f"{localized} of {len(images)} images have a pose, at least {_LEAST_IMAGES} are "
+            f"needed; of the last one without, {failures[-1]}"
+        )
+    posed = collect(camera, images, results)
+    freedom = _freedom(posed.observations, intrinsics)
+    fitted = _best(camera, posed, stamps.interval, freedom)
     observations, no_mount = within(posed.observations, fitted.state.spline), ""
     if imu is not None:
         try:
@@ -207,26 +200,6 @@ def calibrate(
             no_mount = str(error)
     judged = _judged(camera, posed, observations, stamps, fitted, len(images))
     return replace(judged, no_mount=no_mount, own_stamps=own_stamps or stamps.irregular)
-
-
-def _fitted(
-    camera: Camera, images: list[ImagePoints], interval: float, intrinsics: bool,
-    done: Callable[[], object],
-) -> tuple[Posed, Fit]:  # fmt: skip
-    """Images with their own poses, and one motion through them with all that is free."""
-    results = localize_each(camera, images, done)
-    localized = sum(map(bool, results))
-    if localized < _LEAST_IMAGES:
-        failures = [str(result) for result in results if not result]
-        raise ValueError(
-            f"{localized} of {len(images)} images have a pose, at least {_LEAST_IMAGES} are "
-            f"needed; of the last one without, {failures[-1]}"
-        )
-    posed = collect(camera, images, results)
-    try:
-        return posed, _best(camera, posed, interval, _freedom(posed.observations, intrinsics))
-    except Undetermined as error:
-        raise ValueError(str(error)) from error
 
 
 def _thinned(images: list[ImagePoints]) -> list[ImagePoints]:

@@ -5,17 +5,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.tools.adjust.fit import fit
-from rs_localizer.tools.adjust.intrinsics import lens_prior, lens_values, project
+from rs_localizer.tools.adjust.intrinsics import lens_prior, lens_values
 from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.adjust.spline import spline_through
 from rs_localizer.tools.adjust.variables import Freedom, SplineKeypoints, start_state
@@ -67,7 +69,6 @@ _CANDIDATES = (
     _Candidate(DistortionModel.RATIONAL_POLYNOMIAL, 8, cv2.CALIB_RATIONAL_MODEL),
 )
 _RICHER = 0.9
-_POSE_STEPS = 4  # of Gauss and Newton from a pose in rays: they double the digits
 _LEAST_POINTS = 8
 # Images of their own, and a lens of which nothing is known.
 _ALONE = Freedom(
@@ -146,37 +147,21 @@ def _pose(camera: Camera, image: ImagePoints) -> tuple[Array, Array] | None:
     rays = camera.rays(image.pixels)
     if not np.isfinite(rays).all():
         return None
-    # Before several walls the first method may end behind the camera.
+
+    def errors(pose: Array) -> Array:
+        # In pixels, not in rays: far from the middle they are not the same.
+        local = image.points @ Rotation.from_rotvec(pose[:3]).as_matrix().T + pose[3:]
+        return np.ravel(camera.project(local) - image.pixels)
+
+    # Before several walls the first method may end behind the camera, where no pixel is.
     for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_SQPNP):
         solved, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None, flags=method)
-        if solved:
-            rotation = np.array(cv2.Rodrigues(turn)[0], np.float64)
-            pose = _refined(camera, image, rotation, np.array(place, np.float64).ravel())
-            if pose is not None:
-                return pose
+        with suppress(ValueError):
+            if solved:
+                found = least_squares(errors, np.r_[turn.ravel(), place.ravel()], method="lm")
+                if np.isfinite(found.fun).all():
+                    return Rotation.from_rotvec(found.x[:3]).as_matrix(), found.x[3:]
     return None
-
-
-def _refined(
-    camera: Camera, image: ImagePoints, rotation: Array, centre: Array
-) -> tuple[Array, Array] | None:
-    """A pose in pixels, not in rays: far from the middle they are not the same."""
-    for _ in range(_POSE_STEPS):
-        local = image.points @ rotation.T + centre
-        if not np.all(local[:, 2] > 0.0):
-            return None
-        rays = local[:, :2] / local[:, 2:]
-        pixels, by_ray = camera.distort(rays)
-        if not np.isfinite(pixels).all():
-            return None
-        along = -np.einsum("nij,nj->ni", by_ray, rays)[:, :, None]
-        by_point = np.concatenate([by_ray, along], 2) / local[:, 2, None, None]
-        by_pose = np.concatenate([-by_point @ so3.hat(local), by_point], 2).reshape(-1, 6)
-        off = (image.pixels - pixels).ravel()
-        step = np.linalg.lstsq(by_pose, off, rcond=None)[0]
-        turned: Array = so3.exp(np.ascontiguousarray(step[:3]))
-        rotation, centre = turned @ rotation, turned @ centre + step[3:]
-    return rotation, centre
 
 
 def _fisheye(size: tuple[int, int], images: list[ImagePoints], K: Array) -> tuple[float, Camera]:
@@ -213,35 +198,10 @@ def _fisheye(size: tuple[int, int], images: list[ImagePoints], K: Array) -> tupl
     return float(np.sum(fitted.squared_errors)) * len(images) / len(found), fitted.camera
 
 
-def as_fisheye(lens: Camera, pixels: Array) -> Camera:
-    """The equidistant lens that is most like another one at some pixels (n,2) of the image.
-
-    Raises:
-        ValueError: when no such lens exists.
-    """
-    rays = lens.rays(pixels)
-    seen = np.isfinite(rays).all(axis=1)  # a polynomial shows nothing beyond its fold
-    rays, pixels = rays[seen], pixels[seen]
-    numbers = np.r_[lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2], np.zeros(4)]
-    for _ in range(_POSE_STEPS):
-        fisheye = _equidistant(lens.size, numbers)
-        off, by_lens = (pixels - fisheye.distort(rays)[0]).ravel(), _by_lens(fisheye, rays)
-        if not (np.isfinite(off).all() and np.isfinite(by_lens).all()):
-            raise ValueError("no equidistant lens is like this one")
-        numbers = numbers + np.linalg.lstsq(by_lens, off, rcond=None)[0]
-    return _equidistant(lens.size, numbers)
-
-
 def _equidistant(size: tuple[int, int], numbers: Array) -> Camera:
     """The lens of focal lengths, centre and distortion (8)."""
     K = np.array([[numbers[0], 0.0, numbers[2]], [0.0, numbers[1], numbers[3]], [0.0, 0.0, 1.0]])
     return Camera(*size, K=K, D=numbers[4:], distortion_model=DistortionModel.EQUIDISTANT)
-
-
-def _by_lens(camera: Camera, rays: Array) -> Array:
-    """Pixels (2n,m) of rays (n,2) by the numbers of a lens."""
-    points = np.column_stack([rays, np.ones(len(rays))])
-    return project(camera, lens_values(camera), points, True).by_lens.reshape(2 * len(rays), -1)
 
 
 def _calibrated(

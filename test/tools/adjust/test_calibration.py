@@ -15,7 +15,7 @@ from rs_localizer.tools import first_lens as first_lens_module
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
-from rs_localizer.tools.first_lens import as_fisheye, first_lens
+from rs_localizer.tools.first_lens import first_lens
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 
@@ -177,26 +177,3 @@ def test_images_by_whose_first_pose_points_are_behind_the_camera_are_left_out(mo
     error, found = first_lens_module._fisheye(lens.size, images, lens.K)
     assert error < 1.0
     np.testing.assert_allclose(found.K, lens.K, rtol=1e-3)
-
-
-def test_a_fisheye_is_begun_by_a_polynomial_that_does_not_show_the_corners(capfd):
-    """Where it folds a pixel has no ray, and one of them was enough that none was begun."""
-    lens = replace(CAMERA, D=np.array([-0.45, 0.0, 0.0, 0.0]))
-    pixels = np.stack(
-        np.meshgrid(np.arange(5.0, 640.0, 45.0), np.arange(5.0, 480.0, 45.0)), axis=-1
-    )
-    pixels = pixels.reshape(-1, 2)
-    shown = np.isfinite(lens.rays(pixels)).all(axis=1)
-    assert 20 < np.count_nonzero(shown) < len(pixels)
-    found = as_fisheye(lens, pixels)
-    rays = lens.rays(pixels[shown])
-    assert np.abs(found.distort(rays)[0] - pixels[shown]).max() < 5.0
-    assert capfd.readouterr().err == ""  # where LAPACK says that numbers are none
-
-
-def test_what_no_fisheye_is_like_is_refused(capfd):
-    K = np.array([[142.6, 0.0, 357.5], [0.0, 150.1, 958.3], [0.0, 0.0, 1.0]])
-    lens = replace(CAMERA, K=K, D=np.zeros(5))  # as a bad first one of a real video
-    with pytest.raises(ValueError, match="no equidistant lens"):
-        as_fisheye(lens, np.random.default_rng(0).uniform([120, 422], [300, 560], (237, 2)))
-    assert capfd.readouterr().err == ""
