@@ -58,12 +58,10 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   rigs                             several cameras, against their bounds
   real                             videos of real cameras; real gyro FOLDER: your own recording
   gross                            grossly wrong lenses and maps: what is published
-  mutants                          planted bugs, and whether tests catch them
   mapping                          refined maps and surveyed markers
   fuzzing                          wrong input for everything that reads
-  load, load.changes               live nodes under load, and set anew
+  load                             live nodes under load
   load.robot                       a live node on a robot: occlusions, odometry at 200 Hz
-  simulation                       bags as of simulate, of more sensors
   start                            memory and time of a start of the node
   page                             what a bench prints, into the docs
 """
