@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from benchmarks.fuzzing import seeds
-from benchmarks.simulation.keypoints import map_rows
+from benchmarks.fuzzing.seeds import map_rows
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info

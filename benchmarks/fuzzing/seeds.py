@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
-from benchmarks.simulation.keypoints import keypoint_rows, map_rows, random_descriptors
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
@@ -30,6 +29,7 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.simulated_keypoints import keypoint_rows, random_descriptors
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
@@ -278,3 +278,20 @@ def recordings() -> dict[str, list[bytes]]:
             writer.write(connection, 5, store.serialize_ros1(message, "std_msgs/msg/Float64"))
         found[".bag"] = [path.read_bytes()]
     return found
+
+
+def map_rows(landmarks: Map) -> NDArray[Any]:
+    """Rows (n,) of a cloud of landmarks."""
+    kinds: list[tuple[Any, ...]] = [(name, "<f8") for name in "xyz"]
+    if landmarks.ids is not None:
+        kinds.append(("id", landmarks.id_type))
+    if landmarks.descriptors is not None:
+        kinds.append(("descriptor", landmarks.descriptors.dtype, landmarks.descriptors.shape[1:]))
+    rows = np.empty(len(landmarks), kinds)
+    for name, column in zip("xyz", landmarks.points.T, strict=True):
+        rows[name] = column
+    if landmarks.ids is not None:
+        rows["id"] = landmarks.ids
+    if landmarks.descriptors is not None:
+        rows["descriptor"] = landmarks.descriptors
+    return rows

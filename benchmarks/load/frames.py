@@ -11,13 +11,13 @@ import numpy as np
 from rclpy.serialization import serialize_message
 
 from benchmarks.data import HAND_MOTION
-from benchmarks.simulation.imu import ImuSettings, Lever, make_imu, simulate_imu
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_correspondences
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.ros.node.conversion import copy_message
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import simulate_frames
+from rs_localizer.tools.simulation.simulated_imu import ImuSettings, Lever, make_imu, simulate_imu
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 

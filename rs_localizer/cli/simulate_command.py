@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``rs_localizer simulate``: a bag with ground truth of a simulated rolling-shutter camera."""
+"""``rs_localizer simulate``: a bag with ground truth of rolling-shutter cameras, and an IMU."""
 
 from __future__ import annotations
 
@@ -16,19 +16,24 @@ from rs_localizer.cli.typed import typed
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.camera_files import pinhole_matrix, read_calibration
-from rs_localizer.io.recording import MARKER_MAP, PARAMETERS
+from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
+from rs_localizer.io.rigs import read_camchain
+from rs_localizer.io.topics import TF_STATIC
 from rs_localizer.settings import build, camera_values, settings, write_parameters
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings, ImageSettings
 from rs_localizer.tools.simulation.walls import SCENES, Scene
 
 if WORKING:
     import numpy as np
+    from numpy.typing import NDArray
     from tqdm import tqdm
 
     from rs_localizer import data
     from rs_localizer.core.arrays import Array
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.bags import BagWriter
+    from rs_localizer.io.maps.files import write_npz
+    from rs_localizer.io.maps.landmarks import Map
     from rs_localizer.io.trajectories import read_tum
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.tools.simulation.renderer import RenderedFrame, Renderer, rendered_frames
@@ -38,7 +43,26 @@ if WORKING:
         frame_stamps,
         simulate_frames,
     )
+    from rs_localizer.tools.simulation.simulated_imu import (
+        ImuBagWriter,
+        ImuSettings,
+        Lever,
+        shaken,
+        simulate_imu,
+    )
+    from rs_localizer.tools.simulation.simulated_keypoints import (
+        keypoint_rows,
+        random_descriptors,
+        write_keypoints,
+    )
     from rs_localizer.tools.simulation.simulated_recording import write_simulated
+    from rs_localizer.tools.simulation.simulated_rig import (
+        camera_stamps,
+        make_mounts,
+        rig_parameters,
+        simulate_rig,
+        write_rig_frame,
+    )
     from rs_localizer.tools.simulation.true_motion import (
         ConstantVelocity,
         RecordedMotion,
@@ -55,7 +79,9 @@ _READOUT_TIME = 0.03  # s, of a webcam
 _POINTS, _PICTURES = FrameSettings(), ImageSettings()
 _POSITIVE = (0.0, math.inf)
 # Options of the one kind of recording that mean nothing to the other.
-_OF_POINTS, _OF_IMAGES = ("points", "outliers"), ("walls", "exposure")
+_OF_POINTS, _OF_IMAGES = ("points", "outliers", "keypoints"), ("walls", "exposure")
+# Random numbers of their own: the frames are the same with and without them.
+_IMU_STREAM, _VIBRATION_STREAM = 14, 60
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +104,10 @@ class MotionOptions:
         f"seconds (default: the whole trajectory; {_DURATION:g} at constant velocity)", "S",
         limits=_POSITIVE, above=True,
     )  # fmt: skip
+    vibration: list[tuple[float, float]] = option(
+        "add vibration by DEG about any axis; may be repeated", "DEG HZ",
+        list, limits=(0.0, math.inf),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +126,12 @@ class CameraOptions:
         "of the shutter (default: that of the camera, or top_to_bottom)",
         choices=[direction.value for direction in ScanDirection],
     )  # fmt: skip
+    rig: Path | None = option(
+        "several cameras instead: Kalibr's camchain, with readout_time and scan_direction of each",
+        "FILE",
+    )  # fmt: skip
+    imu: bool = option("write an IMU, too, and its mounting on /tf_static", default=False)
+    imu_offset: float = option("to add to its stamps to get the camera's time", "S", 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +145,9 @@ class Options(MotionOptions, CameraOptions, ResultOptions):
         f"levels of 255 ({_PICTURES.noise:g})", "SIGMA", limits=_POSITIVE,
     )  # fmt: skip
     outliers: float = option("of the points", "SHARE", _POINTS.outliers, limits=(0.0, 1.0))
+    keypoints: bool = option(
+        "pixels with binary descriptors, and their map, instead of matches", default=False
+    )
     images: bool = option("render camera images, instead of points", default=False)
     walls: str = option(
         "of images; three: walls of markers at right angles, with their map; room: generated "
@@ -134,7 +173,12 @@ def camera_of(args: Options) -> Camera:
 
 
 def motion_of(args: Options) -> TrueMotion:
-    """Return the recorded motion, or one at constant velocity."""
+    """Return the recorded motion, or one at constant velocity; it vibrates where that is wanted."""
+    rng = np.random.default_rng([args.seed, _VIBRATION_STREAM])
+    return shaken(_smooth_motion(args), args.vibration, rng)
+
+
+def _smooth_motion(args: Options) -> TrueMotion:
     angular, linear = args.angular_velocity, args.linear_velocity
     if args.trajectory is not None:
         if (angular, linear) != (None, None):
@@ -193,27 +237,92 @@ def run(args: Options) -> dict[str, object]:
     for name in _OF_POINTS if args.images else _OF_IMAGES:
         if getattr(args, name) != defaults[name]:
             raise UsageError(f"--{name} is {'not ' if args.images else ''}for --images")
-    camera, motion = camera_of(args), motion_of(args)
-    stamps = stamps_of(args, camera, motion)
-    world, counts = world_of(args, motion, np.random.default_rng(args.seed)), list[int]()
+    if args.rig is not None and (args.imu or args.camera is not None):
+        raise UsageError("--rig goes without --imu and --camera")
+    recorder = _Recorder(args)
     with atomic_directory(args.out, earlier_result(args, "metadata.yaml")) as built:
-        with BagWriter(built) as bag:
-            frames = see(args, world, camera, motion, stamps)
-            for frame in tqdm(frames, "simulate", len(stamps), unit="frame", disable=None):
-                write_simulated(bag, camera, frame)
-                if isinstance(frame, SimulatedFrame):
-                    counts.append(len(frame.points))
-        if counts and not any(counts):
+        recorder.write(built)
+    return _tell(args, recorder.world, recorder.stamps, recorder.counts)
+
+
+class _Recorder:
+    """Writes what the cameras see of a world."""
+
+    def __init__(self, args: Options) -> None:
+        self._args, self._motion = args, motion_of(args)
+        self._parts = None if args.rig is None else read_camchain(args.rig)
+        cameras = [camera_of(args)] if self._parts is None else [*self._parts.cameras.values()]
+        self._camera = cameras[0]
+        self.stamps = stamps_of(args, self._camera, self._motion)
+        self._rng = np.random.default_rng(args.seed)
+        self.world = world_of(args, self._motion, self._rng)
+        self.counts = list[int]()  # points of the frames
+        self._map: Map | None = None
+        if args.keypoints and not isinstance(self.world, Scene):
+            ids, marks = np.arange(len(self.world)), random_descriptors(len(self.world), self._rng)
+            self._map = Map(self.world, ids, marks, MAP_FRAME)
+
+    def write(self, folder: Path) -> None:
+        """The bag, and beside it the parameters of the cameras and what they see."""
+        parameters = self._write_camera(folder) if self._parts is None else self._write_rig(folder)
+        if self.counts and not any(self.counts):
             raise ValueError(
-                f"none of the {len(counts)} images sees any point; nothing is written to {args.out}"
+                f"none of the {len(self.counts)} images sees any point; nothing is written to "
+                f"{self._args.out}"
             )
-        shutter = camera.readout_time, str(camera.scan_direction)
-        write_parameters(
-            built / PARAMETERS, dict(zip(("readout_time", "scan_direction"), shutter, strict=True))
-        )
-        if isinstance(world, Scene) and world.marker_map is not None:
-            write_marker_map(built / MARKER_MAP, world.marker_map)
-    return _tell(args, world, stamps, counts)
+        write_parameters(folder / PARAMETERS, parameters)
+        if isinstance(self.world, Scene) and self.world.marker_map is not None:
+            write_marker_map(folder / MARKER_MAP, self.world.marker_map)
+        if self._map is not None:
+            write_npz(folder / MAP, self._map)
+
+    def _keypoints(self, frame: SimulatedFrame | RenderedFrame) -> NDArray[Any] | None:
+        """Count a frame's points; its keypoints, if they are wanted."""
+        if not isinstance(frame, SimulatedFrame):
+            return None
+        self.counts.append(len(frame.points))
+        return None if self._map is None else keypoint_rows(frame, self._map, self._rng)
+
+    def _write_camera(self, folder: Path) -> dict[str, Any]:
+        args, camera, stamps = self._args, self._camera, self.stamps
+        with self._bag(folder) as bag:
+            frames = see(args, self.world, camera, self._motion, stamps)
+            for frame in tqdm(frames, "simulate", len(stamps), unit="frame", disable=None):
+                rows = self._keypoints(frame)
+                if rows is None:
+                    write_simulated(bag, camera, frame)
+                else:
+                    write_keypoints(bag, camera, frame, rows)
+        direction = str(camera.scan_direction)
+        return {"readout_time": camera.readout_time, "scan_direction": direction}
+
+    def _bag(self, folder: Path) -> BagWriter:
+        args = self._args
+        if not args.imu:
+            return BagWriter(folder)
+        lever, imu = Lever(), ImuSettings(time_offset=args.imu_offset)
+        rng = np.random.default_rng([args.seed, _IMU_STREAM])
+        track = simulate_imu(self._motion, imu, lever, rng)
+        return ImuBagWriter(folder, self._camera.readout_time, track, imu, lever)
+
+    def _write_rig(self, folder: Path) -> dict[str, Any]:
+        parts, motion = self._parts, self._motion
+        assert parts is not None
+        first, last = self.stamps[0], self.stamps[-1]
+        every = camera_stamps(parts, motion, _POINTS.rate, self._args.seed)
+        stamps = {name: [at for at in own if first <= at <= last] for name, own in every.items()}
+
+        def frames(name: str, mounted: TrueMotion, place: int) -> Any:
+            camera = parts.cameras[name]
+            return see(self._args, self.world, camera, mounted, stamps[name], place)
+
+        with BagWriter(folder) as bag:
+            bag.write(TF_STATIC, make_mounts(parts), first)
+            images = simulate_rig(parts, motion, frames)
+            total = sum(map(len, stamps.values()))
+            for image in tqdm(images, "simulate", total, unit="image", disable=None):
+                write_rig_frame(bag, parts, motion, image, self._keypoints(image.frame))
+        return rig_parameters(parts)
 
 
 def _tell(
@@ -231,6 +340,7 @@ def _tell(
             said += f" (of {args.points} asked for; {few} frames see fewer, "
             said += f"{counts.count(0)} of them none)"
         following = ["replay", out, "--params", f"{out}/{PARAMETERS}", "--out", f"{out}_poses"]
+        following += ["--map", f"{out}/{MAP}"] if args.keypoints else []
     elif isinstance(world, Scene) and world.marker_map is not None:
         figures["markers"] = count = len(world.marker_map.markers)
         said += f", {count} markers on the walls"

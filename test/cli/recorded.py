@@ -14,12 +14,13 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulation.imu import ImuSettings, make_imu
+from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.telemetry import CAMERA_FROM_SENSOR
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.simulated_imu import ImuSettings, make_imu
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
@@ -35,6 +36,11 @@ def flight(points: Any, count: int, settings: FrameSettings, start_ns: int) -> l
         np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4, start_ns=start_ns
     )
     return list(simulate_frames(CAMERA, motion, points, settings))[:count]
+
+
+def record(*words: object) -> None:
+    """Write the recording that a command line of ``simulate`` orders."""
+    assert main(["--quiet", "simulate", *map(str, words)]) == 0
 
 
 def tf(parent: str, child: str, position: Any, turn: Rotation, stamp_ns: int = 0) -> Any:

@@ -9,10 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recorded import tf
+from recorded import record, tf
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulation.__main__ import record
 from rs_localizer import data
 from rs_localizer.cli.commands import main
 from rs_localizer.io.bags import BagWriter, open_bag

@@ -10,9 +10,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from recorded import record
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulation.__main__ import record
 from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.rigs import RigParts, read_camchain, write_camchain

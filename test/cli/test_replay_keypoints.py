@@ -5,16 +5,16 @@
 import numpy as np
 import recorded
 from numpy.lib.recfunctions import repack_fields
-from recorded import SHUTTER
+from recorded import SHUTTER, record
 
-from benchmarks.simulation.__main__ import record
-from benchmarks.simulation.keypoints import keypoint_rows, map_rows, random_descriptors
+from benchmarks.fuzzing.seeds import map_rows
 from rs_localizer.cli.commands import main
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_motions, read_tum
 from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.simulated_keypoints import keypoint_rows, random_descriptors
 from rs_localizer.tools.simulation.simulated_recording import write_simulated
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from recorded import record
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulation.__main__ import record
 from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag

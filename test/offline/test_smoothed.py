@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import record
 
-from benchmarks.simulation.__main__ import record
 from rs_localizer.cli.commands import main
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3

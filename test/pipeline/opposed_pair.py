@@ -9,14 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.simulation.rig import (
-    RigFrame,
-    camera_stamps,
-    make_mounts,
-    rig_parameters,
-    simulate_rig,
-    write_rig_frame,
-)
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
@@ -25,6 +17,14 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import write_parameters
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import simulate_frames
+from rs_localizer.tools.simulation.simulated_rig import (
+    RigFrame,
+    camera_stamps,
+    make_mounts,
+    rig_parameters,
+    simulate_rig,
+    write_rig_frame,
+)
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
 

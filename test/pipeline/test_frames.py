@@ -20,6 +20,7 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters, read_camchain
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.rig_frames import RigFrames
 from rs_localizer.settings import build, camera_values, write_camera_file
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
@@ -201,7 +202,7 @@ def test_the_lenses_of_a_rig_are_those_of_its_file(tmp_path, make_camera_info):
     assert again.time_offset == {"a": 0.0, "b": 0.01}
     assert again.cameras["b"].readout_time == 0.02
     np.testing.assert_array_equal(again.camera_from_rig["a"][1], [0.1, 0.0, 0.0])
-    frames = CameraFrames(build({**camera_values(file), "camera_file": str(file)}))
+    frames = RigFrames(build({**camera_values(file), "camera_file": str(file)}))
     frames.load_files()
     for name, camera in cameras.items():
         frames.calibrate(read_camera_info(make_camera_info(width=640, height=480)), name)

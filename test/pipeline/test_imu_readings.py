@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from recorded import record
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulation.__main__ import record
 from rs_localizer.config import Imu, NodeConfig
 from rs_localizer.core.reasons import ImuReason
 from rs_localizer.inertial.buffer import Readings

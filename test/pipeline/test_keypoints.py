@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rs_localizer.pipeline.keypoint_map
-from benchmarks.simulation.keypoints import keypoint_rows, map_rows, random_descriptors
+from benchmarks.fuzzing.seeds import map_rows
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
@@ -21,6 +21,7 @@ from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.simulated_keypoints import keypoint_rows, random_descriptors
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 

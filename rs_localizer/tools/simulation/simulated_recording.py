@@ -30,6 +30,11 @@ def write_simulated(bag: BagWriter, camera: Camera, frame: SimulatedFrame | Rend
         bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, frame.stamp_ns), frame.stamp_ns)
         image = make_image(frame.stamp_ns, FORMAT, frame.data)
         bag.write(RAW_IMAGE_TOPIC, image, frame.stamp_ns)
+    write_truths(bag, frame)
+
+
+def write_truths(bag: BagWriter, frame: SimulatedFrame | RenderedFrame) -> None:
+    """Pose and twist of the camera at the first and the middle row."""
     write_truth(bag, frame.stamp_ns, frame.first_row)
     if frame.middle_ns != frame.stamp_ns:
         write_truth(bag, frame.middle_ns, frame.middle_row)

@@ -22,7 +22,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2, PointField
 
-from benchmarks.simulation.keypoints import map_rows, random_descriptors
+from benchmarks.fuzzing.seeds import map_rows
 from rs_localizer.io.bags import typestore
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map
@@ -30,6 +30,7 @@ from rs_localizer.io.outputs import TYPES
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.managed import spin
+from rs_localizer.tools.simulation.simulated_keypoints import random_descriptors
 
 from ..conftest import TIMEOUT, Peer  # noqa: TID252 - Python has a package "test"
 from .robot import READOUT_TIME, Robot, inputs, record, tf2_ros

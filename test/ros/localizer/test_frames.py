@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import recorded
 from geometry_msgs.msg import TransformStamped
 from rclpy.time import Time
 from scipy.spatial.transform import Rotation, Slerp
 
-from benchmarks.simulation import __main__ as simulated
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES
@@ -74,7 +74,7 @@ def true_odometry(truth: list[Any]) -> Iterator[Sample]:
 
 def record(folder: Path) -> Path:
     """A flight with an IMU, of a robot that knows where its camera is, and has odometry."""
-    simulated.record(folder / "flight", *FLIGHT)
+    recorded.record(folder / "flight", *FLIGHT)
     with open_bag(folder / "flight") as bag:
         items = list(bag.messages((*KINDS, "/tf_static")))
         truth = [message for _, _, message in bag.messages(("/truth/pose",))]

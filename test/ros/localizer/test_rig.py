@@ -9,11 +9,11 @@ import pytest
 from lifecycle_msgs.srv import GetState
 from rclpy.duration import Duration
 
-from benchmarks.simulation.rig import RIG_FRAME, optical_frame
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.ros.node.conversion import copy_message, message_class
+from rs_localizer.tools.simulation.simulated_rig import RIG_FRAME, optical_frame
 
 from ...pipeline.opposed_pair import PARTS, record  # noqa: TID252 - Python has a package "test"
 from ..conftest import TIMEOUT  # noqa: TID252

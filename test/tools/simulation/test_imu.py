@@ -7,9 +7,15 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulation.imu import ImuSettings, Lever, Shaken, shaken, simulate_imu
 from rs_localizer import data
 from rs_localizer.io.trajectories import read_tum
+from rs_localizer.tools.simulation.simulated_imu import (
+    ImuSettings,
+    Lever,
+    Shaken,
+    shaken,
+    simulate_imu,
+)
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion
 
 PERFECT = ImuSettings(2000.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -4,14 +4,14 @@
 
 import numpy as np
 import pytest
+from recorded import record
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulation.__main__ import record
-from benchmarks.simulation.rig import MountedMotion
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.rigs import RigParts, write_camchain
+from rs_localizer.tools.simulation.simulated_rig import MountedMotion
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 K = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 240.0], [0.0, 0.0, 1.0]])

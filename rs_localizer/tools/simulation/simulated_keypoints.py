@@ -7,8 +7,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagWriter, make_message
+from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Descriptors, Map
+from rs_localizer.io.recording import (
+    CAMERA_FRAME,
+    CAMERA_INFO_TOPIC,
+    KEYPOINTS_TOPIC,
+    make_camera_info,
+)
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame
+from rs_localizer.tools.simulation.simulated_recording import write_truths
 
 # Share of the bits that differ between two views of a landmark; ORB's median is about this.
 BIT_ERRORS = 0.1
@@ -51,18 +61,12 @@ def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generato
     return rows
 
 
-def map_rows(landmarks: Map) -> NDArray[Any]:
-    """Rows (n,) of a cloud of landmarks."""
-    kinds: list[tuple[Any, ...]] = [(name, "<f8") for name in "xyz"]
-    if landmarks.ids is not None:
-        kinds.append(("id", landmarks.id_type))
-    if landmarks.descriptors is not None:
-        kinds.append(("descriptor", landmarks.descriptors.dtype, landmarks.descriptors.shape[1:]))
-    rows = np.empty(len(landmarks), kinds)
-    for name, column in zip("xyz", landmarks.points.T, strict=True):
-        rows[name] = column
-    if landmarks.ids is not None:
-        rows["id"] = landmarks.ids
-    if landmarks.descriptors is not None:
-        rows["descriptor"] = landmarks.descriptors
-    return rows
+def write_keypoints(
+    bag: BagWriter, camera: Camera, frame: SimulatedFrame, rows: NDArray[Any]
+) -> None:
+    """Camera info, keypoints, and the truth at the first and the middle row."""
+    stamp_ns = frame.stamp_ns
+    bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, stamp_ns), stamp_ns)
+    cloud = make_cloud(make_message, stamp_ns, CAMERA_FRAME, rows)
+    bag.write(KEYPOINTS_TOPIC, cloud, stamp_ns)
+    write_truths(bag, frame)
