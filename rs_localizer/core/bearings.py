@@ -16,7 +16,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
-from rs_localizer.native import entry
+from rs_localizer.native import entry, kernel
 
 # k1 k2 p1 p2 k3, k4 k5 k6, s1 s2 s3 s4; those behind them tilt the sensor.
 _COEFFICIENTS = 12
@@ -70,10 +70,9 @@ def pinhole(camera: Camera) -> tuple[Array, Array, Array] | None:
     return np.array([fx / x, fy / y]), np.array([(cx - left) / x, (cy - top) / y]), lens
 
 
-def _step(values: list[Lanes]) -> Vector:
-    """Return one step of Newton's method, and the derivatives (4) at its start."""
-    u, v, x, y = values[:_PLACE]
-    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = values[_PLACE:]
+def _image(x: Lanes, y: Lanes, lens: Vector) -> Vector:
+    """Where the lens shows a bearing, from the centre in focal lengths, and derivatives (4)."""
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = lens
     square = x * x + y * y
     above = 1.0 + square * (k1 + square * (k2 + square * k3))
     below = 1.0 / (1.0 + square * (k4 + square * (k5 + square * k6)))
@@ -85,20 +84,40 @@ def _step(values: list[Lanes]) -> Vector:
     prism = [s1 + 2.0 * (square * s2), s3 + 2.0 * (square * s4)]
     both = x * y
     beside = rate * both + 2.0 * (p1 * x + p2 * y)
-    xx = radial + rate * (x * x) + 2.0 * (p1 * y) + 6.0 * (p2 * x) + 2.0 * (x * prism[0])
-    xy = beside + 2.0 * (y * prism[0])
-    yx = beside + 2.0 * (x * prism[1])
-    yy = radial + rate * (y * y) + 6.0 * (p1 * y) + 2.0 * (p2 * x) + 2.0 * (y * prism[1])
-    across = u - (x * radial + 2.0 * (p1 * both) + p2 * (square + 2.0 * (x * x)))
-    across = across - square * (s1 + square * s2)
-    down = v - (y * radial + p1 * (square + 2.0 * (y * y)) + 2.0 * (p2 * both))
-    down = down - square * (s3 + square * s4)
+    across = x * radial + 2.0 * (p1 * both) + p2 * (square + 2.0 * (x * x))
+    down = y * radial + p1 * (square + 2.0 * (y * y)) + 2.0 * (p2 * both)
+    return [
+        across + square * (s1 + square * s2),
+        down + square * (s3 + square * s4),
+        radial + rate * (x * x) + 2.0 * (p1 * y) + 6.0 * (p2 * x) + 2.0 * (x * prism[0]),
+        beside + 2.0 * (y * prism[0]),
+        beside + 2.0 * (x * prism[1]),
+        radial + rate * (y * y) + 6.0 * (p1 * y) + 2.0 * (p2 * x) + 2.0 * (y * prism[1]),
+    ]
+
+
+def _step(values: list[Lanes]) -> Vector:
+    """One step of Newton's method, and the derivatives (4) where it starts."""
+    u, v, x, y = values[:_PLACE]
+    seen_x, seen_y, xx, xy, yx, yy = _image(x, y, values[_PLACE:])
+    across, down = u - seen_x, v - seen_y
     scale = 1.0 / (xx * yy - xy * yx)
     nearer = [x + (yy * across - xy * down) * scale, y + (xx * down - yx * across) * scale]
     return [*nearer, xx, xy, yx, yy, across * across + down * down]
 
 
+_image_lanes = traced(lambda values: _image(values[0], values[1], values[2:]), 2, _COEFFICIENTS)
 _step_lanes = traced(_step, _PLACE, _COEFFICIENTS)
+
+
+@kernel
+def _uniform(lens: Array) -> Array:
+    """Coefficients (12,) in all lanes alike."""
+    uniform = np.empty(_COEFFICIENTS * LANES)
+    for k in range(_COEFFICIENTS):
+        for lane in range(LANES):
+            uniform[k * LANES + lane] = lens[k]
+    return uniform
 
 
 @entry
@@ -112,11 +131,8 @@ def _bearings(
     count = len(pixels)
     rays, by_ray = np.empty((count, 2)), np.empty((count, 2, 2))
     lost = np.empty(count, dtype=np.bool_)
-    uniform, place = np.empty(_COEFFICIENTS * LANES), np.empty(_PLACE * LANES)
+    uniform, place = _uniform(lens), np.empty(_PLACE * LANES)
     steps = np.empty(_RESULTS * LANES)
-    for k in range(_COEFFICIENTS):
-        for lane in range(LANES):
-            uniform[k * LANES + lane] = lens[k]
     for first in range(0, count, LANES):
         for lane in range(LANES):
             i = min(first + lane, count - 1)
@@ -151,51 +167,30 @@ def _bearings(
 @entry
 def _projected(rays: Array2, focal: Array1, centre: Array1, lens: Array1) -> tuple[Array, Array]:
     """Return the pixels (n,2), and their derivatives (n,2,2) by the rays."""
-    k1, k2, p1, p2, k3, k4 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
-    k5, k6, s1, s2, s3, s4 = lens[6], lens[7], lens[8], lens[9], lens[10], lens[11]
     count = len(rays)
     pixels, by_ray = np.empty((count, 2)), np.empty((count, 2, 2))
-    for i in range(count):
-        x, y = rays[i, 0], rays[i, 1]
-        square = x * x + y * y
-        below = 1.0 / (1.0 + square * (k4 + square * (k5 + square * k6)))
-        radial = (1.0 + square * (k1 + square * (k2 + square * k3))) * below
-        # Derivatives by the square.
-        slope = k1 + square * (2.0 * k2 + 3.0 * square * k3)
-        slope -= radial * (k4 + square * (2.0 * k5 + 3.0 * square * k6))
-        rate = 2.0 * slope * below
-        prism_x, prism_y = s1 + 2.0 * square * s2, s3 + 2.0 * square * s4
-        across = x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
-        down = y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
-        pixels[i, 0] = centre[0] + focal[0] * (across + square * (s1 + square * s2))
-        pixels[i, 1] = centre[1] + focal[1] * (down + square * (s3 + square * s4))
-        both = rate * x * y + 2.0 * (p1 * x + p2 * y)
-        own = radial + 2.0 * p1 * y + 2.0 * p2 * x
-        by_ray[i, 0, 0] = focal[0] * (own + rate * x * x + 4.0 * p2 * x + 2.0 * x * prism_x)
-        by_ray[i, 0, 1] = focal[0] * (both + 2.0 * y * prism_x)
-        by_ray[i, 1, 0] = focal[1] * (both + 2.0 * x * prism_y)
-        by_ray[i, 1, 1] = focal[1] * (own + rate * y * y + 4.0 * p1 * y + 2.0 * y * prism_y)
+    uniform, place, image = _uniform(lens), np.empty(2 * LANES), np.empty(6 * LANES)
+    for first in range(0, count, LANES):
+        for lane in range(LANES):
+            for axis in range(2):
+                place[axis * LANES + lane] = rays[min(first + lane, count - 1), axis]
+        _image_lanes(place, uniform, image)
+        for lane in range(min(LANES, count - first)):
+            for axis in range(2):
+                seen = image[axis * LANES + lane]
+                pixels[first + lane, axis] = centre[axis] + focal[axis] * seen
+                for by in range(2):
+                    slope = image[(2 + 2 * axis + by) * LANES + lane]
+                    by_ray[first + lane, axis, by] = focal[axis] * slope
     return pixels, by_ray
 
 
-@entry
-def radial_slopes(rays: Array2, focal: Array1, lens: Array1) -> tuple[Array, Array]:
+def radial_slopes(rays: Array, focal: Array, lens: Array) -> tuple[Array, Array]:
     """Return pixels (n,2), from the image's centre, of rays (n,2); derivatives (n,2) by k1.
 
     Through a lens of :func:`pinhole`.
     """
-    k1, k2, p1, p2, k3, k4 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
-    k5, k6, s1, s2, s3, s4 = lens[6], lens[7], lens[8], lens[9], lens[10], lens[11]
-    pixels, slopes = np.empty(rays.shape), np.empty(rays.shape)
-    for i in range(len(rays)):
-        x, y = rays[i, 0], rays[i, 1]
-        square = x * x + y * y
-        above = 1.0 + square * (k1 + square * (k2 + square * k3))
-        below = 1.0 / (1.0 + square * (k4 + square * (k5 + square * k6)))
-        across = x * above * below + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
-        down = y * above * below + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
-        pixels[i, 0] = focal[0] * (across + square * (s1 + square * s2))
-        pixels[i, 1] = focal[1] * (down + square * (s3 + square * s4))
-        slopes[i, 0] = focal[0] * x * square * below
-        slopes[i, 1] = focal[1] * y * square * below
-    return pixels, slopes
+    square = np.sum(rays**2, axis=1)
+    below = 1.0 + square * (lens[5] + square * (lens[6] + square * lens[7]))
+    slopes: Array = focal * rays * (square / below)[:, None]
+    return _projected(rays, focal, np.zeros(2), lens)[0], slopes

@@ -21,14 +21,9 @@ _solve_vcwt = r6p_vcwt.solve_batch
 
 @entry
 def solve_batch(
-    points: Array2,
-    rays: Array2,
-    tau: Array1,
-    samples: IntArray2,
-    rotations: Array3,
-    iterations: int,
-    models: Out[Array3],
-) -> None:
+    points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
+    iterations: int, models: Out[Array3],
+) -> None:  # fmt: skip
     """Solve a batch; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
     _solve_vct_w(points, rays, tau, samples, rotations, iterations, models[0:1])
     _solve_vcwt(points, rays, tau, samples, rotations, iterations, models[1:2])

@@ -198,14 +198,9 @@ _lanes = traced(_solve, _INPUTS)
 
 @entry
 def solve_batch(
-    points: Array2,
-    rays: Array2,
-    tau: Array1,
-    samples: IntArray2,
-    rotations: Array3,
-    iterations: int,
-    models: Out[Array3],
-) -> None:
+    points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
+    iterations: int, models: Out[Array3],
+) -> None:  # fmt: skip
     """Solve a batch as in :mod:`rs_localizer.solvers.batch`; no initial rotation is taken."""
     work = np.empty(_INPUTS * LANES)
     solutions = np.empty(SOLUTIONS * MODEL_SIZE * LANES)

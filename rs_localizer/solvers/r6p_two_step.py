@@ -15,12 +15,14 @@ Points are in the frame of the initial rotation; one solution.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from rs_localizer.core.arrays import Array1, Array2, Array3, IntArray2, Out
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray2, Out
 from rs_localizer.core.simd.algebra import cross
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
-from rs_localizer.native import entry
+from rs_localizer.native import entry, kernel
 from rs_localizer.solvers import linear
 from rs_localizer.solvers.batch import Sample, converged, gather, inputs, scatter
 
@@ -128,70 +130,51 @@ _vct_wt_lanes = traced(
 )
 
 
-@entry
-def solve_vc_wt(
-    points: Array2,
-    rays: Array2,
-    tau: Array1,
-    samples: IntArray2,
-    rotations: Array3,
-    iterations: int,
-    models: Out[Array3],
-) -> None:
+@kernel
+def _alternate(
+    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    models: Array, t_in_first: bool, t_in_second: bool,
+) -> None:  # fmt: skip
     """Solve a batch, v and C first; arguments as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty(_SIZE)
     for start in range(0, len(samples), LANES):
         gather(points, rays, tau, samples, rotations, start, work)
         _begin_lanes(work, work)
         for _ in range(iterations):
-            _vc_wt_lanes(work, work)
+            if not t_in_first:
+                _vc_wt_lanes(work, work)
+            elif t_in_second:
+                _vct_wt_lanes(work, work)
+            else:
+                _vct_w_lanes(work, work)
             if converged(work, _CHANGE):
                 break
         _end_lanes(work, work)
         scatter(work, _MODEL, start, models[0])
+
+
+@entry
+def solve_vc_wt(
+    points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
+    iterations: int, models: Out[Array3],
+) -> None:  # fmt: skip
+    """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    _alternate(points, rays, tau, samples, rotations, iterations, models, False, True)
 
 
 @entry
 def solve_vct_w(
-    points: Array2,
-    rays: Array2,
-    tau: Array1,
-    samples: IntArray2,
-    rotations: Array3,
-    iterations: int,
-    models: Out[Array3],
-) -> None:
+    points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
+    iterations: int, models: Out[Array3],
+) -> None:  # fmt: skip
     """Solve a batch, v, C and t first; arguments as in :mod:`rs_localizer.solvers.batch`."""
-    work = np.empty(_SIZE)
-    for start in range(0, len(samples), LANES):
-        gather(points, rays, tau, samples, rotations, start, work)
-        _begin_lanes(work, work)
-        for _ in range(iterations):
-            _vct_w_lanes(work, work)
-            if converged(work, _CHANGE):
-                break
-        _end_lanes(work, work)
-        scatter(work, _MODEL, start, models[0])
+    _alternate(points, rays, tau, samples, rotations, iterations, models, True, False)
 
 
 @entry
 def solve_vct_wt(
-    points: Array2,
-    rays: Array2,
-    tau: Array1,
-    samples: IntArray2,
-    rotations: Array3,
-    iterations: int,
-    models: Out[Array3],
-) -> None:
+    points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
+    iterations: int, models: Out[Array3],
+) -> None:  # fmt: skip
     """Solve a batch, t in both steps; arguments as in :mod:`rs_localizer.solvers.batch`."""
-    work = np.empty(_SIZE)
-    for start in range(0, len(samples), LANES):
-        gather(points, rays, tau, samples, rotations, start, work)
-        _begin_lanes(work, work)
-        for _ in range(iterations):
-            _vct_wt_lanes(work, work)
-            if converged(work, _CHANGE):
-                break
-        _end_lanes(work, work)
-        scatter(work, _MODEL, start, models[0])
+    _alternate(points, rays, tau, samples, rotations, iterations, models, True, True)

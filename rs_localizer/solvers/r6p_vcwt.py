@@ -15,12 +15,14 @@ starts again from v^ = 0. It costs the same and converges from tens of degrees, 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from rs_localizer.core.arrays import Array1, Array2, Array3, IntArray2, Out
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray2, Out
 from rs_localizer.core.simd.algebra import cross, multiply, nearest_rotation
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
-from rs_localizer.native import entry
+from rs_localizer.native import entry, kernel
 from rs_localizer.solvers import linear
 from rs_localizer.solvers.batch import Sample, converged, gather, inputs, scatter
 
@@ -90,46 +92,41 @@ _frozen_lanes = traced(_frozen_step, _INPUTS + _STATE)
 _frozen_end_lanes = traced(_frozen_end, _INPUTS + _STATE)
 
 
-@entry
-def solve_batch(
-    points: Array2,
-    rays: Array2,
-    tau: Array1,
-    samples: IntArray2,
-    rotations: Array3,
-    iterations: int,
-    models: Out[Array3],
-) -> None:
+@kernel
+def _iterate(
+    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    models: Array, frozen: bool,
+) -> None:  # fmt: skip
     """Solve a batch, relinearized, with arguments as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty((_INPUTS + _STATE) * LANES)
     for start in range(0, len(samples), LANES):
         gather(points, rays, tau, samples, rotations, start, work)
         _begin_lanes(work, work)
         for _ in range(iterations):
-            _relinearized_lanes(work, work)
+            if frozen:
+                _frozen_lanes(work, work)
+            else:
+                _relinearized_lanes(work, work)
             if converged(work, _CHANGE):
                 break
+        if frozen:
+            _frozen_end_lanes(work, work)
         scatter(work, _MODEL, start, models[0])
 
 
 @entry
+def solve_batch(
+    points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
+    iterations: int, models: Out[Array3],
+) -> None:  # fmt: skip
+    """Relinearised; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    _iterate(points, rays, tau, samples, rotations, iterations, models, False)
+
+
+@entry
 def solve_batch_frozen(
-    points: Array2,
-    rays: Array2,
-    tau: Array1,
-    samples: IntArray2,
-    rotations: Array3,
-    iterations: int,
-    models: Out[Array3],
-) -> None:
+    points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
+    iterations: int, models: Out[Array3],
+) -> None:  # fmt: skip
     """Solve a batch with v^ frozen, as published; arguments as of :func:`solve_batch`."""
-    work = np.empty((_INPUTS + _STATE) * LANES)
-    for start in range(0, len(samples), LANES):
-        gather(points, rays, tau, samples, rotations, start, work)
-        _begin_lanes(work, work)
-        for _ in range(iterations):
-            _frozen_lanes(work, work)
-            if converged(work, _CHANGE):
-                break
-        _frozen_end_lanes(work, work)
-        scatter(work, _MODEL, start, models[0])
+    _iterate(points, rays, tau, samples, rotations, iterations, models, True)

@@ -16,12 +16,14 @@ no rigid motion can follow. Scored by the model above, R9P fits far more points 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from rs_localizer.core.arrays import Array1, Array2, Array3, IntArray2, Out
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray2, Out
 from rs_localizer.core.simd.algebra import dot
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
-from rs_localizer.native import entry
+from rs_localizer.native import entry, kernel
 from rs_localizer.solvers import linear
 from rs_localizer.solvers.batch import MODEL_SIZE, Sample, gather, inputs, scatter
 
@@ -112,39 +114,36 @@ _lanes = traced(lambda values: _solve(values, fix_trace=True), _INPUTS)
 _lanes_as_published = traced(lambda values: _solve(values, fix_trace=False), _INPUTS)
 
 
-@entry
-def solve_batch(
-    points: Array2,
-    rays: Array2,
-    tau: Array1,
-    samples: IntArray2,
-    rotations: Array3,
-    iterations: int,
-    models: Out[Array3],
-) -> None:
+@kernel
+def _solve_each(
+    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, models: Array,
+    fix_trace: bool,
+) -> None:  # fmt: skip
     """Solve a batch, trace fixed, with arguments as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty(_INPUTS * LANES)
     model = np.empty(MODEL_SIZE * LANES)
     for start in range(0, len(samples), LANES):
         gather(points, rays, tau, samples, rotations, start, work)
-        _lanes(work, model)
+        if fix_trace:
+            _lanes(work, model)
+        else:
+            _lanes_as_published(work, model)
         scatter(model, 0, start, models[0])
 
 
 @entry
+def solve_batch(
+    points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
+    iterations: int, models: Out[Array3],
+) -> None:  # fmt: skip
+    """Trace fixed; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    _solve_each(points, rays, tau, samples, rotations, models, True)
+
+
+@entry
 def solve_batch_as_published(
-    points: Array2,
-    rays: Array2,
-    tau: Array1,
-    samples: IntArray2,
-    rotations: Array3,
-    iterations: int,
-    models: Out[Array3],
-) -> None:
+    points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
+    iterations: int, models: Out[Array3],
+) -> None:  # fmt: skip
     """Solve a batch, gauge free, as published; arguments as of :func:`solve_batch`."""
-    work = np.empty(_INPUTS * LANES)
-    model = np.empty(MODEL_SIZE * LANES)
-    for start in range(0, len(samples), LANES):
-        gather(points, rays, tau, samples, rotations, start, work)
-        _lanes_as_published(work, model)
-        scatter(model, 0, start, models[0])
+    _solve_each(points, rays, tau, samples, rotations, models, False)
