@@ -15,9 +15,8 @@ from rs_localizer.cli import WORKING, read_counts
 from rs_localizer.cli.options import UsageError, option
 
 if WORKING:
-    from rs_localizer.markers.map_check import other_units
     from rs_localizer.markers.map_files import read_marker_map
-    from rs_localizer.markers.maps import MarkerMap
+    from rs_localizer.markers.maps import MarkerMap, other_units
     from rs_localizer.markers.poses import Pose
     from rs_localizer.markers.prints import Chessboard
 

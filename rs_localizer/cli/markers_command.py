@@ -17,9 +17,8 @@ from rs_localizer.tools.printing import PAGES, largest_side, page_files, plan, w
 
 if WORKING:
     from rs_localizer.io.atomic_files import atomic_files
-    from rs_localizer.markers.map_check import other_units
     from rs_localizer.markers.map_files import write_marker_map
-    from rs_localizer.markers.maps import MarkerMap, wall
+    from rs_localizer.markers.maps import MarkerMap, other_units, wall
     from rs_localizer.markers.poses import Pose
     from rs_localizer.markers.prints import Charuco, Chessboard
 

@@ -149,24 +149,6 @@ def read_compressed_image(message: Any) -> Image:
     return Image(stamp_ns(message), str(message.header.frame_id), pixels)
 
 
-def in_color(message: Any, image: Image) -> NDArray[np.uint8]:
-    """Return the pixels of a message: (h,w,3) for 8-bit colours, otherwise grey ones (h,w)."""
-    height, width = image.pixels.shape
-    if hasattr(message, "format"):
-        data = np.frombuffer(bytes(message.data), np.uint8)
-        decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-        usable = decoded is not None and decoded.dtype == np.uint8 and decoded.shape[2:] == (3,)
-        return np.asarray(decoded, np.uint8) if usable else image.pixels
-    if message.encoding not in COLORS:
-        return image.pixels
-    step = int(message.step) or 3 * width
-    return np.ndarray((height, width, 3), np.uint8, message.data, strides=(step, 3, 1))
-
-
-COLORS = ("bgr8", "rgb8")
-"""Encodings of raw images whose colours :func:`in_color` keeps; of compressed ones it is bgr8."""
-
-
 def decode(packed: bytes, format_: str) -> Gray:
     """Decode the pixels (h,w) of a JPEG or PNG; ``format_`` is the format that is claimed.
 

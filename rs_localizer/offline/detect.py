@@ -9,13 +9,12 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 
-from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.core.shutter import project_rolling
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.images import Image
@@ -28,7 +27,6 @@ from rs_localizer.io.recording import (
 )
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.boards import BoardSizes
-from rs_localizer.markers.map_check import MapCheck, Predict, still_residual
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.marker_detector import Detected, FrameDetector, correspondences
@@ -79,7 +77,7 @@ class DetectionOptions:
     """Options of how images are recorded."""
 
     with_images: bool = False  # write these, too, as far as they are compressed
-    scan_direction: str = ScanDirection.TOP_TO_BOTTOM  # for the check of the markers' places
+    scan_direction: str = ScanDirection.TOP_TO_BOTTOM  # of the camera
     camera: str = ""  # of a rig, whose topics these are
 
 
@@ -155,12 +153,11 @@ class _MarkerTally:
         marker_map = detector.map
         self._detector, self._map, self._found = detector, marker_map, found
         self._mistakes, self._mistake = Mistakes(), ""
-        self._fit = _RollingFit()
+        self._last: tuple[Camera, Localizer] | None = None
         self._others: Counter[str] = Counter()
         self._faults: Counter[str] = Counter()
         self._residuals: list[float] = []
         self._sizes = BoardSizes(marker_map)
-        self._check = MapCheck(marker_map, self._fit)
 
     def add(self, camera: Camera, detected: Detected) -> None:
         detections = detected.detections
@@ -173,9 +170,14 @@ class _MarkerTally:
             few = len(detections.ids) < _LEAST_CORNERS
             if not (few or self._residuals[-1] <= _MOST_STILL):  # NaN: a pose behind the camera
                 frame = detections.points, detections.pixels, detections.ids
-                localizer = self._fit.localizer(camera)
+                localizer = self._localizer(camera)
                 self._mistake = self._mistakes.look(lambda: of_refused(localizer, *frame))
-            self._check.add(camera, detections)
+
+    def _localizer(self, camera: Camera) -> Localizer:
+        """The localizer of a camera; of the same one as the last time, the same."""
+        if self._last is None or self._last[0] is not camera:
+            self._last = camera, Localizer(camera, min_inliers=_LEAST_INLIERS)
+        return self._last[1]
 
     @property
     def are_few(self) -> bool:
@@ -201,7 +203,7 @@ class _MarkerTally:
 
     def recorded(self) -> Extraction:
         known = [value for value in self._residuals if np.isfinite(value)]
-        faults = [] if (fault := self._check.misplaced()) is None else [fault]
+        faults = list[str]()
         if mistake := self._mistake or self._detector.mistake:
             faults.append(mistake)
         elif known and (least := float(np.percentile(known, _STILL_PERCENT))) > _MOST_STILL:
@@ -215,25 +217,6 @@ class _MarkerTally:
         if known:
             self._found.residual = float(np.median(known))
         return self._found
-
-
-class _RollingFit:
-    """Fits the motion of a rolling shutter (see :data:`rs_localizer.markers.map_check.Fit`)."""
-
-    def __init__(self) -> None:
-        self._last: tuple[Camera, Localizer] | None = None
-
-    def localizer(self, camera: Camera) -> Localizer:
-        """The localizer of a camera; of the same one as the last time, the same."""
-        if self._last is None or self._last[0] is not camera:
-            self._last = camera, Localizer(camera, min_inliers=_LEAST_INLIERS)
-        return self._last[1]
-
-    def __call__(self, camera: Camera, points: Array, pixels: Array) -> Predict | None:
-        estimate = self.localizer(camera).localize(points, pixels)
-        if not estimate:
-            return None
-        return lambda some: project_rolling(camera, estimate.at_rows, some)[0]
 
 
 class Cameras:
@@ -343,7 +326,15 @@ def static_residual(camera: Camera, detected: Detected) -> float:
     detections = detected.detections
     if len(detections.ids) < _LEAST_CORNERS:
         return np.nan
-    return still_residual(camera, detections.points, detections.pixels)
+    points, rays = detections.points, np.ascontiguousarray(camera.rays(detections.pixels))
+    try:
+        solved, turn, shift = cv2.solvePnP(points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
+    except cv2.error:
+        return np.nan
+    if not solved:
+        return np.nan
+    seen = camera.project(points @ np.asarray(cv2.Rodrigues(turn)[0]).T + np.ravel(shift))
+    return float(np.sqrt(np.mean(np.sum((seen - detections.pixels) ** 2, axis=1))))
 
 
 def record_features(

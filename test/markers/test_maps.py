@@ -11,13 +11,14 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.markers.boards import flat_misfit
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.map_files import (
     read_any,
     read_marker_map,
     write_marker_map,
 )
-from rs_localizer.markers.maps import MarkerMap, MarkerMapError, wall
+from rs_localizer.markers.maps import MarkerMap, MarkerMapError, other_units, wall
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Charuco, Chessboard, Marker
 
@@ -231,3 +232,36 @@ TAG = '{"tag_bundles": [{"layout": [{"id": %d, "size": 0.1}]}]}'
 def test_broken_json(tmp_path, text, said):
     with pytest.raises(MarkerMapError, match=said):
         read_any(as_file(tmp_path, text, "a.json"))
+
+
+def marker(id_: int, x: float, size: float = 0.1) -> Marker:
+    return Marker.at("4x4_50", id_, size, Pose(np.array([x, 0.0, 0.0])))
+
+
+@pytest.mark.parametrize(
+    ("markers", "boards", "text"),
+    [
+        ([marker(k, 0.5 * k) for k in range(3)] + [marker(3, 9.0, 4.0)], [], "another unit"),
+        ([marker(0, 0, 60.0), marker(1, 90.0, 60.0)], [], "markers of 60 m: are sizes"),
+        (
+            [],
+            [Charuco(5, 7, 30.0, 20.0, family("5x5_50"))],
+            "30 m from corner to corner: sizes are",
+        ),
+    ],
+)
+def test_sizes_in_other_units(markers, boards, text):
+    (found,) = other_units(MarkerMap(tuple(markers), tuple(boards)))
+    assert text in found
+
+
+def test_corners_in_another_order_fit_no_homography():
+    turn = Rotation.from_euler("xyz", [160.0, -15.0, 20.0], degrees=True).as_matrix()
+    points = np.concatenate([some.corners for some in wall("4x4_50", (3, 2), 0.07, 0.03)[:2]])
+    seen = points @ turn.T + [0.0, 0.0, 0.6]
+    pixels = 500.0 * seen[:, :2] / seen[:, 2:]
+    assert flat_misfit(points, pixels) < 1e-6
+    for order in ([1, 2, 3, 0], [3, 2, 1, 0]):
+        assert flat_misfit(points, pixels.reshape(2, 4, 2)[:, order].reshape(-1, 2)) > 0.25
+    points[4:, 2] += 0.05
+    assert np.isnan(flat_misfit(points, pixels))

@@ -19,8 +19,7 @@ if WORKING:
 
     from rs_localizer.io.maps.landmarks import Map
     from rs_localizer.markers.families import family
-    from rs_localizer.markers.map_check import other_units
-    from rs_localizer.markers.maps import MarkerMap
+    from rs_localizer.markers.maps import MarkerMap, other_units
 
 Figures = dict[str, Any]
 """Printed figures, and those of ``--json``: identifiers, with their units."""

@@ -23,9 +23,8 @@ if WORKING:
 
     from rs_localizer.core.arrays import Array
     from rs_localizer.core.camera import Camera
-    from rs_localizer.markers.map_check import other_units
     from rs_localizer.markers.map_files import write_marker_map
-    from rs_localizer.markers.maps import MarkerMap
+    from rs_localizer.markers.maps import MarkerMap, other_units
     from rs_localizer.markers.prints import Marker
     from rs_localizer.offline.detect import seen_by
     from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey

@@ -23,9 +23,8 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io.transforms import Transform
-from rs_localizer.markers.detection import MarkerDetector
+from rs_localizer.markers.detection import Detections, MarkerDetector
 from rs_localizer.markers.families import LEAST_SIDE, Family
-from rs_localizer.markers.map_check import whole_markers
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
@@ -77,9 +76,17 @@ class Spotter:
     def spot(self, image: NDArray[np.uint8], stamp_ns: int) -> Spotted:
         """The markers of an image (h,w)."""
         found = self._detector.detect(image, stamp_ns)
-        whole = whole_markers(found, self._end)
+        whole = _whole_markers(found, self._end)
         quads = [found.pixels[rows] for rows in whole.values()]
         return Spotted(stamp_ns, np.array(list(whole), np.int64), np.array(quads).reshape(-1, 4, 2))
+
+
+def _whole_markers(detections: Detections, end: int) -> dict[int, IntArray]:
+    """Rows of the detections for each single marker of which all four corners were found."""
+    place = {int(id_): row for row, id_ in enumerate(detections.ids) if id_ < end}
+    markers = sorted({id_ // 4 for id_ in place})
+    corners = {m: [place.get(4 * m + k, -1) for k in range(4)] for m in markers}
+    return {m: np.array(rows) for m, rows in corners.items() if min(rows) >= 0}
 
 
 # Of a pair, evenly, so many images are compared.

@@ -20,8 +20,7 @@ from benchmarks.independent import cameras
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.transforms import Transform
 from rs_localizer.markers.families import family
-from rs_localizer.markers.map_check import other_units
-from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.maps import MarkerMap, other_units
 from rs_localizer.tools.mapping.survey import Survey, survey
 from rs_localizer.tools.mapping.unknown_markers import Chained, Filmed, Spotted, chain, every_marker
 
