@@ -228,7 +228,7 @@ def _by_colmap(
     with TemporaryDirectory(dir=folder) as images, TemporaryDirectory(dir=folder) as work:
         looker = Looker(FeatureConfig().max_keypoints, Path(images))
         shots = islice(footage.images(), len(tracks.stamps_ns))
-        views = [looker.look(Image(stamp, "camera", image)) for stamp, image in shots]
+        views = [looker.detect_in(Image(stamp, "camera", image)) for stamp, image in shots]
         inputs = Given(views, lens, Anchors(), given, direction)
         built = build_map(inputs, Workshop(Path(work), Effort(), _quiet))
     motion = ViewMotion(built.posed, built.refined.times, built.refined)

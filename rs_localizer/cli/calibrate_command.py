@@ -257,7 +257,7 @@ def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
     for image, own in tqdm(seen, unit="image", desc="detect", disable=None):
         camera, size = camera or own, image.pixels.shape[::-1]
         found = detector.detect(image).detections
-        sizes.look(image.pixels, len(found.points) > 0)
+        sizes.count_board(image.pixels, len(found.points) > 0)
         images.append(ImagePoints(image.stamp_ns, found.points, found.pixels))
         frames.append((found.points, found.pixels, found.ids))
     shown = sum(len(image.points) > 0 for image in images)

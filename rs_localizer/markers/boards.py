@@ -119,7 +119,7 @@ class BoardSizes:
         self._images = self._next = 0
         self._sizes: list[tuple[int, int]] = []
 
-    def look(self, image: Gray, complete_board: bool) -> None:
+    def count_board(self, image: Gray, complete_board: bool) -> None:
         """Take an image, and whether the board as it is said to be was found in it."""
         self._images += 1
         if self._board is None or self._images <= self._next or len(self._sizes) >= _SIZES:

@@ -163,7 +163,7 @@ class _MarkerTally:
         detections = detected.detections
         self._others.update(detections.unknown)
         self._faults.update(detections.faults)
-        self._sizes.look(detected.image.pixels, len(detections.ids) > 0)
+        self._sizes.count_board(detected.image.pixels, len(detections.ids) > 0)
         if len(detections.ids):
             self._found.counts.append(len(detections.ids))
             self._residuals.append(static_residual(camera, detected))
@@ -171,7 +171,7 @@ class _MarkerTally:
             if not (few or self._residuals[-1] <= _MOST_STILL):  # NaN: a pose behind the camera
                 frame = detections.points, detections.pixels, detections.ids
                 localizer = self._localizer(camera)
-                self._mistake = self._mistakes.look(lambda: of_refused(localizer, *frame))
+                self._mistake = self._mistakes.explain_frame(lambda: of_refused(localizer, *frame))
 
     def _localizer(self, camera: Camera) -> Localizer:
         """The localizer of a camera; of the same one as the last time, the same."""

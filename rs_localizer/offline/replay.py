@@ -400,13 +400,13 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
     for name, topic in topics.of.items():  # which recorders may write last
         if name.endswith(CAMERA_INFO):
             first = next((message for _, _, message in bag.messages((topic,))), None)
-            list(_each(inputs[topic].take(localizer, first)) if first is not None else ())
+            list(_each(inputs[topic].take_message(localizer, first)) if first is not None else ())
     messages = imu_first(bag.messages(topics.names), topics.of.get(IMU), awaits)
     last: Item | None = None
     for last in messages:
         topic, recorded_ns, message = last
         localizer.take_zero_for_time(recorded_ns)
-        for result in _each(inputs[topic].take(localizer, message)):
+        for result in _each(inputs[topic].take_message(localizer, message)):
             if result or result.reason is not Reason.AWAITS_FRAMES:  # it comes
                 yield answer(recorded_ns, message, result)
     for result in localizer.flush():

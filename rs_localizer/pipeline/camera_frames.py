@@ -118,7 +118,7 @@ class CameraFrames(FrameLocalizer):
             refusal = self._stream.follow(keypoints.stamp_ns, self.map.frame)
             if refusal is not None:
                 return refusal
-        by = self._landmarks.how(keypoints)
+        by = self._landmarks.matching_by(keypoints)
         if isinstance(by, Refusal):
             return by
         if (cloud := self._landmarks.repeated(keypoints)) is not None:
@@ -163,7 +163,7 @@ class CameraFrames(FrameLocalizer):
         if result:
             ahead = (cloud.points[result.inliers] - result.position) @ result.rotation[2]
             self._stream.pace(time_ns, result, float(np.median(ahead)), config)
-            self._pose_prior.judge(result)
+            self._pose_prior.judge_result(result)
             if self.predicts:
                 self._newest = replace(cloud, table=cloud.table[:0], dropped=0)
         if self._tracker.output_lag > 0:

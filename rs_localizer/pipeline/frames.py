@@ -253,11 +253,11 @@ class FrameLocalizer(ABC):
 
     def use_map(self, landmarks: Map) -> None:
         """Match keypoints with this map from the next frame on."""
-        self._landmarks.use(landmarks)
+        self._landmarks.use_map(landmarks)
 
     def give_pose(self, given: GivenPose) -> None:
         """Find the next frame near this pose; one that a user gives ends the track."""
-        self._pose_prior.take(given)
+        self._pose_prior.take_pose(given)
         if not given.lasts:
             self._forget_motion()
 
@@ -294,7 +294,7 @@ class FrameLocalizer(ABC):
         """The refusal of a frame, with what would fit where somebody found that."""
         if refusal.reason not in what_fits.REASONS:
             return refusal
-        said = self._mistakes.look(tried)
+        said = self._mistakes.explain_frame(tried)
         if not said:
             return refusal
         self._notice(notice, said)

@@ -94,7 +94,7 @@ class PosePrior:
         """What waits for a frame."""
         self._expected: Prior | None = None
 
-    def take(self, given: GivenPose) -> None:
+    def take_pose(self, given: GivenPose) -> None:
         self.given = given
 
     def prior(
@@ -129,7 +129,7 @@ class PosePrior:
         self._expected = _of_camera(given, body_from_camera, seconds, config)
         return self._expected
 
-    def judge(self, result: Estimate) -> None:
+    def judge_result(self, result: Estimate) -> None:
         """Be done with it, now that a frame has a pose."""
         given, expected = self.given, self._expected
         if given is None or expected is None:

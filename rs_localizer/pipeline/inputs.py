@@ -87,7 +87,7 @@ class Input:
         """The option of commands that names its topic in a recording."""
         return f"-r {self.topic}:=TOPIC"
 
-    def take(self, localizer: FrameLocalizer, message: Any) -> Results:
+    def take_message(self, localizer: FrameLocalizer, message: Any) -> Results:
         """Read and use a message at once; the results of frames that are complete with it."""
         frames = self.role is Role.FRAMES
         try:

@@ -39,7 +39,7 @@ class Landmarks:
         """The present one."""
         return None if self._matcher is None else self._matcher.map
 
-    def use(self, landmarks: Map) -> None:
+    def use_map(self, landmarks: Map) -> None:
         """Match with this map from now on."""
         previous = self.map
         if previous is not None and landmarks.equals(previous):
@@ -51,7 +51,7 @@ class Landmarks:
         self.error_modes = None if modes is None else ErrorModes(landmarks.points, modes)
         self.lacking = False
 
-    def how(self, keypoints: Keypoints) -> MatchBy | Refusal:
+    def matching_by(self, keypoints: Keypoints) -> MatchBy | Refusal:
         """Means by which keypoints can be matched."""
         if self._matcher is None:
             self.lacking = True

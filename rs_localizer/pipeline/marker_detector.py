@@ -110,7 +110,7 @@ class FrameDetector:
             self._notice(Notice.OTHER_BOARD, fault)
         if len(detections.ids) < _LITTLE or detections.unknown:
             corners = len(detections.ids)
-            self.mistake = self._mistakes.look(lambda: self._mirrored(image, corners))
+            self.mistake = self._mistakes.explain_frame(lambda: self._mirrored(image, corners))
             if self.mistake:
                 self._notice(Notice.WOULD_FIT, self.mistake)
         return Detected(image, detections, self.map, self._row)

@@ -289,7 +289,7 @@ class RigFrames(FrameLocalizer):
             return replace(found, detail=f"{name}: {found.detail}")
         if isinstance(found, Correspondences):
             return found
-        by = self._landmarks.how(found)
+        by = self._landmarks.matching_by(found)
         if isinstance(by, Refusal):
             return by
         return self._landmarks.match(found, self._config.matching, camera, None)

@@ -179,7 +179,7 @@ class Mistakes:
         self._refused, self._next = 0, 1
         self._agreed, self._said = 0, ""
 
-    def look(self, tried: Callable[[], str]) -> str:
+    def explain_frame(self, tried: Callable[[], str]) -> str:
         """Say what is wrong with one more frame; an empty text if nothing is found.
 
         Args:

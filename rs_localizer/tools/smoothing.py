@@ -45,7 +45,7 @@ from rs_localizer.tools.adjust.variables import (
 _NUMBERS, _USUAL = 6.0, np.array([2.0, 1.0])
 
 
-def told(fitted: Fit) -> tuple[Array, Array]:
+def squares_and_numbers(fitted: Fit) -> tuple[Array, Array]:
     """Evidence of an estimate on the accelerations that were expected of it, angular and linear.
 
     Returns:
@@ -261,7 +261,7 @@ def _best(parts: Parts, start: Unknowns, fading: float) -> Fit:
     halved = replace(fitted.state, spline=refined(spline, 0.5 * spline.layout.spacing))
     finer = solve(_problem(parts, halved, fitted.freedom), halved, fitted.deviation)
     finer = _lively(parts, finer)
-    more = np.sum(told(finer)[1]) - np.sum(told(fitted)[1])
+    more = np.sum(squares_and_numbers(finer)[1]) - np.sum(squares_and_numbers(fitted)[1])
     return finer if cheaper(finer, fitted, float(more)) else fitted
 
 
@@ -300,7 +300,7 @@ def _lively(parts: Parts, fitted: Fit) -> Fit:
     Each round is a step nearer to the greatest marginal likelihood.
     """
     for _ in range(_ROUNDS):
-        before, (squares, numbers) = fitted.freedom, told(fitted)
+        before, (squares, numbers) = fitted.freedom, squares_and_numbers(fitted)
         known = np.maximum(numbers, 0.0) + _NUMBERS
         angular, linear = np.sqrt((squares + _NUMBERS * _USUAL**2) / known).tolist()
         freedom = replace(before, angular_acceleration=angular, linear_acceleration=linear)

@@ -48,7 +48,7 @@ def asked(message: Any, time_ns: int = 5 * SECOND) -> tuple[Any, list[str], Pose
     stamped = make_transform(make_message, 0, "base_link", "camera", MOUNT)
     tree.add(SimpleNamespace(transforms=[stamped]), static=True)
     prior = PosePrior(lambda name, text: notices.append(f"{name}: {text}"))
-    prior.take(read_given_pose(message))
+    prior.take_pose(read_given_pose(message))
     return prior.prior(time_ns, "map", "camera", CONFIG, tree), notices, prior
 
 
@@ -92,12 +92,12 @@ def test_a_click_counts_once_and_a_filter_again_and_again(body, lasts):
         rotation=found.motion.rotation, covariance=1e-6 * np.eye(12),
         position=-found.motion.rotation.T @ found.motion.translation,
     )  # fmt: skip
-    prior.judge(at_it)
+    prior.judge_result(at_it)
     assert notices == []
     assert (prior.given is not None) == lasts
     _, notices, prior = asked(given(body=body))
     at_it.position = np.add(at_it.position, [0.0, 0.0, 5.0])
-    prior.judge(at_it)
+    prior.judge_result(at_it)
     assert notices[0].startswith(
         "prior_refused: the points disagree with the given pose, by 5.00 m"
     )

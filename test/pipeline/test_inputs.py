@@ -50,7 +50,7 @@ def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name, tmp_p
     )
     localizer = CameraFrames(NodeConfig(marker_map=str(wall)))
     localizer.load_files()
-    refusal = item.take(localizer, broken)
+    refusal = item.take_message(localizer, broken)
     assert isinstance(refusal, Refusal)
     assert refusal.reason == item.refused
     assert refusal.reason in REASONS

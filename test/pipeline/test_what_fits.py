@@ -109,11 +109,11 @@ def test_a_day_of_refusals_costs_ten_tries():
     tries = []
     mistakes = Mistakes()
     for _ in range(30 * 86_400):
-        assert mistakes.look(lambda: tries.append(1) or "") == ""
+        assert mistakes.explain_frame(lambda: tries.append(1) or "") == ""
     assert len(tries) == 11
     # Two frames have to agree, then nothing is tried any more.
     said, answers = Mistakes(), iter(["a", "b", "b"])
-    assert [said.look(lambda: next(answers)) for _ in range(5)] == ["", "", "b", "b", "b"]
+    assert [said.explain_frame(lambda: next(answers)) for _ in range(5)] == ["", "", "b", "b", "b"]
 
 
 def cloud(t, pixels):

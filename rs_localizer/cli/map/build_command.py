@@ -37,7 +37,7 @@ if WORKING:
     from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
     from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map
     from rs_localizer.tools.mapping.report import advice, rows, written
-    from rs_localizer.tools.mapping.seen_images import Looked, Looker, look
+    from rs_localizer.tools.mapping.seen_images import Looked, Looker, look_through
     from rs_localizer.tools.mapping.structure import Effort, require
 
 
@@ -57,7 +57,7 @@ def look_at_images(args: Options, points: Sequence[_Point], looker: Looker) -> L
         total=source.total, unit="image", desc="look", disable=None
     ) as bar:  # fmt: skip
         moments = [seconds for _, seconds, _, _ in points]
-        looked = look(source.shots, looker, args.images_per_second, moments, bar.update)
+        looked = look_through(source.shots, looker, args.images_per_second, moments, bar.update)
     if not looked.views:
         why = "; ".join(looked.refused.values())
         raise ValueError(f"{args.recording} has no image that can be read; {why}")

@@ -172,7 +172,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         named = inputs_of(config)
 
         def localize(topic: str, message: Any) -> Results:
-            return named[topic].take(frames, message)
+            return named[topic].take_message(frames, message)
 
         self.employ(localize, self._publisher.publish, functools.partial(_patience, frames))
 
@@ -266,7 +266,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         assert self._frames is not None and self.worker is not None  # noqa: PT018
         if self._frames.config.imu.use == ImuUse.NONE:
             return
-        refusal = item.take(self._frames, message)
+        refusal = item.take_message(self._frames, message)
         if isinstance(refusal, Refusal):
             self.refusals.add(refusal.reason, refusal.detail)
             return

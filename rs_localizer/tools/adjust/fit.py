@@ -15,7 +15,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.tools.adjust.intrinsics import with_lens
-from rs_localizer.tools.adjust.problem import Problem, minimise, settle
+from rs_localizer.tools.adjust.problem import Problem, fit_with_noise, minimise
 from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import Factored
@@ -87,8 +87,8 @@ def solve(problem: Problem, start: Unknowns, deviation: float | None = None) -> 
     state = start
     if deviation is None:
         trusted = problem.trusted(start)
-        state, deviation = settle(trusted, start, trusted.noise(start, np.inf))
-    state, deviation = settle(problem, state, deviation)
+        state, deviation = fit_with_noise(trusted, start, trusted.noise(start, np.inf))
+    state, deviation = fit_with_noise(problem, state, deviation)
     return _finish(problem, state, deviation)
 
 

@@ -42,7 +42,7 @@ class Gyroscope:
         self.samples = samples.subset(samples.covered(start.spline.layout, delay, _MARGIN))
         self.start = start.mount
 
-    def _look(self, state: Unknowns) -> tuple[IntArray, Array, Array]:
+    def _linearized(self, state: Unknowns) -> tuple[IntArray, Array, Array]:
         """First controls (k,), derivatives (k,3,24 + 13) by controls and mount, errors (k,3)."""
         mount = state.mount
         assert mount is not None
@@ -71,7 +71,7 @@ class Gyroscope:
 
     def terms(self, state: Unknowns, column: int) -> list[Rows | Quadratic]:
         """Samples with Tukey's weights, and what is known of the mount, from a column on."""
-        first, values, errors = self._look(state)
+        first, values, errors = self._linearized(state)
         deviation, squared = self.samples.deviation, np.sum(np.square(errors), axis=1)
         rest = np.maximum(1.0 - squared / (_LIMIT * deviation) ** 2, 0.0)
         weights = rest[:, None] / deviation

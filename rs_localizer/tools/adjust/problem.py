@@ -123,9 +123,9 @@ class Problem:
 
     def states(self, state: Unknowns) -> list[Unknowns]:
         """Those of the cameras, of one spline."""
-        return self._look(state)[1]
+        return self._on_spline(state)[1]
 
-    def _look(self, state: Unknowns) -> tuple[Curve, list[Unknowns]]:
+    def _on_spline(self, state: Unknowns) -> tuple[Curve, list[Unknowns]]:
         if self._last is None or self._last[0] is not state:
             spline = state.spline
             curve = Curve(
@@ -137,12 +137,12 @@ class Problem:
 
     def sights(self, state: Unknowns) -> list[Projections]:
         """The keypoints of each camera, on the spline."""
-        curve, states = self._look(state)
-        return [of.look(curve, own) for of, own in zip(self.keypoints, states, strict=True)]
+        curve, states = self._on_spline(state)
+        return [of.projections(curve, own) for of, own in zip(self.keypoints, states, strict=True)]
 
     def keypoint_rows(self, state: Unknowns, deviation: float) -> list[Rows]:
         """Rows of each camera, at a standard deviation of the noise (px)."""
-        curve, states = self._look(state)
+        curve, states = self._on_spline(state)
         parts = zip(self.keypoints, states, self.at, self.ratios.tolist(), strict=True)
         return [of.rows(curve, own, at, deviation * ratio) for of, own, at, ratio in parts]
 
@@ -227,7 +227,7 @@ class Problem:
 
     def errors(self, state: Unknowns) -> Array:
         """Squared whitened errors (n,), px^2 of the first camera."""
-        curve, states = self._look(state)
+        curve, states = self._on_spline(state)
         parts = zip(self.keypoints, states, self.ratios, strict=True)
         return np.concatenate([of.squared_errors(curve, own) / r**2 for of, own, r in parts])
 
@@ -235,14 +235,14 @@ class Problem:
         """Standard deviation of the noise (px), from errors that the last one lets count."""
         return max(noise_of(self.errors(state), deviation), self.freedom.least_noise)
 
-    def of(self, views: Sequence[CameraView], start: Unknowns) -> Problem:
+    def of_views(self, views: Sequence[CameraView], start: Unknowns) -> Problem:
         """The same of other views of the cameras."""
         floating = self.floating is not None
         return Problem(views, start, self.noises, self._one_map, self.deviations, floating)
 
     def trusted(self, start: Unknowns) -> Problem:
         """The same with the trusted keypoints only."""
-        return self.of([view.subset(view.observations.trusted) for view in self.views], start)
+        return self.of_views([view.subset(view.observations.trusted) for view in self.views], start)
 
     def images(self, inliers: BoolArray) -> int:
         """How many images of all cameras have some of these keypoints (n,)."""
@@ -277,7 +277,7 @@ def minimise(problem: Problem, state: Unknowns, deviation: float, steps: int = _
     return state
 
 
-def settle(problem: Problem, state: Unknowns, deviation: float) -> tuple[Unknowns, float]:
+def fit_with_noise(problem: Problem, state: Unknowns, deviation: float) -> tuple[Unknowns, float]:
     """State and noise (px) when neither changes any more."""
     for _ in range(_ROUNDS):
         state = minimise(problem, state, deviation)

@@ -47,7 +47,7 @@ class Reprojection:
         self.free = view.freedom
         self._last: tuple[Unknowns, Projections] | None = None
 
-    def look(self, curve: Curve, own: Unknowns) -> Projections:
+    def projections(self, curve: Curve, own: Unknowns) -> Projections:
         """All keypoints on the spline."""
         if self._last and self._last[0] is own:
             return self._last[1]
@@ -79,7 +79,7 @@ class Reprojection:
 
     def squared_errors(self, curve: Curve, own: Unknowns) -> Array:
         """Squared whitened errors (n,), px^2; infinite for keypoints that say nothing."""
-        sights = self.look(curve, own)
+        sights = self.projections(curve, own)
         squared = np.empty(len(sights.first))
         squared_errors(sights, self.terms(own, 1.0), squared)
         return squared
@@ -91,7 +91,7 @@ class Reprojection:
             at: where the camera's unknowns begin among all.
             deviation: px, of the noise.
         """
-        sights, seen = self.look(curve, own), self.observations
+        sights, seen = self.projections(curve, own), self.observations
         terms, count = self.terms(own, deviation), len(sights.first)
         sizes = {"readout": 1, "lens": len(own.lens), "mount": EXTRINSICS}
         shared = [at[name] + np.arange(size) for name, size in sizes.items() if name in at]

@@ -22,7 +22,7 @@ from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.tools.adjust.cluster_robust import Pull, pull_at_landmarks
 from rs_localizer.tools.adjust.fit import inflation_of, left_over, steepness
 from rs_localizer.tools.adjust.intrinsics import with_lens
-from rs_localizer.tools.adjust.problem import Problem, settle
+from rs_localizer.tools.adjust.problem import Problem, fit_with_noise
 from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.adjust.row_kernels import EXTRINSICS
 from rs_localizer.tools.adjust.spline import LONGEST_GAP, Spline
@@ -203,15 +203,15 @@ class Refinement:
         # The motion that goes with the map as it is.
         held = replace(self.freedom, readout_time=False, lens=False)
         motion = self.problem(held, held=True)
-        self.state, before = settle(motion, self.state, motion.noise(self.state, np.inf))
+        self.state, before = fit_with_noise(motion, self.state, motion.noise(self.state, np.inf))
         done("motion")
         problem = self.problem(self.freedom)
-        self.state, deviation = settle(problem, self.state, before)
+        self.state, deviation = fit_with_noise(problem, self.state, before)
         done("map")
         calmer = acceleration_prior(self.state, self.freedom)
         if calmer is not None:
             self.freedom, problem = calmer, self.problem(calmer)
-            self.state, deviation = settle(problem, self.state, deviation)
+            self.state, deviation = fit_with_noise(problem, self.state, deviation)
             done("accelerations")
         return self._result(problem, before, deviation)
 

@@ -75,7 +75,7 @@ class Looker:
         self._images, self._count = images, 0
         self._detector = None if marker_map is None else MarkerDetector(marker_map)
 
-    def look(self, image: Image) -> SeenImage:
+    def detect_in(self, image: Image) -> SeenImage:
         """The view of an image."""
         path = self._images / image_name(self._count)
         self._count += 1
@@ -115,7 +115,7 @@ class Looked:
         return float(np.median(np.diff(self.stamps_ns))) * 1e-9 if self.stamps_ns[1:] else np.nan
 
 
-def look(
+def look_through(
     shots: Iterable[Shot | Carried], looker: Looker, rate: float, moments: Sequence[float],
     done: Callable[[], object],
 ) -> Looked:  # fmt: skip
@@ -151,7 +151,7 @@ def look(
         found.moments |= dict.fromkeys(asked, len(found.views))
         due_ns = 1e9 * _EARLY / rate
         if asked or not found.views or image.stamp_ns - found.views[-1].stamp_ns >= due_ns:
-            found.views.append(looker.look(image))
+            found.views.append(looker.detect_in(image))
             if len(found.views) == _EARLY_VIEWS:
                 check_features(found.views)
     cameras.check()

@@ -57,6 +57,6 @@ def test_a_camera_that_stands_still_is_refused_early(tmp_path):
     looker = Looker(300, tmp_path)
     images = [np.asarray(PICTURE[20:500, x : x + 640]) for x in (0, 1, 2, 1, 0)]
     with pytest.raises(MappingError, match="the camera hardly moves"):
-        check_views([looker.look(Image(k, "camera", image)) for k, image in enumerate(images)])
+        check_views([looker.detect_in(Image(k, "camera", image)) for k, image in enumerate(images)])
     moving = [np.asarray(PICTURE[20:500, x : x + 640]) for x in (0, 40, 80, 120, 160)]
-    check_views([looker.look(Image(k, "camera", image)) for k, image in enumerate(moving)])
+    check_views([looker.detect_in(Image(k, "camera", image)) for k, image in enumerate(moving)])
