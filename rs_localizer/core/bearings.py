@@ -71,7 +71,7 @@ def pinhole(camera: Camera) -> tuple[Array, Array, Array] | None:
 
 
 def _image(x: Lanes, y: Lanes, lens: Vector) -> Vector:
-    """Where the lens shows a bearing, from the centre in focal lengths, and derivatives (4)."""
+    """Return where the lens shows a bearing, from the centre in focal lengths; derivatives (4)."""
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = lens
     square = x * x + y * y
     above = 1.0 + square * (k1 + square * (k2 + square * k3))
@@ -97,7 +97,7 @@ def _image(x: Lanes, y: Lanes, lens: Vector) -> Vector:
 
 
 def _step(values: list[Lanes]) -> Vector:
-    """One step of Newton's method, and the derivatives (4) where it starts."""
+    """Return one step of Newton's method, and the derivatives (4) at its start."""
     u, v, x, y = values[:_PLACE]
     seen_x, seen_y, xx, xy, yx, yy = _image(x, y, values[_PLACE:])
     across, down = u - seen_x, v - seen_y
@@ -112,7 +112,7 @@ _step_lanes = traced(_step, _PLACE, _COEFFICIENTS)
 
 @kernel
 def _uniform(lens: Array) -> Array:
-    """Coefficients (12,) in all lanes alike."""
+    """Return the coefficients (12,), the same in all lanes."""
     uniform = np.empty(_COEFFICIENTS * LANES)
     for k in range(_COEFFICIENTS):
         for lane in range(LANES):

@@ -139,7 +139,7 @@ _OTHER_UNIT, _LARGEST, _LARGEST_SQUARE = 20.0, 5.0, 2.0
 
 
 def other_units(marker_map: MarkerMap) -> Iterator[str]:
-    """Signs of sizes that are not in metres, as sentences."""
+    """Yield sentences on sizes that seem not to be in metres."""
     for board in marker_map.boards:
         if (large := board.square) > _LARGEST_SQUARE:
             yield (

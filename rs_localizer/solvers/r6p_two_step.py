@@ -135,7 +135,7 @@ def _alternate(
     points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
     models: Array, t_in_first: bool, t_in_second: bool,
 ) -> None:  # fmt: skip
-    """Solve a batch, v and C first; arguments as in :mod:`rs_localizer.solvers.batch`."""
+    """Solve a batch by alternating steps; arguments as in :mod:`rs_localizer.solvers.batch`."""
     work = np.empty(_SIZE)
     for start in range(0, len(samples), LANES):
         gather(points, rays, tau, samples, rotations, start, work)
@@ -158,7 +158,7 @@ def solve_vc_wt(
     points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
     iterations: int, models: Out[Array3],
 ) -> None:  # fmt: skip
-    """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    """Solve a batch, v and C first; arguments as in :mod:`rs_localizer.solvers.batch`."""
     _alternate(points, rays, tau, samples, rotations, iterations, models, False, True)
 
 

@@ -119,7 +119,7 @@ def solve_batch(
     points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
     iterations: int, models: Out[Array3],
 ) -> None:  # fmt: skip
-    """Relinearised; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    """Solve a batch, relinearized; arguments as in :mod:`rs_localizer.solvers.batch`."""
     _iterate(points, rays, tau, samples, rotations, iterations, models, False)
 
 
