@@ -72,7 +72,7 @@ class Surroundings:
         return {wanted: sorted(names) for wanted, names in self._found.items()}
 
     def until(self, stopped: Callable[[], bool]) -> None:
-        """Surroundings until it is to stop."""
+        """Look around until ``stopped`` says so."""
         listening: Inputs | None = None
         executor = executor_of(self._node.context)
         executor.add_node(self._node)
@@ -193,7 +193,7 @@ def launch_words(inputs: Mapping[str, list[str]]) -> str:
 
 
 def run(stop: StopRequest, args: list[str] | None = None) -> int:
-    """Surroundings, print and write; 0: a localizer works with what was found."""
+    """Look around, print and write; return 0 if a localizer works with what was found."""
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     looking = Node("doctor")
     around, end = Surroundings(looking), time.monotonic() + _LOOKING
