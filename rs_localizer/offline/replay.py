@@ -15,7 +15,6 @@ import numpy as np
 
 from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagError, BagReader, make_message
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import MessageError, stamp_ns
@@ -407,8 +406,7 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
         topic, recorded_ns, message = last
         localizer.take_zero_for_time(recorded_ns)
         for result in _each(inputs[topic].take_message(localizer, message)):
-            if result or result.reason is not Reason.AWAITS_FRAMES:  # it comes
-                yield answer(recorded_ns, message, result)
+            yield answer(recorded_ns, message, result)
     for result in localizer.flush():
         assert last is not None  # which waits
         yield answer(last[1], last[2], result)

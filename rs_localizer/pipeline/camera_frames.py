@@ -90,13 +90,13 @@ class CameraFrames(FrameLocalizer):
         time_ns = self._middle_row_ns(stamp_ns)
         return self.imu.awaits(self._tracker, self._config, time_ns, patience)
 
-    def localize(self, message: Any) -> Localized | Refusal:
+    def localize(self, message: Any) -> Localized | Refusal | None:
         """Localize one sensor_msgs/PointCloud2 of correspondences; never raises for bad ones."""
         cloud = read_or_refuse(read_correspondences, message, Reason.BAD_CLOUD)
         return cloud if isinstance(cloud, Refusal) else self.localize_cloud(cloud)
 
-    def localize_cloud(self, cloud: Correspondences) -> Localized | Refusal:
-        """Localize correspondences, however they came."""
+    def localize_cloud(self, cloud: Correspondences) -> Localized | Refusal | None:
+        """Localize correspondences, however they came; None: the frame waits (``output_lag``)."""
         refusal = self._stream.follow(cloud.stamp_ns, cloud.frame)
         if refusal is not None:
             return refusal
@@ -105,7 +105,7 @@ class CameraFrames(FrameLocalizer):
             self._landmarks.lacking = False  # who sends correspondences needs none
         return self._delayed(result, cloud.stamp_ns)
 
-    def localize_keypoints(self, message: Any) -> Localized | Refusal:
+    def localize_keypoints(self, message: Any) -> Localized | Refusal | None:
         """Localize one sensor_msgs/PointCloud2 of keypoints; never raises for bad ones.
 
         Tracked, landmarks are first looked for where the motion predicts them only, then, if that
@@ -134,7 +134,7 @@ class CameraFrames(FrameLocalizer):
                 return self._delayed(result, keypoints.stamp_ns)
         return self._delayed(self._localize_by_map(keypoints, None), keypoints.stamp_ns)
 
-    def localize_detections(self, message: Any) -> Localized | Refusal:
+    def localize_detections(self, message: Any) -> Localized | Refusal | None:
         """Localize one AprilTagDetectionArray by ``marker_map``; never raises for bad ones."""
         if self._tags is None:
             return Refusal(Reason.NO_MAP, "detections need the setting marker_map")
@@ -232,12 +232,17 @@ class CameraFrames(FrameLocalizer):
         deviation = self._tracker.readout_time_deviation(self._context)
         return self.mounted(self._camera_result(cloud, estimate, moment, deviation))
 
-    def _delayed(self, newest: Localized | Refusal, stamp_ns: int) -> Localized | Refusal:
-        """The result that ``output_lag`` asks for once the frame of this stamp has come."""
+    def _delayed(self, newest: Localized | Refusal, stamp_ns: int) -> Localized | Refusal | None:
+        """The result that ``output_lag`` asks for when the frame of this stamp has come.
+
+        None while the first frames wait.
+        """
         tracker = self._tracker
         if tracker.output_lag == 0 or tracker.newest_ns != self._middle_row_ns(stamp_ns):
             return newest
-        return self._late(tracker.delayed)
+        found = tracker.delayed
+        waits = not found and found.reason is Reason.AWAITS_FRAMES
+        return None if waits else self._late(found)
 
     def _late(self, found: Estimate | Failure) -> Localized | Refusal:
         """The result of a frame that has waited."""

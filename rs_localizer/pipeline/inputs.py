@@ -35,7 +35,7 @@ IMU_TYPE = "sensor_msgs/msg/Imu"
 
 
 Results = Union["Localized", Refusal, Iterator[Union["Localized", Refusal]], None]
-"""None: the message was no frame.
+"""None: the message was no frame, or its frame waits for others (``output_lag``).
 
 Of a rig an image may complete no frame, or several; each is worked on when it is asked for.
 """

@@ -103,6 +103,8 @@ for words in {[name.split() for name in COMMANDS]}:
         (["replay", "a", "b"], "many recordings need --out DIR"),
         (["calibrate", "x", "--out", "x.txt"], "x.txt"),
         (["evaluate", "a"], "the following arguments are required: TRUTH"),
+        (["simulate", "x", "--rig", "c.yaml", "--imu"], "--rig goes without --imu and --camera"),
+        (["simulate", "x", "--images", "--keypoints"], "--keypoints is not for --images"),
     ],
 )
 def test_wrong_usage(words, text, capsys):

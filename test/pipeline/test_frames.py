@@ -34,12 +34,12 @@ FAST = ConstantVelocity(np.array([1.0, -2.0, 3.0]), np.array([1.0, 0.5, -1.5]), 
 STILL = ConstantVelocity(np.zeros(3), np.zeros(3), 0.1)
 
 
-def localized(result: Localized | Refusal) -> Localized:
+def localized(result: Localized | Refusal | None) -> Localized:
     assert result, result
     return result
 
 
-def refused(result: Localized | Refusal) -> tuple[str, str]:
+def refused(result: Localized | Refusal | None) -> tuple[str, str]:
     assert isinstance(result, Refusal)
     assert not result
     return result.reason, result.detail
@@ -229,3 +229,13 @@ def test_refinement_turns_off_what_knows_more_than_the_points_of_a_frame(make_ca
             assert np.isnan(found.estimate.integrity) == (kind == "none")
     assert [it.estimate.tracked for it in told(replace(wanted, refinement="full"))] == [False, True]
     assert frames.predicts
+
+
+def test_the_first_frames_of_a_lag_wait_and_are_no_refusals(make_camera_info):
+    frames = CameraFrames(NodeConfig(readout_time=READOUT_TIME, output_lag=2))
+    frames.calibrate(read_camera_info(make_camera_info()))
+    seen = simulated()[:5]
+    results = [frames.localize(message_of(each)) for each in seen]
+    assert results[:2] == [None, None]
+    found = [localized(each) for each in (*results[2:], *frames.flush())]
+    assert [each.input_stamp_ns for each in found] == [each.stamp_ns for each in seen]
