@@ -24,7 +24,7 @@ from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import noise_fills, refusal, speeding, uncertain
 from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
-from rs_localizer.estimation.frame_posterior import frame_posterior
+from rs_localizer.estimation.hypotheses import frame_posterior
 from rs_localizer.estimation.left_out import LeftOut, left_out
 from rs_localizer.estimation.observations import (
     NEAREST,

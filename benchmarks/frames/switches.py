@@ -11,14 +11,13 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any, NamedTuple
 
-from rs_localizer.estimation.calibration import NO_EFFECT
-from rs_localizer.estimation.correlated import nothing_shared
-from rs_localizer.estimation.left_out import LeftOut
+import numpy as np
 
-_TINY = -20.0  # logarithm of a size, px
+from rs_localizer.estimation.calibration import NO_EFFECT
+from rs_localizer.estimation.left_out import LeftOut
+from rs_localizer.estimation.smooth_error import nothing_shared
 
 
 class Switch(NamedTuple):
@@ -40,7 +39,7 @@ def _with_posterior(**changed: Any) -> Callable[[Any], Any]:
     )
 
 
-_FRAME = "rs_localizer.estimation.frame_posterior"
+_FRAME = "rs_localizer.estimation.hypotheses"
 _REFUSAL = "rs_localizer.localizer:refusal"
 
 SWITCHES: dict[str, tuple[Switch, ...]] = {
@@ -48,11 +47,9 @@ SWITCHES: dict[str, tuple[Switch, ...]] = {
     "smooth-error": (
         Switch(f"{_FRAME}:smooth_error",
                lambda old: lambda lines, inliers, *_: nothing_shared(int(inliers.sum()))),
-        Switch(f"{_FRAME}:fit_turn", lambda old: lambda *args: old(*args[:8], _TINY, *args[9:])),
     ),
     "in-frame-turn": (
-        Switch(f"{_FRAME}:_with_turn",
-               lambda old: lambda given, look, smooth, steady, evidence: steady),
+        Switch(f"{_FRAME}:_with_turn", lambda old: lambda given, hypotheses, steady: [steady]),
     ),
     "calibration-effect": (
         Switch("rs_localizer.localizer:calibration_effect", lambda old: lambda *args: old(
@@ -60,17 +57,13 @@ SWITCHES: dict[str, tuple[Switch, ...]] = {
     ),
     # Hypotheses.
     "typical-speeds": (
-        Switch(f"{_FRAME}:_of_points", lambda old: lambda observations, start, terms, threshold,
-               assumed, one_lens: old(observations, start, terms, threshold,
-                                      replace(assumed, may_rest=False), one_lens)),
+        Switch(f"{_FRAME}:speeds_of", lambda old: lambda terms, assumed, _: old(
+            terms, assumed, True)),
     ),
-    "grid-over-leans": (
-        Switch(f"{_FRAME}:_steady", lambda old: lambda data, points, look, *args: old(
-            data, points, look._replace(planar=False), *args)),
-    ),
+    "grid-over-leans": (Switch(f"{_FRAME}:over_leans", lambda old: lambda frame, mode, _: mode),),
     "mixture-of-steady-and-vibrating": (
-        Switch(f"{_FRAME}:_either", lambda old: lambda steady, evidence, other, shaken: (
-            steady if evidence > other else shaken)),
+        Switch(f"{_FRAME}:_mixed", lambda old: lambda given, groups: old(given, [max(
+            groups, key=lambda one: np.logaddexp.reduce(one.parts.evidences))])),
     ),
     # Refusals.
     "too-few": (

@@ -24,13 +24,13 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, rotation_of
-from rs_localizer.estimation.correlated import smooth_columns
 from rs_localizer.estimation.observations import Observed, rays_of_lens
 from rs_localizer.estimation.plane import longest_axis
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import SPEEDS, PriorTerms, add_prior, terms_at
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.smooth_error import smooth_columns
 from rs_localizer.native import entry
 
 # Of each camera: centre (2), focal length, distortion.

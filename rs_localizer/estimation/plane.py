@@ -15,7 +15,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray1
-from rs_localizer.native import entry, inlined
+from rs_localizer.native import entry
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.
 _PLANE = 0.1
@@ -62,7 +62,7 @@ def leaning_less(
     return True, other
 
 
-@inlined
+@entry
 def plane_of(points: Array2, inliers: BoolArray1) -> tuple[bool, Array, Array]:
     """True if the points that count lie on a plane, their centre (3,) and its normal (3,)."""
     centre, spread, count = np.zeros(3), np.zeros((3, 3)), 0

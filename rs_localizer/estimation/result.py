@@ -41,7 +41,7 @@ from rs_localizer.core.state import (
 )
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import CalibrationEffect
-from rs_localizer.estimation.modes import along_arcs
+from rs_localizer.estimation.gaussian import along_arcs
 from rs_localizer.estimation.observations import Observations, Observed
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.refine import TINY
@@ -195,11 +195,11 @@ def estimate_of(
     rate, change = state[STATE_ANGULAR], state[STATE_ANGULAR_ACCELERATION]
     covariance = posterior.covariance
     # The noise of this frame is an estimate, and what is on an arc leaves its tangent.
-    arched = posterior.arched
+    motion, arched = covariance[:PARAMETERS, :PARAMETERS], posterior.arched
     if arched is None:
-        alone = np.zeros((1, PARAMETERS)), covariance[None, :PARAMETERS, :PARAMETERS].copy()
-        arched = along_arcs(covariance, state[STATE_TRANSLATION], np.ones(1), *alone)
-    beside = posterior.inflation * arched - covariance
+        alone = np.zeros((1, PARAMETERS)), motion[None]
+        arched = along_arcs(motion, state[STATE_TRANSLATION], np.ones(1), *alone)
+    beside = posterior.inflation * arched - motion
     delay = 0.0, math.inf
     if turn is not None:
         rate, change = rate + turn.rate, change + turn.change

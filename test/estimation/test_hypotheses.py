@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from rs_localizer.estimation.acceptance import refusal
-from rs_localizer.estimation.frame_posterior import frame_posterior
+from rs_localizer.estimation.hypotheses import frame_posterior
 from rs_localizer.estimation.prior import held_terms
 
 from .frames import ASSUMED, PRIOR, distance, fitted, frame, observe

@@ -1,19 +1,15 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Modes and their mixtures, against samples, and against plain integrals over a grid of leans."""
+"""Modes before a plane, against plain integrals over a grid of leans."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.estimation.correlated import Noise, nothing_shared, products_at
-from rs_localizer.estimation.modes import (
-    Frame,
-    _mode,
-    _over_leans,
-    along_arcs,
-)
+from rs_localizer.estimation.leans import Frame, linear_at, mode_of, over_leans
+from rs_localizer.estimation.linear_fit import Noise
 from rs_localizer.estimation.prior import held_terms
+from rs_localizer.estimation.smooth_error import nothing_shared
 
 from .frames import fitted, observe
 from .projection import in_camera, pixels_of
@@ -59,7 +55,7 @@ def beside(points, pixels, rotation, translation, axes):
 
 
 @pytest.mark.parametrize(("tilt", "noise"), [(0.0, 0.5), (12.0, 1.0)])
-def test_leans_are_integrated_as_on_a_fine_grid(as_python, tilt, noise):
+def test_leans_are_integrated_as_on_a_fine_grid(tilt, noise):
     observations, points, pixels, truth = plane_frame(3, tilt, noise)
     terms = held_terms()
     best = fitted(observations, truth, terms, 4.0)
@@ -67,11 +63,8 @@ def test_leans_are_integrated_as_on_a_fine_grid(as_python, tilt, noise):
     smooth = nothing_shared(COUNT)
     noise = Noise(best.noise, 1.0, 2.0 * COUNT - best.freedom)
     seen = Frame(observations.packed, points, best.inliers, smooth, noise, 590.0, 1.6)
-    products = as_python(products_at)(
-        observations.packed, COUNT, best.state, best.inliers, smooth.rows
-    )
-    mode, _, _ = as_python(_mode)(seen, best.state, products, terms, 0.0)
-    found = as_python(_over_leans)(seen, mode, terms)
+    mode, _, _ = mode_of(seen, best.state, linear_at(seen, best.state), terms)
+    found = over_leans(seen, mode, terms)
     rotation, translation = mode.state[:9].reshape(3, 3), mode.state[9:12]
     normal = rotation[:, 2]
     across = np.linalg.svd(normal[None])[2][1:]
@@ -103,41 +96,3 @@ def test_leans_are_integrated_as_on_a_fine_grid(as_python, tilt, noise):
     square, volume = beside(points, pixels, rotation, translation, np.vstack([normal, across]))
     one = volume - 0.5 * freedom * np.log(square) + 2.0 * np.log(best.noise)
     assert found.evidence - mode.evidence == pytest.approx(whole - one, abs=0.1)
-
-
-CENTRE = np.array([0.3, -0.2, 3.0])
-TURNS, MOVES = np.diag([0.05, 0.03, 0.02]), np.diag([0.001, 0.002, 0.02])
-
-
-def hat(v):
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
-def test_moments_of_a_mixture_are_those_of_cameras_on_the_arc():
-    rng = np.random.default_rng(1)
-    weights, count = np.array([0.8, 0.2]), 200_000
-    middles = np.array([[-0.03, 0.01, 0.0, 0.002, 0.0, 0.01], [0.12, -0.04, 0.02, 0.0, 0.01, 0.0]])
-    deviations = np.array([np.diag([*TURNS.diagonal(), *MOVES.diagonal()])] * 2)
-    deviations[1] *= 0.5
-    which = (np.arange(count) < weights[1] * count).astype(int)
-    samples = middles[which] + np.einsum(
-        "nij,nj->ni", deviations[which], rng.normal(size=(count, 6))
-    )
-    phi, d = samples[:, :3], samples[:, 3:]
-    moved = CENTRE - Rotation.from_rotvec(phi).apply(CENTRE + d)
-    steps = np.hstack([phi, moved])
-    expected = steps.T @ steps / count
-    by = np.block([[np.eye(3), np.zeros((3, 3))], [hat(CENTRE), -np.eye(3)]])
-    offsets, covariances = np.zeros((2, 18)), np.zeros((2, 18, 18))
-    offsets[:, :6] = middles @ by.T
-    covariances[:, :6, :6] = by @ deviations**2 @ by.T
-    both = np.einsum("k,ki,kj->ij", weights, offsets, offsets)
-    both += np.tensordot(weights, covariances, 1)
-    found = along_arcs(both, CENTRE, weights, offsets, covariances)[:6, :6]
-    scale = np.sqrt(expected.diagonal())
-    np.testing.assert_allclose(
-        found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03
-    )
-    alone = along_arcs(both, CENTRE, np.ones(1), np.zeros((1, 18)), both[None])
-    # One Gaussian of these moments is 15 % off along the line of sight.
-    assert abs(alone[5, 5] / expected[5, 5] - 1.0) > 0.1

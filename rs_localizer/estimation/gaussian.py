@@ -1,0 +1,214 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Gaussians about motions, and their one mixture.
+
+The points say precisely in which direction they are and roughly how far away. A camera whose
+orientation they hardly tell is somewhere on an arc about them, and arcs leave their tangents: by
+half of 3 m times the square of 4 degrees, 7 mm, where the ellipsoid is thinner than 1 mm. In the
+terms of a step (turn ``phi``, move ``rho``; see :mod:`rs_localizer.estimation.refine`), points at
+``p`` in camera axes that move there by ``d`` are seen from
+
+    rho = p - exp([phi]x) (p + d)
+        = -d - phi x p - (phi x (phi x p) / 2 + phi x d) - ...
+
+of which the ellipsoid has the first two. Arcs also turn the axes: a step from one point of an arc,
+told from another one, moves along other axes. So motions differ by offsets about the middle of the
+points, where arcs are straight (:func:`rs_localizer.estimation.prior.offset_between`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3
+from rs_localizer.core.state import PARAMETERS, STATE_TRANSLATION
+from rs_localizer.estimation.prior import offset_between
+from rs_localizer.estimation.refine import apply_step
+from rs_localizer.native import entry, kernel
+
+
+class Gaussians(NamedTuple):
+    """Gaussians about motions, each with its evidence.
+
+    Behind the 18 numbers of a step covariances may have those of an in-frame turn.
+    """
+
+    states: Array  # (k,24)
+    turns: Array  # (k,t) coefficients of the in-frame turn
+    covariances: Array  # (k,18 + t,18 + t)
+    evidences: Array  # (k,) logarithms
+
+
+class Mixture(NamedTuple):
+    """Gaussians as one."""
+
+    state: Array  # (24,)
+    turn: Array  # (t,)
+    covariance: Array  # (18 + t,18 + t)
+    evidence: float  # logarithm of the sum
+    probable: Array  # (k,) weights in the mean
+    possible: Array  # (k,) weights in the covariance
+    offsets: Array  # (k,18) from the mean
+    covariances: Array  # (k,18,18) of the offsets
+
+    def along_arcs(self) -> Array:
+        """The covariance (18,18) of steps, of second order (:func:`along_arcs`)."""
+        covariance, centre = (
+            self.covariance[:PARAMETERS, :PARAMETERS],
+            self.state[STATE_TRANSLATION],
+        )
+        return along_arcs(
+            np.ascontiguousarray(covariance), centre, self.possible, self.offsets,
+            np.ascontiguousarray(self.covariances),
+        )  # fmt: skip
+
+
+@entry
+def moments(means: Array2, covariances: Array3, weights: Array1) -> Array:
+    """Second moments (p,p) of Gaussians (k,p), (k,p,p) about zero, by their weights (k,)."""
+    size = means.shape[1]
+    total = np.zeros((size, size))
+    for k in range(len(weights)):
+        if weights[k] > 0.0:
+            mean = means[k]
+            for i in range(size):
+                for j in range(size):
+                    total[i, j] += weights[k] * (covariances[k, i, j] + mean[i] * mean[j])
+    return total
+
+
+def weights_of(logarithms: Array) -> Array:
+    """Probabilities (k,) of which these are the logarithms but for a constant."""
+    weights = np.exp(logarithms - logarithms.max())
+    found: Array = weights / weights.sum()
+    return found
+
+
+def mixture(parts: Gaussians, preferences: Array, temper: float) -> Mixture:
+    """The mixture of Gaussians: mean by their probabilities, second moments about it by those to
+    the power of ``temper``.
+
+    Args:
+        preferences: (k,) logarithms of odds that count in the mean alone.
+    """
+    if len(parts.states) == 1:
+        one = parts.covariances[0]
+        return Mixture(
+            parts.states[0], parts.turns[0], one, float(parts.evidences[0]), np.ones(1), np.ones(1),
+            np.zeros((1, PARAMETERS)), one[None, :PARAMETERS, :PARAMETERS],
+        )  # fmt: skip
+    probable = weights_of(parts.evidences + preferences)
+    possible = weights_of(temper * parts.evidences)
+    top = parts.evidences.max()
+    evidence = float(top + np.log(np.exp(parts.evidences - top).sum()))
+    best = int(probable.argmax())
+    first, turn = (
+        parts.states[best],
+        parts.turns[best] + probable @ (parts.turns - parts.turns[best]),
+    )
+    pivot = first[STATE_TRANSLATION]
+    steps, _ = _offsets_between(first, parts.states, pivot)
+    mean = probable @ steps
+    state = apply_step(first, mean)
+    # About the pivot, which the move of a step is not.
+    state[STATE_TRANSLATION] = pivot - mean[3:6] + _cross(pivot, mean[:3])
+    pivot = state[STATE_TRANSLATION].copy()
+    offsets, by_turns = _offsets_between(state, parts.states, pivot)
+    # Covariances of steps as those of offsets, which go with the turn.
+    by_step = np.zeros((len(by_turns), 6, 6))
+    by_step[:, :, :3], by_step[:, 3:, 3:] = by_turns, np.eye(3)
+    about = parts.covariances.copy()
+    about[:, :6] = by_step @ about[:, :6]
+    about[:, :, :6] = about[:, :, :6] @ by_step.transpose(0, 2, 1)
+    away = np.hstack([offsets, parts.turns - turn])
+    covariance = moments(away, about, possible)
+    about = about[:, :PARAMETERS, :PARAMETERS]
+    return Mixture(state, turn, covariance, evidence, probable, possible, offsets, about)
+
+
+@entry
+def _offsets_between(reference: Array1, states: Array2, pivot: Array1) -> tuple[Array, Array]:
+    """:func:`offset_between` of states (k,24): offsets (k,18), derivatives (k,6,3)."""
+    count = len(states)
+    offsets, by_turns = np.empty((count, PARAMETERS)), np.empty((count, 6, 3))
+    for k in range(count):
+        offsets[k], by_turns[k] = offset_between(reference, states[k], pivot)
+    return offsets, by_turns
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """As ``np.cross`` of vectors (3,), for a tenth of the time."""
+    return np.array([
+        a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
+    ])  # fmt: skip
+
+
+@entry
+def along_arcs(
+    covariance: Array2, centre: Array1, weights: Array1, offsets: Array2, covariances: Array3
+) -> Array:
+    """The covariance with the second order of the move; that of the turn has none.
+
+    A mixture's is not that of one Gaussian: who turned by three deviations moved nine times as far
+    off the tangent as who turned by one. The mean stays where the points fit best, so that the mean
+    of the second order counts, too: for ``s_i = y^T H_i y`` of Gaussians ``y`` with mean ``m`` and
+    covariance ``C``, ``E[s_i] = tr(H_i C) + m^T H_i m``, ``E[s_i s_j]`` is ``E[s_i] E[s_j] +
+    2 tr(H_i C H_j C) + 4 m^T H_i C H_j m``, and ``E[y s_i] = m E[s_i] + 2 C H_i m``.
+
+    Args:
+        covariance: (18,18), of a step.
+        centre: (3,) of the points, in camera axes.
+        weights: (k,) of Gaussians whose mixture it is.
+        offsets: (k,18) of their means (:func:`offset_between`).
+        covariances: (k,18,18) of the offsets.
+    """
+    # y = (phi, d): d = -rho + [p]x phi.
+    by_step, forms = np.eye(6), np.zeros((3, 6, 6))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        by_step[3 + i, 3 + i] = -1.0
+        by_step[3 + j, i], by_step[3 + k, i] = centre[k], -centre[j]
+        # (phi x (phi x p))_i = phi_i (phi . p) - p_i (phi . phi)
+        for m in range(3):
+            forms[i, i, m] -= 0.25 * centre[m]
+            forms[i, m, i] -= 0.25 * centre[m]
+            forms[i, m, m] += 0.5 * centre[i]
+        forms[i, j, 3 + k] = forms[i, 3 + k, j] = -0.5
+        forms[i, k, 3 + j] = forms[i, 3 + j, k] = 0.5
+    farther, means = covariance.copy(), np.empty(3)
+    products, pulls = np.empty((3, 6, 6)), np.empty((3, 6))
+    for part in range(len(weights)):
+        spread = covariances[part, :, :6].copy()
+        mean = _times(offsets[part : part + 1, :6].copy(), by_step)
+        crossed = _times(spread, by_step)
+        both = _times(_times(by_step, spread[:6]), by_step)
+        for i in range(3):
+            products[i] = _times(forms[i], both)
+            pulls[i] = _times(mean, forms[i])[0]
+            means[i] = np.trace(products[i]) + np.sum(mean[0] * pulls[i])
+        pulled = _times(pulls, both)
+        across = 2.0 * _times(pulls, crossed)
+        for i in range(3):
+            for j in range(3):
+                second = means[i] * means[j] + 2.0 * np.sum(products[i] * products[j].T)
+                second += 4.0 * np.sum(pulls[j] * pulled[i])
+                farther[3 + i, 3 + j] += weights[part] * second
+            first = weights[part] * (means[i] * offsets[part] + across[i])
+            farther[3 + i] += first
+            farther[:, 3 + i] += first
+    return farther
+
+
+@kernel
+def _times(left: Array2, right: Array2) -> Array:
+    """The product ``left right^T`` of matrices so small that a loop is the fastest."""
+    product = np.empty((len(left), len(right)))
+    for i in range(len(left)):
+        for j in range(len(right)):
+            total = 0.0
+            for k in range(left.shape[1]):
+                total += left[i, k] * right[j, k]
+            product[i, j] = total
+    return product

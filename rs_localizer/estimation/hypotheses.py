@@ -1,0 +1,542 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The posterior of a frame: a list of hypotheses, each fitted and weighed, and one Gaussian of all.
+
+docs/estimator.md is the page. A camera rests or moves at a typical speed, and is steady or
+vibrates within its frame: each is a Gaussian with its evidence (:mod:`.linear_fit`,
+:mod:`.leans`), and the mean and the covariance of their mixture go out (:mod:`.gaussian`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, Array1, BoolArray, BoolArray1
+from rs_localizer.core.shake import COMBINATIONS, RESOLVED, shake_at
+from rs_localizer.core.state import (
+    LINEAR,
+    MOTION_PARAMETERS,
+    PARAMETERS,
+    POSE,
+    POSE_SIZE,
+    VELOCITIES,
+)
+from rs_localizer.estimation.gaussian import Gaussians, mixture, weights_of
+from rs_localizer.estimation.leans import Frame, Mode, linear_at, mode_of, over_leans
+from rs_localizer.estimation.linear_fit import (
+    MIDDLE,
+    NO_TURN,
+    TURNS,
+    VIBRATION,
+    Linear,
+    Noise,
+    fit,
+    known_at,
+    linear_of,
+    moved,
+    under,
+    without,
+)
+from rs_localizer.estimation.observations import MOST_POINTS, NEAREST, Observations
+from rs_localizer.estimation.plane import plane_of
+from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, best_motion
+from rs_localizer.estimation.prior import SPEEDS, Assumed, PriorTerms, terms_at
+from rs_localizer.estimation.refine import LEAST_NOISE, TINY, apply_step, solve_positive
+from rs_localizer.estimation.residuals import Lines, linearized
+from rs_localizer.estimation.smooth_error import (
+    ORDINARY,
+    Shared,
+    bend_of,
+    nothing_shared,
+    smooth_error,
+)
+from rs_localizer.native import entry, kernel
+
+# Logarithm of the odds of rest against each typical speed before any frame: errors of maps that no
+# polynomial of the image follows look like motion, and a hundred to one is what surveyed tags ask
+# for. The same of none against an in-frame turn.
+REST_ODDS = STEADY_ODDS = math.log(100.0)
+# The pose is the mean of the posterior. Its region is that of the posterior with probabilities to
+# this power, about the same mean: it holds for a camera that moves so little that rest is more
+# probable (1 would hold on average over all cameras, and not for that one). The odds for rest and
+# those against an in-frame turn, which are choices, have no part in it.
+TEMPER = 0.25
+# Logarithm of the odds of a typical speed beside a better one, beyond which no faster one is tried.
+_FAR_LESS_PROBABLE = 9.0
+# Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
+# which the prior knows less than this part: typical speeds are not weighed.
+_CLEARLY_MOVING, _LITTLE_OF_THE_PRIOR = 67.0, 0.05
+# Points just outside of the gate that are no chance: shaking may have moved them there. The corners
+# of one marker may, beside four and more others, be misplaced in the map. Beside fewer points, 12
+# or 13 are a plain motion's of 20 that shake by a degree, and 3 or 4 lie just outside: of 25 such
+# frames one was inside its region (benchmarks.frames bands).
+_MARKER = 4
+_NEAR_PART, _NEAR_GATE = 0.2, 8.0
+# Errors of points in neighbouring rows differ by less than those of any two, by so many standard
+# deviations, where it is the row that moves them.
+_WITH_ROWS = 3.0
+# Shaking of up to this (rad, 2 deg) moves points out of the gate of a motion without it.
+_LARGEST_SHAKE = 0.035
+# A fit that loses more inliers than this part leaves is another group of points.
+_KEPT = 0.9
+# Probability that does not count, of either kind of camera.
+_NO_PART = 1e-4
+# Of the cameras that do not show it, one in ten shakes.
+_HIDDEN_ODDS = math.log(10.0)
+# Logarithm of the evidence of an ordinary vibration against none from which it is fitted, and of
+# the ordinary spectrum, one of several, from which all are looked at.
+_ASKS, _MAY_SHAKE = -0.5, -1.8
+# The gate closes by this factor from step to step (graduated non-convexity).
+_CLOSING = 0.6
+# A last step this short, in squared standard deviations: the next one is its square.
+_SHORT = 1e-2
+_STEPS = 20
+# Pose and velocities with the vibration by all unknowns, see MIDDLE.
+_TURNED = np.hstack([np.eye(PARAMETERS), MIDDLE])[:MOTION_PARAMETERS]
+# Fewer inliers determine nothing; nor, beside an in-frame turn, do these.
+_FEWEST, _FEWEST_TURNING = 6, 8
+
+
+class MotionHypothesis(NamedTuple):
+    """What a camera may be doing."""
+
+    name: str
+    speed: float  # part of the configured one
+    terms: PriorTerms  # of its motion
+    odds: float  # logarithm, by all but the points
+    preference: float  # logarithm of odds that count in the mean alone
+
+
+class _Given(NamedTuple):
+    """The points of a frame, what is known of it, and its best motion."""
+
+    observations: Observations
+    terms: PriorTerms
+    threshold: float  # px, of inliers
+    assumed: Assumed
+    best: Posterior
+    lines: Lines  # at the best motion
+    frame: Frame
+    bend: Array  # (n,b), see smooth_columns
+    size: float  # px, expected of the smooth error
+
+
+class _Camera(NamedTuple):
+    """The hypotheses of a camera that is steady, or vibrates, and what the most probable one leaves
+    of the points.
+    """
+
+    parts: Gaussians
+    preferences: Array  # (k,)
+    posterior: Posterior
+
+
+def frame_posterior(
+    observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed,
+    one_lens: bool = True,
+) -> Posterior:  # fmt: skip
+    """Posterior of the motion by the points, near a first motion.
+
+    Args:
+        observations: the points; of very many a part is enough, evenly taken.
+        start: state (24,).
+        terms: what is known of the motion beside the points.
+        threshold: px, of inliers.
+        assumed: of the camera.
+        one_lens: one camera sees them all; of two lenses a smooth error is not one polynomial.
+    """
+    if observations.count > MOST_POINTS:
+        some = np.linspace(0, observations.count - 1, MOST_POINTS).astype(np.int64)
+        part = _of_points(observations.only(some), start, terms, threshold, assumed, one_lens)
+        lines = linearized(
+            observations.packed, observations.count, part.state,
+            shake_at(observations.tau, part.shake),
+        )  # fmt: skip
+        errors = np.sum(lines.errors**2, axis=1)
+        # The farthest inlier of the part is one of all points: no rounding leaves it out.
+        inliers = errors <= errors[some][part.inliers].max(initial=0.0)
+        bend = part.bend
+        if bend.shape[1]:
+            depth = max(observations.median_depth(part.state, inliers), NEAREST)
+            bend = bend_of(observations.points, inliers, depth / assumed.focal_length)
+        return part._replace(squared_errors=errors, inliers=inliers, bend=bend)
+    return _of_points(observations, start, terms, threshold, assumed, one_lens)
+
+
+def _of_points(
+    observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed,
+    one_lens: bool,
+) -> Posterior:  # fmt: skip
+    best = Posterior(*best_motion(observations.packed, observations.count, start, terms, threshold))
+    if not best.determined or np.count_nonzero(best.inliers) < _FEWEST:
+        return best
+    given = _given(observations, best, terms, threshold, assumed, one_lens)
+    declares, best = assumed.map_deviation > 0.0, given.best
+    planar, _, _ = plane_of(observations.points, best.inliers)
+    is_clear = not (declares or planar) and _clearly_moving(given)
+    hypotheses = speeds_of(terms, assumed, is_clear)
+    modes = _modes(given.frame, hypotheses, best.state, planar)
+    if not modes:
+        return best._replace(smallest_eigenvalue=0.0)
+    steady = _steady(given, modes)
+    groups = [steady]
+    if assumed.rolling and not (declares and planar):
+        # What looks like vibration before a board that is bent is more of its bend.
+        groups = _with_turn(given, hypotheses, steady)
+    return _mixed(given, groups)
+
+
+def _given(
+    observations: Observations, best: Posterior, terms: PriorTerms, threshold: float,
+    assumed: Assumed, one_lens: bool,
+) -> _Given:  # fmt: skip
+    """What does not depend on the hypothesis."""
+    data, points, count = observations.packed, observations.points, observations.count
+    found = int(np.count_nonzero(best.inliers))
+    depth = max(observations.median_depth(best.state, best.inliers), NEAREST)
+    lines = linearized(data, count, best.state, np.zeros((count, 6)))
+    declared = assumed.map_deviation * assumed.focal_length / depth
+    size, shared = declared or ORDINARY, nothing_shared(found)
+    near, bend = 0, np.zeros((count, 0))
+    if assumed.rolling:
+        near = near_outliers(lines, best.squared_errors, best.inliers, threshold)
+        if declared:
+            bend = bend_of(points, best.inliers, depth / assumed.focal_length)
+        if one_lens:
+            shared = smooth_error(lines, best.inliers, bend, size)
+    left = float(best.squared_errors[best.inliers].sum()) / max(best.freedom, 1.0)
+    noise = Noise(
+        best.noise, max(best.noise**2 / max(left, LEAST_NOISE**2), 1.0),
+        max(2.0 * found - best.freedom, 0.0),
+    )  # fmt: skip
+    return _Given(
+        observations, terms, threshold, assumed,
+        best._replace(near_outliers=near, declared=declared), lines,
+        Frame(data, points, best.inliers, shared, noise, assumed.focal_length, depth), bend, size,
+    )  # fmt: skip
+
+
+def speeds_of(terms: PriorTerms, assumed: Assumed, is_clear: bool) -> list[MotionHypothesis]:
+    """The typical speeds of a camera, the slowest first; the configured one alone, if that it moves
+    is clear or known.
+    """
+    turn = assumed.turn
+    return [
+        MotionHypothesis(
+            f"speed {speed:g}",
+            speed,
+            terms if speed == 1.0 else terms_at(terms, speed, turn is not None),
+            (assumed.of_rest if speed == 0.0 else 0.0) + (turn.evidence(speed) if turn else 0.0),
+            REST_ODDS if speed == 0.0 else 0.0,
+        )
+        for speed in SPEEDS
+        if speed == 1.0 or (assumed.may_rest and not is_clear)
+    ]
+
+
+def _modes(
+    frame: Frame, hypotheses: list[MotionHypothesis], start: Array, planar: bool
+) -> list[tuple[MotionHypothesis, Mode]]:
+    """The Gaussian of each hypothesis of a steady camera, as far as they are probable."""
+    modes, best, near = [], -math.inf, start
+    if len(hypotheses) > 1:
+        near = np.concatenate([start[:POSE_SIZE], np.zeros(len(start) - POSE_SIZE)])
+    linear = linear_at(frame, near)
+    for one in hypotheses:
+        mode, near, linear = mode_of(frame, near, linear, one.terms)
+        if planar:
+            mode = over_leans(frame, mode, one.terms)
+        evidence = mode.evidence + one.odds
+        if evidence > -math.inf:
+            modes.append((one, mode._replace(evidence=evidence)))
+        best = max(best, evidence)
+        if evidence < best - _FAR_LESS_PROBABLE / TEMPER:
+            break
+    return modes
+
+
+def _steady(given: _Given, modes: list[tuple[MotionHypothesis, Mode]]) -> _Camera:
+    """Cameras that do not turn within their frame."""
+    parts = Gaussians(
+        np.array([mode.state for _, mode in modes]), np.zeros((len(modes), 0)),
+        np.array([mode.covariance for _, mode in modes]),
+        np.array([mode.evidence for _, mode in modes])
+        - _of_outliers(given, given.best.inliers),
+    )  # fmt: skip
+    preferences = np.array([one.preference for one, _ in modes])
+    _, likely = modes[int((parts.evidences + preferences).argmax())]
+    possible = weights_of(TEMPER * parts.evidences)
+    shared = math.sqrt(possible @ np.square([mode.size for _, mode in modes]))
+    speeds = np.zeros(len(SPEEDS))
+    speeds[[SPEEDS.index(one.speed) for one, _ in modes]] = possible
+    posterior = given.best._replace(
+        noise=likely.noise, freedom=likely.freedom, model_error=shared, shared=shared,
+        bend=given.bend, speeds=speeds, squared_errors=np.zeros(0),
+    )  # fmt: skip
+    return _Camera(parts, preferences + STEADY_ODDS, posterior)
+
+
+def _of_outliers(given: _Given, inliers: BoolArray) -> float:
+    """What the evidence loses by the others, which are anywhere in an image of a focal length
+    squared.
+    """
+    outside = given.observations.count - np.count_nonzero(inliers)
+    return 2.0 * outside * math.log(given.assumed.focal_length)
+
+
+def _with_turn(given: _Given, hypotheses: list[MotionHypothesis], steady: _Camera) -> list[_Camera]:
+    """Cameras that do not turn within their frame and, if there may be such, those that do."""
+    wide, vibrating = given.best.near_outliers > 0, None
+    if given.assumed.turn is not None and not wide:  # what a gyroscope leaves tells its offset
+        return [steady]
+    gain, undetected = _hidden(given, steady.posterior)
+    if wide or gain > _ASKS:
+        vibrating = _vibrating(given, hypotheses, steady.posterior)
+    if vibrating is None:
+        weight = 1.0 / (1.0 + math.exp(min(_HIDDEN_ODDS - TEMPER * gain, 700.0)))
+        return [steady._replace(posterior=steady.posterior._replace(
+            undetected=weight * undetected
+        ))]  # fmt: skip
+    total, other = (np.logaddexp.reduce(one.parts.evidences) for one in (steady, vibrating))
+    # As if any speed left it, where vibration hardly shows.
+    raised = vibrating.parts.evidences + max(total + gain - other, 0.0)
+    return [steady, vibrating._replace(parts=vibrating.parts._replace(evidences=raised))]
+
+
+def _hidden(given: _Given, steady: Posterior) -> tuple[float, Array]:
+    """Evidence and effect of vibration at the best motion without it.
+
+    Returns:
+        logarithm of its evidence, against none; (12,12) second moments of the motion by it.
+    """
+    best, shared = given.best, given.frame.shared.at(steady.shared)
+    own = steady.shared**2 * shared.squares
+    # What is left is as much as beside all sizes of the smooth error.
+    decided = len(shared.rows) - float(np.sum(own / (steady.noise**2 + own))) - steady.freedom
+    noise = Noise(steady.noise, 1.0, decided)
+    linear = linear_of(given.lines, best.inliers, True, shared.rows)
+    known = known_at(given.terms, best.state)
+    found = fit(linear, shared, known, noise, VIBRATION.of_first(), True)
+    if found.gain > _MAY_SHAKE:
+        found = fit(linear, shared, known, noise, VIBRATION, True)
+    none = np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
+    if not found.evidence > -math.inf:
+        return -math.inf, none
+    alone = fit(without(linear, "turn"), shared, known, noise, NO_TURN, True)
+    place = slice(0, MOTION_PARAMETERS)
+    move = _TURNED @ found.step - alone.step[place]
+    beside = (found.noise / noise.deviation) ** 2 * alone.covariance[place, place]
+    return found.gain, _TURNED @ found.covariance @ _TURNED.T - beside + np.outer(move, move)
+
+
+def _with_middle(covariance: Array) -> Array:
+    """Covariance (72,72) of the motion with its vibration, from one without it."""
+    covariance = covariance.copy()
+    covariance[:PARAMETERS] += MIDDLE @ covariance[PARAMETERS:]
+    covariance[:, :PARAMETERS] += covariance[:, PARAMETERS:] @ MIDDLE.T
+    return covariance
+
+
+class _Turning(NamedTuple):
+    """A motion with an in-frame turn, and its points."""
+
+    state: Array  # (24,)
+    turn: Array  # (54,)
+    lines: Lines
+    squares: Array  # (n,) px^2
+    inliers: BoolArray  # (n,)
+
+
+def _at(given: _Given, state: Array, turn: Array, gate: float) -> _Turning:
+    """The points at a motion with an in-frame turn, those within a gate (px) as inliers."""
+    observations = given.observations
+    data, count = observations.packed, observations.count
+    shake = shake_at(observations.tau, COMBINATIONS @ turn.reshape(RESOLVED, 3))
+    lines = linearized(data, count, state, shake)
+    squares = np.square(lines.errors).sum(axis=1)
+    squares[np.isinf(observations.squared_errors(state))] = np.inf
+    return _Turning(state, turn, lines, squares, squares < gate * gate)
+
+
+def _vibrating(
+    given: _Given, hypotheses: list[MotionHypothesis], steady: Posterior
+) -> _Camera | None:
+    """Cameras that turn within their frame, if such a fit converges to as many points."""
+    best, threshold, wide = given.best, given.threshold, given.best.near_outliers > 0
+    widest = WIDEST_GATE * threshold
+    gate, noise = min(max(threshold, GATE * best.noise), widest), best.noise
+    if wide:
+        gate, noise = max(2.0 * widest, _LARGEST_SHAKE * given.assumed.focal_length), threshold
+    now, is_last, farthest = _at(given, best.state, np.zeros(TURNS), gate), False, math.inf
+    # Points decide all of the motion.
+    decided = float(PARAMETERS)
+    for k in range(_STEPS):
+        if np.count_nonzero(now.inliers) < _FEWEST_TURNING:
+            return None
+        beside = _beside_turn(given, now)
+        known = known_at(given.terms, beside.state)
+        found = fit(
+            beside.linear, beside.shared, known, Noise(noise, 1.0, decided), VIBRATION,
+            is_last or k == _STEPS - 1,
+        )  # fmt: skip
+        step = beside.step + found.step
+        if not found.evidence > -math.inf:
+            return None
+        lengths = np.square(step) / np.maximum(np.diagonal(found.covariance), TINY)
+        farthest = float(lengths.max())
+        state, turn = _after(now, step)
+        if is_last or not np.isfinite(state).all():
+            break
+        is_closed = gate <= widest
+        noise = max(found.noise, LEAST_NOISE)
+        gate = max(_CLOSING * gate, min(max(threshold, GATE * noise), widest))
+        now, is_last = _at(given, state, turn, gate), is_closed and farthest < _SHORT
+    kept, had = np.count_nonzero(now.inliers), np.count_nonzero(best.inliers)
+    if not (farthest < 1.0 and kept >= _KEPT * had) or (wide and found.freedom < kept):
+        return None
+    parts, last = [], _at(given, state, turn, math.inf)
+    for one in hypotheses:
+        part = under(found, known, known_at(one.terms, beside.state))
+        parts.append((
+            *_after(now, beside.step + part.step), _with_middle(part.covariance),
+            part.evidence + one.odds,
+        ))  # fmt: skip
+    states, turns, covariances, evidences = (np.array(each) for each in zip(*parts, strict=True))
+    evidences -= _of_outliers(given, now.inliers)
+    preferences = np.array([one.preference for one in hypotheses])
+    posterior = steady._replace(
+        noise=found.noise, freedom=found.freedom, inliers=now.inliers, speeds=np.zeros(0),
+        near_outliers=near_outliers(last.lines, last.squares, now.inliers, threshold),
+        squared_errors=last.squares, shared=given.size,
+    )  # fmt: skip
+    return _Camera(Gaussians(states, turns, covariances, evidences), preferences, posterior)
+
+
+class _BesideTurn(NamedTuple):
+    """The products of motion and in-frame turn, from a camera that does not move."""
+
+    linear: Linear
+    shared: Shared
+    state: Array  # (24,) without its vibration
+    step: Array  # (72,) to there from where the lines are; the turn is whole
+
+
+def _beside_turn(given: _Given, now: _Turning) -> _BesideTurn:
+    shared = smooth_error(now.lines, now.inliers, given.bend, given.size).at(given.size)
+    linear = linear_of(now.lines, now.inliers, True, shared.rows)
+    still = apply_step(now.state, -MIDDLE @ now.turn)
+    # From no velocity, of which the prior of a camera at rest is so sure that rounding would show.
+    step = np.append(np.zeros(PARAMETERS), -now.turn)
+    step[POSE.stop : PARAMETERS] = -still[POSE_SIZE:]
+    return _BesideTurn(moved(linear, step), shared, apply_step(still, step[:PARAMETERS]), step)
+
+
+def _after(now: _Turning, step: Array) -> tuple[Array, Array]:
+    """State and in-frame turn after a step (72,)."""
+    change = step[PARAMETERS:]
+    return apply_step(now.state, step[:PARAMETERS] + MIDDLE @ change), now.turn + change
+
+
+def _mixed(given: _Given, groups: list[_Camera]) -> Posterior:
+    """The mixture of all hypotheses, with what the most probable kind leaves of the points."""
+    if len(groups) > 1:
+        evidences = np.concatenate([one.parts.evidences for one in groups])
+        preferences = np.concatenate([one.preferences for one in groups])
+        first = len(groups[0].preferences)
+        shares = [
+            weights_of(each)[:first].sum() for each in (TEMPER * evidences, evidences + preferences)
+        ]
+        groups = [
+            one for one, part in zip(groups, (max(shares), 1.0 - min(shares)), strict=True)
+            if part > _NO_PART
+        ]  # fmt: skip
+    parts = groups[0].parts if len(groups) == 1 else _together(*(one.parts for one in groups))
+    found = mixture(parts, np.concatenate([one.preferences for one in groups]), TEMPER)
+    likely = groups[0].posterior
+    if len(groups) > 1 and found.probable[: len(groups[0].preferences)].sum() < 0.5:
+        likely = groups[1].posterior
+    covariance, shake = found.covariance, np.zeros((0, 3))
+    if len(found.turn):
+        covariance, shake = _in_functions(covariance), COMBINATIONS @ found.turn.reshape(-1, 3)
+    if not len(likely.squared_errors):  # of all steady ones, and not of the best one alone
+        likely = likely._replace(squared_errors=given.observations.squared_errors(found.state))
+    return likely._replace(
+        state=found.state, covariance=covariance, arched=found.along_arcs(), shake=shake
+    )
+
+
+def _together(steady: Gaussians, vibrating: Gaussians) -> Gaussians:
+    """Gaussians of both kinds, the ones without an in-frame turn as such of none."""
+    count = len(steady.states)
+    covariances = np.zeros((count, PARAMETERS + TURNS, PARAMETERS + TURNS))
+    covariances[:, :PARAMETERS, :PARAMETERS] = steady.covariances
+    whole = steady._replace(turns=np.zeros((count, TURNS)), covariances=covariances)
+    return Gaussians(*map(np.concatenate, zip(whole, vibrating, strict=True)))
+
+
+def _in_functions(covariance: Array) -> Array:
+    """Covariance (102,102) of motion and all functions' coefficients, from one of (72,72)."""
+    half, size = covariance[:, PARAMETERS:].reshape(-1, RESOLVED, 3), PARAMETERS + TURNS
+    half = np.hstack([covariance[:, :PARAMETERS], (COMBINATIONS @ half).reshape(size, -1)])
+    turned = (COMBINATIONS @ half[PARAMETERS:].reshape(RESOLVED, -1)).reshape(-1, half.shape[1])
+    return np.vstack([half[:PARAMETERS], turned])
+
+
+@entry
+def near_outliers(
+    lines: Lines, squared_errors: Array1, inliers: BoolArray1, threshold: float
+) -> int:
+    """Points just beyond the gate, where they are too many to be chance and it is the row that
+    moves them; else 0.
+
+    A part of the points that is shifted alike is another group of points, whatever its rows.
+    """
+    within = squared_errors < (_NEAR_GATE * threshold) ** 2
+    count = int(np.count_nonzero(within & ~inliers))
+    most = np.count_nonzero(inliers)
+    shaken = count > _MARKER or most < 4 * _MARKER
+    if not (shaken and count >= _NEAR_PART * most):
+        return 0
+    return count if _go_with_rows(lines, within) > _WITH_ROWS else 0
+
+
+@kernel
+def _go_with_rows(lines: Lines, chosen: BoolArray1) -> float:
+    """How much less the errors of neighbouring rows differ than those of any two rows, standard
+    normal if the row does not matter (von Neumann 1941).
+    """
+    order, count, mean = np.argsort(lines.tau), 0, np.zeros(2)
+    for i in order:
+        if chosen[i]:
+            mean += lines.errors[i]
+            count += 1
+    mean /= max(count, 1)
+    spread, steps, previous = 0.0, 0.0, -1
+    for i in order:
+        if not chosen[i]:
+            continue
+        for k in range(2):
+            spread += (lines.errors[i, k] - mean[k]) ** 2
+            if previous >= 0:
+                steps += 0.5 * (lines.errors[i, k] - lines.errors[previous, k]) ** 2
+        previous = i
+    if count < 4 or not spread > 0.0:
+        return 0.0
+    return (1.0 - steps / spread) * math.sqrt(float(count))
+
+
+def _clearly_moving(given: _Given) -> bool:
+    """True if neither rest nor another typical speed would change anything."""
+    turn_known = given.assumed.turn is not None
+    first = LINEAR.start if turn_known else VELOCITIES.start  # of the others a gyroscope knows
+    place = slice(first, VELOCITIES.stop)
+    spread = given.best.covariance[place, place].copy()
+    part = float(np.diagonal(given.terms.informations[0])[place] @ np.diagonal(spread))
+    if not part < _LITTLE_OF_THE_PRIOR:
+        return False
+    velocities = given.best.state[POSE_SIZE - POSE.stop :][place]
+    solved, _ = solve_positive(spread, velocities)
+    return bool(velocities @ solved > _CLEARLY_MOVING)

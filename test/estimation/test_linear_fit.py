@@ -1,0 +1,332 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The one linear fit, against dense matrices of plain NumPy."""
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from rs_localizer.core.shake import CYCLES, IN_COMBINATIONS
+from rs_localizer.estimation.linear_fit import (
+    BLOCKS,
+    FACTORS,
+    MIDDLE,
+    NO_TURN,
+    SHARED,
+    SPECTRA,
+    TURNS,
+    VIBRATION,
+    Noise,
+    TurnPrior,
+    fit,
+    known_at,
+    linear_of,
+    marginal,
+    moved,
+    under,
+    without,
+)
+from rs_localizer.estimation.prior import add_prior, terms_at
+from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.smooth_error import (
+    bend_of,
+    nothing_shared,
+    smooth_columns,
+    smooth_error,
+)
+
+from .frames import PRIOR, frame
+
+NOISE = 0.4
+SIZES = np.linspace(-2.5, 5.5, 11)  # as the module has them
+TERMS = terms_at(PRIOR, 0.1, False)
+
+
+def everything(bent):
+    observations, truth = frame(3, 0.05, NOISE, count=30)
+    chosen = np.ones(30, bool)
+    chosen[[4, 17]] = False
+    lines = linearized(observations.packed, 30, truth, np.zeros((30, 6)))
+    bend = np.zeros((30, 0))
+    if bent:
+        bend = bend_of(observations.points, chosen, 4.0 / 590.0)
+    shared = smooth_error(lines, chosen, bend, 0.2)
+    columns = smooth_columns(lines.by_motion[chosen], lines.image[chosen], bend[chosen])
+    return truth, chosen, lines, shared, columns.reshape(56, -1)
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_sizes_are_integrated_as_over_dense_matrices(bent):
+    truth, chosen, lines, shared, columns = everything(bent)
+    known = known_at(TERMS, truth)
+    # One noise for all sizes: it is held, but for rounding.
+    noise = Noise(NOISE, 1.0, 12.0)
+    found = fit(linear_of(lines, chosen, False, shared.rows), shared, known, noise, NO_TURN, True)
+    dense, errors = lines.by_motion[chosen].reshape(56, 18), lines.errors[chosen].ravel()
+    logs, steps, covariances = [], [], []
+    for away in SIZES:
+        shared_noise = 0.2**2 * np.exp(2.0 * away) * columns @ columns.T
+
+        def at(deviation, shared_noise=shared_noise):
+            whole = shared_noise + deviation**2 * np.eye(56)
+            inverse = np.linalg.inv(whole)
+            of_step = dense.T @ inverse @ dense + known.information
+            step = -np.linalg.solve(of_step, dense.T @ inverse @ errors + known.slope)
+            moved = errors + dense @ step
+            rest = deviation**2 * inverse @ moved
+            own = np.linalg.inv(of_step)
+            cost = errors @ inverse @ errors + known.cost
+            cost += step @ (dense.T @ inverse @ errors + known.slope)
+            log = -0.5 * (
+                cost + np.linalg.slogdet(2.0 * np.pi * whole)[1] + np.linalg.slogdet(of_step)[1]
+            )
+            taken = 56.0 - deviation**2 * np.trace(inverse)
+            left = rest @ rest / max(56.0 - 12.0 - taken, 5.6)
+            usual = NOISE * np.array([0.16, 1.3])
+            return log, step, own, np.clip(np.sqrt(left), *usual)
+
+        if not logs:
+            deviation_here = at(NOISE)[3]
+        log, step, covariance, deviation_here = at(deviation_here)
+        logs.append(log - 0.5 * away**2)
+        steps.append(step)
+        covariances.append(covariance)
+    weights = np.exp(np.array(logs) - logsumexp(logs))
+    mean = weights @ np.array(steps)
+    spread = np.einsum("k,kij->ij", weights, covariances)
+    spread += np.einsum("k,ki,kj->ij", weights, steps - mean, steps - mean)
+    deviations = np.sqrt(np.diag(spread))
+    np.testing.assert_allclose(found.step / deviations, mean / deviations, atol=0.02)
+    scaled = found.covariance / np.outer(deviations, deviations)
+    np.testing.assert_allclose(scaled, spread / np.outer(deviations, deviations), atol=0.02)
+    expected = logsumexp(logs) - logsumexp(-0.5 * SIZES**2)
+    expected += 0.5 * np.log(np.diag(TERMS.informations[0])[6:]).sum()
+    assert found.evidence == pytest.approx(expected, abs=0.05)
+    sizes = 0.2 * np.exp(SIZES)
+    assert found.size == pytest.approx(np.sqrt(weights @ sizes**2), rel=0.05)
+
+
+def test_all_spectra_are_as_strong_and_odds_are_probabilities():
+    strengths = np.square(SPECTRA).sum(axis=1)
+    np.testing.assert_allclose(strengths, strengths[0])
+    assert logsumexp(VIBRATION.odds) == pytest.approx(0.0, abs=1e-12)
+
+
+def shaking():
+    """Points of a camera that is linearized without its vibration, and whole waves as columns."""
+    observations, truth = frame(5, 0.05, 0.5, count=40)
+    lines = linearized(observations.packed, 40, truth, np.zeros((40, 6)))
+    dense = lines.by_motion.reshape(80, 18)
+    angles = 2.0 * np.pi * np.outer(lines.tau, CYCLES)
+    waves = np.stack([np.cos(angles) - 1.0, np.sin(angles) - angles], 2).reshape(40, -1)
+    middle = np.zeros((18, 28, 3))
+    for axis in range(3):
+        middle[axis, ::2, axis] = 1.0
+        middle[6 + axis, 1::2, axis] = 2.0 * np.pi * CYCLES
+    middle = middle.reshape(18, -1)
+    turns = (lines.by_turn[:, :, None, :] * waves[:, None, :, None]).reshape(80, -1)
+    return truth, lines, dense, turns + dense @ middle, middle
+
+
+def test_vibration_is_integrated_as_over_dense_matrices():
+    """Whole cosines and sines beside a motion of which a prior knows something, at one noise."""
+    truth, lines, dense, turns, middle = shaking()
+    information, slope = np.zeros((18, 18)), np.zeros(18)
+    prior_cost = add_prior(PRIOR, truth, 1.0, information, slope)
+    errors = lines.errors.ravel()
+    logs, moments = [], []
+    freedom, noise = 62.0, 0.5
+    white = dense.T @ dense / noise**2 + information
+    first = -np.linalg.solve(white, dense.T @ errors / noise**2 + slope)
+    sizes = np.repeat(SPECTRA[0], 2)
+    prior = -0.5 * (np.log(FACTORS) / np.log(10.0)) ** 2
+    prior -= logsumexp(prior) + np.log(len(SPECTRA))
+    rest = noise**2 * (
+        errors @ errors / noise**2 + prior_cost
+        + first @ (dense.T @ errors / noise**2 + slope)
+    )  # fmt: skip
+    for factor, before in zip(FACTORS, prior, strict=True):
+        columns = turns * np.repeat(factor * sizes, 3)
+        beside = columns.T @ columns / noise**2
+        across = np.linalg.solve(white, dense.T @ columns) / noise**2
+        beside -= columns.T @ dense / noise**2 @ across
+        along = columns.T @ (errors + dense @ first) / noise**2
+        inner = np.linalg.inv(np.eye(84) + beside)
+        explained = noise**2 * along @ inner @ along
+        left = 1.0 - explained / rest
+        logs.append(before + 0.5 * np.linalg.slogdet(inner)[1] - 0.5 * freedom * np.log(left))
+        pull = middle * np.repeat(factor * sizes, 3) - across
+        mean = -inner @ along
+        second = rest * left / freedom / noise**2 * inner + np.outer(mean, mean)
+        moments.append(pull @ second @ pull.T)
+    shared, chosen = nothing_shared(40), np.ones(40, bool)
+    linear = linear_of(lines, chosen, True, shared.rows)
+    known = known_at(PRIOR, truth)
+    found = fit(linear, shared, known, Noise(noise, 1.0, 18.0), VIBRATION.of_first(), True)
+    assert found.gain == pytest.approx(logsumexp(logs), abs=0.05)
+    weights = np.exp(logs - logsumexp(logs))
+    np.testing.assert_allclose(found.weights[0], weights, atol=0.01)
+    expected = np.einsum("k,kij->ij", weights, moments)
+    # What the motion with its vibration is off by, beyond what it is without.
+    whole = np.hstack([np.eye(18), MIDDLE])
+    ratio = (found.noise / noise) ** 2
+    shown = whole @ found.covariance @ whole.T - ratio * np.linalg.inv(white)
+    moved = whole @ found.step - first
+    shown += np.outer(moved, moved)
+    # Pose and velocities; what truncated combinations lose of accelerations is not asked for.
+    deviations = np.sqrt(np.diag(expected))[:12]
+    np.testing.assert_allclose(
+        shown[:12, :12] / np.outer(deviations, deviations),
+        expected[:12, :12] / np.outer(deviations, deviations), atol=0.05,
+    )  # fmt: skip
+
+
+def test_blocks_by_name_have_their_mean_and_covariance():
+    """Of one spectrum and one size all unknowns are one dense solution, scaled by its noise."""
+    truth, lines, dense, _, _ = shaking()
+    rng = np.random.default_rng(2)
+    turn, shared, chosen = 1e-3 * rng.normal(size=TURNS), nothing_shared(40), np.ones(40, bool)
+    linear = linear_of(lines, chosen, True, shared.rows)
+    linear = moved(linear, np.append(np.zeros(18), -turn))  # as errors of no vibration
+    odds = np.full(VIBRATION.odds.shape, -np.inf)
+    odds[2, 3] = 0.0
+    one = VIBRATION._replace(odds=odds)
+    found = fit(linear, shared, known_at(PRIOR, truth), Noise(0.5, 1.0, 18.0), one, True)
+    information, slope = linear.own / 0.25, linear.along / 0.25
+    np.testing.assert_allclose(linear.own[:18, :18], dense.T @ dense)
+    of_prior, pulled = np.zeros((18, 18)), np.zeros(18)
+    add_prior(PRIOR, truth, 1.0, of_prior, pulled)
+    information[:18, :18] += of_prior
+    slope[:18] += pulled
+    small = np.repeat(SPECTRA[2] * FACTORS[3], 2) ** 2
+    prior = np.linalg.inv(IN_COMBINATIONS * small @ IN_COMBINATIONS.T)
+    information[18:, 18:] += np.kron(prior, np.eye(3))
+    covariance = (found.noise / 0.5) ** 2 * np.linalg.inv(information)
+    mean = -np.linalg.solve(information, slope)
+    for name, place in BLOCKS.items():
+        of_mean, own = marginal(found, name)
+        deviations = np.sqrt(np.diag(covariance))[place]
+        np.testing.assert_allclose(of_mean / deviations, mean[place] / deviations, atol=1e-4)
+        np.testing.assert_allclose(
+            own / np.outer(deviations, deviations),
+            covariance[place, place] / np.outer(deviations, deviations), atol=1e-4,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["turn", SHARED])
+def test_a_block_that_is_dropped_by_name_leaves_the_fit_without_it(name):
+    truth, chosen, lines, shared, _ = everything(False)
+    known, noise = known_at(TERMS, truth), Noise(NOISE, 1.0, 12.0)
+    both = linear_of(lines, chosen, True, shared.rows)
+    if name == "turn":
+        dropped = fit(without(both, name), shared, known, noise, NO_TURN, True)
+        never = linear_of(lines, chosen, False, shared.rows)
+        expected = fit(never, shared, known, noise, NO_TURN, True)
+    else:
+        nothing = nothing_shared(28)
+        dropped = fit(without(both, name), nothing, known, noise, VIBRATION, True)
+        never = linear_of(lines, chosen, True, nothing.rows)
+        expected = fit(never, nothing, known, noise, VIBRATION, True)
+    deviations = np.sqrt(np.diag(expected.covariance))
+    np.testing.assert_allclose(dropped.step / deviations, expected.step / deviations, atol=1e-12)
+    np.testing.assert_allclose(
+        dropped.covariance / np.outer(deviations, deviations),
+        expected.covariance / np.outer(deviations, deviations), atol=1e-12,
+    )  # fmt: skip
+    assert dropped.evidence == pytest.approx(expected.evidence, abs=1e-9)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.1, 0.3])
+def test_another_prior_of_the_motion_makes_the_fit_that_it_would_have_made(speed):
+    truth, lines, _, _, _ = shaking()
+    shared, chosen = nothing_shared(40), np.ones(40, bool)
+    still = truth.copy()
+    still[12:] = 0.0
+    linear = linear_of(lines, chosen, True, shared.rows)
+    linear = moved(linear, np.append(np.zeros(6), np.append(-truth[12:], np.zeros(TURNS))))
+    odds = np.full(VIBRATION.odds.shape, -np.inf)
+    odds[0, 2] = 0.0
+    one, noise = VIBRATION._replace(odds=odds), 0.5
+    before, after = known_at(PRIOR, still), known_at(terms_at(PRIOR, speed, False), still)
+    for _ in range(20):  # the noise that it finds is the one that the prior was weighed against
+        first = fit(linear, shared, before, Noise(noise, 1.0, 18.0), one, True)
+        noise = first.noise
+    expected = fit(linear, shared, after, Noise(noise, 1.0, 18.0), one, True)
+    # Its evidence is of the errors' freedom before the turn, too, takes parameters.
+    shown = under(first._replace(freedom=80.0 - 18.0), before, after)
+    deviations = np.sqrt(np.diag(expected.covariance))
+    np.testing.assert_allclose(
+        shown.step / deviations, expected.step / deviations, rtol=1e-3, atol=1e-3
+    )
+    ratio = (noise / expected.noise) ** 2
+    units = np.outer(deviations, deviations)
+    np.testing.assert_allclose(
+        shown.covariance / units, ratio * expected.covariance / units, atol=1e-3
+    )
+    assert shown.evidence == pytest.approx(expected.evidence, abs=1e-3)
+
+
+def test_a_gyroscope_enters_as_mean_and_covariance_of_the_turn_and_what_couples_it():
+    """One Gaussian of all 72 unknowns, beside a motion's own prior: one dense solution."""
+    truth, lines, _, _, _ = shaking()
+    rng, shared, chosen = np.random.default_rng(7), nothing_shared(40), np.ones(40, bool)
+    linear, known = linear_of(lines, chosen, True, shared.rows), known_at(PRIOR, truth)
+    mean, factor = np.append(np.zeros(18), 1e-3 * rng.normal(size=TURNS)), np.zeros((72, 72))
+    factor[6:9], factor[18:] = rng.normal(size=(3, 72)), rng.normal(size=(54, 72))
+    told = 1e5 * factor @ factor.T  # of angular velocities and the turn
+    whole = told.copy()
+    whole[:18, :18] += known.information
+    beside = known._replace(information=whole, slope=np.append(known.slope, np.zeros(TURNS)))
+    beside.information[18:, 18:] = 0.0
+    turn = told[18:, 18:].copy()
+    prior = TurnPrior(
+        turn[None], 0.5 * np.linalg.slogdet(turn[None])[1], np.ones(1), np.zeros((1, 1))
+    )  # fmt: skip
+    found = fit(moved(linear, mean), shared, beside, Noise(0.5, 1.0, 18.0), prior, True)
+    information, slope = linear.own / 0.25 + told, linear.along / 0.25 - told @ mean
+    information[:18, :18] += known.information
+    slope[:18] += known.slope
+    expected = np.linalg.inv(information)
+    deviations = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        (mean + found.step) / deviations, -expected @ slope / deviations, atol=1e-4
+    )
+    np.testing.assert_allclose(
+        found.covariance / (found.noise / 0.5) ** 2 / np.outer(deviations, deviations),
+        expected / np.outer(deviations, deviations), atol=1e-4,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("noise", [1e-9, 1e-3, 1e6])
+@pytest.mark.parametrize("size", [0.0, 1e-200, 1e-9, 1e9, 1e150])
+def test_no_size_of_errors_is_an_exception(noise, size):
+    truth, lines, _, _, _ = shaking()
+    shared, known = nothing_shared(40), known_at(PRIOR, truth)
+    far = lines._replace(errors=size * lines.errors)
+    linear = linear_of(far, np.ones(40, bool), True, shared.rows)
+    found = fit(linear, shared, known, Noise(noise, 1.0, 18.0), VIBRATION, True)
+    assert found.evidence == -np.inf or np.isfinite(found.step).all()
+
+
+def test_products_farther_along_the_tangent_leave_the_same_optimum():
+    truth, chosen, lines, shared, _ = everything(False)
+    noise, linear = Noise(NOISE, 1.0, 12.0), linear_of(lines, chosen, False, shared.rows)
+    known = known_at(TERMS, truth)
+    at_once = fit(linear, shared.at(0.2), known, noise, NO_TURN, True)
+    step = 1e-3 * np.random.default_rng(0).normal(size=18)
+    there = known._replace(
+        slope=known.slope + known.information @ step,
+        cost=known.cost + float(step @ (2.0 * known.slope + known.information @ step)),
+    )  # fmt: skip
+    farther = fit(moved(linear, step), shared.at(0.2), there, noise, NO_TURN, True)
+    deviations = np.sqrt(np.diag(at_once.covariance))
+    np.testing.assert_allclose((farther.step + step - at_once.step) / deviations, 0.0, atol=1e-8)
+    assert farther.evidence == pytest.approx(at_once.evidence, abs=1e-8)
+
+
+def test_without_an_in_frame_turn_it_explains_nothing():
+    truth, chosen, lines, shared, _ = everything(False)
+    linear = linear_of(lines, chosen, False, shared.rows)
+    found = fit(linear, shared, known_at(TERMS, truth), Noise(NOISE, 1.0, 12.0), NO_TURN, True)
+    assert found.gain == 0.0
+    assert found.weights.size == 0
