@@ -164,9 +164,20 @@ def _build_level(level: str, to: Path, is_portable: bool, is_checkout: bool) -> 
     for source in sorted((*_HERE.glob("*.c"), *_HERE.glob("*.h"), *_HERE.glob("*.cpp"))):
         glue.update(source.read_bytes())
     known = json.loads(record.read_text()) if is_checkout and record.is_file() else {}
-    if module.is_file() and known.get("digest") == glue.hexdigest():
-        return
-    compiler = _Compiler(_MACHINES[level], is_portable)
+    if not (module.is_file() and known.get("digest") == glue.hexdigest()):
+        _link(level, module, key, _Compiler(_MACHINES[level], is_portable))
+    if is_checkout:
+        files = {str(path.relative_to(sources.PACKAGE)): path for path in sorted(_all_files())}
+        said = {
+            "digest": glue.hexdigest(),
+            "files": {name: sources.digest_of_file(path) for name, path in files.items()},
+            "modules": sources.digests(),
+        }
+        record.write_text(json.dumps(said, indent=1))
+
+
+def _link(level: str, module: Path, key: str, compiler: _Compiler) -> None:
+    """Link a level's module from compiled kernels, which are made where they are missing."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = ASSEMBLED / level
         if (folder / "kernels.s").is_file():
@@ -186,14 +197,6 @@ def _build_level(level: str, to: Path, is_portable: bool, is_checkout: bool) -> 
             "-o", objects[-1], cpu=_CPUS[level],
         )  # fmt: skip
         compiler.link(objects, module)
-    if is_checkout:
-        files = {str(path.relative_to(sources.PACKAGE)): path for path in sorted(_all_files())}
-        said = {
-            "digest": glue.hexdigest(),
-            "files": {name: sources.digest_of_file(path) for name, path in files.items()},
-            "modules": sources.digests(),
-        }
-        record.write_text(json.dumps(said, indent=1))
 
 
 def _all_files() -> set[Path]:

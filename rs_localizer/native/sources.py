@@ -3,7 +3,8 @@
 """The files that kernels are compiled from, and digests of them.
 
 A kernel is compiled from its own file and from those that it imports, so machine code is known by
-the digest of all of them: a callee that changed in another file makes another digest.
+the digest of all of them: a callee that changed in another file makes another digest. Comments and
+docstrings compile to nothing, and do not count.
 """
 
 from __future__ import annotations
@@ -79,6 +80,19 @@ def digest_of_file(path: Path) -> str:
 
 
 @functools.cache
+def digest_of_code(path: Path) -> str:
+    """Return the SHA-256 digest of a file's statements, without comments and docstrings."""
+    tree = ast.parse(path.read_bytes())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            node.body = [
+                each for each in node.body
+                if not (isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant))
+            ]  # fmt: skip
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+
+
+@functools.cache
 def digest(module: str) -> str:
     """Return the digest of all sources that kernels of a module are compiled from."""
     return _digest_of(closure(module))
@@ -89,7 +103,7 @@ def _digest_of(modules: frozenset[str]) -> str:
     for each in sorted(modules):
         path = path_of(each)
         assert path is not None, each
-        sha.update(f"{each} {digest_of_file(path)}\n".encode())
+        sha.update(f"{each} {digest_of_code(path)}\n".encode())
     return sha.hexdigest()
 
 

@@ -46,6 +46,21 @@ def test_a_digest_follows_callees_in_other_files():
     assert "rs_localizer.estimation.refine" not in sources.closure("rs_localizer.core.so3")
 
 
+@pytest.mark.parametrize(
+    ("text", "is_same"),
+    [
+        ('"""More."""\ndef f(x):\n    """Say."""\n    return x + 1  # why\n', True),
+        ("def f(x):\n\n    return (x + 1)\n", True),
+        ("def f(x):\n    return x + 2\n", False),
+    ],
+)
+def test_comments_and_docstrings_compile_nothing_anew(tmp_path, text, is_same):
+    before, after = tmp_path / "before.py", tmp_path / "after.py"
+    before.write_text("def f(x):\n    return x + 1\n")
+    after.write_text(text)
+    assert (sources.digest_of_code(before) == sources.digest_of_code(after)) == is_same
+
+
 def test_what_is_imported_for_types_alone_is_no_part_of_a_kernel():
     found = set()
     text = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import rs_localizer.core.rig\n"
