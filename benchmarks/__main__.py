@@ -58,6 +58,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   rigs                             several cameras, against their bounds
   real                             videos of real cameras; real gyro FOLDER: your own recording
   gross                            grossly wrong lenses and maps: what is published
+  faulty_gyroscopes                gyroscopes that are wrong, beside the camera alone
   mapping                          refined maps and surveyed markers
   fuzzing                          wrong input for everything that reads
   load                             live nodes under load

@@ -14,8 +14,8 @@ from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import Moving
 from benchmarks.independent.scenes import Scene
 from rs_localizer.core import camera as core
-from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.status import InertialSettings
 
 _BIAS_WALK = 1e-4  # rad/s^2/sqrt(Hz)
 _BEFORE, _AFTER = 0.6, 0.03  # s of samples before the middle row and behind it
@@ -53,7 +53,7 @@ class Recorded:
 
     @property
     def settings(self) -> InertialSettings:
-        return InertialSettings(self.imu.noise, _BIAS_WALK, True)
+        return InertialSettings(self.imu.noise, _BIAS_WALK)
 
 
 def record(

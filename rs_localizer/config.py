@@ -317,8 +317,17 @@ class Imu:
     time_offset: float = setting(
         0.0, "Time to add to the stamps of the IMU to get the camera's time, in s", (-10.0, 10.0)
     )
-    estimate_time_offset: bool = setting(
-        True, "Estimate the remaining time offset from the camera's motion"
+    time_offset_deviation: float = setting(
+        0.0,
+        "Standard deviation of that before any frame has told, in s; 0: 0.02, or 0.002 where "
+        "imu.time_offset is given",
+        (0.0, 0.1),
+    )
+    scale_deviation: float = setting(
+        0.03, "Standard deviation of the scale of the gyroscope's axes, a share", (1e-4, 0.5)
+    )
+    mount_deviation: float = setting(
+        0.035, "Standard deviation of the rotation between IMU and camera, in rad", (1e-4, 0.5)
     )
     gyroscope_noise: float = setting(
         2e-4, "Noise density of the gyroscope, in rad/s/sqrt(Hz)", (1e-7, 1.0)

@@ -337,15 +337,19 @@ class Localizer:
         errors: Array = np.linalg.norm(shown - seen, axis=1)
         return errors
 
-    def known_of(self, prior: Prior | None, span: float) -> PriorTerms:
+    def known_of(
+        self, prior: Prior | None, span: float, turn: GyroRotation | None = None
+    ) -> PriorTerms:
         """Return the prior of a frame in the map's frame, from all knowledge beside its points.
 
         Args:
             prior: of which the motion counts; None: the settings alone.
             span: s, of the row times.
+            turn: beside which the motion is.
         """
-        terms, _ = self._assume(span)
-        return terms if prior is None else with_motion(terms, prior, np.zeros(3))
+        terms, assumed = self._assume(span)
+        terms, _ = of_frame(terms, assumed, None, turn)
+        return terms if prior is None else with_motion(terms, prior, np.zeros(3), turn is not None)
 
     def _settle(self, observed: Observed, best: Candidate, terms: PriorTerms) -> Posterior:
         # Unless more is known of this very frame than the prior of the configuration.

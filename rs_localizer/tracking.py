@@ -9,14 +9,15 @@ two while new ones come (Singer, "Estimating optimal tracking filter performance
 maneuvering targets", 1970); their size is learnt. The trajectory predicts each frame and is the
 prior of its maximum a posteriori estimate. What the points add to the prior joins the window. A
 gyroscope, if there is one, replaces the rotation of the motion model
-(:mod:`rs_localizer.inertial.aiding`).
+(:mod:`rs_localizer.inertial.gyro_prior`); the window stays the camera's own, and predicts frames
+that contradict the gyroscope.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -26,30 +27,39 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration, RefinementKind
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, BoolArray, instance
+from rs_localizer.core.arrays import BoolArray, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
-from rs_localizer.core.state import ANGULAR, PARAMETERS, TURN, VELOCITIES
+from rs_localizer.core.state import (
+    ANGULAR,
+    PARAMETERS,
+    STATE_ANGULAR,
+    STATE_ANGULAR_ACCELERATION,
+    TURN,
+    VELOCITIES,
+)
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.motion_model import (
     FADING,
     acceleration_covariance,
-    surprises_of,
+    mean_turn,
     unshaken,
 )
 from rs_localizer.estimation.motion_window import (
     LENGTH,
     Gaussian,
+    MotionSample,
     MotionWindow,
     estimate_at,
     gaussian_of,
     motion_of,
     predicted_estimate,
     sample_of,
+    told_of,
 )
-from rs_localizer.estimation.prior import Prior, offset_between, pivot_of, state_in
+from rs_localizer.estimation.prior import Prior
 from rs_localizer.integrity import Integrity
 from rs_localizer.localizer import Localizer
 from rs_localizer.prediction_errors import PredictionErrors
@@ -58,10 +68,9 @@ from rs_localizer.shutter_watch import FAR_OFF, ShutterWatch
 from rs_localizer.solvers.table import find_solver
 
 if TYPE_CHECKING:  # without a gyroscope nobody needs them
-    from rs_localizer.inertial.aiding import Before, Found, GyroPrediction, GyroscopeAid
-    from rs_localizer.inertial.gyroscope_noise import InertialSettings
+    from rs_localizer.inertial.gyro_prior import Before, GyroPrediction, GyroscopeTrack
     from rs_localizer.inertial.samples import ImuSamples
-    from rs_localizer.inertial.status import InertialStatus
+    from rs_localizer.inertial.status import InertialSettings, InertialStatus
 
 
 # After a longer gap (s) a prediction helps less than a fresh search.
@@ -73,9 +82,8 @@ _LEAST_STEP_NS, _MOST_TOO_CLOSE = 1000, 3
 _COUNTED, _SINCE_1970 = 1_000_000, ((10**9, 4 * 10**9), (10**12, 4 * 10**12))
 # Weight of the newest frame in the share of inliers of the last frames.
 _NEWEST = 0.3
-# Beside a gyroscope: exponent with which innovations change the expected variance of linear
-# accelerations, and bounds of that change.
-_LEARNING, _LEAST_SCALE, _MOST_SCALE = 0.5, 0.3, 1e4
+# Deviation (s) of a gyroscope's delay that no frames estimate: it is the given one.
+_GIVEN_DELAY = 1e-4
 # Largest squared distance of a searched motion from the track: once in a million by chance.
 _MOST_INNOVATION = 62.0
 # Covariance of a motion that is only a first guess.
@@ -105,8 +113,6 @@ class _Track:
     time_ns: int
     share: float  # of inliers among the points
     window: MotionWindow
-    # Beside a gyroscope: expected over configured variance of linear accelerations.
-    linear_scale: float = 1.0
 
 
 @dataclass(slots=True)
@@ -153,7 +159,7 @@ class Tracker:
         if remembers_motion:
             _check_motion(localizer)
         elif inertial is not None:
-            inertial = replace(inertial, estimate_time_offset=False)
+            inertial = replace(inertial, time_offset_deviation=_GIVEN_DELAY)
         if output_lag not in range(LENGTH):
             raise ValueError(f"output_lag must be 0 to {LENGTH - 1} frames, got {output_lag!r}")
         if not 0.0 <= max_prediction < math.inf:
@@ -170,12 +176,11 @@ class Tracker:
         self._errors = PredictionErrors(max_prediction)
         self._last_ns: int | None = None
         self._too_close = 0
-        self._aid: GyroscopeAid | None = None
+        self._aid: GyroscopeTrack | None = None
         if inertial is not None:
-            from rs_localizer.inertial.aiding import GyroscopeAid
+            from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 
-            self._aid = GyroscopeAid(inertial, localizer.camera.readout_time)
-        self._without_gyro = Acceleration(_LEAST_ACCELERATION, localizer.config.acceleration.linear)
+            self._aid = GyroscopeTrack(inertial, localizer.camera.readout_time)
 
     def reset(self) -> None:
         """Forget all frames so far."""
@@ -334,7 +339,7 @@ class Tracker:
         middle_ns = min(time_ns, last_ns - half_ns)
         if middle_ns < track.time_ns or time_ns > last_ns + half_ns:
             return None
-        from rs_localizer.inertial.aiding import changed
+        from rs_localizer.inertial.gyro_prior import changed
 
         last = track.estimate
         if middle_ns > track.time_ns:
@@ -406,22 +411,15 @@ class Tracker:
             return self.delayed
         share = 0.0 if self._track is None else self._track.share
 
-        def localized(predicted: GyroPrediction | None) -> Found:
-            turn = None if predicted is None else predicted.turn
-            prior = None if predicted is None else predicted.prior
-            if prior is None:
-                prior = self._prior(time_ns, turn, span, context)
-            found = self.localizer.find(
+        def find(prior: Prior | None, turn: GyroRotation | None = None) -> Estimate | Failure:
+            return self.localizer.find(
                 points, pixels, scores, prior, share, turn, stamps, context.error_modes
             )
-            return found, prior
 
-        if self._aid is None:
-            result, prior = localized(None)
-        else:
-            result, prior = self._aid.localize(
-                imu, time_ns, lambda: self._before(time_ns), localized
-            )
+        foreseen = None
+        if self._aid is not None:
+            foreseen = self._aid.foresee(imu, time_ns, self._before(time_ns))
+        result, prior = self._fitted(time_ns, foreseen, span, context, find)
         if pixels is not None:  # of a camera alone
             self.shutter.add(time_ns, result, np.asarray(points, float), np.asarray(pixels, float))
         if result:
@@ -429,14 +427,45 @@ class Tracker:
             if self.remembers_motion:
                 result = self._covering(replace(result, time_ns=time_ns), context)
                 self._remember(time_ns, prior, result, context)
-            if self._aid is not None and imu is not None:
-                camera = self.localizer.camera
-                assert pixels is not None and not isinstance(points, Mapping)  # noqa: PT018
-                self._aid.seek(camera, points, pixels, result, time_ns)
         self._keep(_Seen(time_ns, result, points, pixels, stamps))
         self._images.add(time_ns, points, pixels)
         self._publish()
         return self.delayed
+
+    def _fitted(
+        self, time_ns: int, foreseen: GyroPrediction | None, span: float | None,
+        context: FrameContext,
+        find: Callable[[Prior | None, GyroRotation | None], Estimate | Failure],
+    ) -> tuple[Estimate | Failure, Prior | None]:  # fmt: skip
+        """The frame beside what a gyroscope knows, or without what its points contradict.
+
+        Returns:
+            what was found, and the prior that it was found with.
+        """
+        alone = self._prior(time_ns, None, span, context)
+        if foreseen is None or self._aid is None:
+            return find(alone, None), alone
+        turn = foreseen.turn
+        prior = foreseen.prior or self._prior(time_ns, turn, span, context)
+        found = find(prior, turn)
+        if found and self._aid.agrees(foreseen, found, self._told(found, prior, foreseen)):
+            return found, prior
+        other = find(alone, None)
+        if other and not found:
+            self._aid.agrees(foreseen, other, self._told(other, alone, foreseen))
+        return (other, alone) if other else (found, prior)
+
+    def _told(self, found: Estimate, prior: Prior | None, foreseen: GyroPrediction) -> MotionSample:
+        """What its points tell of the motion of a frame beside a gyroscope's turn."""
+        near = prior if found.tracked else None
+        known = self.localizer.known_of(near, found.span, found.turn)
+        told = told_of(found, known)
+        if found.turn is not None:
+            return told
+        state = told.state.copy()
+        state[STATE_ANGULAR] -= mean_turn(foreseen.turn)[0]
+        state[STATE_ANGULAR_ACCELERATION] -= foreseen.turn.parabola[1]
+        return told._replace(state=state)
 
     def _keep(self, seen: _Seen) -> None:
         if self._seen and self._seen[-1].time_ns == seen.time_ns:  # the same frame, matched anew
@@ -511,7 +540,8 @@ class Tracker:
             return
         known = {time_ns: k for k, time_ns in enumerate(reversed(window.times))}
         for seen in list(self._seen)[-1 - self.output_lag :]:
-            if seen.time_ns in known and isinstance(seen.found, Estimate):
+            own = isinstance(seen.found, Estimate) and seen.found.turn is None
+            if own and seen.time_ns in known:
                 seen.found = self._published(seen, window.before(known[seen.time_ns]))
 
     def _covering(self, result: Estimate, context: FrameContext) -> Estimate:
@@ -563,7 +593,7 @@ class Tracker:
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
         if turn is None:
             return prior
-        from rs_localizer.inertial.aiding import without_gyro
+        from rs_localizer.inertial.gyro_prior import without_gyro
 
         return without_gyro(prior, turn)
 
@@ -581,13 +611,11 @@ class Tracker:
         self, time_ns: int, prior: Prior | None, result: Estimate, context: FrameContext
     ) -> None:
         """Keep what the next frames are to know of this one."""
-        track, share, linear_scale = self._track, float(np.mean(result.inliers)), 1.0
+        track, share = self._track, float(np.mean(result.inliers))
         if track is not None and result.tracked:
             share = (1.0 - _NEWEST) * track.share + _NEWEST * share
-        if track is not None and result.turn is not None:
-            linear_scale = _learnt(track.linear_scale, prior, result)
         window = self._window(time_ns, prior, result, track, context)
-        self._track = _Track(result, time_ns, share, window, linear_scale)
+        self._track = _Track(result, time_ns, share, window)
         self._errors.add(result, window, unshaken(result)[2])
 
     def _window(
@@ -603,11 +631,12 @@ class Tracker:
             return alone
         window = track.window
         alone = replace(alone, deviations=window.deviations)
-        if result.turn is not None or not self._trusts_motion(context):
+        if not self._trusts_motion(context):
             return alone
         near = prior if result.tracked else None
         try:
-            sample = sample_of(result, time_ns, self.localizer.known_of(near, result.span))
+            known = self.localizer.known_of(near, result.span, result.turn)
+            sample = sample_of(result, time_ns, known)
             window = replace(window, readout_share=share).joined(sample)
         except np.linalg.LinAlgError:  # rounding errors are all that is left of a covariance
             return alone
@@ -615,15 +644,15 @@ class Tracker:
 
     def _beside_gyro(self, track: _Track) -> Acceleration:
         """Return the accelerations beside the rotation that a gyroscope measures."""
-        linear = math.sqrt(track.linear_scale) * self._without_gyro.linear
-        return replace(self._without_gyro, linear=max(linear, _LEAST_ACCELERATION))
+        linear = max(float(track.window.deviations[3]), _LEAST_ACCELERATION)
+        return Acceleration(_LEAST_ACCELERATION, linear)
 
     def _before(self, time_ns: int) -> Before | None:
         """Return what the last frame knows of the motion beside the gyroscope's rotation."""
         track = self._track
         if track is None:
             return None
-        from rs_localizer.inertial.aiding import Before
+        from rs_localizer.inertial.gyro_prior import Before
 
         readout_time = self.localizer.camera.readout_time
         motion, covariance, added, _ = unshaken(track.estimate)
@@ -643,26 +672,3 @@ def _check_motion(localizer: Localizer) -> None:
         raise ValueError(
             f"tracking needs velocities, which solver {localizer.config.solver} does not find"
         )
-
-
-def _learnt(scale: float, prior: Prior | None, newest: Estimate) -> float:
-    """Return the scale of linear accelerations beside a gyroscope, from its prediction error."""
-    if prior is None or prior.motion is None:
-        return 1.0
-    changed = scale * _innovation(prior, newest)[1] ** _LEARNING
-    return float(np.clip(changed, _LEAST_SCALE, _MOST_SCALE))
-
-
-def _innovation(prior: Prior, newest: Estimate) -> Array:
-    """Return squared innovations over their expectations (2,): rotation, displacement."""
-    assert prior.motion is not None
-    assert prior.covariance is not None
-    if np.isinf(prior.covariance.diagonal()).any():
-        return np.ones(2)  # a first guess predicts nothing
-    motion, origin = newest.without_gyro(), np.zeros(3)
-    joint, expected = map(np.ascontiguousarray, (newest.joint_covariance, prior.covariance))
-    step, _ = offset_between(
-        state_in(prior.motion, origin), state_in(motion, origin), pivot_of(expected)
-    )
-    innovation: Array = surprises_of(step, expected, joint)
-    return innovation

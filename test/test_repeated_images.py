@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 import rs_localizer as rsl
 from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.status import InertialSettings
 from rs_localizer.repeated_images import displacement
 from rs_localizer.tracking import Tracker
 
@@ -143,7 +143,9 @@ def test_a_gyroscope_tells_a_resting_image_from_a_hanging_one():
     times = np.arange(10) / 20.0
 
     def run(rate):
-        tracker = Tracker(rsl.Localizer(CAMERA), InertialSettings(1e-4, 1e-5, False))
+        tracker = Tracker(
+            rsl.Localizer(CAMERA), InertialSettings(1e-4, 1e-5, time_offset_deviation=1e-3)
+        )
         stamps = np.arange(ns(-1.0), ns(1.0), 2_000_000)
         found = []
         for k, t in enumerate(times):

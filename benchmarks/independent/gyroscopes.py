@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.independent.motions import IntArray, Moving
-from benchmarks.independent.rotations import Array
+from benchmarks.independent.rotations import Array, exponential
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +21,10 @@ class Imu:
     noise: float = math.radians(0.01)  # rad/s/sqrt(Hz) of the gyroscope
     bias: float = math.radians(0.5)  # rad/s, length of the gyroscope's
     offset: float = 0.0  # s that its stamps are early: to be added to them
+    scale: float = 1.0  # of the rates that it shows to the true ones
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rad that it is turned on its mount
+    step: float = 0.0  # s by which its stamps are later after time 0
+    limit: float = math.inf  # rad/s, the end of its range
 
     def record(
         self, motions: Moving, which: int, first: float, last: float, rng: np.random.Generator
@@ -37,5 +41,8 @@ class Imu:
         direction = rng.normal(size=3)
         bias = self.bias * direction / np.linalg.norm(direction)
         deviation = self.noise * math.sqrt(self.rate)
-        shown = states.angular + bias + deviation * rng.normal(size=(len(times), 3))
-        return np.rint(1e9 * (times - self.offset)).astype(np.int64), shown
+        turned = self.scale * states.angular @ exponential(np.array(self.mount))
+        shown = turned + bias + deviation * rng.normal(size=(len(times), 3))
+        shown = np.clip(shown, -self.limit, self.limit)
+        stamps = times - self.offset + self.step * (times > 0.0)
+        return np.rint(1e9 * stamps).astype(np.int64), shown

@@ -28,8 +28,8 @@ from benchmarks.real.recordings import Frame, Recording
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
-from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.status import InertialSettings
 from rs_localizer.io.trajectories import read_tum, split_at_gaps
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
@@ -216,7 +216,7 @@ def at_any_time(
     """``Tracker.at`` within rows, between images and ahead; beside poses held, and moved on as the
     last image moved. A gyroscope's samples come some milliseconds late.
     """
-    inertial = InertialSettings(_GYROSCOPE_NOISE, _GYROSCOPE_NOISE, estimate_time_offset=True)
+    inertial = InertialSettings(_GYROSCOPE_NOISE, _GYROSCOPE_NOISE)
     camera = recording.camera
     tracker = Tracker(Localizer(camera), None if samples is None else inertial)
     found: dict[str, list[tuple[int, Estimate]]] = {}

@@ -62,8 +62,6 @@ class Estimate(Motion):
     time_ns: int = 0  # of a tracker: when the middle row was exposed
     # How a gyroscope says that the camera turned; velocities and accelerations are those of both
     turn: GyroRotation | None = None
-    # By how many readouts the points would delay the known turn, and the variance of that
-    delay: tuple[float, float] = (0.0, math.inf)
     span: float = 0.0  # s of a readout, as which row times count; 0: unknown
     # Probability that the pose lies outside its region or the map is another one; NaN: not judged
     integrity: float = math.nan
@@ -109,16 +107,6 @@ class Estimate(Motion):
         """
         turn = shake_at(np.array([within_rows(tau)]), self.shake)[0]
         return turn[:3], turn[3:] if tau == within_rows(tau) else np.zeros(3)
-
-    def turned(self, turn: GyroRotation, delay: tuple[float, float]) -> Estimate:
-        """Return the same with the gyroscope's rotation, beside which its motion was estimated."""
-        return replace(
-            self,
-            angular_velocity=self.angular_velocity + turn.rate,
-            angular_acceleration=self.angular_acceleration + turn.change,
-            turn=turn,
-            delay=delay,
-        )
 
     def without_gyro(self) -> Motion:
         """Return the motion without the gyroscope's rotation."""

@@ -290,8 +290,6 @@ def _of_outliers(given: _Given, inliers: BoolArray) -> float:
 def _with_turn(given: _Given, hypotheses: list[MotionHypothesis], steady: _Camera) -> list[_Camera]:
     """Cameras that do not turn within their frame and, if there may be such, those that do."""
     wide, vibrating = given.best.near_outliers > 0, None
-    if given.assumed.turn is not None and not wide:  # what a gyroscope leaves tells its offset
-        return [steady]
     gain, undetected = _hidden(given, steady.posterior)
     if wide or gain > _ASKS:
         vibrating = _vibrating(given, hypotheses, steady.posterior)

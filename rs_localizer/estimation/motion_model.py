@@ -8,20 +8,18 @@ R. Singer, "Estimating optimal tracking filter performance for manned maneuverin
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
 from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, Array1, Array2
+from rs_localizer.core.arrays import Array, Array2
 from rs_localizer.core.blocks import add_block
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.shake import MIDDLE_RATES, MIDDLE_VALUES
 from rs_localizer.core.shutter import Motion, Numbers, carried, motion_of, numbers_of
 from rs_localizer.core.state import ANGULAR, PARAMETERS
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.refine import inverted
 from rs_localizer.native import entry, kernel
 
 # Time (s) in which accelerations fade. Of 0.1, 0.05 and 0.03 the last one has the least errors of
@@ -145,8 +143,8 @@ def _unshaken(motion: Numbers, shake: Array2, joint: Array2) -> tuple[Numbers, A
     return beside, covariance, swing, jacobian
 
 
-def with_mean_turn(motion: Motion, covariance: Array, turn: GyroRotation) -> tuple[Motion, Array]:
-    """A motion beside a known turn with the mean rate of that, for a camera that goes on alone.
+def mean_turn(turn: GyroRotation) -> tuple[Array, Array]:
+    """Mean rate (3,) of a known turn and a covariance (18,18), for a camera that goes on alone.
 
     How much the rate changed within the readout, a gyroscope knows it to change in the next.
     """
@@ -154,45 +152,4 @@ def with_mean_turn(motion: Motion, covariance: Array, turn: GyroRotation) -> tup
     mean = so3.log(np.ascontiguousarray(ends[0] @ ends[1].T))
     spread = np.zeros((PARAMETERS, PARAMETERS))
     spread[ANGULAR, ANGULAR] = np.mean((rates - mean) ** 2) * np.eye(3)
-    faster = replace(motion, angular_velocity=motion.angular_velocity + mean)
-    return faster, covariance + spread
-
-
-@entry
-def surprises_of(step: Array1, covariance: Array2, posterior: Array2) -> Array:
-    """How many times farther than predicted a motion has changed, squared; 1 is as predicted.
-
-    The squared step from the prediction to the estimate, in standard deviations of the prediction,
-    is expected to be what the points decide of the parameters. Errors of map and lens make a step
-    larger, and its covariance larger than the prediction's: by at least that much.
-
-    Args:
-        step: (18,).
-        covariance: (18,18) of the prediction.
-        posterior: (18 + k,18 + k) of the estimate, and of what it has beside the motion.
-
-    Returns:
-        (2,) of all that turns, and of all that moves.
-    """
-    half = PARAMETERS // 2
-    surprises, predicted = np.empty(2), np.empty((half, half))
-    for part in range(2):
-        for i in range(half):
-            for j in range(half):
-                predicted[i, j] = covariance[_place_of(i, part), _place_of(j, part)]
-        information = inverted(predicted)
-        squared, expected = 0.0, float(half)
-        for i in range(half):
-            for j in range(half):
-                row, column = _place_of(i, part), _place_of(j, part)
-                squared += step[row] * information[i, j] * step[column]
-                expected -= information[i, j] * posterior[row, column]
-        surprises[part] = squared / max(abs(expected), 1.0)
-    return surprises
-
-
-@kernel
-def _place_of(i: int, part: int) -> int:
-    """Place in a step of the i-th number of what turns (0) or moves (1)."""
-    place: int = 6 * (i // 3) + 3 * part + i % 3
-    return place
+    return mean, spread

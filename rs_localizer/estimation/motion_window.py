@@ -38,7 +38,7 @@ from rs_localizer.core.state import (
     step_between,
 )
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.motion_model import FADING, singer, unshaken, with_mean_turn
+from rs_localizer.estimation.motion_model import FADING, mean_turn, singer, unshaken
 from rs_localizer.estimation.prior import PriorTerms, add_prior, state_in
 from rs_localizer.estimation.refine import apply_step, inverted
 from rs_localizer.native import entry, kernel
@@ -384,7 +384,9 @@ def gaussian_of(estimate: Estimate, time_ns: int) -> Gaussian:
     """Motion by one frame without its shaking, and without a gyroscope's turn."""
     motion, covariance, _, _ = unshaken(estimate)
     if estimate.turn is not None:
-        motion, covariance = with_mean_turn(motion, covariance, estimate.turn)
+        mean, spread = mean_turn(estimate.turn)
+        motion = replace(motion, angular_velocity=motion.angular_velocity + mean)
+        covariance = covariance + spread
     units = _per_second(estimate.span)
     return Gaussian(time_ns, _state(motion, units), covariance * np.outer(units, units))
 
@@ -402,19 +404,35 @@ def motion_of(gaussian: Gaussian, span: float) -> tuple[Motion, Array]:
     return motion, gaussian.covariance * np.outer(units, units)
 
 
-def sample_of(estimate: Estimate, time_ns: int, known: PriorTerms) -> MotionSample:
-    """Sample by the points of an estimate, beside what was known of its motion before.
+def told_of(estimate: Estimate, known: PriorTerms) -> MotionSample:
+    """What the points of an estimate tell of its motion, per readout, beside its known turn.
 
-    ``known`` is that, in the map's frame.
+    ``known`` is what was known of that motion before, in the map's frame.
     """
     motion, covariance, _, _ = unshaken(estimate)
     information, slope = np.zeros((PARAMETERS,) * 2), np.zeros(PARAMETERS)
-    add_prior(known, state_in(motion, np.zeros(3)), 1.0, information, slope)
+    state = state_in(motion, np.zeros(3))
+    add_prior(known, state, 1.0, information, slope)
+    return MotionSample(estimate.time_ns, state, _told_by_points(covariance, information), slope)
+
+
+def sample_of(estimate: Estimate, time_ns: int, known: PriorTerms) -> MotionSample:
+    """Sample by the points of an estimate, beside what was known of its motion before.
+
+    ``known`` is that, in the map's frame; of an estimate with a gyroscope beside the known turn.
+    """
+    told = told_of(estimate, known)
+    state, information, slope = told.state.copy(), told.information, told.gradient
+    if estimate.turn is not None:
+        mean, spread = mean_turn(estimate.turn)
+        state[STATE_ANGULAR] += mean
+        # (L^-1 + spread)^-1 of what is not known for sure.
+        left = np.linalg.inv(np.eye(PARAMETERS) + information @ spread)
+        information, slope = left @ information, left @ slope
+        information = 0.5 * (information + information.T)
     units = _per_second(estimate.span)
-    told: Array = _told_by_points(covariance, information)
-    return MotionSample(
-        time_ns, _state(motion, units), told / np.outer(units, units), slope / units
-    )
+    state[12:] *= units[6:]
+    return MotionSample(time_ns, state, information / np.outer(units, units), slope / units)
 
 
 def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:

@@ -31,9 +31,9 @@ LONGEST_PERIOD_NS = 16_000_000
 """At a longer period, a shaking of 30 Hz turns by half a cycle between two readings."""
 # Between readings that are closer than this the noise would make the spline swing: one counts.
 _CLOSEST_NS = 250_000
-# A gyroscope that shows its greatest value so many times in a row, and at least this (rad/s; the
-# smallest range there is), shows the end of its range.
-_SATURATED_COUNT, _SATURATED_RATE = 4, 2.0
+# A gyroscope that shows its greatest value so many times in a row shows the end of its range; one
+# that rests, in steps of its resolution, shows no more than this (rad/s).
+_SATURATED_COUNT, _SATURATED_RATE = 2, 0.1
 # The rate is that of the last readings.
 _RATE_COUNT = 64
 
@@ -144,7 +144,7 @@ class ReadingBuffer:
             if (outside := _outside(known, start_ns, end_ns)) is not None:
                 return outside
             begin = max(int(known.searchsorted(since_ns, "right")) - 1, 0)
-            end = int(known.searchsorted(until_ns)) + 1
+            end = min(int(known.searchsorted(until_ns)) + 1, len(known))
             stamps = known[begin:end].copy()
             values = self._values[self._first + begin : self._first + end].copy()
         span = span_of(stamps, start_ns, end_ns)

@@ -1,13 +1,14 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Turns of the camera by the gyroscope: within a frame, and from one to the next.
+"""The camera's rotation by the readings of its gyroscope, within a frame and since the last one.
 
-How they depend on the time offset is seen by shifting the samples to and fro by its standard
-deviation (the unscented transform: Julier, Uhlmann, "Unscented filtering and nonlinear estimation",
-2004). While the offset is hardly known, the derivative of a vibration would say nothing of what a
-shift makes of it; what is no line within the deviation counts as noise.
+The gyroscope is off by ten numbers, of which the track knows a mean and a covariance:
 
-Rates between the samples of a gyroscope.
+    reading(t) = (I + S) M omega(t + d) + b + noise
+
+a bias ``b``, a delay ``d`` of its stamps, scales ``S`` of its axes and a turn ``M`` of its mount.
+A vibration whose phase nobody knows, because the delay is known no better than a part of its
+period, is no rotation that is known: rates are averaged over where the delay may lie.
 
 A gyroscope filters what it shows below half its sample rate, so its samples tell the rates between
 them; but a cubic spline through the samples loses 4 % of a vibration at 0.3 of the sample rate (3
@@ -24,14 +25,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, Array1, Array2, IntArray, IntArray1
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.blocks import median, write
 from rs_localizer.core.gyro_rotation import GyroRotation, turn_of
-from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
-from rs_localizer.core.so3 import coefficients, log
-from rs_localizer.inertial.gyroscope_noise import JITTER, SCALE_DEVIATION
+from rs_localizer.core.rate_spline import rotations_at_knots, spline, turns_at
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.native import entry, kernel
+from rs_localizer.native import entry
+
+PARAMETERS = 10
+"""Of what a gyroscope is off by, in this order."""
+BIAS, DELAY, SCALE, MOUNT = slice(0, 3), slice(3, 4), slice(4, 7), slice(7, 10)
+BETWEEN, RATE, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)
+"""Of what it says: the turn since the last frame, the rate within this one, and its change."""
+
+# What stamps of single frames and samples are off by beside a constant delay, at best, s.
+_JITTER = 4e-5
+# What is left of a turn beside scales and mount: axes that are not square, by data sheets.
+_SKEW = 0.003
+# The integral of white noise is a random walk. The least-squares parabola of one over an interval
+# of length 1 has a slope and a curvature of these variances (by its Legendre coefficients).
+_WALK_SLOPE, _WALK_CURVATURE = 6.0 / 5.0, 120.0 / 7.0
+# Squared mean and slope of a line through a vibration, to its mean square; at most.
+_WAVE_MEAN, _WAVE_SLOPE = 2.0, 120.0
+# Of the samples' period: shifts by less leave all that samples show.
+_SHORT = 0.3
+# s of a shift that rounding does not decide; and of squared rates.
+_LEAST_SHIFT, _TINY = 1e-6, 1e-30
 
 # End of the spectrum, as a part of the sample rate, and noise beside it (variance).
 _BAND, _NOISE = 0.4, 1e-5
@@ -39,8 +59,15 @@ _BAND, _NOISE = 0.4, 1e-5
 _MOST = 64
 
 
-@kernel
-def densified(times: Array, rates: Array) -> tuple[Array, Array]:
+def _densified(times: Array, rates: Array) -> tuple[Array, Array]:
+    """:func:`densified` for the last samples, which are the frame's."""
+    late = max(len(times) - _MOST, 0)
+    dense, found = densified(times[late:].copy(), rates[late:].copy())
+    return np.concatenate([times[:late], dense]), np.concatenate([rates[:late], found])
+
+
+@entry
+def densified(times: Array1, rates: Array2) -> tuple[Array, Array]:
     """Times (2 n - 1,) and rates (2 n - 1,3): those given, and one between each two of them.
 
     Args:
@@ -98,229 +125,160 @@ def densified(times: Array, rates: Array) -> tuple[Array, Array]:
     return dense, found
 
 
-PARAMETERS = 4
-"""Of a gyroscope: its bias (3, rad/s), and the time offset of its stamps (s)."""
-BIAS, OFFSET = slice(0, 3), 3
-
-# The integral of white noise is a random walk. The least-squares parabola of one over an interval
-# of length 1 has a slope and a curvature of these variances (by its Legendre coefficients).
-_WALK_SLOPE, _WALK_CURVATURE = 6.0 / 5.0, 120.0 / 7.0
-# Of the samples, s or readouts.
-_LEAST_SHIFT = 1e-4
-# A vibration of more than this (rad per readout) of whose phase nothing is known, because the
-# offset is not known this well (s), says nothing of bias and offset: one that is in step with the
-# frames is the same in all of them, as a bias is.
-MOST_ROUGH, _NEAR = 2e-3, 5e-4
-_WAVE_SLOPE = 60.0  # squared slope of a line through a wave, to its mean square; at most
-
-
-_Turn = tuple[Array, Array, Array, Array, Array, Array, float]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroscopeErrors:
-    """Estimates of a gyroscope's errors."""
+    """What a gyroscope is off by, as far as that is known."""
 
-    bias: Array  # (3,) rad/s, to be taken from its rates
-    time_offset: float  # s, to be added to its times
-    covariance: Array  # (4,4) of bias and time offset
+    mean: Array  # (10,) rad/s, s, shares, rad
+    covariance: Array  # (10,10)
     noise: float  # rad/s/sqrt(Hz)
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TurnBetween:
-    """The turn from one moment to another, and how it depends on what is not known."""
-
-    rotation: Array  # (3,3) camera_then_from_camera_now
-    # (3,4) of a turn of the camera then, in its own axes, by the gyroscope's parameters
-    by_parameters: Array
-    variances: Array  # (3,) rad^2, by noise and scale
+    @property
+    def bias(self) -> Array:
+        """(3,) rad/s, to be taken from its rates."""
+        return self.mean[BIAS]
 
     @property
-    def numbers(self) -> tuple[Array, Array, Array]:
-        """Numbers as kernels take them."""
-        return self.rotation, self.by_parameters, self.variances
+    def time_offset(self) -> float:
+        """Seconds to be added to its times."""
+        return float(self.mean[DELAY.start])
+
+    def corrected(self, rates: Array) -> Array:
+        """Rates (n,3) of the camera by those that were read."""
+        shown = (rates - self.bias) / (1.0 + self.mean[SCALE])
+        turned: Array = shown @ so3.exp(np.ascontiguousarray(self.mean[MOUNT])).T
+        return np.ascontiguousarray(turned)
+
+    def derivative(self, rate: Array) -> Array:
+        """Derivative (3,10) of a corrected rate (3,) by all but the delay."""
+        mount, scale = so3.exp(np.ascontiguousarray(self.mean[MOUNT])), 1.0 + self.mean[SCALE]
+        by_errors = np.zeros((3, PARAMETERS))
+        by_errors[:, BIAS] = -mount / scale
+        by_errors[:, SCALE] = -mount * (mount.T @ rate) / scale
+        by_errors[:, MOUNT] = -so3.hat(rate)
+        return by_errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TurnWithin:
-    """The turn during a frame, and how what it leaves depends on what is not known.
+class Rotated:
+    """The rotation by a gyroscope, and how it depends on what is not known of that."""
 
-    That is the rate and its change (6), per readout, along the axes of the middle row.
-    """
-
-    known: GyroRotation
-    by_parameters: Array  # (6,4)
-    variances: Array  # (6,) by noise and scale
-
-    @property
-    def numbers(self) -> tuple[Array, Array]:
-        """Numbers as kernels take them."""
-        return self.by_parameters, self.variances
+    known: GyroRotation  # within the frame
+    between: Array | None  # (3,3) camera_then_from_camera_now
+    # (9,10) of the turn since the last frame, in the axes of then, and of rate and change that the
+    # known rotation leaves, per readout
+    by_errors: Array
+    variances: Array  # (9,) of what else is not known
+    swing: Array  # (3,) rad^2, variances of the turn by vibration whose phase is not known
 
 
-def turn_within(
-    samples: ImuSamples, middle_ns: int, readout_time: float, errors: GyroscopeErrors
-) -> TurnWithin | None:
-    """Turn of the camera during a frame; None if the samples do not cover it.
+def rotated(
+    samples: ImuSamples, middle_ns: int, readout_time: float, errors: GyroscopeErrors,
+    since_ns: int | None = None,
+) -> Rotated | None:  # fmt: skip
+    """The rotation during a frame, and since a moment before; None if samples do not cover it.
 
     Args:
         middle_ns: exposure of the middle row.
         readout_time: s.
+        since_ns: of the middle row of the last frame.
     """
-    here_ns = _by_samples(middle_ns, errors)
-    reach_ns = round(0.5e9 * readout_time)
-    span = samples.around(here_ns - reach_ns, here_ns + reach_ns)
+    here_ns, half = middle_ns - round(1e9 * errors.time_offset), 0.5 * readout_time
+    length = 0.0 if since_ns is None else 1e-9 * (middle_ns - since_ns)
+    before = max(length, half)
+    span = samples.around(here_ns - round(1e9 * before), here_ns + round(1e9 * half))
     if span is None:
         return None
-    turn, error, by_parameters, variances, period = _within(
-        samples.times_ns[span], samples.angular_velocity[span], here_ns, errors.bias, readout_time,
-        errors.noise, errors.covariance,
-    )  # fmt: skip
-    rate_noise = errors.noise * readout_time / math.sqrt(period)
-    delay = math.sqrt(errors.covariance[OFFSET, OFFSET] + JITTER**2) / readout_time
-    rate_error = readout_time**2 * errors.covariance[BIAS, BIAS]
-    known = GyroRotation(*turn, error, rate_noise, delay, rate_error)
-    return TurnWithin(known, by_parameters, variances)
-
-
-def turn_between(
-    samples: ImuSamples, from_ns: int, to_ns: int, errors: GyroscopeErrors
-) -> TurnBetween | None:
-    """Turn of the camera from one moment to a later one; None if the samples do not cover it."""
-    length = 1e-9 * (to_ns - from_ns)
-    here_ns = _by_samples(to_ns, errors)
-    span = samples.around(here_ns - (to_ns - from_ns), here_ns)
-    if span is None:
-        return None
-    found = _between(
-        samples.times_ns[span], samples.angular_velocity[span], here_ns, errors.bias, length,
-        errors.noise, math.sqrt(errors.covariance[OFFSET, OFFSET]),
-    )  # fmt: skip
-    return TurnBetween(*found)
-
-
-def _by_samples(at_ns: int, errors: GyroscopeErrors) -> int:
-    """A moment by the clock of the samples."""
-    return at_ns - round(1e9 * errors.time_offset)
-
-
-@kernel
-def _relative(times_ns: IntArray, rates: Array, here_ns: int, bias: Array) -> tuple[Array, Array]:
-    """Times (k,) in s since a moment, and rates (k,3) without the bias."""
-    count = len(times_ns)
-    times, steady = np.empty(count), np.empty((count, 3))
-    for i in range(count):
-        times[i] = 1e-9 * (times_ns[i] - here_ns)
-        for axis in range(3):
-            steady[i, axis] = rates[i, axis] - bias[axis]
-    return times, steady
-
-
-@entry
-def _within(
-    times_ns: IntArray1, rates: Array2, here_ns: int, bias: Array1, readout_time: float,
-    noise: float,
-    of_parameters: Array2,
-) -> tuple[_Turn, Array, Array, Array, float]:  # fmt: skip
-    """The turn of a :class:`GyroRotation`, its error and so on; the samples' period (s)."""
-    times, steady = _relative(times_ns, rates, here_ns, bias)
-    period = (times[-1] - times[0]) / (len(times) - 1)
-    dense, found = densified(times, steady)
+    deviation = math.hypot(math.sqrt(errors.covariance[DELAY, DELAY].item()), _JITTER)
+    reach_ns = round(2e9 * deviation)
+    first = int(samples.times_ns.searchsorted(samples.times_ns[span.start] - reach_ns))
+    last = int(samples.times_ns.searchsorted(samples.times_ns[span][-1] + reach_ns, "right"))
+    times = np.asarray(1e-9 * (samples.times_ns[first:last] - here_ns), np.float64)
+    rates = errors.corrected(samples.angular_velocity[first:last])
+    period = float(times[-1] - times[0]) / (len(times) - 1)
+    # Samples may not reach as far as the delay may.
+    shift = max(min(deviation, times[-1] - half, -before - times[0]), _LEAST_SHIFT)
+    dense, found = _densified(times, rates)
+    near = (dense >= times[span.start - first]) & (dense <= times[min(span.stop, last) - 1 - first])
+    rough, swing = np.zeros(3), np.zeros(3)
+    if shift > _SHORT * period:
+        smooth, rough, swing = _averaged(dense, found, shift, near)
+        found, rough = smooth, rough * readout_time**2
+    dense, found = dense[near], found[near]
+    by_errors, variances = np.zeros((9, PARAMETERS)), np.zeros(9)
+    # Turn since the last frame, rate and change by samples that are so much later.
+    shown = np.array([_shown(dense, found, length, half, late) for late in (-shift, 0.0, shift)])
+    by_errors[:, DELAY] = -0.5 / shift * (shown[2] - shown[0])[:, None]
+    variances += (0.5 * (shown[2] + shown[0]) - shown[1]) ** 2
+    variances += (_JITTER * by_errors[:, DELAY.start]) ** 2
+    between = None
+    if length > 0.0:
+        cubics = spline(dense, found)
+        turns, _ = turns_at(
+            np.array([-length, 0.0]), dense, cubics, rotations_at_knots(dense, cubics)
+        )
+        between = np.ascontiguousarray(turns[1] @ turns[0].T)
+        angle = so3.log(np.ascontiguousarray(between.T))
+        # A constant rate in the camera's axes of each moment, seen in those of then.
+        by_rate = length * so3.right_jacobian(angle)
+        by_errors[BETWEEN] += by_rate @ errors.derivative(angle / length)
+    unit = readout_time
+    by_errors[RATE] += unit * errors.derivative(shown[1][RATE] / unit)
+    by_errors[CHANGE] += unit * errors.derivative(shown[1][CHANGE] / unit)
+    by_errors[CHANGE, BIAS] = 0.0
+    variances += _SKEW**2 * np.repeat(np.square(shown[1]).reshape(3, 3).sum(axis=1), 3)
+    walk = errors.noise**2
+    variances += walk * np.repeat(
+        [length, _WALK_SLOPE * readout_time, _WALK_CURVATURE * readout_time], 3
+    )
+    variances += np.concatenate([_WAVE_MEAN * swing, _WAVE_MEAN * rough, _WAVE_SLOPE * rough])
+    within = slice(BETWEEN.stop, None)
+    error = by_errors[within] @ errors.covariance @ by_errors[within].T
+    error[np.diag_indices(6)] += variances[within]
+    static = by_errors[RATE].copy()
+    static[:, DELAY] = 0.0
     tau = dense / readout_time
-    cubics, rotations, rate, change, parabola, rough = turn_of(tau, found * readout_time)
-    deviation = np.sqrt(of_parameters[OFFSET, OFFSET])
-    shift = _shift(deviation / readout_time, tau[0] + 0.5, tau[-1] - 0.5)
-    wanted = np.array([-0.5, 0.0, 0.5])
-    early = _halves(turns_at(wanted - shift, tau, cubics, rotations)[0])
-    middle = _halves(turns_at(wanted, tau, cubics, rotations)[0])
-    late = _halves(turns_at(wanted + shift, tau, cubics, rotations)[0])
-    by_parameters, variances = np.zeros((6, PARAMETERS)), np.empty(6)
-    turned, changed = 0.0, 0.0
-    for k in range(3):
-        by_parameters[k, k] = -readout_time
-        turned += middle[k] * middle[k]
-        changed += middle[3 + k] * middle[3 + k]
-    walk, scale = noise * noise * readout_time, SCALE_DEVIATION * SCALE_DEVIATION
-    for k in range(6):
-        # Samples of later times: each row has the rate of a little earlier.
-        by_parameters[k, OFFSET] = -0.5 * (late[k] - early[k]) / (shift * readout_time)
-        variances[k] = (0.5 * (late[k] + early[k]) - middle[k]) ** 2
-        if k < 3:
-            variances[k] += _WALK_SLOPE * walk + scale * turned
-        else:
-            variances[k] += _WALK_CURVATURE * walk + scale * changed
-    if rough * min(deviation / _NEAR, 1.0) > MOST_ROUGH:
-        for k in range(6):
-            variances[k] += rough * rough * (2.0 if k < 3 else 2.0 * _WAVE_SLOPE)
-            uncertain = 0.0
-            for column in range(PARAMETERS):
-                own = by_parameters[k, column]
-                uncertain += own * own * of_parameters[column, column]
-            variances[k] += uncertain
-        by_parameters[:] = 0.0
-    error = by_parameters @ of_parameters @ by_parameters.T
-    for k in range(6):
-        error[k, k] += variances[k]
-    turn = (tau, cubics, rotations, rate, change, parabola, rough)
-    return turn, error, by_parameters, variances, period
+    known = GyroRotation(
+        tau, *turn_of(tau, found * readout_time), error,
+        errors.noise * readout_time / math.sqrt(period), deviation / readout_time,
+        static @ errors.covariance @ static.T + np.diag(rough),
+    )  # fmt: skip
+    return Rotated(known, between, by_errors, variances, swing)
 
 
-@kernel
-def _shift(deviation: float, before: float, after: float) -> float:
-    """Shift as far as deviation and samples reach; never so little that rounding decides."""
-    shift: float = max(min(deviation, -before, after), _LEAST_SHIFT)
-    return shift
+def _averaged(
+    times: Array, rates: Array, deviation: float, near: BoolArray
+) -> tuple[Array, Array, Array]:
+    """Rates (n,3) averaged over a normal shift of their times (n,).
+
+    Returns:
+        them; of those that are near, variances (3,) about the average, but for what goes with the
+        shift, and of the turns to and fro that these make.
+    """
+    weights = np.gradient(times) * np.exp(-0.5 * ((times[:, None] - times) / deviation) ** 2)
+    weights /= weights.sum(axis=1)[:, None]
+    averaged = weights @ rates
+    # Beside what goes with the shift to first order.
+    along = deviation * np.gradient(averaged, times, axis=0)
+    spread = (weights @ rates**2 - averaged**2 - along**2)[near]
+    rough = np.maximum(spread.mean(axis=0), 0.0)
+    left = (rates - averaged)[near]
+    turned = np.cumsum(left * np.gradient(times[near])[:, None], axis=0)
+    return averaged, rough, rough * turned.var(axis=0) / np.maximum((left**2).mean(axis=0), _TINY)
 
 
-@kernel
-def _halves(rotations: Array) -> Array:
-    """Mean rate and its change (6,) of a turn (3,3,3) over an interval of length 1."""
-    first = log(multiplied(rotations[0], rotations[1].T.copy()))
-    second = log(multiplied(rotations[1], rotations[2].T.copy()))
-    found = np.empty(6)
-    for k in range(3):
-        found[k] = first[k] + second[k]
-        found[3 + k] = 4.0 * (second[k] - first[k])
-    return found
+def _shown(times: Array, rates: Array, length: float, half: float, late: float) -> Array:
+    """What rates say (9,) if they come so much later.
 
-
-@entry
-def _between(
-    times_ns: IntArray1, rates: Array2, here_ns: int, bias: Array1, length: float, noise: float,
-    deviation: float,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """The fields of a :class:`TurnBetween`; it ends here."""
-    dense, found = densified(*_relative(times_ns, rates, here_ns, bias))
-    cubics = spline(dense, found)
-    rotations = rotations_at_knots(dense, cubics)  # from the camera then
-    shift = _shift(deviation, dense[0] + length, dense[-1])
-    wanted = np.array([-length, 0.0, -length - shift, -shift, shift - length, shift])
-    turned, _ = turns_at(wanted, dense, cubics, rotations)
-    rotation = multiplied(turned[1], turned[0].T.copy())
-    angle = log(rotation.T.copy())
-    x, y, z = angle[0], angle[1], angle[2]
-    squared = x * x + y * y + z * z
-    _, c, d = coefficients(squared)
-    by_parameters = np.empty((3, PARAMETERS))
-    # A constant rate in the camera's axes of each moment, seen in those of then: the right
-    # Jacobian of the exponential.
-    by_parameters[0, 0] = -length * (1.0 - d * (y * y + z * z))
-    by_parameters[1, 1] = -length * (1.0 - d * (x * x + z * z))
-    by_parameters[2, 2] = -length * (1.0 - d * (x * x + y * y))
-    by_parameters[0, 1] = -length * (c * z + d * x * y)
-    by_parameters[1, 0] = -length * (-c * z + d * x * y)
-    by_parameters[0, 2] = -length * (-c * y + d * x * z)
-    by_parameters[2, 0] = -length * (c * y + d * x * z)
-    by_parameters[1, 2] = -length * (c * x + d * y * z)
-    by_parameters[2, 1] = -length * (-c * x + d * y * z)
-    # By how much more the camera turns if the samples come later, or earlier.
-    back = rotation.T.copy()
-    late = log(multiplied(multiplied(turned[3], turned[2].T.copy()), back))
-    early = log(multiplied(multiplied(turned[5], turned[4].T.copy()), back))
-    variances = np.empty(3)
-    for k in range(3):
-        by_parameters[k, OFFSET] = -0.5 * (late[k] - early[k]) / shift
-        variances[k] = (0.5 * (late[k] + early[k])) ** 2
-        variances[k] += noise * noise * length + SCALE_DEVIATION * SCALE_DEVIATION * squared
-    return rotation, by_parameters, variances
+    That is the turn over a length until time 0, and mean rate and its change over a readout, of so
+    much on both sides of it, per readout. Axes are those of each moment: how they turn meanwhile
+    makes no difference to a small shift.
+    """
+    steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(times)[:, None]
+    angles = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    wanted = np.array([-length, -half, 0.0, half]) + late
+    at = np.clip(np.searchsorted(times, wanted) - 1, 0, len(times) - 2)
+    since, step = (wanted - times[at])[:, None], (times[at + 1] - times[at])[:, None]
+    bend = 0.5 * since**2 / step * (rates[at + 1] - rates[at])
+    past, first, middle, last = angles[at] + since * rates[at] + bend
+    return np.concatenate([middle - past, last - first, 4.0 * (last - 2.0 * middle + first)])

@@ -312,6 +312,8 @@ def summary(tally: Tally, config: NodeConfig, timed: bool = True) -> list[str]:
             bias = np.linalg.norm(np.degrees(imu.status.bias))
             rows.append(("  bias of the gyroscope (deg/s)", f"{bias:.2f}"))
             rows.append(("  time offset of the IMU (ms)", f"{1e3 * imu.time_offset:.2f}"))
+            if imu.status.oddity:
+                rows.append(("  said by the camera's rotation:", imu.status.oddity))
     if timed:
         rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
     if (smoothed := tally.smoothed) is not None:

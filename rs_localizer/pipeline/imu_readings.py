@@ -19,9 +19,8 @@ from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.inertial.buffer import LONGEST_PERIOD_NS, ReadingBuffer, Readings
-from rs_localizer.inertial.gyroscope_noise import InertialSettings
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.status import InertialStatus, Unused
+from rs_localizer.inertial.status import InertialSettings, InertialStatus, Unused
 from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.transforms import TransformError, Transforms
 from rs_localizer.pipeline.refusal import IMU_REASONS, Notify
@@ -38,6 +37,8 @@ _MANY, _LONG = 100, 5
 # Frames whose accelerometer readings average a hand's accelerations out of gravity.
 _SOME = 30
 
+# s: drivers stamp images and readings some milliseconds off; who gives an offset has measured it.
+_ANY_OFFSET, _GIVEN_OFFSET = 0.02, 0.002
 # Hz: at less, a shaking of 30 Hz turns by half a cycle between two readings.
 _LEAST_RATE = 1e9 / LONGEST_PERIOD_NS
 
@@ -84,6 +85,7 @@ class ImuInput:
         self._reasons: Counter[str] = Counter()
         self._in_a_row: deque[ImuReason] = deque(maxlen=_LONG)
         self._reported: ImuReason | None = None
+        self._odd = 0  # frames in a row that say what the gyroscope has
         self._status: InertialStatus | None = None
         self._given_offset = 0.0
 
@@ -242,6 +244,10 @@ class ImuInput:
         self._recently.append(unused)
         self._status = None if tracker is None else tracker.inertial
         self._given_offset = config.imu.time_offset
+        oddity = "" if self._status is None else self._status.oddity
+        self._odd = self._odd + 1 if oddity else 0
+        if self._odd == _LONG:
+            self._notice(ImuReason.DISAGREES, f"the gyroscope is allowed for as it is: {oddity}")
         if unused is None:
             self._in_a_row.clear()
             self._reported = None
@@ -260,7 +266,10 @@ def inertial_settings(config: NodeConfig) -> InertialSettings | None:
     return InertialSettings(
         gyroscope_noise=config.imu.gyroscope_noise,
         gyroscope_bias_walk=config.imu.gyroscope_bias_walk,
-        estimate_time_offset=config.imu.estimate_time_offset,
+        scale_deviation=config.imu.scale_deviation,
+        mount_deviation=config.imu.mount_deviation,
+        time_offset_deviation=config.imu.time_offset_deviation
+        or (_GIVEN_OFFSET if config.imu.time_offset else _ANY_OFFSET),
         gravity_in_map=np.array(config.gravity_in_map, float) if config.imu.gravity else None,
     )
 

@@ -23,7 +23,6 @@ from rs_localizer.core.rig import Rig
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 from rs_localizer.core.types import Estimate
-from rs_localizer.inertial.turning import MOST_ROUGH
 from rs_localizer.tools.adjust.fit import Fit, cheaper, solve
 from rs_localizer.tools.adjust.motion import acceleration_rows
 from rs_localizer.tools.adjust.observe import ImagePoints, collect
@@ -75,6 +74,8 @@ _FADING = 0.1
 # way that knots cannot follow: by so many times the noise, and beyond the chance (so many standard
 # deviations) of its points. Where so much of the frames is, the motion between them is none.
 _SHAKEN, _SHAKEN_SIGMAS, _MOST_SHAKEN = 1.5, 5.0, 0.2
+# rad per readout that gyroscopes see beside a parabola: vibration.
+_ROUGH = 2e-3
 # So are frames whose own in-frame turns move their points by more than their residual, as most of
 # those next to them do: of a hand, 65 points at 1 px, at most one in twenty does by chance, of 0.3
 # deg at 60 Hz all do, by 1.3 to 5.4 times.
@@ -278,7 +279,7 @@ def _shaken(fitted: Fit, parts: Parts, focal_length: float, estimates: list[Esti
     limit = np.maximum(_SHAKEN**2, 1.0 + _SHAKEN_SIGMAS / np.sqrt(np.maximum(count, 1)))
     shaken = (count > 0) & (off > limit * own / freedom)
     # Or their gyroscopes know it.
-    rough = [one.turn is not None and one.turn.roughness > MOST_ROUGH for one in estimates]
+    rough = [one.turn is not None and one.turn.roughness > _ROUGH for one in estimates]
     return np.asarray(shaken | rough | _turns_in_frame(focal_length, estimates), np.bool_)
 
 

@@ -41,7 +41,15 @@ def some_estimate(shaken=0, gyroscope=False, speed=0.2, acceleration=0.3):
         shake=shake[:shaken], span=SPAN, time_ns=10**12,
     )  # fmt: skip
     turn = GyroRotation.of(TAU, RATES, rate_noise=0.01)
-    return found.turned(turn, (0.0, math.inf)) if gyroscope else found
+    return beside(found, turn) if gyroscope else found
+
+
+def beside(found, turn):
+    """An estimate with the known turn beside which it was found."""
+    return replace(
+        found, turn=turn, angular_velocity=found.angular_velocity + turn.rate,
+        angular_acceleration=found.angular_acceleration + turn.change,
+    )  # fmt: skip
 
 
 def centre(pose):

@@ -10,21 +10,20 @@ import pytest
 from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.so3 import log
 from rs_localizer.core.types import Estimate
-from rs_localizer.inertial.gyroscope_noise import InertialSettings
-from rs_localizer.inertial.status import Unused
-from rs_localizer.inertial.turning import GyroscopeErrors, turn_between, turn_within
+from rs_localizer.inertial.status import InertialSettings, Unused
+from rs_localizer.inertial.turning import GyroscopeErrors, rotated
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 from rs_localizer.tracking import Tracker
 
 from .conftest import MIDDLE_NS, READOUT_TIME, Shaken
 
-SETTINGS = InertialSettings(2e-4, 1e-4, True)
+SETTINGS = InertialSettings(2e-4, 1e-4)
 
 
-def errors(bias=(0.0, 0.0, 0.0), offset=0.0):
-    covariance = np.diag([1e-8, 1e-8, 1e-8, 1e-10])
-    return GyroscopeErrors(np.asarray(bias), offset, covariance, 1e-5)
+def errors(mean=(0.0,) * 10):
+    covariance = np.diag([1e-8, 1e-8, 1e-8, 1e-10, *6 * [1e-8]])
+    return GyroscopeErrors(np.asarray(mean), covariance, 1e-5)
 
 
 @pytest.mark.parametrize("solver", ["r6p_vcwt", "p3p"])
@@ -32,7 +31,7 @@ def test_the_truth_comes_back_under_vibration(camera, solver):
     shaken = Shaken(vibration=0.3)
     shaken.velocity = np.zeros(3) if solver == "p3p" else shaken.velocity
     points, pixels = shaken.frame(camera)
-    turn = turn_within(shaken.samples(), MIDDLE_NS, READOUT_TIME, errors()).known
+    turn = rotated(shaken.samples(), MIDDLE_NS, READOUT_TIME, errors()).known
     found = Localizer(camera, solver=solver).localize(points, pixels, turn=turn)
     assert found
     assert found.inliers.all()
@@ -50,7 +49,7 @@ def test_the_truth_comes_back_under_vibration(camera, solver):
 def test_velocities_are_the_derivatives_of_the_poses(camera):
     shaken = Shaken()
     points, pixels = shaken.frame(camera)
-    turn = turn_within(shaken.samples(), MIDDLE_NS, READOUT_TIME, errors()).known
+    turn = rotated(shaken.samples(), MIDDLE_NS, READOUT_TIME, errors()).known
     found = Localizer(camera).localize(points, pixels, turn=turn)
     step = 1e-5
     rotations, translations = found.at_rows(np.array([0.2 - step, 0.2, 0.2 + step]))
@@ -62,25 +61,41 @@ def test_velocities_are_the_derivatives_of_the_poses(camera):
     assert np.all(found.without_gyro().angular_velocity == found.angular_velocity - turn.rate)
 
 
-def test_derivatives_by_bias_and_offset():
+@pytest.mark.parametrize("far", [0.0, 0.1])
+def test_derivatives_by_what_the_gyroscope_is_off_by(far):
+    """By differences, from none of it and from a scale and a mount that are far off."""
     samples = Shaken(vibration=0.02).samples(rate=397.0)  # none at the ends
-    start, step = errors(), 1e-5
-    within = turn_within(samples, MIDDLE_NS, READOUT_TIME, start)
-    between = turn_between(samples, MIDDLE_NS - 33_000_000, MIDDLE_NS, start)
-    for k in range(4):
-        other = step * np.eye(4)[k]
-        moved = GyroscopeErrors(other[:3], other[3], start.covariance, start.noise)
-        turned = turn_between(samples, MIDDLE_NS - 33_000_000, MIDDLE_NS, moved).rotation
-        by = -log(np.ascontiguousarray(turned @ between.rotation.T)) / step
+    start, step, since = errors(far * np.r_[0, 0, 0, 0, 1, -1, 0.5, 0.6, 0.5, -1]), 1e-5, 33_000_000
+    found = rotated(samples, MIDDLE_NS, READOUT_TIME, start, MIDDLE_NS - since)
+    for k in range(10):
+        moved = errors(start.mean + step * np.eye(10)[k])
+        other = rotated(samples, MIDDLE_NS, READOUT_TIME, moved, MIDDLE_NS - since)
+        by = -log(np.ascontiguousarray(other.between @ found.between.T)) / step
         np.testing.assert_allclose(
-            between.by_parameters[:, k], by, atol=2e-3 + 0.02 * abs(by).max()
+            found.by_errors[:3, k], by, atol=3e-3 + 0.02 * abs(by).max(), err_msg=str(k)
         )
-        known = turn_within(samples, MIDDLE_NS, READOUT_TIME, moved).known
-        whole = [log(t.at(-0.5)[0] @ t.at(0.5)[0].T) for t in (known, within.known)]
+        whole = [log(t.known.at(-0.5)[0] @ t.known.at(0.5)[0].T) for t in (other, found)]
         by = (whole[0] - whole[1]) / step
         np.testing.assert_allclose(
-            within.by_parameters[:3, k], by, atol=2e-3 + 0.02 * abs(by).max()
+            found.by_errors[3:6, k], by, atol=3e-3 + 0.02 * abs(by).max(), err_msg=str(k)
         )
+
+
+def test_a_vibration_of_unknown_phase_is_no_rotation_that_is_known():
+    """Averaged over its period it vanishes; what is left counts as vibration without a phase."""
+    shaken = Shaken(vibration=0.3, turn=0.0)
+    samples = shaken.samples(rate=400.0, reach=0.2)
+    known, vague = errors(), errors()
+    vague.covariance[3, 3] = 0.02**2
+    sure, unsure = (rotated(samples, MIDDLE_NS, READOUT_TIME, one) for one in (known, vague))
+    swing = np.radians(0.3) / np.sqrt(2.0)
+    fastest = [
+        np.abs(one.known.at_rows(np.linspace(-0.5, 0.5, 41))[1]).max() for one in (sure, unsure)
+    ]
+    assert fastest[0] > READOUT_TIME * 0.5 * 2.0 * np.pi * 60.0 * np.radians(0.3)
+    assert fastest[1] < 0.05 * fastest[0]
+    assert sure.swing.sum() < (0.01 * swing) ** 2
+    assert unsure.swing.sum() == pytest.approx(swing**2, rel=0.3)
 
 
 def test_without_samples_everything_is_as_without_a_gyroscope(camera):

@@ -10,7 +10,7 @@ from rs_localizer.inertial.gravity import STANDARD_GRAVITY, gravity_seen
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.turning import GyroscopeErrors
 
-ERRORS = GyroscopeErrors(np.zeros(3), 0.0, 1e-8 * np.eye(4), 1e-4)
+ERRORS = GyroscopeErrors(np.zeros(10), 1e-8 * np.eye(10), 1e-4)
 TIMES = 10**12 + np.arange(400) * 2_500_000
 
 

@@ -50,6 +50,14 @@ def estimate(rate: float, seed: int = 0, acceleration: float = 0.0, shake: float
     )
 
 
+def beside(motion: Estimate, turn: GyroRotation) -> Estimate:
+    """The same with a known turn beside which it was found."""
+    return replace(
+        motion, turn=turn, angular_velocity=motion.angular_velocity + turn.rate,
+        angular_acceleration=motion.angular_acceleration + turn.change,
+    )  # fmt: skip
+
+
 def shake(motion: Estimate, tau: float) -> Array:
     """A cosine and a sine per half-cycle of the readout, less value and slope at 0."""
     if abs(tau) > 0.51:  # beyond the rows it stays as it was; differences reach a little beyond
@@ -176,7 +184,7 @@ def test_nothing_runs_away_beyond_the_rows(tau):
     samples = np.linspace(-0.6, 0.6, 25)
     rates = 0.02 * np.sin(np.outer(samples, [20.0, 25.0, 30.0]))
     motion = replace(estimate(0.1), shake=shaking, joint_covariance=1e-10 * np.eye(18 + 84))
-    for seen in (motion, motion.turned(GyroRotation.of(samples, rates), (0.0, np.inf))):
+    for seen in (motion, beside(motion, GyroRotation.of(samples, rates))):
         edge = 0.5 if tau > 0.0 else -0.5
         before, after = pose_at(seen, edge), pose_at(seen, tau)
         turn = Rotation.from_matrix(before.rotation.T @ after.rotation).magnitude()
@@ -214,7 +222,7 @@ def test_what_no_row_has_seen_grows_with_the_distance(known):
     if known:
         turn = GyroRotation.of(samples, rates)
         motion = replace(motion, shake=np.zeros((0, 3)), joint_covariance=np.zeros((18, 18)))
-        motion = motion.turned(turn, (0.0, np.inf))
+        motion = beside(motion, turn)
         swung = turn.at_rows(rows)[1]
         seen = np.mean((swung - swung.mean(axis=0)) ** 2)
     for tau in (0.7, 0.8, 1.4):
@@ -233,7 +241,7 @@ def test_an_estimate_beside_a_gyroscope_moves_on_in_the_axes_of_then():
     rates = 0.3 + 0.1 * np.sin(np.outer(samples, [20.0, 25.0, 30.0]))
     turn = GyroRotation.of(samples, rates, rate_noise=0.05, delay=0.01)
     seen = replace(estimate(0.5, acceleration=0.02), span=READOUT_TIME)
-    seen = seen.turned(turn, (0.0, np.inf))
+    seen = beside(seen, turn)
     for tau in (-0.5, 0.3, 0.8):
         moved = seen.at_time(tau * READOUT_TIME)
         for of in (pose_at, lambda motion, tau: twist_at(motion, tau, READOUT_TIME)):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from rs_localizer.core.reasons import Notice
+from rs_localizer.core.reasons import ImuReason, Notice
 from rs_localizer.io.messages import make_header
 from rs_localizer.io.outputs import Localized
 from rs_localizer.pipeline.camera_frames import DOUBTFUL
@@ -90,6 +90,11 @@ def imu_oddity(state: ImuState | None) -> dict[str, str]:
     if state.mostly is not None and state.share < _FEW:
         look_at = IMU_REASONS[state.mostly.reason].look_at
         oddities["imu"] = f"the IMU is not used: {in_words(state.mostly)} ({look_at})"
+    if state.status is not None and state.status.oddity:
+        oddities["imu.gyroscope"] = (
+            f"the camera's rotation says of the gyroscope: {state.status.oddity} "
+            f"({IMU_REASONS[ImuReason.DISAGREES].look_at})"
+        )
     if state.gravity is not None and state.gravity > _MOST_TILT:
         oddities["imu.gravity"] = (
             f"the accelerometer shows gravity {math.degrees(state.gravity):.0f} degrees off "

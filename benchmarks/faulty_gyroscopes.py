@@ -1,0 +1,171 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A gyroscope that is wrong beside a tracker: it is never worse than none, and what it has is said.
+
+python -m benchmarks.faulty_gyroscopes
+
+The independent simulator's hand before two scenes: points at all depths, and a wall. The gyroscope
+is too fast, turned on its mount, late, its stamps step, or its range ends. Errors are medians of
+the frames behind the first five, beside those of the camera alone on the same frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.aided import Recorded, believed, record
+from benchmarks.experiments.results import Table
+from benchmarks.independent.cameras import Camera
+from benchmarks.independent.gyroscopes import Imu
+from benchmarks.independent.motions import hand
+from benchmarks.independent.rotations import Array, logarithm
+from benchmarks.independent.scenes import Rich, Scene, Wall
+from rs_localizer.core.types import Estimate
+from rs_localizer.inertial.buffer import ReadingBuffer
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.status import Unused
+from rs_localizer.localizer import Localizer
+from rs_localizer.tracking import Tracker
+
+SCENES: dict[str, Scene] = {"room": Rich(), "wall": Wall()}
+_AXIS = np.array([0.48, 0.6, 0.64])
+
+
+def _mount(degrees: float) -> tuple[float, float, float]:
+    x, y, z = (math.radians(degrees) * _AXIS).tolist()
+    return x, y, z
+
+
+FAULTS: dict[str, Imu] = {
+    "right": Imu(),
+    **{f"scale {percent} %": Imu(scale=1.0 + 0.01 * percent) for percent in (1, 2, 5, 10, 20)},
+    **{f"mount {degrees} deg": Imu(mount=_mount(degrees)) for degrees in (1, 2, 5, 10)},
+    **{f"late {ms} ms": Imu(offset=-1e-3 * ms) for ms in (5, 20, 40)},
+    "step 15 ms": Imu(step=0.015),
+    "saturated": Imu(limit=0.5),
+}
+_NOISE = 1.0  # px
+_BEGIN = 5  # frames
+_INSIDE = 12.592  # 95 % quantile of chi-squared with six degrees of freedom
+_LENGTH = 60  # frames of a recording
+_BEFORE_NS, _AFTER_NS = 600_000_000, 10_000_000
+_LATEST_NS = 60_000_000  # stamps that are early or late by no more than this
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What became of the frames of some recordings."""
+
+    orientation: Array  # (n,) deg off at the middle row; NaN: not localized
+    rate: Array  # (n,) deg/s off there
+    inside: Array  # (n,) whether the pose lies in its region of 95 %
+    used: float  # share of frames with the gyroscope
+    said: str  # why it was not, or what it has; of the last frame that says so
+
+
+def followed(recorded: Recorded, with_imu: bool = True) -> Found:
+    """Track the frames of each recording with the gyroscope's readings, or the camera alone."""
+    frames, rows, used, said = recorded.frames, [], 0, ""
+    tracker, buffer = Tracker(Localizer(believed(frames.camera))), ReadingBuffer()
+    half_ns = round(0.5e9 * frames.camera.readout_time)
+    for frame in range(len(frames)):
+        middle_ns, which = frames.middle_ns(frame), int(frames.recording[frame])
+        if frames.place[frame] == 0:
+            tracker = Tracker(
+                Localizer(believed(frames.camera)), recorded.settings if with_imu else None
+            )
+            buffer, every = ReadingBuffer(), recorded.samples[which]
+            heard = 0
+        samples = None
+        if with_imu:
+            until = int(np.searchsorted(every.times_ns, middle_ns + _LATEST_NS))
+            for k in range(heard, until):
+                x, y, z = every.angular_velocity[k].tolist()
+                buffer.add(int(every.times_ns[k]), "camera", (x, y, z))
+            heard = until
+            found = buffer.between(
+                middle_ns - half_ns, middle_ns + half_ns,
+                middle_ns - _BEFORE_NS, middle_ns + _LATEST_NS,
+            )  # fmt: skip
+            if isinstance(found, Unused):
+                said = found.reason.removeprefix("imu_")
+            else:
+                samples = ImuSamples(found.stamps_ns, found.angular_velocities)
+        result = tracker.localize(middle_ns, *frames.seen(frame, _NOISE), imu=samples)
+        if samples is not None and tracker.inertial is not None:
+            status = tracker.inertial
+            used += status.unused is None
+            said = status.oddity or said
+        if frames.place[frame] >= _BEGIN:
+            rows.append(_errors(recorded, frame, result if result else None))
+    orientation, rate, inside = np.array(rows).T
+    return Found(orientation, rate, inside, used / len(frames), said)
+
+
+def _errors(recorded: Recorded, frame: int, found: Estimate | None) -> tuple[float, float, float]:
+    if found is None:
+        return math.nan, math.nan, math.nan
+    true, readout = recorded.frames.middle, recorded.frames.camera.readout_time
+    # A step turns the camera in its own axes: exp(-[turn]x) R.
+    turn = logarithm(true.rotation[frame].T @ found.rotation.T)
+    move = found.rotation @ (found.position - true.position[frame])
+    off = np.concatenate([turn, move])
+    squared = off @ np.linalg.solve(found.covariance[:6, :6], off)
+    rate = found.angular_velocity / readout - true.angular[frame]
+    degrees = np.degrees([np.linalg.norm(turn), np.linalg.norm(rate)])
+    return float(degrees[0]), float(degrees[1]), float(squared < _INSIDE)
+
+
+def table(faults: Sequence[str], recordings: int, seed: int) -> Table:
+    """One row a fault: both scenes, beside the camera alone."""
+    columns = [column for name in SCENES for column in (name, "inside")]
+    rows: list[list[str]] = []
+    alone = {
+        name: followed(record(Camera(), hand, scene, (recordings, _LENGTH), seed), False)
+        for name, scene in SCENES.items()
+    }
+    row: list[str] = []
+    for one in alone.values():
+        row += [
+            f"{np.nanmedian(one.orientation):.3f} deg, {np.nanmedian(one.rate):.1f} deg/s",
+            f"{100.0 * np.nanmean(one.inside):.0f}",
+        ]
+    rows.append(["camera alone", *row, "", ""])
+    for fault in faults:
+        row, used, said = [], [], ""
+        for name, scene in SCENES.items():
+            imu = FAULTS[fault]
+            one = followed(record(Camera(), hand, scene, (recordings, _LENGTH), seed, imu))
+            both = [
+                np.nanmedian(aided) / np.nanmedian(own)
+                for aided, own in (
+                    (one.orientation, alone[name].orientation), (one.rate, alone[name].rate)
+                )
+            ]  # fmt: skip
+            row += [f"{both[0]:.2f}, {both[1]:.2f}", f"{100.0 * np.nanmean(one.inside):.0f}"]
+            used.append(f"{100.0 * one.used:.0f}")
+            said = one.said or said
+        rows.append([fault, *row, ", ".join(used), said])
+    return Table(("", *columns, "used", "says"), rows)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--recordings", type=int, default=2, help="of 60 frames; %(default)s")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("faults", nargs="*", help=", ".join(FAULTS))
+    args = parser.parse_args(argv)
+    print(table(args.faults or list(FAULTS), args.recordings, args.seed).text())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

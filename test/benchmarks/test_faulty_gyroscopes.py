@@ -1,0 +1,47 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Gyroscopes that are wrong: beside the camera alone no frame is worse, and what they have is said.
+
+The independent simulator's frames and gyroscopes; the whole table is ``python -m
+benchmarks.faulty_gyroscopes``.
+"""
+
+import numpy as np
+import pytest
+
+from benchmarks.aided import record
+from benchmarks.faulty_gyroscopes import FAULTS, followed
+from benchmarks.independent.cameras import Camera
+from benchmarks.independent.motions import hand
+from benchmarks.independent.scenes import Wall
+
+SEED = 3
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return followed(record(Camera(), hand, Wall(), (1, 60), SEED), with_imu=False)
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("right", ""),
+        ("scale 5 %", "it turns 5 % too fast"),
+        ("scale 20 %", "it turns 20 % too fast"),
+        ("mount 10 deg", "its mount is 10 deg off"),
+        ("late 40 ms", "its stamps are 40 ms late"),
+        ("step 15 ms", "its stamps stepped by 16 ms"),
+        ("saturated", "saturated"),
+    ],
+)
+def test_a_gyroscope_is_never_worse_than_none(fault, said, alone):
+    found = followed(record(Camera(), hand, Wall(), (1, 60), SEED, FAULTS[fault]))
+    for aided, own in ((found.orientation, alone.orientation), (found.rate, alone.rate)):
+        assert np.isfinite(aided).all()
+        assert np.median(aided) < 1.1 * np.median(own)
+    assert np.mean(found.inside) >= 0.9
+    if fault == "right":
+        assert found.used > 0.95
+        assert np.median(found.rate) < 0.2 * np.median(alone.rate)
+    assert found.said == said

@@ -1,0 +1,165 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A tracker and its gyroscope: what that is off by is found, and where it lies it is left out."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from benchmarks.aided import believed, record
+from benchmarks.independent.cameras import Camera
+from benchmarks.independent.gyroscopes import Imu
+from benchmarks.independent.motions import hand, rest, shaken_hand
+from benchmarks.independent.scenes import Rich
+from rs_localizer.core.reasons import ImuReason
+from rs_localizer.core.shutter import Motion
+from rs_localizer.inertial.gyro_prior import GyroscopeTrack, _Foreseen
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.status import InertialSettings
+from rs_localizer.inertial.turning import GyroscopeErrors
+from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline.pose_at_time import twist_at
+from rs_localizer.tracking import Tracker
+
+STILL = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+
+
+def test_the_update_is_that_of_the_whole_filter():
+    """As a Kalman filter of motion and gyroscope at once, of an image that sees the motion."""
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(28, 28)) / np.r_[np.full(18, 1.0), np.full(10, 30.0)][:, None]
+    joint = root @ root.T
+    observed, noise = rng.normal(size=(7, 18)), 0.1  # fewer numbers than the motion has
+    seen = np.hstack([observed, np.zeros((7, 10))])
+    gain = joint @ seen.T @ np.linalg.inv(seen @ joint @ seen.T + noise * np.eye(7))
+    after, innovation = joint - gain @ seen @ joint, rng.normal(size=7)
+
+    gyroscope = GyroscopeTrack(InertialSettings(1e-4, 1e-4), 0.02)
+    gyroscope.errors = GyroscopeErrors(np.zeros(10), joint[18:, 18:], 1e-4)
+    foreseen = _Foreseen(STILL, joint[:18, :18], joint[:18, 18:])
+    gyroscope._learn(foreseen, observed.T @ observed / noise, observed.T @ innovation / noise)
+    np.testing.assert_allclose(gyroscope.errors.mean, gain[18:] @ innovation, atol=1e-10)
+    np.testing.assert_allclose(gyroscope.errors.covariance, after[18:, 18:], atol=1e-10)
+    np.testing.assert_allclose(gyroscope._tied, after[:18, 18:], atol=1e-10)
+
+
+def vibrating(count, rng):
+    return shaken_hand(count, rng, ((0.3, 60.0), (0.1, 120.0)))
+
+
+def around(recorded, frame):
+    """Samples of a frame until long after it: stamps may be late."""
+    (samples,) = recorded.samples
+    middle = recorded.frames.middle_ns(frame)
+    first, last = np.searchsorted(samples.times_ns, [middle - 600_000_000, middle + 60_000_000])
+    return ImuSamples(samples.times_ns[first:last], samples.angular_velocity[first:last])
+
+
+def followed(recorded, frames=60, change=lambda samples: samples):
+    """The gyroscope's status after each frame, and the results."""
+    tracker = Tracker(Localizer(believed(recorded.frames.camera)), recorded.settings)
+    found = []
+    for frame in range(frames):
+        seen, samples = recorded.frames.seen(frame, 1.0), change(around(recorded, frame))
+        result = tracker.localize(recorded.frames.middle_ns(frame), *seen, imu=samples)
+        found.append((tracker.inertial, result))
+    return found
+
+
+def rate_errors(recorded, found, first):
+    """Errors (n,3) of the turn rate in rad/s from a frame on, and their squared lengths (n,) in
+    deviations.
+    """
+    off, squared = [], []
+    for frame, (_, result) in enumerate(found[first:], first):
+        twist = twist_at(result, 0.0, recorded.frames.camera.readout_time)
+        off.append(twist.angular - recorded.frames.middle.angular[frame])
+        squared.append(off[-1] @ np.linalg.solve(twist.covariance[3:, 3:], off[-1]))
+    return np.array(off), np.array(squared)
+
+
+@pytest.fixture(scope="module")
+def held():
+    return record(Camera(), hand, Rich(), (1, 60), seed=4)
+
+
+@pytest.mark.parametrize("motion", [vibrating, pytest.param(hand, marks=pytest.mark.bench)])
+def test_a_time_offset_is_found(motion):
+    recorded = record(Camera(), motion, Rich(), (1, 75), 4, replace(Imu(), offset=0.005))
+    found = followed(recorded, 75)
+    assert abs(found[-1][0].time_offset - 0.005) < 5e-4
+    assert all(result for _, result in found[60:])
+    off, _ = rate_errors(recorded, found, 60)
+    # 50 without the gyroscope; a tenth of a millisecond is worth 5 under the vibrations.
+    assert np.median(np.degrees(np.linalg.norm(off, axis=1))) < 7.0
+
+
+@pytest.mark.parametrize(("offset", "hertz"), [(0.005, 61.3), (-0.011, 120.0)])
+def test_no_period_of_a_vibration_is_mistaken_for_another(hertz, offset):
+    """Also of one that is in step with the images, and so turns alike in all of them."""
+    motion = partial(shaken_hand, shaking=((0.2, hertz),))
+    recorded = record(Camera(), motion, Rich(), (1, 60), 5, replace(Imu(), offset=offset))
+    found = followed(recorded)
+    status, _ = found[-1]
+    assert abs(status.time_offset - offset) < 5e-4
+    # Also before it is known.
+    assert np.mean(rate_errors(recorded, found, 5)[1] < 7.81) > 0.85
+
+
+def test_a_camera_at_rest_says_nothing_of_the_offset():
+    recorded = record(Camera(), rest, Rich(), (1, 12), 5)
+    status, _ = followed(recorded, 12)[-1]
+    assert status.time_offset_deviation > 0.01
+
+
+@pytest.mark.parametrize("shaking", [((0.2, 60.0),), pytest.param((), marks=pytest.mark.bench)])
+def test_a_step_of_the_stamps_is_found(shaking):
+    """Another clock from one sample on, by 20 ms: more than a period of the vibration."""
+    motion = partial(shaken_hand, shaking=shaking) if shaking else hand
+    recorded = record(Camera(), motion, Rich(), (1, 70), 5, replace(Imu(), step=0.02))
+    found = followed(recorded, 70)  # in the middle of them
+    assert abs(found[-1][0].time_offset + 0.02) < 1e-3
+    assert "stamps" in found[-1][0].oddity
+    _, squared = rate_errors(recorded, found, 0)
+    assert np.mean(squared[35:50] < 7.81) > 0.4
+    assert np.mean(squared[50:] < 7.81) > 0.85
+
+
+def test_the_bias_is_found(held):
+    status, result = followed(held)[-1]
+    assert status.unused is None
+    assert status.oddity == ""
+    assert result.turn is not None
+    assert 0.1 < np.degrees(np.linalg.norm(status.bias)) < 0.9  # of 0.5
+    assert np.degrees(status.bias_deviation) < 0.2
+
+
+def test_upside_down_is_left_out(held):
+    def turned(samples):
+        return ImuSamples(samples.times_ns, samples.angular_velocity * (1.0, -1.0, -1.0))
+
+    found = followed(held, change=turned)
+    reasons = [status.unused.reason for status, _ in found[5:] if status.unused is not None]
+    assert len(reasons) > 40
+    assert reasons.count(ImuReason.DISAGREES) > 0.8 * len(reasons)
+    assert all(result for _, result in found)
+    assert np.mean(rate_errors(held, found, 5)[1] < 7.81) > 0.9
+
+
+def test_behind_the_last_row_the_camera_turns_on(held):
+    """Readings of later than the middle row have not come: the frame's own rows say it."""
+    tracker = Tracker(Localizer(believed(held.frames.camera)), held.settings)
+    half = round(0.5e9 * Camera().readout_time)
+    off = []
+    for frame in range(60):
+        samples, middle = held.around(frame), held.frames.middle_ns(frame)
+        tracker.localize(middle, *held.frames.seen(frame, 1.0), imu=samples)
+        here = int(np.searchsorted(samples.times_ns, middle))
+        late = ImuSamples(samples.times_ns[:here], samples.angular_velocity[:here])
+        moved = [tracker.at(middle + half + 1_000_000, heard) for heard in (late, samples)]
+        if frame >= 20:
+            off.append(np.subtract(*(one.angular_velocity for one in moved)))
+    off = np.degrees(np.linalg.norm(off, axis=1)) / Camera().readout_time
+    assert np.median(off) < 1.0  # 4.8 deg/s where the motion of the frames so far is carried on
