@@ -80,6 +80,7 @@ _POINTS, _PICTURES = FrameSettings(), ImageSettings()
 _POSITIVE = (0.0, math.inf)
 # Options of the one kind of recording that mean nothing to the other.
 _OF_POINTS, _OF_IMAGES = ("points", "outliers", "keypoints"), ("walls", "exposure")
+_OF_A_CAMERA = {"camera", "readout_time", "scan_direction", "imu", "imu_offset"}
 # Random numbers of their own: the frames are the same with and without them.
 _IMU_STREAM, _VIBRATION_STREAM = 14, 60
 
@@ -233,12 +234,13 @@ def see(
 
 
 def run(args: Options) -> dict[str, object]:
-    defaults = {item.name: item.default for item in fields(args)}
-    for name in _OF_POINTS if args.images else _OF_IMAGES:
-        if getattr(args, name) != defaults[name]:
-            raise UsageError(f"--{name} is {'not ' if args.images else ''}for --images")
-    if args.rig is not None and (args.imu or args.camera is not None):
-        raise UsageError("--rig goes without --imu and --camera")
+    given = {item.name for item in fields(args) if getattr(args, item.name) != item.default}
+    for name in given & {*(_OF_POINTS if args.images else _OF_IMAGES)}:
+        raise UsageError(f"--{name} is {'not ' if args.images else ''}for --images")
+    for name in given & _OF_A_CAMERA if args.rig is not None else ():
+        raise UsageError(f"--rig goes without --{name.replace('_', '-')}")
+    if "imu_offset" in given and not args.imu:
+        raise UsageError("--imu-offset goes with --imu")
     recorder = _Recorder(args)
     with atomic_directory(args.out, earlier_result(args, "metadata.yaml")) as built:
         recorder.write(built)

@@ -103,7 +103,8 @@ for words in {[name.split() for name in COMMANDS]}:
         (["replay", "a", "b"], "many recordings need --out DIR"),
         (["calibrate", "x", "--out", "x.txt"], "x.txt"),
         (["evaluate", "a"], "the following arguments are required: TRUTH"),
-        (["simulate", "x", "--rig", "c.yaml", "--imu"], "--rig goes without --imu and --camera"),
+        (["simulate", "x", "--rig", "c.yaml", "--imu"], "--rig goes without --imu"),
+        (["simulate", "x", "--imu-offset", "0.1"], "--imu-offset goes with --imu"),
         (["simulate", "x", "--images", "--keypoints"], "--keypoints is not for --images"),
     ],
 )
